@@ -1,6 +1,5 @@
 """What a user can cause and mend, everything else is a bug and keeps its traceback; names in what is said of it."""
 
-import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -46,11 +45,3 @@ class DiagnosedError(SurveyError):
 def listed(names: Sequence[str], most: int, between: str = ", ") -> str:
     """The first names of a message, and how many more there are."""
     return between.join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
-
-
-def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Key that sorts ``e2`` before ``e10``; different names have different keys."""
-    parts = re.split(r"(\d+)", name)
-    # 4000: the interpreter refuses to take longer numbers apart
-    numbers = [(0, int(part[:4000]), part) if part.isdecimal() else (1, 0, part) for part in parts if part]
-    return tuple(numbers)

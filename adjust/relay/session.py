@@ -20,7 +20,7 @@ from adjust.model.observations import Pair
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, PoseParameter, Station, Survey
 from adjust.observations.factors import pose_prior_factor
-from adjust.observations.pairs import NoiseCache, checked_arrays, native_factor, pair_arrays
+from adjust.observations.pairs import NoiseCache, checked_arrays, native_factor
 from adjust.pose_network.from_survey import network_from_survey
 from adjust.pose_network.network import PoseNetwork
 from adjust.relay.growth import Batch, Growth, Tree, moved_over
@@ -134,6 +134,7 @@ class NetworkSession:
         Raises SurveyError for a pair id that exists, for a pair that does not join stations and for new stations that
         no pair ties to the network; the session is then as before.
         """
+        arrays = checked_arrays(pairs)
         new, start = self._placed(pairs)
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for station in new:
@@ -142,7 +143,7 @@ class NetworkSession:
             self._neighbours.append([])
             values.insert(self._index[station], start[station])
             self._last[self._index[station]] = start[station]
-        kept, arrays = list[Pair](), pair_arrays(pairs)
+        kept = list[Pair]()
         for pair, b_from_a, W in zip(pairs, arrays.poses, arrays.whitening, strict=True):
             factor = self._factor(self._index[pair.a.frame_id], self._index[pair.b.frame_id], b_from_a, W)
             if factor is not None:
@@ -167,7 +168,6 @@ class NetworkSession:
             fresh.add(pair.pair_id)
             if pair.a.kind != "station" or pair.b.kind != "station" or pair.a.frame_id == pair.b.frame_id:
                 raise SurveyError(f"pair {pair.pair_id!r} does not join two stations")
-        checked_arrays(pairs)
         ordered = sorted((p for p in pairs if isinstance(p.b_from_a, Pose3)), key=lambda p: float(np.trace(p.cov)))
         start: dict[str, Pose3] = {}
         while True:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import sparse
 
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS
-from adjust.model.errors import natural_key
+from adjust.model.names import natural_key
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import side_by_side

@@ -13,7 +13,6 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from adjust.model.errors import SurveyError
-from adjust.model.errors import natural_key as natural_key
 from survey.folder.locking import hold, remove_unheld
 
 LARGEST_FILE = 4 * 2**30  # bytes; longer observations go into several projects

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from adjust.model.names import natural_key
 from survey.folder.replacing import filling
-from survey.folder.text import atomic_write, id_problem, natural_key
+from survey.folder.text import atomic_write, id_problem
 from survey.project.images import IMAGE_ENDINGS
 from survey.project.project import DEFINITION_FILE, IMAGES_FOLDER
 

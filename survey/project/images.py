@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from adjust.model.errors import SurveyError
-from survey.folder.text import id_problem, natural_key, suggestion
+from adjust.model.names import natural_key
+from survey.folder.text import id_problem, suggestion
 from survey.project.detected import ImageKey
 from survey.project.project import Definition
 from survey.project.targets import DetectableTarget, PointList

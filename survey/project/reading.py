@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from adjust.model.names import natural_key
 from adjust.model.survey import Datum, FloatArray, Point, PointParameter, Survey
 from survey.folder.locking import settled
-from survey.folder.text import id_problem, natural_key, suggestion
+from survey.folder.text import id_problem, suggestion
 from survey.project.declared.declarations import keys_of
 from survey.project.declared.instruments import (
     read_beams,

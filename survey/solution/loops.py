@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3, Rot3
 
+from adjust.model.names import natural_key
 from adjust.model.observations import FrameRef, Pair, frame_text
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, PoseParameter, Survey
@@ -23,7 +24,6 @@ from adjust.relay.counts import Counts, count
 from adjust.relay.loops import LoopMisclosures, loop_misclosures
 from adjust.relay.network import MeasuredPairs, topology
 from adjust.spatial.rigid_motions import Motions
-from survey.folder.text import natural_key
 from survey.solution.quantities import ARCSEC_PER_RAD
 
 ALPHA = 0.001

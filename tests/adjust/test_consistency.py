@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from adjust.adjustment import adjust
-from adjust.model.errors import natural_key
+from adjust.model.names import natural_key
 from adjust.model.result import GlobalTest
 from adjust.model.survey import FloatArray, Survey
 from adjust.statistics.changes import ChangeSearch

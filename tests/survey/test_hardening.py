@@ -15,13 +15,14 @@ import numpy as np
 import pytest
 
 from adjust.model.errors import SurveyError
+from adjust.model.names import natural_key
 from survey import project as files
 from survey.cli import FAILED, main
 from survey.detection.gray import read_image
 from survey.detection.image_header import image_size
 from survey.folder.messages import message
 from survey.folder.replacing import recover
-from survey.folder.text import cell_text, id_problem, natural_key, read_bytes
+from survey.folder.text import cell_text, id_problem, read_bytes
 from survey.jobs.adjusting.job import adjust_job
 from survey.project.declared.node import read_toml
 from survey.project.tables.files import read_table, write_table

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from adjust.model.names import natural_key
 from capture.devices.camera import (
     CameraError,
     CameraInfo,
@@ -16,7 +17,6 @@ from capture.devices.camera import (
 )
 from capture.devices.cameras.base import LOCKED_WHILE_ARMED, DriverCamera, gray_copy
 from survey.detection.gray import read_image
-from survey.folder.text import natural_key
 from survey.project.images import IMAGE_ENDINGS
 
 

@@ -14,9 +14,9 @@ from tqdm import tqdm
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.diagnosis.trajectory import OfTrajectory, causes_of_trajectory
 from adjust.model.errors import IndeterminateError, SurveyError, listed
+from adjust.model.names import natural_key
 from adjust.navigation import EpochPose, Motion, NavigateOptions, Trajectory, head_and_beacons, navigate
 from survey.folder.replacing import changing, replace_parts
-from survey.folder.text import natural_key
 from survey.jobs.adjusting.job import run_info
 from survey.jobs.adjusting.probable_causes import explained, with_probable_causes
 from survey.jobs.navigating.calibration import Calibration, digest, keep, kept

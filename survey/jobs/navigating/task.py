@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from adjust.model.names import natural_key
 from adjust.model.subsets import in_use, points_read, with_points
 from adjust.model.survey import Survey
 from adjust.navigation import NavigationEpoch, Spots, head_of
 from adjust.statistics.outliers.supported import supported
-from survey.folder.text import decode, natural_key, read_bytes
+from survey.folder.text import decode, read_bytes
 from survey.project import Project
 
 

@@ -5,9 +5,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from adjust.model.names import natural_key
 from adjust.model.observations import CoordinateDifferences, Coordinates, PositionRef
 from adjust.model.survey import FloatArray
-from survey.folder.text import natural_key, suggestion
+from survey.folder.text import suggestion
 from survey.folder.units import to_si
 from survey.project.project import Sigmas
 from survey.project.tables.covariance import joint_problem, read_triples

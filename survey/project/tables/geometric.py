@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from adjust.model.names import natural_key
 from adjust.model.observations import Alignment, FrameRef, LaserSpot, Level, OnSurface
 from adjust.model.survey import FloatArray
-from survey.folder.text import LARGEST_NUMBER, natural_key, suggestion
+from survey.folder.text import LARGEST_NUMBER, suggestion
 from survey.folder.units import to_si
 from survey.project.project import Sigmas
 from survey.project.tables.covariance import covariance_from_sigmas

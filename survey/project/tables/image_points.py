@@ -7,9 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from adjust.model.names import natural_key
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import BoolArray, FloatArray, IntArray
-from survey.folder.text import natural_key, suggestion
+from survey.folder.text import suggestion
 from survey.project.project import ImagePointsWhere, Sigmas, SpotBlock
 from survey.project.tables.covariance import covariance_from_sigmas
 from survey.project.tables.reading import Layout, Table, TextColumn, checked_groups, first_row

@@ -6,10 +6,10 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model.errors import SurveyError
+from adjust.model.names import natural_key
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.spatial.rotation_forms import euler_from_matrix, tangent_cov_from_euler
-from survey.folder.text import natural_key
 from survey.folder.units import to_si
 from survey.project.declared.poses import rotation_from_euler, rotation_from_quaternion
 from survey.project.project import Sigmas

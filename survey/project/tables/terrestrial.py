@@ -4,9 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from adjust.model.names import natural_key
 from adjust.model.observations import PositionRef, Reading, ReadingCovariance, ReadingKind
 from adjust.model.survey import FloatArray
-from survey.folder.text import choice_hint, natural_key, suggestion
+from survey.folder.text import choice_hint, suggestion
 from survey.folder.units import to_si
 from survey.project.declared.instruments import setup_problem
 from survey.project.project import Accuracy, Sigmas
