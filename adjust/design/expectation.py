@@ -11,8 +11,9 @@ from adjust.graph.rank import readable
 from adjust.graph.solver import settled
 from adjust.model.result import CAUTIOUS_SIGMAS, Adjustment, ParameterName
 from adjust.model.survey import FloatArray, Survey
+from adjust.statistics.weakness import inflated
 
-_PART = 0.25  # of the largest share: what is named of a direction
+_PART, _MOST = 0.25, 6  # of the largest share: what is named of a direction, and how many
 
 
 @dataclass(frozen=True)
@@ -79,15 +80,11 @@ def weak_directions(adjustment: Adjustment, n: int = 5, least: float = 10.0) -> 
     alone = 1.0 / np.sqrt(np.maximum(np.diag(np.linalg.pinv(C, rcond=1e-13, hermitian=True)), 1.0))
     values, vectors = np.linalg.eigh(C / np.outer(alone, alone))
     labels = component_names(adjustment, names)
-    out = []
-    for k in np.argsort(values)[::-1][:n]:
-        if values[k] < least**2:
-            break
-        moves = vectors[:, k] * alone  # back to sigmas of the unknowns
-        moves = moves / np.abs(moves).max()
-        order = [i for i in np.argsort(-np.abs(moves), kind="stable") if abs(moves[i]) > _PART][:6]
-        out.append(WeakDirection(float(np.sqrt(values[k])), tuple((*labels[i], float(moves[i])) for i in order)))
-    return tuple(out)
+    moves = vectors[:, ::-1][:, :n] * alone[:, None]  # back to sigmas of the unknowns
+    return tuple(
+        WeakDirection(factor, tuple((*labels[i], float(shares[i])) for i in order[:_MOST]))
+        for factor, shares, order in inflated(values[::-1][:n], moves, least, _PART)
+    )
 
 
 def group_redundancy(adjustment: Adjustment) -> dict[str, tuple[int, float, FloatArray]]:

@@ -1,6 +1,6 @@
 """What is badly determined, by name: correlations, unknowns that replace each other, the weakest deformation."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -200,17 +200,28 @@ def weak_directions(
     used = system.used[system.row_of]
     alone = np.sqrt(np.maximum(np.asarray(system.A[used].multiply(system.A[used]).sum(axis=0)).ravel(), 1e-300))
     values, vectors = _largest(system, np.arange(len(alone)), alone, most)
-    out = []
-    for value, vector in zip(values, vectors.T, strict=True):
-        if value < least_inflation**2:
-            break
-        size = np.abs(vector) / np.abs(vector).max()
-        amount = np.sqrt(value) * vector / alone * np.sign(vector[size.argmax()])
-        order = [int(i) for i in np.argsort(-size, kind="stable") if size[i] > _SHARE]
-        c = system.columns
+    c, out = system.columns, []
+    for inflation, shares, order in inflated(values, vectors, least_inflation, _SHARE):
+        amount = inflation * shares / np.linalg.norm(shares) / alone * np.sign(shares[order[0]])
         parts = tuple(WeakPart(c.names[i], c.components[i], c.units[i], float(amount[i])) for i in order)
-        out.append(WeakDirection(float(np.sqrt(value)), parts))
+        out.append(WeakDirection(inflation, parts))
     return tuple(out)
+
+
+def inflated(
+    values: FloatArray, moves: FloatArray, least: float, share: float
+) -> Iterator[tuple[float, FloatArray, list[int]]]:
+    """Of directions by eigenvalue (k,), largest first, those that inflate a sigma at least so much, and by how much.
+
+    moves: (n, k), how components move in each; with it their shares (n,) of the largest one, and the components of
+    which more than ``share`` is there, the largest first.
+    """
+    for value, move in zip(values, moves.T, strict=True):
+        if value < least**2:
+            return
+        shares = move / np.abs(move).max()
+        order = [int(i) for i in np.argsort(-np.abs(shares), kind="stable") if abs(shares[i]) > share]
+        yield float(np.sqrt(value)), shares, order
 
 
 def _largest(system: LinearSystem, index: IntArray, scale: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
