@@ -14,8 +14,6 @@ from adjust.native.library import Function
 from adjust.native.trees import TREE, TreeArrays
 
 SEGMENT_LENS, SEGMENT_POSE, SEGMENT_TABLE, SEGMENT_WARP = 0, 1, 2, 3
-MAX_KEY = 64
-"""Components of a key that a pose follows from, at most."""
 MAX_LOCAL = 28
 """Local unknowns and residual of a block, at most."""
 N_SHAPE = 4

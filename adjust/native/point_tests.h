@@ -114,28 +114,4 @@ inline void point_tests(int64_t first, int64_t last, AdjustedPoints P, Vector la
     }
 }
 
-// Of the minimal detectable biases of each point, which lie on an ellipse: major and minor axis px, direction of the major.
-inline void bias_ellipses(int64_t first, int64_t last, AdjustedPoints P, Vector lambda0, Out<double, 2> out) {
-    for (int64_t i = first; i < last; ++i) {
-        const Directions d(P, i);
-        const Back back(P, i);
-        const int freedom = d.freedom();
-        double a[2], b[2], axes[2] = {__builtin_inf(), __builtin_inf()}, angle;
-        back.times(d.x, d.y, a), back.times(-d.y, d.x, b);
-        if (freedom == 1) {  // along a nothing is controlled; across it b' W'KW b = lambda0
-            const double length = root(a[0] * a[0] + a[1] * a[1]);
-            axes[1] = root(lambda0[0] / d.k[1]) * magnitude(a[0] * b[1] - a[1] * b[0]) / length;
-            angle = std::atan2(a[1], a[0]);
-        } else {
-            const double p = freedom ? 1.0 / d.k[0] : 1.0, q = freedom ? 1.0 / d.k[1] : 1.0;
-            const double uu = p * a[0] * a[0] + q * b[0] * b[0], uv = p * a[0] * a[1] + q * b[0] * b[1], vv = p * a[1] * a[1] + q * b[1] * b[1];
-            const double half = root(0.25 * (uu - vv) * (uu - vv) + uv * uv), most = 0.5 * (uu + vv) + half;
-            const double area = back.b00 * back.b11;
-            if (freedom) axes[0] = root(lambda0[1] * most), axes[1] = root(lambda0[1] * p * q / most) * area;
-            angle = 0.5 * std::atan2(2.0 * uv, uu - vv);
-        }
-        out(i, 0) = axes[0], out(i, 1) = axes[1], out(i, 2) = angle;
-    }
-}
-
 }  // namespace

@@ -16,7 +16,6 @@ _point_tests = Function(
     f"{_POINTS} lambda0[2] redundancy[N] least[N] statistic[N] detectable[N] external[N] w[N,2] error[N,2] "
     "detectable_component[N,2] bias[N,2]",
 )
-_bias_ellipses = Function("bias_ellipses", f"{_POINTS} lambda0[2] out[N,3]")
 
 
 class AdjustedPoints(NamedTuple):
@@ -53,13 +52,3 @@ def point_tests(points: AdjustedPoints, lambda0: FloatArray, out: tuple[FloatArr
     The latter (N, 2); all as ``ObservationTests`` has them. lambda0: (2,) of tests with one and two components.
     """
     run_ranges(_point_tests, len(points.v), *points, lambda0, *out)
-
-
-def bias_ellipses(points: AdjustedPoints, lambda0: FloatArray) -> FloatArray:
-    """Major and minor axis (px) and direction of the major (rad, x to y) of biases b with b' W'KW b = lambda0: (N, 3).
-
-    Infinite where nothing controls them.
-    """
-    out = np.empty((len(points.v), 3))
-    run_ranges(_bias_ellipses, len(out), *points, lambda0, out)
-    return out

@@ -50,9 +50,7 @@ class Start:
 
     lenses: full vectors (n,) by camera. poses: by parameter name. points: (3,) m by point id. vectors: table_angles,
     table_geometry and warp by parameter name. excluded_blocks: positions in ``Survey.image_blocks`` of what is not
-    trusted, each with its reason. orphans: poses that only such blocks reach; they have a value here, but nothing in an
-    adjustment without these blocks determines them: leave the blocks out altogether, or hold the poses. block_rms_px:
-    misfit of every block at the start, px (nan where it has no rays).
+    trusted, each with its reason. block_rms_px: misfit of every block at the start, px (nan where it has no rays).
     """
 
     lenses: Mapping[str, FloatArray]
@@ -61,7 +59,6 @@ class Start:
     vectors: Mapping[ParameterName, FloatArray] = field(default_factory=dict)
     excluded_blocks: tuple[int, ...] = ()
     reasons: tuple[str, ...] = ()
-    orphans: tuple[ParameterName, ...] = ()
     block_rms_px: tuple[float, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -399,15 +396,5 @@ class _Search:
         points = {p.point_id: x for p, x in zip(survey.points, self.points.x, strict=True)}
         reasons = tuple(self.reasons[i] for i in order)
         return Start(
-            self.lenses, poses, points, vectors, order, reasons, self._orphans(), tuple(rms.tolist()), tuple(self.notes)
+            self.lenses, poses, points, vectors, order, reasons, tuple(rms.tolist()), tuple(self.notes)
         )
-
-    def _orphans(self) -> tuple[ParameterName, ...]:
-        """Poses that only distrusted blocks reach."""
-        if not self.reasons:
-            return ()
-        chains = [chain for i, chain in enumerate(self.chains) if i not in self.reasons]
-        chains += [o.chain for o in self.network.observations if o.block_idx < 0]
-        reached = {link.slot for chain in chains for link in chain}
-        doubted = {link.slot for i in self.reasons for link in self.chains[i]}
-        return tuple(self.network.names[slot] for slot in sorted(doubted - reached) if not self.network.fixed[slot])

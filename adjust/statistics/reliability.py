@@ -66,7 +66,7 @@ def reliability(
         most_influences = 0
     return Reliability(
         found, tests, _influences(adjustment, tests, points, batches, most_influences, system),
-        _uncontrolled(adjustment, tests), adjustment.sigma0, adjustment.redundancy, points,
+        _uncontrolled(adjustment, tests), adjustment.sigma0, adjustment.redundancy,
     )  # fmt: skip
 
 

@@ -9,7 +9,6 @@ import numpy as np
 from adjust.model.errors import listed
 from adjust.model.result import ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
-from adjust.native.point_tests import AdjustedPoints, bias_ellipses
 from adjust.testing.criteria import Criteria
 from adjust.testing.distributions import norm
 from adjust.testing.single_tests import p_posterior, p_prior, p_tau
@@ -91,15 +90,6 @@ class ObservationTests:
         return p_tau(self.tau[:, None], np.repeat(self.used, self.n_components), self.total_redundancy)[:, 0]
 
 
-@dataclass(frozen=True, eq=False)
-class ImageEllipses:
-    """Minimal detectable biases of image points (N,): semi-axes (px) and the direction (rad, x to y) of the major."""
-
-    major: FloatArray
-    minor: FloatArray
-    direction: FloatArray
-
-
 @dataclass(frozen=True)
 class Influence:
     """What an undetected bias of the least detectable size does.
@@ -124,7 +114,7 @@ class Reliability:
     """Tests of all observations, what they could not find, and what is not controlled.
 
     influences: worst external reliability first. uncontrolled: for people, observations of which some direction shows
-    in no residual. sigma0, redundancy: of the a posteriori tests. image_points: what was tested.
+    in no residual. sigma0, redundancy: of the a posteriori tests.
     """
 
     criteria: Criteria
@@ -133,13 +123,6 @@ class Reliability:
     uncontrolled: tuple[str, ...]
     sigma0: float
     redundancy: int
-    image_points: AdjustedPoints
-
-    @cached_property
-    def ellipses(self) -> ImageEllipses:
-        """Of all image points."""
-        found = bias_ellipses(self.image_points, np.ascontiguousarray(self.criteria.lambda0[:2]))
-        return ImageEllipses(found[:, 0], found[:, 1], found[:, 2])
 
 
 @dataclass(frozen=True)

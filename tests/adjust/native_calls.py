@@ -117,7 +117,6 @@ def _images() -> None:
     n = len(points.v)
     point_tests.controlled_directions(points, np.zeros(n, dtype=np.int64))
     point_tests.point_tests(points, lambda0, tuple(np.zeros((n,) if i < 5 else (n, 2)) for i in range(9)))
-    point_tests.bias_ellipses(points, lambda0)
     words = text.Words.of(["a", "bc", ""])
     text.number_rows(words, np.array([0, 1, 2]), words, np.array([1, 1, 0]), points.v[:3], [3, 0])
     names = list(graph.unknowns.by_name)

@@ -4,7 +4,6 @@ import numpy as np
 
 from adjust.native.point_tests import (
     AdjustedPoints,
-    bias_ellipses,
     controlled_directions,
     point_tests,
     residual_tests,
@@ -94,36 +93,12 @@ def test_residuals_over_their_sigmas() -> None:
     assert np.isnan(test[points.used & (points.M[:, 0] + points.M[:, 2] > 2.0 - 1e-12)]).all()
 
 
-def test_ellipses_hold_the_biases_that_are_just_found() -> None:
-    points = some_points()
-    W, M = matrices(points)
-    x = whitened(np.zeros_like(points.v), M, points.used)
-    N = W.transpose(0, 2, 1) @ x.K @ W
-    major, minor, angle = bias_ellipses(points, LAMBDA0).T
-    along = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    clear = x.values.min(axis=1) > 1e-3
-    two = clear & (x.freedom == 2)
-    for axis, unit in ((major, along), (minor, across)):
-        found = axis[two] ** 2 * np.einsum("ni,nij,nj->n", unit, N, unit)[two]
-        np.testing.assert_allclose(found, LAMBDA0[1], rtol=1e-6)
-    assert (major[two] >= minor[two] * (1.0 - 1e-12)).all()
-    one = (x.freedom == 1) & (x.values.min(axis=1) < 1e-9)
-    assert one.any()
-    assert np.isinf(major[one]).all()
-    np.testing.assert_allclose(minor[one] ** 2 * np.einsum("ni,nij,nj->n", across, N, across)[one], LAMBDA0[0],
-                               rtol=1e-6)  # fmt: skip
-    none = x.freedom == 0
-    assert np.isinf(major[none]).all()
-    assert np.isinf(minor[none]).all()
-
-
 def test_every_point_by_itself(monkeypatch) -> None:  # type: ignore[no-untyped-def]
     """The same to the bit in any ranges."""
     points = some_points(20_001)
     found = []
     for threads in ("1", "3"):
         monkeypatch.setenv("LABSURVEY_THREADS", threads)
-        found.append([*table(points), *residual_tests(points), bias_ellipses(points, LAMBDA0)])
+        found.append([*table(points), *residual_tests(points)])
     for a, b in zip(*found, strict=True):
         np.testing.assert_array_equal(a, b)

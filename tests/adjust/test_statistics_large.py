@@ -169,10 +169,9 @@ def test_threads_and_portions_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> 
         listed = correlations(adjustment, 0.5, system=condensed.system)
         tests = [x for x in vars(found.tests).values() if isinstance(x, np.ndarray)]
         tests += [found.tests.p, found.tests.p_posterior, found.tests.p_w, found.tests.p_tau]
-        ellipses = [found.ellipses.major, found.ellipses.minor, found.ellipses.direction]
         rows = [condensed.system.A.toarray(), condensed.e, condensed.lens, condensed.camera, condensed.shape]
         shifts = np.array([x.shift for x in found.influences])
-        return [*tests, *ellipses, *rows, shifts, np.array([x.coefficient for x in listed])]
+        return [*tests, *rows, shifts, np.array([x.coefficient for x in listed])]
 
     monkeypatch.setattr(parallel, "_WORTHWHILE", 300)
     monkeypatch.setattr(normal_module, "_AT_ONCE", 7)

@@ -59,7 +59,6 @@ class EyeAdjustment:
     scales: Mapping[str, float]
     scale_sigmas: Mapping[str, float]
     outliers: tuple[OutlierEpoch, ...]
-    n_conditions: int
     omega: float
     redundancy: int
     solution: EyeSolution = field(repr=False)
@@ -147,7 +146,7 @@ def _adjusted(setup: EyeSetup, options: EyeOptions) -> EyeAdjustment:
         {w: as_pose(solution.unknowns[np.array([i])]) for w, i in setup.world_idx.items()},
         {ids[e]: float(factors[i]) for i, e in enumerate(setup.scaled_eyes)},
         {ids[e]: float(spread[i] * factors[i]) for i, e in enumerate(setup.scaled_eyes)},
-        outliers, len(solution.problem.conditions), solution.omega, solution.redundancy, solution, setup,
+        outliers, solution.omega, solution.redundancy, solution, setup,
     )  # fmt: skip
 
 

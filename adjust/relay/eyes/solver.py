@@ -78,8 +78,8 @@ class EyeProblem:
 class EyeSolution:
     """unknowns: (u,). scales: exponents. cov: (6f + s,) squared, of the free unknowns in order and then the scales.
 
-    residuals: (n, 6) of the observations, adjusted minus observed in their tangents. misclosure: (m, 6) with
-    ``misclosure_cov`` (m, 6, 6) after adjustment; test: (m,) chi-square with 6 degrees of freedom.
+    residuals: (n, 6) of the observations, adjusted minus observed in their tangents. misclosure: (m, 6) after adjustment,
+    test: (m,) of it, chi-square with 6 degrees of freedom.
     influence: (6f + s, 6n) derivative of the unknowns by the observations. omega: v'Pv.
     """
 
@@ -89,7 +89,6 @@ class EyeSolution:
     cov: FloatArray
     residuals: FloatArray
     misclosure: FloatArray
-    misclosure_cov: FloatArray
     test: FloatArray
     influence: FloatArray
     omega: float
@@ -277,7 +276,7 @@ def _finish(problem: EyeProblem, U: Motions, scales: FloatArray, v: FloatArray, 
     influence = -cov @ (weights.B.T @ MA).T
     redundancy = 6 * len(at.f) + 6 * len(problem.known) - len(cov)
     return EyeSolution(
-        problem, U, scales, cov, v, w, left, test, np.asarray(influence), omega, redundancy, iterations
+        problem, U, scales, cov, v, w, test, np.asarray(influence), omega, redundancy, iterations
     )  # fmt: skip
 
 
