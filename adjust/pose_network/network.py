@@ -228,12 +228,12 @@ def _pairs_where(network: PoseNetwork, wrong: BoolArray, what: str) -> None:
         raise SurveyError(f"pair {network.pair_ids[found[0]]!r}{more} {what}")
 
 
-def check_determined(network: PoseNetwork, used: BoolArray | None = None) -> None:
+def check_determined(network: PoseNetwork) -> None:
     """Raise IndeterminateError naming the stations that the pairs in use leave floating."""
     for poses_only in (False, True):
         if poses_only and (network.rotation_only or network.is_pose.all()):
             continue
-        part = network.components(used, poses_only)
+        part = network.components(poses_only=poses_only)
         known = set(network.held.tolist()) | ({network.anchor} if network.anchor is not None else set())
         known |= {i for i, c in network.prior_cov.items() if np.isfinite(np.diag(c)[: 6 if poses_only else 3]).all()}
         reached = {int(part[i]) for i in known}

@@ -78,7 +78,7 @@ class EyeProblem:
 class EyeSolution:
     """unknowns: (u,). scales: exponents. cov: (6f + s,) squared, of the free unknowns in order and then the scales.
 
-    residuals: (n, 6) of the observations, adjusted minus observed in their tangents. misclosure: (m, 6) after adjustment,
+    residuals: (n, 6) of the observations, adjusted minus observed in their tangents. misclosure: (m, 6) after it,
     test: (m,) of it, chi-square with 6 degrees of freedom.
     influence: (6f + s, 6n) derivative of the unknowns by the observations. omega: v'Pv.
     """

@@ -7,7 +7,7 @@ nothing to determine it: it goes, with the observations that hang on it. What an
 never dropped: a station that nobody has measured is an error of the survey, not a decision of its owner.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -209,9 +209,9 @@ def _without_owners(survey: Survey, lost: Needs) -> Survey:
     ))  # fmt: skip
 
 
-def lost_notes(lost: Iterable[ParameterName], text: Callable[[ParameterName], str] | None = None) -> tuple[str, ...]:
+def lost_notes(lost: Iterable[ParameterName]) -> tuple[str, ...]:
     """One line that names what is gone, for people; none where nothing is."""
-    names = [text(name) if text is not None else " ".join(name) for name in lost]
+    names = [" ".join(name) for name in lost]
     if not names:
         return ()
     return (f"left out, because every observation of it is left out, or too many are: {listed(names, 12)}",)
