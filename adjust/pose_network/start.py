@@ -12,14 +12,14 @@ from adjust.pose_network.network import PoseNetwork
 from adjust.spatial.rigid import nearest_rotation
 
 
-def find_network_start(network: PoseNetwork) -> tuple[FloatArray, FloatArray]:
+def find_network_start(network: PoseNetwork, weights: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
     """``world_from_station`` of all stations, (N, 3, 3) and (N, 3), from the pairs in use alone.
 
-    The held stations, the stations with a prior, or the given poses of a free network (else its first station at the
-    identity) say where it lies.
+    weights: (E,) on the information of the pairs, zero leaves a pair out. The held stations, the stations with a prior,
+    or the given poses of a free network (else its first station at the identity) say where it lies.
     """
-    R = start_rotations(network)
-    return R, np.zeros((network.n_stations, 3)) if network.rotation_only else start_translations(network, R)
+    R = start_rotations(network, weights)
+    return R, np.zeros((network.n_stations, 3)) if network.rotation_only else start_translations(network, R, weights)
 
 
 def datum_stations(network: PoseNetwork) -> IntArray:
@@ -33,12 +33,14 @@ def datum_stations(network: PoseNetwork) -> IntArray:
     return network.inner if all_given else np.zeros(0, dtype=np.int64)
 
 
-def start_rotations(network: PoseNetwork) -> FloatArray:
+def start_rotations(network: PoseNetwork, weights: FloatArray | None = None) -> FloatArray:
     """Rotations (N, 3, 3) by averaging, turned onto the given ones."""
-    rows = np.flatnonzero(network.used)
+    rows = np.flatnonzero(network.used if weights is None else network.used & (weights > 1e-9))
     variance = np.trace(network.cov[rows][:, :3, :3], axis1=1, axis2=2) / 3.0
     # only ratios matter: a common scale keeps GTSAM's tests of pivots away from rounding
     variance = variance / np.median(variance)
+    if weights is not None:
+        variance = variance / weights[rows]
     graph = gtsam.NonlinearFactorGraph()
     noise: dict[float, gtsam.noiseModel.Isotropic] = {}
     a, b = network.a_idx[rows].tolist(), network.b_idx[rows].tolist()
@@ -73,12 +75,17 @@ def _tie_datum(network: PoseNetwork, graph: gtsam.NonlinearFactorGraph) -> None:
         graph.push_back(gtsam.BetweenFactorRot3(int(datum[0]), i, relative, tight))
 
 
-def start_translations(network: PoseNetwork, R: FloatArray) -> FloatArray:
+def start_translations(network: PoseNetwork, R: FloatArray, weights: FloatArray | None = None) -> FloatArray:
     """Positions (N, 3) m with the rotations taken as true: t_a - t_b = R_b t_ba for every pair, one linear system."""
-    rows = np.flatnonzero(network.used & network.is_pose)
+    keep = network.used & network.is_pose
+    if weights is not None:
+        keep = keep & (weights > 1e-9)
+    rows = np.flatnonzero(keep)
     a, b = network.a_idx[rows], network.b_idx[rows]
     observed = np.einsum("nij,nj->ni", R[b], network.translations[rows])
     sigma = translation_sigmas(network)[rows]
+    if weights is not None:
+        sigma = sigma / np.sqrt(weights[rows])
     datum = datum_stations(network)
     fixed = np.zeros(network.n_stations, dtype=np.bool_)
     t = np.zeros((network.n_stations, 3))

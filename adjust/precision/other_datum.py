@@ -19,7 +19,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.rewriting import Rewriting
 from adjust.model.survey import Datum, FloatArray, PointParameter, PoseParameter, Survey
-from adjust.precision.precision import Covariances, Precision, of_solution, rotations_only
+from adjust.precision.precision import Covariances, Precision, precision_of, rotations_only
 from adjust.precision.s_transformation import STransformation, s_transformation
 
 _ROUNDS, _SETTLED = 20, 1e-13
@@ -61,7 +61,7 @@ def in_datum(result: Adjustment, datum: Datum, reference: Mapping[str, FloatArra
     """
     if datum.kind != "inner":
         raise SurveyError("a solution can be moved to a datum of kind 'inner' only; to hold points, adjust again")
-    precision = of_solution(result)
+    precision = precision_of(result)
     if rotations_only(result):
         raise SurveyError("nothing but rotations was measured: there are no coordinates to be moved to another datum")
     survey = replace(released(result.survey), datum=datum)

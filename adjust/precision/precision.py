@@ -264,7 +264,7 @@ class Precision(Covariances):
         return rows.e, rows.influence, rows.root
 
 
-def of_solution(adjustment: Adjustment) -> Precision:
+def precision_of(adjustment: Adjustment) -> Precision:
     """The precision of an adjustment from its solution; raises SurveyError where that was moved to another datum."""
     if not isinstance(adjustment.precision, Precision):
         raise SurveyError("this solution was moved to another datum; take the one it was moved from")

@@ -10,11 +10,11 @@ from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.point_tests import AdjustedPoints, controlled_directions, point_tests
 from adjust.observations.terrestrial.statistics import influences as influences_of_readings
-from adjust.precision.precision import Precision
+from adjust.precision.precision import Precision, precision_of
 from adjust.statistics.condensed import CondensedSystem, condensed_system
 from adjust.statistics.influence import influences
 from adjust.statistics.result import Influence, ObservationTests, Reliability
-from adjust.statistics.system import groups_of_others, precision_of
+from adjust.statistics.system import groups_of_others
 from adjust.testing.criteria import Criteria, LevelOptions, criteria
 from adjust.testing.single_tests import Whitened, component_tests, whitened
 

@@ -16,14 +16,13 @@ from scipy import sparse
 
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.datum import gauge
-from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.lenses import MAX_LENS
 from adjust.observations.factors import ObservationFactor
 from adjust.observations.images.bundles import BundleBatch
 from adjust.observations.terrestrial.layout import Chunk
-from adjust.precision.precision import Precision
+from adjust.precision.precision import Precision, precision_of
 from adjust.statistics.normal import Normal
 
 
@@ -268,14 +267,6 @@ def mixed_blocks(system: LinearSystem) -> list[tuple[IntArray, tuple[str, ...], 
         if len(set(groups)) > 1:
             out.append((joint.rows, groups, np.asarray(np.linalg.inv(joint.W))))
     return out
-
-
-def precision_of(adjustment: Adjustment) -> Precision:
-    """The precision with its graph. Raises SurveyError where the adjustment has none."""
-    found = adjustment.precision
-    if isinstance(found, Precision):
-        return found
-    raise SurveyError("the adjustment has no covariances; adjust the survey again")
 
 
 def _columns(graph: AdjustmentGraph) -> Columns:

@@ -19,7 +19,7 @@ from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray
 from adjust.observations.factors import ChainPose
-from adjust.precision.precision import of_solution
+from adjust.precision.precision import precision_of
 from adjust.testing.distributions import norm
 from survey.project.project import AlignmentTask
 from survey.solution.quantities import SigmaKind, scale_of
@@ -110,7 +110,7 @@ def _sheet(adjustment: Adjustment, task: AlignmentTask, alpha: float, factor: fl
 
 def relative_rotation(adjustment: Adjustment, a: FrameRef, b: FrameRef) -> tuple[Rot3, FloatArray]:
     """The adjusted rotation ``b_from_a`` and its covariance (3, 3), in a."""
-    precision = of_solution(adjustment)
+    precision = precision_of(adjustment)
     graph, values = precision.graph, precision.solved.values
     u = graph.unknowns
     before = len(u.by_name), len(u.slot_key)

@@ -10,6 +10,7 @@ from gtsam import Pose3
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import Beside
+from adjust.precision.precision import precision_of
 from adjust.statistics.budget import uncertainty_budget
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.consistency import consistency
@@ -25,7 +26,7 @@ from adjust.statistics.result import (
     VarianceComponents,
     WeakDirection,
 )
-from adjust.statistics.system import LinearSystem, precision_of
+from adjust.statistics.system import LinearSystem
 from adjust.statistics.weakness import compared_columns, correlations, weak_directions
 from survey.project.project import Tolerance
 from survey.solution.quantities import PROBABILITY, Scale

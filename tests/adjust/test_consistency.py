@@ -10,11 +10,12 @@ from adjust.adjustment import adjust
 from adjust.model.names import natural_key
 from adjust.model.result import GlobalTest
 from adjust.model.survey import FloatArray, Survey
+from adjust.precision.precision import precision_of
 from adjust.statistics.changes import ChangeSearch
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.consistency import consistency, eigenvalues, parts_of
 from adjust.statistics.result import Change, Consistency
-from adjust.statistics.system import linear_system, precision_of
+from adjust.statistics.system import linear_system
 from adjust.testing.criteria import sidak
 from adjust.testing.quadratic_forms import upper_tail, upper_tail_bound
 from survey.simulate import head_on_table

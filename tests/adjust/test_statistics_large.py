@@ -10,12 +10,13 @@ from adjust.adjustment import adjust
 from adjust.model.result import Adjustment
 from adjust.native import parallel
 from adjust.observations.images import batch as batch_module
+from adjust.precision.precision import precision_of
 from adjust.statistics import changes, weakness
 from adjust.statistics import normal as normal_module
 from adjust.statistics.budget import uncertainty_budget
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.reliability import reliability
-from adjust.statistics.system import linear_system, precision_of
+from adjust.statistics.system import linear_system
 from adjust.statistics.weakness import correlations, weak_directions
 from survey.simulate import head_on_table
 from tests.adjust import helpers as h

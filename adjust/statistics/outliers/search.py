@@ -19,7 +19,7 @@ from adjust.graph.assembly import StartValues, values_of
 from adjust.model.errors import IndeterminateError, NotConvergedError
 from adjust.model.result import Adjustment, ObservationResidual, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
-from adjust.precision.precision import Precision
+from adjust.precision.precision import Precision, precision_of
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.outliers.candidates import Candidates, as_given, candidates, without
 from adjust.statistics.outliers.exchange import Exchange, better_set, equal_sets
@@ -27,7 +27,7 @@ from adjust.statistics.outliers.snooping import Snooping, Verdict
 from adjust.statistics.outliers.watched import FOLLOWED, WatchedSnooping, large, watchable, watched
 from adjust.statistics.reliability import observation_name
 from adjust.statistics.result import Alternative, Decision
-from adjust.statistics.system import groups_of_others, linear_system, precision_of
+from adjust.statistics.system import groups_of_others, linear_system
 from adjust.testing.criteria import MANY, limits
 from adjust.testing.distributions import chi2
 from adjust.testing.gross_errors import Search, State, Verdicts, best_back_first
