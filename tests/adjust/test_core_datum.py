@@ -20,7 +20,7 @@ HEAD = {"n_cameras": 2, "n_table_epochs": 4, "n_free_epochs": 2}
 
 
 def head() -> tuple[Survey, Truth]:
-    return head_on_table(1, **HEAD)  # type: ignore[arg-type]  # whole numbers
+    return head_on_table(1, **HEAD)
 
 
 def message(survey: Survey, truth: Truth) -> str:

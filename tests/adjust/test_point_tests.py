@@ -118,7 +118,7 @@ def test_ellipses_hold_the_biases_that_are_just_found() -> None:
     assert np.isinf(minor[none]).all()
 
 
-def test_every_point_by_itself(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+def test_every_point_by_itself(monkeypatch) -> None:
     """The same to the bit in any ranges."""
     points = some_points(20_001)
     found = []

@@ -100,7 +100,7 @@ def test_the_condensed_system_is_the_same_system(case: Callable[[], tuple[Survey
         np.testing.assert_allclose(whole * scale, full.A[2 * row : 2 * row + 2].toarray() * scale, atol=1e-9)
 
 
-def check_tests(adjustment: Adjustment, full: h.Dense, Q: FloatArray, found) -> None:  # type: ignore[no-untyped-def]
+def check_tests(adjustment: Adjustment, full: h.Dense, Q: FloatArray, found) -> None:
     t, at, sigma0, f = found.tests, 0, adjustment.sigma0, adjustment.redundancy
     checked = 0
     for k in range(len(t.used)):
@@ -148,7 +148,7 @@ def check_tests(adjustment: Adjustment, full: h.Dense, Q: FloatArray, found) -> 
     assert checked > 0.5 * len(t.used)
 
 
-def check_ellipse(ellipses, k: int, N: FloatArray, lambda0: float) -> None:  # type: ignore[no-untyped-def]
+def check_ellipse(ellipses, k: int, N: FloatArray, lambda0: float) -> None:
     for axis, turned in ((ellipses.major[k], 0.0), (ellipses.minor[k], np.pi / 2)):
         angle = ellipses.direction[k] + turned
         b = axis * np.array([np.cos(angle), np.sin(angle)])
@@ -156,7 +156,7 @@ def check_ellipse(ellipses, k: int, N: FloatArray, lambda0: float) -> None:  # t
     assert ellipses.major[k] ** 2 == pytest.approx(lambda0 * np.linalg.eigvalsh(np.linalg.inv(N))[1], rel=1e-4)
 
 
-def check_influences(adjustment, full, Q, found, columns, names) -> None:  # type: ignore[no-untyped-def]
+def check_influences(adjustment, full, Q, found, columns, names) -> None:
     t = found.tests
     sigma = np.sqrt(np.diag(Q))
     assert len(found.influences) == np.count_nonzero(t.used & (t.freedom > 0) & (t.external > 0))
