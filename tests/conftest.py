@@ -52,6 +52,15 @@ def _daily(config: pytest.Config) -> bool:
     return bool(config.option.markexpr.strip() == "not slow")
 
 
+@pytest.fixture(scope="module")
+def browser() -> Generator[Any]:
+    """A browser, started once for a file."""
+    from tests.browsing import launched
+
+    with launched() as found:
+        yield found
+
+
 @pytest.fixture
 def undiagnosed(monkeypatch: pytest.MonkeyPatch) -> None:
     """What does not fit is not explained by trial: for tests on numbers, where that takes most of the time."""

@@ -43,7 +43,8 @@ class Measuring:
     def pytest_terminal_summary(self, terminalreporter: Any) -> None:
         seconds = {name: round(s, 1) for name, s in self.files.most_common() if s > 1.0}
         KEPT.write_text(json.dumps(seconds, indent=0) + "\n", encoding="utf-8")
-        terminalreporter.write_line(f"{sum(c for c, _, _ in self.tests.values()):.0f} s of computing; {KEPT} is written")
+        computed = sum(computed for computed, _, _ in self.tests.values())
+        terminalreporter.write_line(f"{computed:.0f} s of computing; {KEPT} is written")
         for test, (computed, taken, is_slow) in sorted(self.tests.items()):
             takes_long = computed > SLOW_S or taken - computed > WAIT_S
             if takes_long != is_slow and "/acceptance/" not in test:
