@@ -61,10 +61,15 @@ def browser() -> Generator[Any]:
         yield found
 
 
-@pytest.fixture
-def undiagnosed(monkeypatch: pytest.MonkeyPatch) -> None:
+def _without_diagnosis() -> Generator[None]:
     """What does not fit is not explained by trial: for tests on numbers, where that takes most of the time."""
-    monkeypatch.setattr("survey.jobs.adjusting.probable_causes._diagnosis", lambda *_: None)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("survey.jobs.adjusting.probable_causes._diagnosis", lambda *_: None)
+        yield
+
+
+undiagnosed = pytest.fixture(_without_diagnosis, name="undiagnosed")
+undiagnosed_module = pytest.fixture(_without_diagnosis, scope="module", name="undiagnosed_module")
 
 
 @pytest.hookimpl(wrapper=True)
