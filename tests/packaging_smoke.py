@@ -21,7 +21,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
-from tests.lower_bounds import build_requirements, chosen, pins, requirements  # noqa: E402
+from tests.lower_bounds import build_requirements, chosen, pins, requirements  # noqa: E402  # found by the line above
 
 _IMPORTS = "import adjust, survey, capture; print(adjust.__file__)"
 _COMMANDS = (

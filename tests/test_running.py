@@ -22,8 +22,8 @@ def _asked(*words: str, **said: Any) -> tuple[int | None, str]:
 
 
 def test_folders_run_side_by_side_and_files_alone() -> None:
-    assert _asked(str(TESTS)) == _asked(str(TESTS / "adjust"), str(TESTS / "survey")) == (cores() + 1, "worksteal")
-    assert _asked(str(TESTS), markexpr="not slow") == (cores(), "worksteal")
+    assert _asked(str(TESTS)) == _asked(str(TESTS / "adjust"), str(TESTS / "survey")) == (cores() + 1, "loadfile")
+    assert _asked(str(TESTS), markexpr="not slow") == (cores(), "loadfile")
     assert _asked(str(TESTS / "test_docs.py")) == _asked(f"{__file__}::test_a_tenth") == (None, "no")
 
 

@@ -22,10 +22,10 @@ _COARSE_PX = 1300  # longer side of the image in which markers are looked for fi
 
 
 class SeenMarkers:
-    """The markers of an image, sought once for all targets of a dictionary."""
+    """The markers of an image, sought once for all targets of a dictionary; of each only the first ones if so said."""
 
-    def __init__(self, gray8: Gray8) -> None:
-        self._full = gray8
+    def __init__(self, gray8: Gray8, first: int | None = None) -> None:
+        self._full, self._first = gray8, first
         self._found: dict[tuple[str, bool], tuple[IntArray, FloatArray]] = {}
 
     @cached_property
@@ -43,7 +43,9 @@ class SeenMarkers:
 
     def _in(self, dictionary: str, full: bool) -> tuple[IntArray, FloatArray]:
         if (dictionary, full) not in self._found:
-            self._found[dictionary, full] = _markers_in(self._full if full else self._reduced[0], dictionary)
+            self._found[dictionary, full] = _markers_in(
+                self._full if full else self._reduced[0], dictionary, self._first
+            )
         return self._found[dictionary, full]
 
 
@@ -109,11 +111,13 @@ def _gap_cells(target: MarkerGrid | MarkerBlock, cells: int) -> float:
     return 1.0
 
 
-def _markers_in(gray8: Gray8, dictionary: str) -> tuple[IntArray, FloatArray]:
-    """Ids (n,) and corners (n, 4, 2) px of all markers of a dictionary, in ascending id."""
+def _markers_in(gray8: Gray8, dictionary: str, first: int | None) -> tuple[IntArray, FloatArray]:
+    """Ids (n,) and corners (n, 4, 2) px of the markers of a dictionary, in ascending id."""
+    whole = marker_dictionary(dictionary)
+    sought = cv2.aruco.Dictionary(whole.bytesList[:first], whole.markerSize, whole.maxCorrectionBits)
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
-    corners, ids, _ = cv2.aruco.ArucoDetector(marker_dictionary(dictionary), parameters).detectMarkers(gray8)
+    corners, ids, _ = cv2.aruco.ArucoDetector(sought, parameters).detectMarkers(gray8)
     if ids is None or len(np.ravel(ids)) == 0:
         return np.zeros(0, np.int64), np.zeros((0, 4, 2))
     markers = np.ravel(ids).astype(np.int64)

@@ -41,7 +41,7 @@ def other_markers(gray8: Gray8, target: Markers) -> OtherMarkers | None:
     for inverted, mirrored in ((False, False), (True, False), (False, True), (True, True)):
         image = 255 - gray8 if inverted else gray8
         image = np.ascontiguousarray(image[:, ::-1]) if mirrored else image
-        seen = SeenMarkers(image)
+        seen = SeenMarkers(image, max(wanted) + 1)
         for name in (own, *(n for n in _LARGEST if n in dictionary_names() and n != own)):
             if name == own and not (inverted or mirrored):
                 continue

@@ -1,5 +1,6 @@
 """A laboratory while it is being laid out: things with their true place, then the images taken in it."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -88,9 +89,11 @@ class Draft:
         parameter = PoseParameter(pose, "held") if held else PoseParameter()
         self.targets.append(Target(target_id, ids, x, carrier_from_target=parameter))
 
-    def outline_visible(self, shot: Shot, target_id: str, outline_in_target: FloatArray, margin_px: float) -> bool:
-        """Whether the whole outline (n, 3) m of a target lies in the image."""
-        scene = self.scene()
+    def outline_visible(
+        self, shot: Shot, target_id: str, outline_in_target: FloatArray, margin_px: float, scene: Scene | None = None
+    ) -> bool:
+        """Whether the whole outline (n, 3) m of a target lies in the image; of a scene that has all but the truth."""
+        scene = scene or self.scene()
         x = transform(scene.world_from_target(target_id, shot.epoch_id), outline_in_target)
         return bool(scene.inside(shot.camera_id, scene.project(shot.camera_id, shot.epoch_id, x), margin_px).all())
 
@@ -165,16 +168,16 @@ def table_angles(direction_in_mount: FloatArray, direction_in_table: FloatArray)
 
     ``Rx(a1) Rz(a2) d = b``: the x component fixes a2 (two faces, as of a theodolite), the other two then a1.
     """
-    d = direction_in_mount / np.linalg.norm(direction_in_mount)
-    b = direction_in_table / np.linalg.norm(direction_in_table)
-    reach = np.hypot(d[0], d[1])
+    d = (direction_in_mount / np.linalg.norm(direction_in_mount)).tolist()
+    b = (direction_in_table / np.linalg.norm(direction_in_table)).tolist()
+    reach = math.hypot(d[0], d[1])
     if reach < abs(b[0]):
         return []
     solutions = []
     for face in (1.0, -1.0):
-        a2 = face * np.arccos(b[0] / reach) - np.arctan2(d[1], d[0])
-        y = np.sin(a2) * d[0] + np.cos(a2) * d[1]
-        a1 = np.arctan2(b[2], b[1]) - np.arctan2(d[2], y)
+        a2 = face * math.acos(b[0] / reach) - math.atan2(d[1], d[0])
+        y = math.sin(a2) * d[0] + math.cos(a2) * d[1]
+        a1 = math.atan2(b[2], b[1]) - math.atan2(d[2], y)
         solutions.append((np.array([a1, a2]) + np.pi) % (2.0 * np.pi) - np.pi)
     return solutions
 

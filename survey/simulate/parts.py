@@ -28,7 +28,7 @@ from survey.simulate.draft import (
     rotation_vector,
     table_angles,
 )
-from survey.simulate.scene import rotation_about, transform
+from survey.simulate.scene import Scene, rotation_about, transform
 
 BOARD = Checkerboard(11, 8, 0.020)
 CHARUCO = Charuco(9, 6, 0.030, 0.022, "DICT_5X5_100")
@@ -105,17 +105,17 @@ def _board_in_table() -> FloatArray:
 
 def shoot_board_from_table(draft: Draft, camera_id: str, n: int) -> None:
     """``n`` epochs of the table with the whole board in one camera, over its whole frame and on both faces."""
-    border, taken = outline(BOARD, _BOARD_BORDER), 0
+    border, scene, taken = outline(BOARD, _BOARD_BORDER), draft.scene(), 0
     for trial in range(_TRIALS):
         if taken == n:
             return
         pixel = pixel_in_cell(taken + trial // 100, draft.rng)
-        angles = _aimed(draft, camera_id, pixel, face=taken % 2)
+        angles = _aimed(draft, scene, camera_id, pixel, face=taken % 2)
         if angles is None:
             continue
         epoch_id = add_table_epoch(draft, "t", angles)
         shot = Shot(camera_id, epoch_id, ("board",))
-        if draft.outline_visible(shot, "board", border, 8.0):
+        if draft.outline_visible(shot, "board", border, 8.0, scene):
             draft.shots.append(shot)
             taken += 1
         else:
@@ -123,12 +123,11 @@ def shoot_board_from_table(draft: Draft, camera_id: str, n: int) -> None:
     raise ValueError(f"no room for {n} images of the board in camera {camera_id}")
 
 
-def _aimed(draft: Draft, camera_id: str, pixel: FloatArray, face: int) -> FloatArray | None:
+def _aimed(draft: Draft, scene: Scene, camera_id: str, pixel: FloatArray, face: int) -> FloatArray | None:
     """Angles (2,) that bring the board's middle near a pixel; None where the table cannot.
 
     The camera stands off the table's centre and moves as it turns, hence the few rounds.
     """
-    scene = draft.scene()
     table_from_board = np.linalg.inv(world_from_room(draft)).astype(np.float64)
     board_in_table = transform(table_from_board, centre(BOARD)[None])[0]
     pose = draft.truth["station_from_camera", camera_id]

@@ -4,6 +4,7 @@ Everything here is plain matrix lines and OpenCV's projection, on purpose not th
 there cannot hide by being made twice.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -21,15 +22,18 @@ Truth = dict[ParameterName, Pose3 | FloatArray]
 BROWN = ("fx", "fy", "skew", "u0", "v0", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _OPENCV_DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _AXIS_NUMBER = {"x": 0, "y": 1, "z": 2}
+_WAVES = {n: tuple(f"{kind}_{n}_" for kind in ("angle", "axial", "radial", "tilt")) for n in (1, 2)}
 _WIDEST_TANGENT = 1.2  # beyond, a Brown polynomial may fold points back into the image
 
 
 def rotation_about(axis: str, angle: float) -> FloatArray:
     """(4, 4) right-handed turn by ``angle`` rad about a named axis."""
-    vector = np.zeros(3)
-    vector[_AXIS_NUMBER[axis]] = angle
+    i = _AXIS_NUMBER[axis]
+    j, k = (i + 1) % 3, (i + 2) % 3
     matrix = np.eye(4)
-    matrix[:3, :3] = cv2.Rodrigues(vector)[0]
+    matrix[j, j] = matrix[k, k] = math.cos(angle)
+    matrix[k, j] = math.sin(angle)
+    matrix[j, k] = -matrix[k, j]
     return matrix
 
 
@@ -65,10 +69,11 @@ def _warped(target: Target, warp: FloatArray, temperature: float) -> FloatArray:
 def _moving(axis: str, number: int, geometry: Mapping[str, float], angle: float) -> FloatArray:
     """(4, 4): what the harmonics of an axis add to its turn by an angle, in the words of ``adjust.model.tables``."""
     error, along, whirl = 0.0, 0.0, {"radial": 0.0j, "tilt": 0.0j}
-    for name, value in geometry.items():
-        kind, *rest = name.split("_")
-        if kind not in ("angle", "axial", "radial", "tilt") or rest[0] != str(number):
-            continue
+    waves = [name for name in geometry if name.startswith(_WAVES[number])]
+    if not waves:
+        return np.eye(4)
+    for name in waves:
+        (kind, *rest), value = name.split("_"), geometry[name]
         order = int(rest[2].replace("m", "-").replace("p", ""))
         if kind in whirl:
             whirl[kind] += value * (1j if rest[1] == "im" else 1.0) * np.exp(1j * order * angle)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from gtsam import Pose3, Rot3
@@ -58,6 +59,7 @@ def held_lens(seed: int) -> tuple[Survey, Truth]:
     return replace(survey, cameras=cameras), truth
 
 
+@cache
 def small_head(seed: int) -> tuple[Survey, Truth]:
     """Three cameras on a two-axis table before a board."""
     return head_on_table(seed, n_table_epochs=9, n_free_epochs=5)

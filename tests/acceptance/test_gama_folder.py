@@ -7,6 +7,7 @@ from tests.acceptance.networks import DEFAULTS
 from tests.data import data_folder
 
 
+@pytest.mark.usefixtures("undiagnosed")
 @pytest.mark.parametrize("name", [*DEFAULTS, "2019-08-20-knin_test", "tst-tetrahedron-1"])
 def test_coordinates_sigmas_and_sigma0_are_gamas(tmp_path, name):
     """To 1e-6 m; sigmas and sigma0 to what Gama's last linearisation leaves (1e-4)."""

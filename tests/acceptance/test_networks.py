@@ -29,6 +29,7 @@ from tests.acceptance.networks import (
 )
 from tests.data import data_folder
 
+pytestmark = pytest.mark.usefixtures("undiagnosed_module")
 PRINTED = np.array([5e-4, 5e-4, 5e-4])  # half digits of qrr, f and the standardized residual
 
 

@@ -99,6 +99,7 @@ def test_an_epoch_that_was_not_asked_for_is_no_part_of_the_calibration(tmp_path:
     assert sigma0[0] == sigma0[1]
 
 
+@pytest.mark.usefixtures("undiagnosed")
 @pytest.mark.parametrize("name", ["photogra", "photogra_nostart"])
 def test_tilted_cameras_of_comp3d(name: str) -> None:
     """Twelve tilted stations that see known targets and a car, with start poses and without any."""

@@ -60,7 +60,7 @@ def held_epochs(survey: Survey, truth: Truth) -> Survey:
 )
 def test_bundle_equals_the_dense_adjustment(options: dict[str, object], reduced: int, tied: int) -> None:
     """Values, covariances of lenses, hidden poses, reduced, tied and held points, all redundancy numbers and tests."""
-    survey, truth = h.network(1, **options)  # type: ignore[arg-type]  # keywords of all kinds
+    survey, truth = h.network(1, **options)
     precision, _ = h.check_against_dense(survey, near(truth))
     (bundle,) = precision.graph.bundles
     assert (len(bundle.reduced), len(bundle.tied)) == (reduced, tied)
@@ -169,7 +169,7 @@ def test_back_substitution_gives_the_dense_step() -> None:
 )
 def test_free_network_equals_the_dense_one(options: dict[str, int], datum: Datum) -> None:
     """Inner constraints over all points, some points, the stations; six defects with a distance, seven without."""
-    survey, truth = h.network(5, held=0, **options)  # type: ignore[arg-type]  # keywords of all kinds
+    survey, truth = h.network(5, held=0, **options)
     precision, _ = h.check_against_dense(replace(survey, datum=datum), near(truth))
     assert precision.solved.datum is not None
     assert precision.solved.datum.defect == (6 if options["distances"] else 7)

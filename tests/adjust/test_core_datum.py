@@ -1,6 +1,7 @@
 """Datum and rank: what is missing is named; a free network has the shape of a held one and the smallest covariance."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -19,8 +20,9 @@ from tests.adjust import helpers as h
 HEAD = {"n_cameras": 2, "n_table_epochs": 4, "n_free_epochs": 2}
 
 
+@cache
 def head() -> tuple[Survey, Truth]:
-    return head_on_table(1, **HEAD)  # type: ignore[arg-type]  # whole numbers
+    return head_on_table(1, **HEAD)
 
 
 def message(survey: Survey, truth: Truth) -> str:

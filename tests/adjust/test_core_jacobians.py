@@ -202,7 +202,7 @@ def test_the_helper_sees_a_wrong_derivative(what: str) -> None:
     graph = h.build(survey, start)
     key = graph.unknowns.by_name["carrier_from_target", "board"].key
 
-    def residual(_f, values, jacobians):  # type: ignore[no-untyped-def]  # GTSAM's protocol
+    def residual(_f, values, jacobians):
         pose: Pose3 = values.atPose3(key)
         t, R = pose.translation(), pose.rotation()
         if what == "distance":

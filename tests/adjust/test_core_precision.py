@@ -1,6 +1,7 @@
 """Covariances, redundancy numbers, residual statistics and gross errors, without a bundle (see test_core_bundle)."""
 
 from dataclasses import replace
+from functools import cache
 
 import gtsam
 import numpy as np
@@ -155,12 +156,17 @@ def with_gross_error(kind: str, survey: Survey, rng: np.random.Generator) -> tup
     return replace(survey, table_readings=tuple(readings)), i, 1
 
 
+@cache
+def night() -> tuple[Survey, Truth]:
+    return beacons(3, n_table_epochs=4, n_free_epochs=3, n_night_epochs=6)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("kind", ["image", "distance", "table"])
 def test_a_gross_error_is_found_where_it_is(kind: str, seed: int) -> None:
     """The largest test of its kind, beyond doubt."""
-    survey, truth = beacons(3, n_table_epochs=4, n_free_epochs=3, n_night_epochs=6)
+    survey, truth = night()
     spoilt, i, k = with_gross_error(kind, survey, np.random.default_rng(seed))
     result = adjusted(spoilt, near(truth))
     if kind == "image":

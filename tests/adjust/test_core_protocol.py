@@ -13,7 +13,7 @@ from tests.adjust import helpers as h
 from tests.adjust.terrestrial_networks import measured, polar_network, start_near
 
 
-def rows_of(graph: AdjustmentGraph, values: gtsam.Values) -> list[tuple[np.ndarray, np.ndarray]]:  # type: ignore[type-arg]  # plain floats
+def rows_of(graph: AdjustmentGraph, values: gtsam.Values) -> list[tuple[np.ndarray, np.ndarray]]:
     return [graph.graph.at(i).linearize(values).jacobian() for i in range(graph.graph.size())]
 
 

@@ -105,7 +105,7 @@ def test_sights_are_chosen_by_what_measuring_them_brings() -> None:
     sights = [
         Candidate(
             f"P4 to P{t}", "sight",
-            readings=tuple(Reading(f"{kind}{t}", kind, P("P4"), P(f"P{t}"), 1.0, sigma)  # type: ignore[arg-type]
+            readings=tuple(Reading(f"{kind}{t}", kind, P("P4"), P(f"P{t}"), 1.0, sigma)
                            for kind, sigma in (("zenith", 2e-5), ("slope_distance", 2e-4))),
         ) for t in (2, 3, 5)
     ]  # fmt: skip

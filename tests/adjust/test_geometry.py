@@ -251,7 +251,7 @@ def test_surfaces_move_with_the_survey(kind: str, distance) -> None:
     """A position keeps its distance from a surface that moves along, but for the scale."""
     p = {"plane": [0.2, -0.1, 0.7], "line": [0.2, -0.1, 0.4, 0.3], "sphere": [0.1, 0.2, 0.3, 0.5]}[kind]
     full, x, step = np.array(p), np.array([0.9, -0.4, 0.8]), 1e-6
-    surface = Surface("s", kind, None if kind == "sphere" else UP)  # type: ignore[arg-type]
+    surface = Surface("s", kind, None if kind == "sphere" else UP)
     G, M = surface_motions(surface, full), point_motions(x)
     reference = np.zeros(3) if kind == "sphere" else UP
     for i in range(7):
@@ -286,7 +286,7 @@ def measured(x: FloatArray, kind: str, **given) -> Survey:
     """Points held as they were measured, all on one surface."""
     points = tuple(Point(f"P{i}", PointParameter(v, "held")) for i, v in enumerate(x))
     on = tuple(OnSurface("s", PositionRef(p.point_id), 1e-3) for p in points)
-    return Survey(points=points, surfaces=(Surface("s", kind, **given),), on_surfaces=on)  # type: ignore[arg-type]
+    return Survey(points=points, surfaces=(Surface("s", kind, **given),), on_surfaces=on)
 
 
 @pytest.mark.parametrize("kind", ["plane", "line"])

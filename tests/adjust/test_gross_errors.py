@@ -38,7 +38,7 @@ def test_limits_are_those_of_the_family() -> None:
 
 
 @pytest.mark.parametrize("step", [worst_first, best_back_first])
-def test_what_fails_goes_and_what_was_out_by_mistake_comes_back(step) -> None:  # type: ignore[no-untyped-def]
+def test_what_fails_goes_and_what_was_out_by_mistake_comes_back(step) -> None:
     lengths = np.array([0.3, -0.4, 0.1, 12.0, 0.2, -9.0, -0.1, 0.5])
     search = of_one_length(lengths)
     search.step = step

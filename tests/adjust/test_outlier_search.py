@@ -60,7 +60,7 @@ def joint_hall() -> LinearSystem:
 
 
 @pytest.mark.parametrize(("make", "out"), [(mixed_survey, [3, 20, 45]), (joint_hall, [2, 14, 40, 17])])
-def test_elimination_against_a_dense_refit(make, out: list[int]) -> None:  # type: ignore[no-untyped-def]
+def test_elimination_against_a_dense_refit(make, out: list[int]) -> None:
     system = make()
     snooping = Snooping(system, np.ones(len(system.used), dtype=np.bool_))
     for o in out:
@@ -313,7 +313,7 @@ def test_the_last_solution_stays_where_there_is_none_without_an_observation(monk
     def fragile(given: Survey, *arguments: object) -> object:
         if any(r.reading_id == needed and not r.used for r in given.readings):
             raise NotConvergedError("it went astray")
-        return adjust(given, *arguments)  # type: ignore[arg-type]
+        return adjust(given, *arguments)
 
     monkeypatch.setattr("adjust.statistics.outliers.search.adjust", fragile)
     found = search_outliers(wrong, start)

@@ -116,7 +116,7 @@ def test_one_factor_serves_several_steps_to_the_same_minimum(monkeypatch: pytest
 
     def counted(self: PairNormals, linear: object) -> bool:
         counts["eliminated"] += 1
-        return plain(self, linear)  # type: ignore[arg-type]  # passed on
+        return plain(self, linear)
 
     monkeypatch.setattr(PairNormals, "_eliminated", counted)
     kept = solve_network(network)

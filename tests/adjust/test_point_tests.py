@@ -93,7 +93,7 @@ def test_residuals_over_their_sigmas() -> None:
     assert np.isnan(test[points.used & (points.M[:, 0] + points.M[:, 2] > 2.0 - 1e-12)]).all()
 
 
-def test_every_point_by_itself(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+def test_every_point_by_itself(monkeypatch) -> None:
     """The same to the bit in any ranges."""
     points = some_points(20_001)
     found = []

@@ -89,7 +89,7 @@ def test_few_loops_by_closure_factors_many_by_normal_equations(n: int, monkeypat
     expected = adjust_conditions(network).pairs
     used: list[int] = []
 
-    def counted(*given, **named):  # type: ignore[no-untyped-def]  # passes on whatever it is given
+    def counted(*given, **named):
         used.append(1)
         return adjust_condition_factors(*given, **named)
 
@@ -99,11 +99,11 @@ def test_few_loops_by_closure_factors_many_by_normal_equations(n: int, monkeypat
     np.testing.assert_allclose(found.residual, expected.residual, atol=1e-10)
     np.testing.assert_allclose(found.cov, expected.cov, atol=1e-8 * np.abs(expected.cov).max())
 
-    def lost(*given, **named):  # type: ignore[no-untyped-def]  # as above
+    def lost(*given, **named):
         done = adjust_condition_factors(*given, **named)
         return replace(done, pairs=replace(done.pairs, redundancy=done.pairs.redundancy * 0.99, omega=-1.0))
 
-    def stuck(*_given, **_named):  # type: ignore[no-untyped-def]  # as above
+    def stuck(*_given, **_named):
         raise NotConvergedError("the hard loop closures did not settle")
 
     for wrong in (lost, stuck):

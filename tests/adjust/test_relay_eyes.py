@@ -102,7 +102,7 @@ def _check_derivatives(problem: EyeProblem, rng: np.random.Generator) -> None:
         for component in range(6):
             one = np.zeros_like(v)
             one[obs, component] = 1.0
-            numeric = by(lambda x, one=one: linearise(problem, U, scales, v + x * one).f).reshape(-1, 6)  # type: ignore[misc]  # a lambda's default
+            numeric = by(lambda x, one=one: linearise(problem, U, scales, v + x * one).f).reshape(-1, 6)
             analytic = np.zeros_like(numeric)
             for idx, D in ((problem.conditions.k_idx, at.by_k), (problem.conditions.l_idx, at.by_l)):
                 analytic[idx == obs] += D[idx == obs][:, :, component]
@@ -320,7 +320,7 @@ def test_a_known_relation_helps_and_the_same_target_is_exact() -> None:
 
 
 def _joint_pair(result: object, a: str, b: str) -> tuple[Pose3, FloatArray]:
-    estimates, precision = result.estimates, result.precision  # type: ignore[attr-defined]  # an Adjustment
+    estimates, precision = result.estimates, result.precision
     X = {e: estimates["station_from_camera", e].value for e in (a, b)}
     free = [e for e in (a, b) if e != "a"]
     C = np.zeros((12, 12))

@@ -100,7 +100,7 @@ def test_the_condensed_system_is_the_same_system(case: Callable[[], tuple[Survey
         np.testing.assert_allclose(whole * scale, full.A[2 * row : 2 * row + 2].toarray() * scale, atol=1e-9)
 
 
-def check_tests(adjustment: Adjustment, full: h.Dense, Q: FloatArray, found) -> None:  # type: ignore[no-untyped-def]
+def check_tests(adjustment: Adjustment, full: h.Dense, Q: FloatArray, found) -> None:
     t, at, sigma0, f = found.tests, 0, adjustment.sigma0, adjustment.redundancy
     checked = 0
     for k in range(len(t.used)):
@@ -146,7 +146,7 @@ def check_tests(adjustment: Adjustment, full: h.Dense, Q: FloatArray, found) -> 
     assert checked > 0.5 * len(t.used)
 
 
-def check_influences(adjustment, full, Q, found, columns, names) -> None:  # type: ignore[no-untyped-def]
+def check_influences(adjustment, full, Q, found, columns, names) -> None:
     t = found.tests
     sigma = np.sqrt(np.diag(Q))
     assert len(found.influences) == np.count_nonzero(t.used & (t.freedom > 0) & (t.external > 0))

@@ -1,6 +1,7 @@
 """What the statistics do in large surveys, against what they do in small ones."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from tests.adjust import statistics_networks as net
 pytestmark = pytest.mark.slow
 
 
+@cache
 def lab() -> Adjustment:
     survey, truth = head_on_table(2, n_cameras=2, n_table_epochs=12, n_free_epochs=8)
     return adjust(survey, h.start_at(truth))

@@ -41,7 +41,7 @@ def world(east: float, north: float, up: float = 0.0) -> np.ndarray:
 def value_of(kind: str, a: np.ndarray, b: np.ndarray, bearings: Bearings = CONVENTIONS[0], **more: float) -> float:
     """What the core predicts for one reading from a to b: the observed value is zero, so it is the residual."""
     points = (Point("A", PointParameter(a, "held")), Point("B", PointParameter(b)))
-    reading = Reading("r", kind, P("A"), P("B"), 0.0, 1.0, **more)  # type: ignore[arg-type]
+    reading = Reading("r", kind, P("A"), P("B"), 0.0, 1.0, **more)
     graph = GraphBuilder(Survey(points=points, readings=(reading,), bearings=bearings), {}).build(
         StartValues({}, {}, {"A": a, "B": b})
     )
@@ -311,7 +311,7 @@ def test_heights_say_nothing_in_a_plane_network() -> None:
     survey = measured(survey, truth, 1)
     start = start_near(survey, truth, 1)
     for kind in ("zenith", "height_difference"):
-        extra = Reading("up", kind, P("P4"), P("P5"), 1.5, 1e-4)  # type: ignore[arg-type]
+        extra = Reading("up", kind, P("P4"), P("P5"), 1.5, 1e-4)
         with pytest.raises(SurveyError, match="as in a plane network"):
             adjust(replace(survey, readings=(*survey.readings, extra)), start)
 

@@ -23,7 +23,7 @@ SOME = Datum("inner", points=("P0", "P3", "P5"))
 
 
 def free_network(kinds: tuple[str, ...], flat_heights: bool = False, **options: object) -> tuple[Survey, Truth]:
-    survey, truth = polar_network(4, held=0, extra=False, datum=Datum("inner"), **options)  # type: ignore[arg-type]
+    survey, truth = polar_network(4, held=0, extra=False, datum=Datum("inner"), **options)
     kept = tuple(r for r in survey.readings if r.kind in kinds)
     if flat_heights:  # heights of instruments are lengths: with them angles alone tell the scale
         kept = tuple(replace(r, instrument_height=0.0, target_height=0.0) for r in kept)

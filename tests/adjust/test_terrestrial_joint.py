@@ -90,7 +90,7 @@ def laboratory(seed: int) -> tuple[Survey, Truth]:
     pillar = Station("pillar", world_from_station=PoseParameter(pose, held=("rx", "ry", "rz")))
     at = PositionRef(frame=FrameRef("station", "pillar"))
     ids = [p.point_id for p in survey.points if p.x_in_world.treatment != "held"][:8]
-    readings = tuple(Reading(f"{kind}-{n}", kind, at, P(n), 0.0, sigma, "T1", group="total station")  # type: ignore[arg-type]
+    readings = tuple(Reading(f"{kind}-{n}", kind, at, P(n), 0.0, sigma, "T1", group="total station")
                      for n in ids for kind, sigma in POLAR)  # fmt: skip
     values = truth | {("world_from_station", "pillar"): pose, ("orientation", "T1"): np.array([0.7])}
     more = replace(survey, stations=(*survey.stations, pillar), setups=(Setup("T1"),), readings=readings)
@@ -139,7 +139,7 @@ def test_jacobians_through_frames() -> None:
     block = survey.image_blocks[0]
     frame = PositionRef(frame=FrameRef("camera", block.camera_id, block.epoch_id))
     at = survey.readings[0].at
-    more = tuple(Reading(f"{kind}-camera", kind, at, frame, 0.3, sigma, "T1") for kind, sigma in POLAR)  # type: ignore[arg-type]
+    more = tuple(Reading(f"{kind}-camera", kind, at, frame, 0.3, sigma, "T1") for kind, sigma in POLAR)
     survey = replace(survey, readings=(*survey.readings, *more))
     graph = h.build(survey, start_of(truth, survey))
     values = h.disturbed(graph.start, graph, 5, 0.1)

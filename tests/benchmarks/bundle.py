@@ -161,7 +161,7 @@ def survey(case: Bundle) -> Survey:
     bars = ()
     if len(case.bar):
         a, b = (PositionRef(ids[int(p)]) for p in case.bar[:2])
-        bars = (Distance("bar", a, b, float(case.bar[2]), float(case.bar[3])),)  # type: ignore[assignment]  # one or none
+        bars = (Distance("bar", a, b, float(case.bar[2]), float(case.bar[3])),)
     datum = Datum("inner", tuple(n for n in ids if len(n) <= 3) if case.aicon else ids[:: len(ids) // 10])
     return Survey(cameras=(camera,), stations=(Station("body", "epoch"),), points=tuple(Point(n) for n in ids),
                   image_blocks=tuple(blocks), distances=bars, datum=datum)  # fmt: skip

@@ -117,7 +117,7 @@ def pylon() -> Iterator[tuple[Take, Take]]:
         prepared(camera, ExposureTime=100.0, AcquisitionFrameRate=1000.0)
         cameras = TriggerSet({"soak": camera})
         cameras.arm()
-        inner, bare_number = camera._camera, [0]  # type: ignore[attr-defined]
+        inner, bare_number = camera._camera, [0]
         from pypylon import pylon as sdk
 
         def bare() -> np.ndarray:
@@ -138,7 +138,7 @@ def gige() -> Iterator[tuple[Take, Take]]:
     with gige_port(), GigeServer("gradient"), open_camera("gige:127.0.0.1") as camera:
         prepared(camera, TriggerMode="Off", AcquisitionFrameRate=200.0)
         camera.arm()
-        stream = camera._stream  # type: ignore[attr-defined]
+        stream = camera._stream
         yield lambda: camera.fetch(TIMEOUT_S), lambda: stream.next_frame(5000).to_numpy()
 
 

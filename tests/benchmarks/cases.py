@@ -12,10 +12,10 @@ class Arrays:
 
     def save(self, path: Path) -> None:
         """Write all fields."""
-        np.savez(path, **{f.name: np.asarray(getattr(self, f.name)) for f in fields(self)})  # type: ignore[arg-type]  # a dataclass
+        np.savez(path, **{f.name: np.asarray(getattr(self, f.name)) for f in fields(self)})
 
     @classmethod
     def load(cls, path: Path) -> Self:
         """Read all fields."""
         with np.load(path) as data:
-            return cls(**{f.name: data[f.name] for f in fields(cls)})  # type: ignore[arg-type]  # a dataclass
+            return cls(**{f.name: data[f.name] for f in fields(cls)})

@@ -71,11 +71,11 @@ class InTurn:
 def main() -> None:
     """Runs the command of the arguments."""
     pool = InTurn()
-    parallel._pool = parallel._stages = lambda workers: pool  # type: ignore[assignment,misc]  # stands for both
-    parallel.Beside.__exit__ = lambda self, *_: pool.finished()  # type: ignore[assignment,method-assign]
+    parallel._pool = parallel._stages = lambda workers: pool
+    parallel.Beside.__exit__ = lambda self, *_: pool.finished()
     from survey.jobs.adjusting import job
 
-    job.time = SimpleNamespace(perf_counter=time.process_time)  # type: ignore[assignment]
+    job.time = SimpleNamespace(perf_counter=time.process_time)
     from survey.cli import program
 
     sys.argv = ["labsurvey", *sys.argv[1:]]

@@ -113,7 +113,7 @@ def ours_tight(case: Calibration) -> Competitor:
     return run
 
 
-def _ours(given: Survey, unknowns: Unknowns, values) -> dict[str, FloatArray]:  # type: ignore[no-untyped-def]  # gtsam
+def _ours(given: Survey, unknowns: Unknowns, values) -> dict[str, FloatArray]:
     lens = [free_lens(unknowns.vectors[("lens", c.camera_id)].full(values)) for c in given.cameras]
     heads, boards = [np.eye(4)], []
     for name, unknown in unknowns.by_name.items():
@@ -157,7 +157,7 @@ def opencv_multiview(case: Calibration) -> Competitor:
 
     def run() -> Outcome:
         t0 = perf_counter()
-        _, K, d, R, T, *_ = cv2.calibrateMultiview(  # type: ignore[call-overload]  # the stubs do not know None for what it finds
+        _, K, d, R, T, *_ = cv2.calibrateMultiview(
             [board] * n, views, [SIZE] * cameras, np.ones((cameras, n), np.uint8), np.zeros(cameras, np.uint8),
             None, None, None, None, np.full(cameras, cv2.CALIB_FIX_K3, np.int32), 0, TIGHT,
         )  # fmt: skip

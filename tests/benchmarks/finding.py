@@ -63,7 +63,7 @@ def rendered(width: int, height: int, charuco: bool) -> Pictures:
     return Pictures(np.array(images), np.array(truth), np.array(charuco))
 
 
-Finder = Callable[[np.ndarray], FloatArray]  # type: ignore[type-arg]  # 8 bit
+Finder = Callable[[np.ndarray], FloatArray]
 
 
 def _ours(case: Pictures) -> Finder:
@@ -75,7 +75,7 @@ def _classic(case: Pictures) -> Finder:
     half = (11, 11) if case.images.shape[1] > 1000 else (5, 5)
     until = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-3)
 
-    def find(image):  # type: ignore[no-untyped-def]  # 8 bit
+    def find(image):
         ok, corners = cv2.findChessboardCorners(image, size)
         if not ok:
             return np.zeros((0, 2))
@@ -87,7 +87,7 @@ def _classic(case: Pictures) -> Finder:
 def _sector(case: Pictures) -> Finder:
     size = BOARD.columns, BOARD.rows
 
-    def find(image):  # type: ignore[no-untyped-def]  # 8 bit
+    def find(image):
         ok, corners = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_ACCURACY)
         return corners.reshape(-1, 2) if ok else np.zeros((0, 2))
 
@@ -97,7 +97,7 @@ def _sector(case: Pictures) -> Finder:
 def _charuco(case: Pictures) -> Finder:
     detector = cv2.aruco.CharucoDetector(charuco_board(CHARUCO))
 
-    def find(image):  # type: ignore[no-untyped-def]  # 8 bit
+    def find(image):
         corners = detector.detectBoard(image)[0]
         return np.zeros((0, 2)) if corners is None else corners.reshape(-1, 2)
 

@@ -24,7 +24,7 @@ def _best(run: object, times: int = 7) -> float:
     found = []
     for _ in range(times):
         begin = perf_counter()
-        run()  # type: ignore[operator]  # any callable
+        run()
         found.append(perf_counter() - begin)
     return min(found)
 
@@ -56,7 +56,7 @@ def kernel_against_machine() -> str:
     n = int(images.n_rows[0])
     flops = gram_flops(n) + _OTHER_FLOPS
     measured = _best(kernel) / points
-    reduced = 0.0 if graph.reduction is None else _best(lambda: graph.reduction.reduce(0.0)) / points  # type: ignore[union-attr]  # tested
+    reduced = 0.0 if graph.reduction is None else _best(lambda: graph.reduction.reduce(0.0)) / points
     rows = [
         ["normal equations", f"{1e9 * measured:.0f}", ""],
         ["poses reduced", f"{1e9 * reduced:.0f}", ""],

@@ -8,7 +8,7 @@ import sys
 import time
 from typing import Any
 
-import mrcal  # type: ignore[import-not-found]  # lives in the system Python
+import mrcal
 import numpy as np
 
 

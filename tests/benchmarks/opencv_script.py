@@ -20,7 +20,7 @@ def main() -> None:
     """Print the focal lengths and the distance of the cameras."""
     board = np.zeros((SIZE[0] * SIZE[1], 3), np.float32)
     board[:, :2] = SQUARE * np.mgrid[: SIZE[0], : SIZE[1]].T.reshape(-1, 2)
-    found: list[dict[str, np.ndarray]] = [{}, {}]  # type: ignore[type-arg]  # of 32 bits
+    found: list[dict[str, np.ndarray]] = [{}, {}]
     size = (0, 0)
     for corners, name in zip(found, ("left", "right"), strict=True):
         for path in sorted((Path(sys.argv[1]) / name).iterdir()):

@@ -20,7 +20,7 @@ from playwright.sync_api import sync_playwright
 
 from survey.project import write_project
 from survey.simulate import stereo
-from tests.survey.test_report_browser import need_browser
+from tests.browsing import need_browser
 
 POINTS_PER_PAIR = 108
 PATIENCE_S = 120.0

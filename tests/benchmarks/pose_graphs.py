@@ -105,7 +105,7 @@ def _native(case: PoseGraph) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     return graph, values
 
 
-def _optimizer(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, gauss_newton: bool):  # type: ignore[no-untyped-def]  # gtsam
+def _optimizer(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, gauss_newton: bool):
     parameters = gtsam.GaussNewtonParams() if gauss_newton else gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(1e-10)
     parameters.setAbsoluteErrorTol(1e-10)

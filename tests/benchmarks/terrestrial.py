@@ -63,7 +63,7 @@ def network(n: int, free: bool, seed: int = 1) -> Survey:
             truth = (np.arctan2(d[0], d[1]) - turn, np.arctan2(across, d[2]), np.linalg.norm(d))
             for (kind, sigma), value in zip(KINDS, truth, strict=True):
                 value = float(value + sigma * rng.standard_normal())
-                readings.append(Reading(f"{s}-{j}-{kind}", kind, refs[s], refs[j], value, sigma, f"S{s}"))  # type: ignore[arg-type]
+                readings.append(Reading(f"{s}-{j}-{kind}", kind, refs[s], refs[j], value, sigma, f"S{s}"))
     held = 0 if free else 4
     points = tuple(Point(f"P{i}", PointParameter(q, "held" if i < held else "free")) for i, q in enumerate(x))
     setups = tuple(Setup(f"S{s}") for s in seen)
@@ -109,7 +109,7 @@ def ours(given: Terrestrial) -> Competitor:
     return run
 
 
-def _points(survey: Survey, result) -> tuple[FloatArray, FloatArray]:  # type: ignore[no-untyped-def]  # Adjustment
+def _points(survey: Survey, result) -> tuple[FloatArray, FloatArray]:
     x, sigmas = np.zeros((2, len(survey.points), 3))
     for i, p in enumerate(survey.points):
         estimate = result.estimates.get(("point", p.point_id))

@@ -53,7 +53,7 @@ def table_1_gtsam(case: Trials) -> Competitor:
     return run
 
 
-def _one_graph(start, pairs, a: IntArray, b: IntArray, sigma: float) -> float:  # type: ignore[no-untyped-def]  # arrays
+def _one_graph(start, pairs, a: IntArray, b: IntArray, sigma: float) -> float:
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
     for i, j, R in zip(a.tolist(), b.tolist(), pairs, strict=True):

@@ -19,7 +19,7 @@ def frame_of(image: np.ndarray, bits: int = 8) -> Frame:
 
 def board(scale: int = 1, **imaging: float) -> np.ndarray:
     camera = BrownCamera((640 * scale, 512 * scale), 800.0 * scale, 800.0 * scale, 320.0 * scale, 256.0 * scale)
-    return render(camera, [PlacedTarget(BOARD, POSE)], imaging=Imaging(**imaging))  # type: ignore[arg-type]
+    return render(camera, [PlacedTarget(BOARD, POSE)], imaging=Imaging(**imaging))
 
 
 @pytest.mark.slow

@@ -141,7 +141,7 @@ def test_one_camera_that_cannot_be_armed_leaves_none_armed(world: World) -> None
 
 def test_block_ids_of_16_bit(world: World) -> None:
     class Gige1(SimulatedCamera):
-        last_block_id = 65535  # type: ignore[assignment]
+        last_block_id = 65535
 
     for after, accepted in ((1, True), (65536, True), (0, False), (2, False)):
         with Gige1("W", world) as camera:

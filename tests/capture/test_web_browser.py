@@ -9,19 +9,10 @@ from capture.plan.plan import read_plan
 from capture.session.run import run_plan
 from capture.web.serve import PageServer
 from capture.web.state import FolderView
+from tests.browsing import CONTRAST, Page
 from tests.capture.session_runs import write_plan
-from tests.survey.test_report_browser import CONTRAST, need_browser
-from tests.survey.test_workbench_browser import Page, need_playwright
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
-
-
-@pytest.fixture(scope="module")
-def browser() -> Any:
-    with need_playwright().sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=need_browser(), args=["--no-sandbox"])
-        yield found
-        found.close()
 
 
 @pytest.fixture(scope="module")

@@ -121,7 +121,7 @@ def _by_arrow(folder: Path) -> Read:
         finally:
             arrow_columns.LARGE = 0
         for name, column in (found or {}).items():
-            same = repr(column) if IMAGE_POINTS.is_text(name) else column.tobytes()  # type: ignore[union-attr]
+            same = repr(column) if IMAGE_POINTS.is_text(name) else column.tobytes()
             other = repr(table.text(name)) if IMAGE_POINTS.is_text(name) else table.numbers(name).tobytes()
             if same != other:
                 raise AssertionError(f"Arrow reads {name} in another way than row by row")

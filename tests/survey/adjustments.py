@@ -203,7 +203,7 @@ def _other(
 def _estimates(survey: Survey, angles: FloatArray, lab: Lab, rng: np.random.Generator) -> dict[ParameterName, Estimate]:
     out: dict[ParameterName, Estimate] = {}
 
-    def vector(name: ParameterName, value, components, units, sigmas, status) -> None:  # type: ignore[no-untyped-def]
+    def vector(name: ParameterName, value, components, units, sigmas, status) -> None:
         cov = random_cov(rng, np.asarray(sigmas))
         free = (np.asarray(sigmas) > 0).astype(float)
         drawn = np.asarray(value) + free * rng.multivariate_normal(np.zeros(len(free)), cov)

@@ -37,14 +37,14 @@ def solution(folder: Path) -> survey.Solution:
 
 @pytest.mark.parametrize("package", [survey, adjust])
 def test_public_names_are_there_and_documented(package: object) -> None:
-    names = package.__all__  # type: ignore[attr-defined]  # of any package
+    names = package.__all__
     assert sorted(names) == list(names) == dir(package)
     text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
     for name in names:
         assert getattr(package, name).__doc__, name
         assert f"`{name}`" in text, name
     with pytest.raises(AttributeError, match="nonsense"):
-        package.nonsense  # type: ignore[attr-defined]  # noqa: B018  # that it raises is the test
+        package.nonsense  # noqa: B018  # that it raises is the test
 
 
 def test_importing_the_packages_loads_nothing_heavy() -> None:
@@ -158,7 +158,7 @@ def test_joint_covariance_agrees_with_the_scatter_of_solutions() -> None:
     found = []
     for seed in range(12):
         a = adjust.solve(resample(simulated, truth, seed))
-        made = survey.Solution(None, a, type("Run", (), {"sigmas": "a_priori"})())  # type: ignore[arg-type]
+        made = survey.Solution(None, a, type("Run", (), {"sigmas": "a_priori"})())
         cov = made.covariance("lens/left/fx", "lens/right/fx")
         d = np.array([a.estimates["lens", c].value[0] for c in ("left", "right")]) - true
         found.append(float(d @ np.linalg.solve(cov.matrix, d)))

@@ -11,6 +11,7 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,8 +29,8 @@ from survey.batch.tables import folders_csv, overview_json, short_names, summary
 from survey.batch.task import adjust_task
 from survey.batch.trends import all_series, trends_of
 from survey.batch.worker import Worker, WorkerDiedError, attempts
+from tests.browsing import CONTRAST, asked
 from tests.survey.epochs import write_epochs
-from tests.survey.test_report_browser import CONTRAST, seen
 
 DRIFT_PX = 5.0
 N = 7
@@ -389,14 +390,17 @@ def test_no_scheduler_is_said_at_once(nights: list[Path], monkeypatch: pytest.Mo
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("width", "dark"), [(390, False), (1280, True)])
-def test_reasons_are_on_the_screen(records: tuple[Record, ...], tmp_path: Path, width: int, dark: bool) -> None:
+def test_reasons_are_on_the_screen(
+    browser: Any, records: tuple[Record, ...], tmp_path: Path, width: int, dark: bool
+) -> None:
     """Also on a phone; every word can be read on a dark screen too."""
     page = write_overview(tmp_path / "o", records, trends_of(records))["overview.html"].read_text(encoding="utf-8")
     measure = """[document.documentElement.scrollWidth,
       Math.max(...[...document.querySelectorAll("#failures .words, #folders .words")]
         .map((e) => e.getBoundingClientRect().right))]"""
-    page_width, reasons = seen(page, measure, tmp_path, width, dark)
+    (page_width, reasons), (ratio, words) = asked(
+        browser, page, tmp_path, measure, CONTRAST, width=width, dark=dark, ready="document.readyState === 'complete'"
+    )
     assert page_width <= width
     assert reasons <= width
-    ratio, words = seen(page, CONTRAST, tmp_path, width, dark)
     assert ratio >= 4.5, words

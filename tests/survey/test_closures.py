@@ -54,9 +54,9 @@ def _upper() -> list[tuple[str, str, str]]:
     return [(names[i], names[j], units[(i >= 3) + (j >= 3)]) for i in range(6) for j in range(i, 6)]
 
 
-def adjusted(folder: Path) -> dict:  # type: ignore[type-arg]  # as JSON has it
+def adjusted(folder: Path) -> dict:
     assert main(["adjust", str(folder), "--quiet"]) in (0, 3)
-    return json.loads((folder / "results" / "solution.json").read_text())  # type: ignore[no-any-return]
+    return json.loads((folder / "results" / "solution.json").read_text())
 
 
 def test_loops_between_eyes_close(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

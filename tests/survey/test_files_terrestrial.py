@@ -229,7 +229,7 @@ def loose(a: object, b: object, rtol: float = 3e-15) -> list[str]:
 
     original = np.allclose
     try:
-        t.np.allclose = lambda x, y, **k: original(x, y, rtol=rtol, atol=k.get("atol", 0), equal_nan=True)  # type: ignore[assignment]
+        t.np.allclose = lambda x, y, **k: original(x, y, rtol=rtol, atol=k.get("atol", 0), equal_nan=True)
         return differences(a, b)
     finally:
         t.np.allclose = original

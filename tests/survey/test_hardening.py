@@ -218,7 +218,7 @@ def test_image_bombs(tmp_path: Path, name: str) -> None:
 def bomb(folder: Path, arrays: dict[str, bytes]) -> None:
     with zipfile.ZipFile(folder / "results" / "covariance.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in arrays.items():
-            archive.writestr(f"{name}.npy", data)
+            archive.writestr(f"{name}.npy", bytes(data))  # a number: as many zeros
 
 
 def head(shape: str, dtype: str = "<f8") -> bytes:
@@ -232,13 +232,13 @@ def head(shape: str, dtype: str = "<f8") -> bytes:
     [
         {"start": head("(1000000000000,)")},
         {"start": head("(2,)", "|O") + b"\0" * 99},
-        {"start": b"\0" * 200_000_000},
+        {"start": 200_000_000},
         {"start": b"cos\nsystem\n(S'true'\ntR."},
         {"start": head("(2,)") + struct.pack("<2d", 0, 1e9)},
     ],
     ids=["shape", "objects", "zeros", "pickle", "doubles"],
 )
-def test_archives_that_mean_harm(small: Path, arrays: dict[str, bytes]) -> None:
+def test_archives_that_mean_harm(small: Path, arrays: dict[str, bytes | int]) -> None:
     adjust_job(small, progress=False)
     project = files.read(small)
     bomb(small, arrays)

@@ -78,7 +78,7 @@ def test_no_lock_is_taken_through_a_link(elsewhere: None, tmp_path: Path) -> Non
 
 def test_signals_are_fetched(elsewhere: None) -> None:
     before = [signal.getsignal(number) for number in (signal.SIGUSR1, signal.SIGTERM)]
-    with _signals_blocked(SimpleNamespace()):  # type: ignore[arg-type]
+    with _signals_blocked(SimpleNamespace()):
         assert _heard(0.0) is None
         os.kill(os.getpid(), signal.SIGUSR1)
         assert _heard(0.01) == signal.SIGUSR1

@@ -2,6 +2,7 @@
 
 import tomllib
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ WAVES = (*harmonic_names("angle", 1, 2), *harmonic_names("radial", 1, 1))
 BENT = ("warp_x", "warp_y", "shear", "expansion")
 
 
+@cache
 def uneven() -> tuple[Survey, Truth]:
     """A head on a table with an eccentric encoder, before a board that is bent and leans, at two temperatures."""
     survey, truth = head_on_table(5, n_cameras=2, n_table_epochs=9, n_free_epochs=4)

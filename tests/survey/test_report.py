@@ -253,7 +253,7 @@ def test_ellipse_has_the_axes_of_its_covariance() -> None:
     (axes,) = drawing.half_axes((turn @ np.diag([900.0, 100.0]) @ turn.T)[None])
     words = drawing.ellipse(np.array([10.0, 20.0]), axes, "red", "red")
     assert 'rx="30.0" ry="10.0"' in words
-    angle = float(re.search(r"rotate\((.*?)\)", words)[1])  # type: ignore[index]  # it is there
+    angle = float(re.search(r"rotate\((.*?)\)", words)[1])
     assert angle % 180 == pytest.approx(np.degrees(0.5), abs=0.1)
 
 
@@ -411,11 +411,11 @@ def test_the_page_grows_no_further_with_the_observations() -> None:
 
 def test_rows_shown_are_the_same_with_and_without_the_others(adjustment: Adjustment, page: str) -> None:
     """The worst rows of a page that is cut are the first of the one that is not."""
-    whole = json.loads(re.search(r'id="all-data">(.*?)</script>', page, re.S)[1])  # type: ignore[index]  # it is there
+    whole = json.loads(re.search(r'id="all-data">(.*?)</script>', page, re.S)[1])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(observations, "MOST", 40)
         cut = report_html(adjustment, RUN)
-    part = json.loads(re.search(r'id="all-data">(.*?)</script>', cut, re.S)[1])  # type: ignore[index]  # it is there
+    part = json.loads(re.search(r'id="all-data">(.*?)</script>', cut, re.S)[1])
     assert part["rows"] == 40
     assert part["flags"] == whole["flags"][:40]
     for a, b in zip(part["columns"], whole["columns"], strict=True):

@@ -175,4 +175,4 @@ def test_points_named_like_formulas_are_renamed_on_the_way_in(tmp_path, capsys):
 def test_a_wrong_word_in_python_is_no_kind(tmp_path):
     _project(tmp_path / "lab", None)
     with pytest.raises(SurveyError, match="there are no sigmas 'apriori'; write a_priori or a_posteriori"):
-        survey.adjust(survey.problem(tmp_path / "lab").with_options(sigmas="apriori")).scale  # noqa: B018
+        survey.adjust(survey.problem(tmp_path / "lab").with_options(sigmas="apriori")).scale  # noqa: B018  # asked for, it raises

@@ -32,7 +32,7 @@ tolerance_arcsec = 60
 
 
 @pytest.fixture(scope="module")
-def adjustment():  # type: ignore[no-untyped-def]  # a fixture
+def adjustment():
     return lab_adjustment(Lab())
 
 
@@ -65,7 +65,7 @@ def test_what_is_wrong_is_said_with_its_line(tmp_path: Path, change: tuple[str, 
         read(tmp_path)
 
 
-def test_uncertainty_is_judged_in_its_worst_direction(adjustment) -> None:  # type: ignore[no-untyped-def]
+def test_uncertainty_is_judged_in_its_worst_direction(adjustment) -> None:
     scale = scale_of(adjustment, "a_posteriori")
     k = float(t.ppf(0.975, adjustment.redundancy))
     assert coverage(adjustment, scale) == pytest.approx(k)
@@ -79,7 +79,7 @@ def test_uncertainty_is_judged_in_its_worst_direction(adjustment) -> None:  # ty
     assert len(every) == sum(name[0] == "point" for name in adjustment.estimates)
 
 
-def test_a_value_must_be_proven_to_lie_within(adjustment) -> None:  # type: ignore[no-untyped-def]
+def test_a_value_must_be_proven_to_lie_within(adjustment) -> None:
     scale = scale_of(adjustment, "a_posteriori")
     lens = adjustment.estimates["lens", "X"]
     i = lens.components.index("fx")
@@ -89,7 +89,7 @@ def test_a_value_must_be_proven_to_lie_within(adjustment) -> None:  # type: igno
         assert (found.met, found.of_value, found.unit) == (met, True, "px")
 
 
-def test_a_demand_about_nothing_is_an_error(adjustment) -> None:  # type: ignore[no-untyped-def]
+def test_a_demand_about_nothing_is_an_error(adjustment) -> None:
     scale = scale_of(adjustment, "a_posteriori")
     demand = Tolerance("x", "points", ("B99",), "position", 1.0)
     for wrong, words in ((demand, "no result for B99"), (replace(demand, ids=(), quantity="fx"), "none of the points")):

@@ -2,10 +2,8 @@
 
 import csv
 import json
-import os
 import re
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,57 +21,15 @@ from survey.workbench.live import Listening
 from survey.workbench.rows import columns
 from survey.workbench.server import WEB, Server
 from survey.workbench.session import Workbench
-from tests.survey.test_report_browser import CONTRAST, need_browser
+from tests.browsing import CONTRAST, Page
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 WRONG = ("tX05", "X", "board", "c40")  # an image point that is moved by 4 px
 NAME = "X/tX05/board/c40"
-SECONDS = 30.0
 READY = "document.body.dataset.ready !== undefined"
 VIEWS = ("scene", "plan", "south", "east", "camera", "compare", "history", "angles", "loops", "correlations",
          "settings", "network", "jobs")  # fmt: skip
 ROWS = "Number(document.querySelector('#tables [role=grid]').getAttribute('aria-rowcount'))"
-
-
-def need_playwright() -> Any:
-    """The driver of the browser, or a skip; where data is required its absence is a failure too."""
-    if os.environ.get("LABSURVEY_REQUIRE_DATA"):
-        from playwright import sync_api
-    else:
-        sync_api = pytest.importorskip("playwright.sync_api")
-    return sync_api
-
-
-class Page:
-    """A page of the workbench, with what it complained of and what it asked of others."""
-
-    def __init__(self, browser: Any, address: str, width: int, ready: str = READY, **given: Any) -> None:
-        self.context = browser.new_context(viewport={"width": width, "height": 800}, locale="en-GB", **given)
-        self.page = self.context.new_page()
-        self.complaints: list[str] = []
-        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
-        self.page.on("console", lambda m: self.complaints.append(m.text) if m.type in ("error", "warning") else None)
-        self.page.on("request", lambda r: None if r.url.startswith((address.split("#")[0], "blob:")) else
-                     self.complaints.append(r.url))  # fmt: skip
-        self.page.goto(address)
-        self.wait(ready)
-
-    def wait(self, expression: str) -> None:
-        """Polls from outside: inside the page the content policy forbids evaluating a text."""
-        end = time.monotonic() + SECONDS
-        while not self.page.evaluate(expression):
-            if time.monotonic() > end:
-                raise TimeoutError(f"{expression}\n{self.page.inner_text('body')[:600]}\n{self.complaints}")
-            time.sleep(0.02)
-
-    def done(self, act: Callable[[], Any]) -> None:
-        """Does something and waits until the page shows what came of it."""
-        self.page.evaluate("delete document.body.dataset.done")
-        act()
-        self.wait("document.body.dataset.done !== undefined")
-
-    def facts(self) -> str:
-        return str(self.page.inner_text("#facts"))
 
 
 @pytest.fixture(scope="module")
@@ -106,19 +62,10 @@ def address(folder: Path) -> Iterator[str]:
         yield f"{listening.address}#token={token}"
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """Debian's Chromium; nothing is downloaded."""
-    with need_playwright().sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=need_browser(), args=["--no-sandbox"])
-        yield found
-        found.close()
-
-
 @pytest.fixture
 def page(browser: Any, address: str) -> Iterator[Page]:
     """The page as first opened on a desk; it may complain of nothing."""
-    found = Page(browser, address, 1280)
+    found = Page(browser, address, 1280, READY)
     yield found
     found.context.close()
     assert found.complaints == []
@@ -226,7 +173,7 @@ def test_nothing_of_a_project_becomes_markup(page: Page) -> None:
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1280, 390])
 def test_readable_on_desk_and_phone(browser: Any, address: str, scheme: str, width: int) -> None:
-    page = Page(browser, address, width, color_scheme=scheme)
+    page = Page(browser, address, width, READY, color_scheme=scheme)
     p = page.page
     for region in ("left", "tables", "inspector", "tree"):
         p.evaluate(f"document.body.dataset.pane = '{region}'")
@@ -347,7 +294,7 @@ def test_images_are_detected_and_shown_as_they_come(browser: Any, tmp_path: Path
         name.unlink()
     token = new_token()
     with Listening(Server(Workbench(tmp_path / "lab"), token), "127.0.0.1", 0) as listening:
-        page = Page(browser, f"{listening.address}#token={token}&view=findings,jobs", 1280)
+        page = Page(browser, f"{listening.address}#token={token}&view=findings,jobs", 1280, READY)
         p = page.page
         page.wait("document.querySelector('#left .verdict').textContent.includes('nothing to adjust')")
         page.done(lambda: p.get_by_label("Run: Detect").click())

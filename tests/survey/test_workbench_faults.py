@@ -13,8 +13,8 @@ from survey.workbench.guard import new_token
 from survey.workbench.live import Listening
 from survey.workbench.server import Server
 from survey.workbench.session import Workbench
-from tests.survey.test_report_browser import need_browser
-from tests.survey.test_workbench_browser import Page, need_playwright
+from tests.browsing import Page
+from tests.survey.test_workbench_browser import READY
 
 pytestmark = [pytest.mark.slow, pytest.mark.browser]
 
@@ -76,18 +76,17 @@ class Clicks:
 
 
 @pytest.fixture
-def page(tmp_path: Path) -> Iterator[tuple[Page, Path]]:
+def page(browser: Any, tmp_path: Path) -> Iterator[tuple[Page, Path]]:
     """A page of a head on a table with the three mistakes."""
     folder = tmp_path / "lab"
     write_spoilt(folder)
     token = new_token()
     bench = Workbench(folder)
     bench.adjust()
-    with Listening(Server(bench, token), "127.0.0.1", 0) as listening, need_playwright().sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=need_browser(), args=["--no-sandbox"])
-        found = Page(browser, f"{listening.address}#token={token}", 1280)
+    with Listening(Server(bench, token), "127.0.0.1", 0) as listening:
+        found = Page(browser, f"{listening.address}#token={token}", 1280, READY)
         yield found, folder
-        browser.close()
+        found.context.close()
         assert [text for text in found.complaints if "404" not in text] == []  # the example has no pictures
 
 

@@ -1,0 +1,116 @@
+"""A page in a real browser: opened, waited for, asked; what it complains of is kept."""
+
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from survey.report import page as printing
+
+SECONDS = 30.0
+# the smallest contrast of any text with what is behind it, by the formula of WCAG 2.1, with that text
+CONTRAST = """(() => {
+  const rgb = (text) => text.match(/[\\d.]+/g).map(Number);
+  const light = (c) => c.slice(0, 3).map((x) => x / 255)
+    .map((x) => (x <= 0.03928 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4))
+    .reduce((sum, x, k) => sum + x * [0.2126, 0.7152, 0.0722][k], 0);
+  const behind = (e) => {
+    for (; e; e = e.parentElement) {
+      const c = rgb(getComputedStyle(e).backgroundColor);
+      if (c.length < 4 || c[3] > 0) return c;
+    }
+    return [255, 255, 255];
+  };
+  let worst = [99, ""];
+  for (const e of document.body.querySelectorAll("*")) {
+    const own = [...e.childNodes].filter((n) => n.nodeType === 3).map((n) => n.textContent.trim()).join("");
+    if (!own || e.closest("script, style, title") || !e.getClientRects().length) continue;
+    const style = getComputedStyle(e);
+    const [a, b] = [light(rgb(e.closest("svg") ? style.fill : style.color)), light(behind(e))].sort((x, y) => y - x);
+    const ratio = (a + 0.05) / (b + 0.05);
+    if (ratio < worst[0]) worst = [ratio, own.slice(0, 60)];
+  }
+  return worst;
+})()"""
+BROWSER = next((path for name in printing.BROWSERS if (path := shutil.which(name))), None)
+
+
+def need_browser() -> str:
+    """A browser, or a skip; where data is required a missing browser is a failure too."""
+    if BROWSER is None:
+        if os.environ.get("LABSURVEY_REQUIRE_DATA"):
+            pytest.fail("no browser is installed; install Chromium")
+        pytest.skip("no browser is installed")
+    return BROWSER
+
+
+def need_playwright() -> Any:
+    """The driver of the browser, or a skip; where data is required its absence is a failure too."""
+    if os.environ.get("LABSURVEY_REQUIRE_DATA"):
+        from playwright import sync_api
+    else:
+        sync_api = pytest.importorskip("playwright.sync_api")
+    return sync_api
+
+
+@contextmanager
+def launched() -> Iterator[Any]:
+    """Debian's Chromium; nothing is downloaded."""
+    with need_playwright().sync_playwright() as playwright:
+        found = playwright.chromium.launch(executable_path=need_browser(), args=["--no-sandbox"])
+        yield found
+        found.close()
+
+
+class Page:
+    """A page, with what it complained of and what it asked of others."""
+
+    def __init__(self, browser: Any, address: str, width: int, ready: str, **given: Any) -> None:
+        self.context = browser.new_context(viewport={"width": width, "height": 800}, locale="en-GB", **given)
+        self.page = self.context.new_page()
+        self.complaints: list[str] = []
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("console", lambda m: self.complaints.append(m.text) if m.type in ("error", "warning") else None)
+        self.page.on("request", lambda r: None if r.url.startswith((address.split("#")[0], "blob:")) else
+                     self.complaints.append(r.url))  # fmt: skip
+        self.page.goto(address)
+        self.wait(ready)
+
+    def wait(self, expression: str) -> None:
+        """Polls from outside: inside the page the content policy forbids evaluating a text."""
+        end = time.monotonic() + SECONDS
+        while not self.page.evaluate(expression):
+            if time.monotonic() > end:
+                raise TimeoutError(f"{expression}\n{self.page.inner_text('body')[:600]}\n{self.complaints}")
+            time.sleep(0.02)
+
+    def done(self, act: Callable[[], Any]) -> None:
+        """Does something and waits until the page shows what came of it."""
+        self.page.evaluate("delete document.body.dataset.done")
+        act()
+        self.wait("document.body.dataset.done !== undefined")
+
+    def facts(self) -> str:
+        return str(self.page.inner_text("#facts"))
+
+
+def asked(
+    browser: Any, page: str, folder: Path, *questions: str, width: int = 1280, dark: bool = False, place: str = "",
+    ready: str = "document.documentElement.classList.contains('ready')",
+) -> list[Any]:  # fmt: skip
+    """What expressions are, one after the other, on a page as first opened, at a place of it."""
+    path = folder / "page.html"
+    path.write_text(page, encoding="utf-8")
+    shown = Page(browser, path.as_uri() + place, width, ready, color_scheme="dark" if dark else "light")
+    found = []
+    for question in questions:
+        shown.page.evaluate("new Promise((r) => requestAnimationFrame(() => requestAnimationFrame(() => r(0))))")
+        found.append(shown.page.evaluate(question))
+    shown.context.close()
+    assert shown.complaints == []
+    return found
