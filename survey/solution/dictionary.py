@@ -20,6 +20,7 @@ from survey.project.project import LeftOut
 from survey.solution.instruments import instrument_entries
 from survey.solution.left_out import left_out_dict
 from survey.solution.quantities import Scale, SigmaKind, point_entry, pose_entries, scale_of, vector_entry
+from survey.solution.records import Records
 from survey.solution.statistics import Statistics
 from survey.solution.statistics_dict import statistics_dict
 from survey.solution.verdict import findings, fit_of, suspects, verdict
@@ -127,7 +128,7 @@ def _free_datum(adjustment: Adjustment) -> dict[str, Any]:
 def plain(value: Any) -> Any:
     """Only what JSON knows: mappings and sequences kept, numbers as Python's, None for what is not finite."""
     kind = type(value)
-    if kind in _AS_IT_IS:
+    if kind in _AS_IT_IS or kind is Records:
         return value
     if kind is float:
         return value if math.isfinite(value) else None
@@ -358,7 +359,7 @@ def _targets(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, An
     return out
 
 
-def _pairs(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
+def _pairs(adjustment: Adjustment, scale: Scale) -> Mapping[str, Any]:
     if not adjustment.survey.pairs:
         return {}
     from survey.solution.pairs import pairs_dict  # here: as above
@@ -397,6 +398,8 @@ def _lines(value: Any, depth: int) -> str:
         before = " " * (depth + 1)
         inner = ",\n".join([f"{before}{_key(k)}: {_lines(v, depth + 1)}" for k, v in value.items()])
         return f"{{\n{inner}\n{' ' * depth}}}"
+    if kind is Records:
+        return str(value.lines(depth))
     if kind is not list:
         return _one(value)
     try:

@@ -4,7 +4,7 @@ Everything that a report or a result file says about the precision of an unknown
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -115,8 +115,8 @@ def vector_entry(estimate: Estimate, scale: Scale) -> dict[str, Any]:
     return entry | {"status": dict(zip(estimate.components, estimate.status, strict=True))}
 
 
-def pose_dicts(rotations: FloatArray, translations: FloatArray) -> list[dict[str, Any]]:
-    """Of each of n poses (n, 3, 3), (n, 3) m what :func:`pose_dict` says."""
+def pose_columns(rotations: FloatArray, translations: FloatArray) -> dict[str, FloatArray]:
+    """Of n poses (n, 3, 3), (n, 3) m what :func:`pose_dict` says, by columns (n, 3) or (n, 4)."""
     signs = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
     squares = 1.0 + np.diagonal(rotations, axis1=1, axis2=2) @ signs.T  # 4 w^2, 4 x^2, 4 y^2, 4 z^2
     q = np.zeros((len(rotations), 4, 4))  # four times its products; the row of the largest is the best conditioned
@@ -131,14 +131,13 @@ def pose_dicts(rotations: FloatArray, translations: FloatArray) -> list[dict[str
     y = np.arctan2(-R[2, 0], np.hypot(R[2, 1], R[2, 2]))
     # of the first two turns alone, which a quarter turn about y does not hide
     z = np.arctan2(np.sin(x) * R[0, 2] - np.cos(x) * R[0, 1], np.cos(x) * R[1, 1] - np.sin(x) * R[1, 2])
-    rows = (1e3 * translations).tolist(), wxyz.tolist(), np.degrees(np.column_stack([x, y, z])).tolist()
-    names = "translation_mm", "rotation_quaternion_wxyz", "rotation_euler_xyz_deg"
-    return [dict(zip(names, row, strict=True)) for row in zip(*rows, strict=True)]
+    turns = {"rotation_quaternion_wxyz": wxyz, "rotation_euler_xyz_deg": np.degrees(np.column_stack([x, y, z]))}
+    return {"translation_mm": 1e3 * translations} | turns
 
 
 def pose_dict(pose: Pose3) -> dict[str, Any]:
     """Translation, unit quaternion with w >= 0, and Euler angles with R = Rz(z) Ry(y) Rx(x)."""
-    return pose_dicts(pose.rotation().matrix()[None], pose.translation()[None])[0]
+    return first_row(pose_columns(pose.rotation().matrix()[None], pose.translation()[None]))
 
 
 def pose_entries(estimates: Iterable[Estimate], scale: Scale) -> dict[ParameterName, dict[str, Any]]:
@@ -152,11 +151,10 @@ def pose_entries(estimates: Iterable[Estimate], scale: Scale) -> dict[ParameterN
     cov = np.array([e.cov for e, _ in found]).reshape(-1, 6, 6)
     shift = 1e3 * scale.factor * np.sqrt(_variances(R @ cov[:, 3:, 3:] @ np.swapaxes(R, 1, 2)))
     turn = ARCSEC_PER_RAD * scale.factor * np.sqrt(_variances(cov[:, :3, :3]))
-    rows = zip(found, pose_dicts(R, t), shift.tolist(), turn.tolist(), strict=True)
-    return {
-        e.name: entry | {"sigma_translation_mm": mm, "sigma_rotation_arcsec": arcsec, "status": status_of(e)}
-        for (e, _), entry, mm, arcsec in rows
-    }
+    columns = pose_columns(R, t) | {"sigma_translation_mm": shift, "sigma_rotation_arcsec": turn}
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    return {e.name: dict(zip(columns, row, strict=True)) | {"status": status_of(e)}
+            for (e, _), row in zip(found, rows, strict=True)}  # fmt: skip
 
 
 def _variances(cov: FloatArray) -> FloatArray:
@@ -169,17 +167,21 @@ def pose_entry(estimate: Estimate, scale: Scale) -> dict[str, Any]:
     return pose_entries([estimate], scale)[estimate.name]
 
 
-def pair_sigmas(rotations: FloatArray, covs: FloatArray, factor: float = 1.0) -> list[dict[str, Any]]:
-    """Sigmas of n ``b_from_a`` times factor: rotation about the axes of a, translation along the axes of b.
+def pair_sigmas(rotations: FloatArray, covs: FloatArray, factor: float = 1.0) -> dict[str, FloatArray]:
+    """Sigmas (n, 3) of n ``b_from_a`` times factor: rotation about the axes of a, translation along the axes of b.
 
     rotations: (n, 3, 3) of ``b_from_a``. covs: (n, 6, 6) or (n, 3, 3) in the tangent in frame a.
     """
-    turn = ARCSEC_PER_RAD * factor * np.sqrt(_variances(covs[:, :3, :3]))
-    out: list[dict[str, Any]] = [{"sigma_rotation_arcsec": row} for row in turn.tolist()]
+    out = {"sigma_rotation_arcsec": ARCSEC_PER_RAD * factor * np.sqrt(_variances(covs[:, :3, :3]))}
     if covs.shape[1] == 6:
-        shift = 1e3 * factor * np.sqrt(_variances(rotations @ covs[:, 3:, 3:] @ np.swapaxes(rotations, 1, 2)))
-        out = [entry | {"sigma_translation_mm": row} for entry, row in zip(out, shift.tolist(), strict=True)]
+        turned = rotations @ covs[:, 3:, 3:] @ np.swapaxes(rotations, 1, 2)
+        out["sigma_translation_mm"] = 1e3 * factor * np.sqrt(_variances(turned))
     return out
+
+
+def first_row(columns: Mapping[str, FloatArray]) -> dict[str, Any]:
+    """What columns say of the first of their rows."""
+    return {name: column[0].tolist() for name, column in columns.items()}
 
 
 def point_entry(estimate: Estimate, scale: Scale) -> dict[str, Any]:
