@@ -65,7 +65,7 @@ def record_rows(
 ) -> tuple[bytes, IntArray]:
     """Records of one form one after the other, and where each ends (n,).
 
-    parts: of every record, in turn: (TEXT, i) the i-th of the words; (WORD, j) the word number ``word[row, j]``, (n, w);
+    parts: of every record, in turn: (TEXT, i) the i-th of the words; (WORD, j) the word of number ``word[row, j]``;
     (NUMBERS, m) the next m of ``values[row]``, (n, k), with ", " between them, the first of the words for what is not
     finite. significant: digits at most; fewer than ``WHOLE`` are written as by ``"%.12g"``.
     """

@@ -36,7 +36,7 @@ def pairs_dict(adjustment: Adjustment, scale: Scale) -> Records:
 
     def tree(rows: IntArray, is_pose: bool, there: bool, dim: int, size: int) -> Tree:
         kept = [key for key in measured if is_pose or key != "translation_mm"]
-        out: dict[str, Column | Tree] = {end: [names[i] for i in rows.tolist()] for end, names in zip("ab", ends, strict=True)}
+        out: dict[str, Column | Tree] = {end: [ends[k][i] for i in rows.tolist()] for k, end in enumerate("ab")}
         out |= {"used": used[rows], "measured": {key: measured[key][rows] for key in kept}}
         if there:
             sigmas = pair_sigmas(now.rotation[rows], covs[rows, :dim, :dim], scale.factor) if dim else {}
@@ -45,8 +45,8 @@ def pairs_dict(adjustment: Adjustment, scale: Scale) -> Records:
 
     kinds, of_kind = np.unique(np.column_stack([whole, known, n_cov, n_tested]), axis=0, return_inverse=True)
     rows = [np.flatnonzero(of_kind.ravel() == k) for k in range(len(kinds))]
-    forms = [Form(mine, tree(mine, bool(w), bool(t), d, s)) for mine, (w, t, d, s) in zip(rows, kinds.tolist(), strict=True)]
-    return Records([p.pair_id for p in pairs], forms)
+    forms = (Form(of, tree(of, bool(w), bool(t), d, s)) for of, (w, t, d, s) in zip(rows, kinds.tolist(), strict=True))
+    return Records([p.pair_id for p in pairs], tuple(forms))
 
 
 def _columns(of: Motions) -> dict[str, FloatArray]:
@@ -54,7 +54,7 @@ def _columns(of: Motions) -> dict[str, FloatArray]:
 
 
 def _adjusted(adjustment: Adjustment) -> tuple[FloatArray, tuple[list[str], list[str]], Motions]:
-    """Of which pairs (E,) both ends are known, names of these, and the adjusted ``b_from_a``, nonsense for the others."""
+    """Of which pairs (E,) both ends are known; names of these; the adjusted ``b_from_a``, nonsense for the others."""
     frames, pairs = AdjustedFrames(adjustment), adjustment.survey.pairs
     ends = [frame_text(p.a) for p in pairs], [frame_text(p.b) for p in pairs]
     ref = dict(zip(ends[0] + ends[1], [*(p.a for p in pairs), *(p.b for p in pairs)], strict=True))
@@ -79,12 +79,12 @@ def _covariances(adjustment: Adjustment) -> tuple[FloatArray, IntArray]:
 
 
 def _tests(adjustment: Adjustment) -> tuple[dict[str, FloatArray], IntArray]:
-    """Residuals, redundancy numbers and tests (E, ...) of all pairs, and their components (E,), 0 where there are none."""
+    """Residuals, redundancy numbers and tests (E, ...) of all pairs, and how many components they have (E,)."""
     pairs = adjustment.survey.pairs
     found: dict[str, ObservationResidual] = {o.ids[0]: o for o in adjustment.other_residuals if o.kind == "pair"}
     of: Sequence[ObservationResidual | None] = [found.get(p.pair_id) for p in pairs]
     size = np.array([0 if o is None else len(o.residual) for o in of], dtype=np.int64)
-    out: dict[str, FloatArray] = {name: np.zeros((len(pairs), 6)) for name in ("residual", "redundancy", "standardized")}
+    out = {name: np.zeros((len(pairs), 6)) for name in ("residual", "redundancy", "standardized")}
     for dim in (3, 6):
         rows = np.flatnonzero(size == dim)
         for name, into in out.items():

@@ -18,7 +18,7 @@ Tree = Mapping[str, "Column | Tree"]
 
 @dataclass(frozen=True, eq=False)
 class Form:
-    """Records with the same keys. rows: (n,) their numbers among all. tree: their columns by key, nested as they are."""
+    """Records with the same keys. rows: (n,) their numbers among all. tree: columns by key, nested as they are."""
 
     rows: IntArray
     tree: Tree
