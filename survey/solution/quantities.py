@@ -6,6 +6,7 @@ Everything that a report or a result file says about the precision of an unknown
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -78,6 +79,12 @@ def unit_for_people(component: str, unit: str) -> tuple[str, float]:
 def sigma_unit_for_people(unit: str, component: str = "") -> tuple[str, float]:
     """Unit and factor in which a person reads a residual or a sigma: mm, arcsec, ppm, px."""
     return ("arcsec", ARCSEC_PER_RAD) if unit == "rad" else unit_for_people(component, unit)
+
+
+@lru_cache
+def units_for_people(component: str, unit: str) -> tuple[str, float, str, float]:
+    """Both: of its value, and of its residuals and sigmas."""
+    return *unit_for_people(component, unit), *sigma_unit_for_people(unit)
 
 
 def key_of(component: str, unit: str) -> str:

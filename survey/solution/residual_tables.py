@@ -7,7 +7,6 @@ import csv
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import chain, groupby
 from math import isfinite
 from typing import Any
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from adjust.model.observations import Reading
-from adjust.model.result import Adjustment, ImageResiduals, ObservationResidual, ReadingResiduals
+from adjust.model.result import Adjustment, ImageResiduals, ObservationResidual
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.parallel import side_by_side
 from adjust.native.text import NUMBERS, TEXT, WORD, Words, number_rows, record_rows
@@ -23,7 +22,7 @@ from adjust.observations.terrestrial.statistics import reading_names, reading_un
 from survey.folder.text import cell_text
 from survey.project.tables.arrow import parquet_bytes
 from survey.project.tables.reading import TextColumn
-from survey.solution.quantities import sigma_unit_for_people, unit_for_people
+from survey.solution.quantities import units_for_people
 
 IMAGE_COLUMNS = (
     "epoch_id,camera_id,target_id,point_id,u_px,v_px,residual_u_px,residual_v_px,sigma_u_px,sigma_v_px,"
@@ -133,46 +132,43 @@ def _quoted(word: str) -> str:
 
 def other_residuals_csv(adjustment: Adjustment) -> bytes:
     """``residuals_other.csv``: values in mm and degrees, residuals and sigmas in mm and arcseconds."""
-    readings = adjustment.reading_residuals
+    readings, arrays = adjustment.reading_residuals, adjustment.other_arrays
     n = len(adjustment.other_residuals) - (0 if readings is None else len(readings.observed))
-    out = [OTHER_COLUMNS.encode() + b"\n"]
-    for alike, some in groupby(adjustment.other_residuals[:n], lambda o: (o.kind, o.components, o.units)):
-        out.append(_other_rows(alike[0], list(map(_units, *alike[1:])), list(some)))
+    out, first, at = [OTHER_COLUMNS.encode() + b"\n"], 0, 0
+    columns = np.column_stack([arrays.observed, arrays.adjusted, arrays.residual, arrays.sigma, arrays.redundancies,
+                               arrays.standardized, arrays.test[arrays.observation]])  # fmt: skip
+    for _, alike in groupby(adjustment.other_residuals[:n], lambda o: (o.kind, o.components, o.units)):
+        some = list(alike)
+        end = at + len(some) * len(some[0].components)
+        out.append(_other_rows(some, columns[at:end], arrays.used[first : first + len(some)]))
+        first, at = first + len(some), end
     if readings is not None:
-        out.append(_reading_rows(adjustment.survey.readings, readings))
+        out.append(_reading_rows(adjustment.survey.readings, columns[at:], readings.used))
     return b"".join(out)
 
 
-def _other_rows(
-    kind: str, units: Sequence[tuple[str, float, str, float]], some: Sequence[ObservationResidual]
-) -> bytes:
+def _other_rows(some: Sequence[ObservationResidual], columns: FloatArray, used: BoolArray) -> bytes:
     """Of observations with the same components."""
-    names, factor, small_names, small = (list(x) for x in zip(*units, strict=True))
-    k = len(units)
-    columns = [
-        (np.array([getattr(o, name) for o in some], dtype=float).reshape(-1, k) * scale).ravel()
-        for name, scale in (("observed", factor), ("adjusted", factor), ("residual", small), ("sigma", small),
-                            ("redundancy", 1.0), ("standardized", 1.0))
-    ]  # fmt: skip
-    columns.append(np.repeat([o.test for o in some], k))
+    kind, components, k = some[0].kind, some[0].components, len(some[0].components)
+    names, factor, small_names, small = zip(*map(units_for_people, components, some[0].units), strict=True)
     heads = [_cells(kind, o.group, " ".join(o.ids)) for o in some]
-    middles = list(map(_cells, some[0].components, names))
-    each = np.repeat(np.arange(len(some)), k), np.tile(np.arange(k), len(some))
-    return _rows(heads, middles, small_names, (*each, each[1]), columns, np.repeat([o.used for o in some], k))
+    own = np.tile(np.arange(k), len(some))
+    which = np.repeat(np.arange(len(some)), k), own, own
+    return _rows(heads, list(map(_cells, components, names)), small_names, which, (np.array(factor), np.array(small)),
+                 columns, np.repeat(used, k))  # fmt: skip
 
 
-def _reading_rows(readings: Sequence[Reading], found: ReadingResiduals) -> bytes:
+def _reading_rows(readings: Sequence[Reading], columns: FloatArray, used: BoolArray) -> bytes:
     """The same of readings, which are many and have one component."""
-    of = [_units(r.kind, reading_unit(r.kind)) for r in readings]
-    kinds = list(dict.fromkeys((r.kind, *unit) for r, unit in zip(readings, of, strict=True)))
+    of = [(r.kind, *units_for_people(r.kind, reading_unit(r.kind))) for r in readings]
+    kinds = list(dict.fromkeys(of))
     number = {kind: i for i, kind in enumerate(kinds)}
-    which = np.array([number[r.kind, *unit] for r, unit in zip(readings, of, strict=True)], dtype=np.int64)
-    factor, small = np.array([kind[2] for kind in kinds])[which], np.array([kind[4] for kind in kinds])[which]
+    own = np.array([number[kind] for kind in of], dtype=np.int64)
+    names, units, factor, small_units, small = zip(*kinds, strict=True)
     heads = [_cells(r.kind, r.group, " ".join(reading_names(r))) for r in readings]
-    columns = [found.observed * factor, found.adjusted * factor, found.residual * small, found.sigma * small,
-               found.redundancy, found.standardized, found.test]  # fmt: skip
-    words = np.arange(len(readings)), which, which
-    return _rows(heads, [_cells(*kind[:2]) for kind in kinds], [kind[3] for kind in kinds], words, columns, found.used)
+    which = np.arange(len(readings)), own, own
+    return _rows(heads, list(map(_cells, names, units)), small_units, which, (np.array(factor), np.array(small)),
+                 columns, used)  # fmt: skip
 
 
 def _cells(*words: str) -> str:
@@ -181,23 +177,21 @@ def _cells(*words: str) -> str:
 
 def _rows(
     heads: Sequence[str], middles: Sequence[str], units: Sequence[str], which: tuple[IntArray, IntArray, IntArray],
-    columns: Sequence[FloatArray], used: BoolArray,
+    factors: tuple[FloatArray, FloatArray], columns: FloatArray, used: BoolArray,
 ) -> bytes:  # fmt: skip
     """Rows of ``residuals_other.csv``: words of each, numbers with 12 digits, blank where there is none, used or not.
 
     heads: kind, group and ids; middles: component and its unit; units: of the residual. which: of these, by row (n,).
-    columns: (n,) in the order of the table.
+    factors: from SI to the unit of the value and of the residual, by component. columns: (n, 7) in the table's order.
     """
+    factor, small = (x[which[1]] for x in factors)
+    one = np.ones(len(columns))
     words = ["", ",", ",1\n", ",0\n", *heads, *middles, *units]
     first = 4 + np.cumsum([0, len(heads), len(middles)])
     word = np.column_stack([*(i + at for i, at in zip(which, first.tolist(), strict=True)), np.where(used, 2, 3)])
     comma, number = (TEXT, 1), (NUMBERS, 1)
-    parts = [(WORD, 0), comma, (WORD, 1), comma, number, comma, number, comma, (WORD, 2)]
-    parts += [comma, number] * (len(columns) - 2) + [(WORD, 3)]
-    return record_rows(Words.of(words), word, np.column_stack(columns), parts, 12)[0]
-
-
-@lru_cache
-def _units(component: str, unit: str) -> tuple[str, float, str, float]:
-    return *unit_for_people(component, unit), *sigma_unit_for_people(unit)
+    value = [comma, number]
+    parts = [(WORD, 0), comma, (WORD, 1), *value, *value, comma, (WORD, 2), *value * 5, (WORD, 3)]
+    values = columns * np.column_stack([factor, factor, small, small, one, one, one])
+    return record_rows(Words.of(words), word, values, parts, 12)[0]
 
