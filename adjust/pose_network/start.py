@@ -66,8 +66,9 @@ class _Average:
         variance = np.trace(network.cov[rows][:, :3, :3], axis1=1, axis2=2) / 3.0
         # only ratios matter: a common scale keeps tests of pivots away from rounding
         turn = np.concatenate([shared * np.median(variance) / variance, np.full(len(ties), _TIGHT)])
-        sigma = translation_sigmas(network)[rows]
-        shift = np.concatenate([shared * (np.median(sigma) / sigma) ** 2, np.zeros(len(ties))])
+        known = 1.0 / translation_sigmas(network)[rows]  # zero of rotations
+        typical = np.median(known[known > 0.0]) if known.any() else 1.0
+        shift = np.concatenate([shared * (known / typical) ** 2, np.zeros(len(ties))])
         self.turn, self.shift = (np.sqrt(np.where(w > 0.0, w**power, 0.0)) for w in (turn, shift))
         self.fixed = np.zeros(network.n_stations, dtype=np.bool_)
         self.fixed[self.datum if len(self.datum) else self.anchor] = True

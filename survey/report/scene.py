@@ -130,14 +130,14 @@ def _half_angles(adjustment: Adjustment, camera_id: str) -> tuple[float, float]:
 
 
 def _add_stations(scene: Scene, adjustment: Adjustment, scale: Scale) -> None:
-    for name, estimate in adjustment.estimates.items():
-        if name[0] == "world_from_station" and isinstance(estimate.value, Pose3):
-            if len(name) > 2:
-                scene.moves.append(np.asarray(estimate.value.translation()))
-                continue
-            R = estimate.value.rotation().matrix()
-            cov = scale.factor**2 * R @ estimate.cov[3:, 3:] @ R.T
-            scene.spots.append(Spot(name[1], "station", np.asarray(estimate.value.translation()), cov))
+    found = [(name, e.value, e.cov) for name, e in adjustment.estimates.items()
+             if name[0] == "world_from_station" and isinstance(e.value, Pose3)]  # fmt: skip
+    scene.moves += [np.asarray(pose.translation()) for name, pose, _ in found if len(name) > 2]
+    fixed = [(name[1], pose, cov) for name, pose, cov in found if len(name) == 2]
+    R = np.array([pose.rotation().matrix() for _, pose, _ in fixed]).reshape(-1, 3, 3)
+    covs = R @ np.array([cov[3:, 3:] for *_, cov in fixed]).reshape(-1, 3, 3) @ np.swapaxes(R, 1, 2)
+    scene.spots += [Spot(label, "station", np.asarray(pose.translation()), cov)
+                    for (label, pose, _), cov in zip(fixed, scale.factor**2 * covs, strict=True)]  # fmt: skip
 
 
 def _add_targets(scene: Scene, adjustment: Adjustment, frames: AdjustedFrames, epochs: list[str]) -> None:
