@@ -14,7 +14,7 @@ from adjust.spatial.rigid_motions import Motions
 from adjust.testing.distributions import chi2
 from survey.solution.frames import AdjustedFrames
 from survey.solution.loops import motion_arrays
-from survey.solution.quantities import ARCSEC_PER_RAD, Scale, pair_sigmas, pose_columns
+from survey.solution.quantities import ARCSEC_PER_RAD, Scale, motion_columns, pair_sigmas
 from survey.solution.records import Column, Form, Records, Tree
 
 UNCONTROLLED = 1e-4
@@ -50,7 +50,7 @@ def pairs_dict(adjustment: Adjustment, scale: Scale) -> Records:
 
 
 def _columns(of: Motions) -> dict[str, FloatArray]:
-    return pose_columns(of.rotation, np.zeros((len(of), 3)) if of.translation is None else of.translation)
+    return motion_columns(of.rotation, np.zeros((len(of), 3)) if of.translation is None else of.translation)
 
 
 def _adjusted(adjustment: Adjustment) -> tuple[FloatArray, tuple[list[str], list[str]], Motions]:

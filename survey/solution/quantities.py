@@ -4,7 +4,7 @@ Everything that a report or a result file says about the precision of an unknown
 """
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -14,7 +14,7 @@ from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Estimate, ParameterName
-from adjust.model.survey import FloatArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.model.tables import harmonic
 from adjust.testing.distributions import chi2, fisher
 from survey.project.project import SIGMA_KINDS
@@ -122,7 +122,7 @@ def vector_entry(estimate: Estimate, scale: Scale) -> dict[str, Any]:
     return entry | {"status": dict(zip(estimate.components, estimate.status, strict=True))}
 
 
-def pose_columns(rotations: FloatArray, translations: FloatArray) -> dict[str, FloatArray]:
+def motion_columns(rotations: FloatArray, translations: FloatArray) -> dict[str, FloatArray]:
     """Of n poses (n, 3, 3), (n, 3) m what :func:`pose_dict` says, by columns (n, 3) or (n, 4)."""
     signs = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
     squares = 1.0 + np.diagonal(rotations, axis1=1, axis2=2) @ signs.T  # 4 w^2, 4 x^2, 4 y^2, 4 z^2
@@ -144,11 +144,36 @@ def pose_columns(rotations: FloatArray, translations: FloatArray) -> dict[str, F
 
 def pose_dict(pose: Pose3) -> dict[str, Any]:
     """Translation, unit quaternion with w >= 0, and Euler angles with R = Rz(z) Ry(y) Rx(x)."""
-    return first_row(pose_columns(pose.rotation().matrix()[None], pose.translation()[None]))
+    return first_row(motion_columns(pose.rotation().matrix()[None], pose.translation()[None]))
 
 
-def pose_entries(estimates: Iterable[Estimate], scale: Scale) -> dict[ParameterName, dict[str, Any]]:
-    """Of poses ``a_from_b`` by name: sigmas of their origins along the axes of a, of their rotations about those of b.
+@dataclass(frozen=True, eq=False)
+class PoseColumns:
+    """Poses ``a_from_b`` by columns (n, 3) or (n, 4). rows: by name. status: of each."""
+
+    rows: dict[ParameterName, int]
+    columns: dict[str, FloatArray]
+    status: list[Any]
+
+    def entry(self, name: ParameterName) -> dict[str, Any]:
+        """What is said of one."""
+        row = self.rows[name]
+        return {key: column[row].tolist() for key, column in self.columns.items()} | {"status": self.status[row]}
+
+    def trees(self, names: Sequence[ParameterName]) -> list[tuple[IntArray, dict[str, Any]]]:
+        """Of these, which by number have a word as their status, or one for each component, and their columns."""
+        rows = np.array([self.rows[name] for name in names], dtype=np.int64)
+        whole = np.array([isinstance(self.status[row], str) for row in rows.tolist()], dtype=np.bool_)
+        out = []
+        for alike in (np.flatnonzero(whole), np.flatnonzero(~whole)):
+            said = [self.status[row] for row in rows[alike].tolist()]
+            words = {c: [s[c] for s in said] for c in said[0]} if said and isinstance(said[0], dict) else said
+            out.append((alike, {key: column[rows[alike]] for key, column in self.columns.items()} | {"status": words}))
+        return out
+
+
+def pose_columns(estimates: Iterable[Estimate], scale: Scale) -> PoseColumns:
+    """Of poses ``a_from_b``: sigmas of their origins along the axes of a, of their rotations about those of b.
 
     The tangent of the covariance is in b; the translation part is turned into a: ``R cov R'``.
     """
@@ -158,10 +183,8 @@ def pose_entries(estimates: Iterable[Estimate], scale: Scale) -> dict[ParameterN
     cov = np.array([e.cov for e, _ in found]).reshape(-1, 6, 6)
     shift = 1e3 * scale.factor * np.sqrt(_variances(R @ cov[:, 3:, 3:] @ np.swapaxes(R, 1, 2)))
     turn = ARCSEC_PER_RAD * scale.factor * np.sqrt(_variances(cov[:, :3, :3]))
-    columns = pose_columns(R, t) | {"sigma_translation_mm": shift, "sigma_rotation_arcsec": turn}
-    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-    return {e.name: dict(zip(columns, row, strict=True)) | {"status": status_of(e)}
-            for (e, _), row in zip(found, rows, strict=True)}  # fmt: skip
+    columns = motion_columns(R, t) | {"sigma_translation_mm": shift, "sigma_rotation_arcsec": turn}
+    return PoseColumns({e.name: i for i, (e, _) in enumerate(found)}, columns, [status_of(e) for e, _ in found])
 
 
 def _variances(cov: FloatArray) -> FloatArray:
@@ -171,7 +194,7 @@ def _variances(cov: FloatArray) -> FloatArray:
 
 def pose_entry(estimate: Estimate, scale: Scale) -> dict[str, Any]:
     """The same of one; raises KeyError where it is no pose."""
-    return pose_entries([estimate], scale)[estimate.name]
+    return pose_columns([estimate], scale).entry(estimate.name)
 
 
 def pair_sigmas(rotations: FloatArray, covs: FloatArray, factor: float = 1.0) -> dict[str, FloatArray]:

@@ -1,7 +1,12 @@
-"""Many entries of a result file with the same keys, kept by columns: dictionaries where asked for, JSON by the core."""
+"""Result files as JSON; many entries with the same keys are kept by columns and written by the core.
 
+Such entries are dictionaries where they are asked for.
+"""
+
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from json.encoder import encode_basestring
 from math import isfinite
 from typing import Any
@@ -12,8 +17,9 @@ from adjust.model.survey import FloatArray, IntArray
 from adjust.native.text import NUMBERS, TEXT, WORD, Words, record_rows
 
 Column = np.ndarray[Any, Any] | Sequence[str]
-"""Of n records: numbers or truths (n,), lists of numbers (n, k), or n words."""
+"""Of n records: floats, whole numbers or truths (n,), lists of floats (n, k), or n words."""
 Tree = Mapping[str, "Column | Tree"]
+_JSON = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,17 +31,18 @@ class Form:
 
 
 class Records(Mapping[str, dict[str, Any]]):
-    """Entries by name, in the order of ``names``; every one is of one form."""
+    """Entries by name, in the order of ``names``; every one is of one form, or stands apart with plain values."""
 
-    def __init__(self, names: Sequence[str], forms: Sequence[Form]) -> None:
-        self._forms = [form for form in forms if len(form.rows)]
-        self._names = tuple(names)
-        of = [(f, r, row) for f, form in enumerate(self._forms) for r, row in enumerate(form.rows.tolist())]
-        self._place = {self._names[row]: (f, r) for f, r, row in sorted(of, key=lambda x: x[2])}
+    def __init__(
+        self, names: Sequence[str], forms: Sequence[Form], apart: Mapping[str, dict[str, Any]] | None = None
+    ) -> None:
+        self._forms, self._names, self._apart = [f for f in forms if len(f.rows)], tuple(names), dict(apart or {})
+        of = {row: (f, r) for f, form in enumerate(self._forms) for r, row in enumerate(form.rows.tolist())}
+        self._place = {name: of.get(row) for row, name in enumerate(self._names)}
 
     def __getitem__(self, name: str) -> dict[str, Any]:
-        form, row = self._place[name]
-        return _entry(self._forms[form].tree, row)
+        place = self._place[name]
+        return self._apart[name] if place is None else _entry(self._forms[place[0]].tree, place[1])
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._place)
@@ -54,15 +61,21 @@ class Records(Mapping[str, dict[str, Any]]):
 
     def lines(self, depth: int) -> str:
         """As JSON, one line per entry of a mapping, the whole beginning in a line indented by so many spaces."""
+        if not self._names:
+            return "{}"
         parts = [b""] * len(self._names)
         for form in self._forms:
             text, ends = _json_rows(form, [self._names[row] for row in form.rows.tolist()], depth + 1)
-            if len(self._forms) == 1:
+            if len(form.rows) == len(self._names):
                 return f"{{\n{text[:-2].decode()}\n{' ' * depth}}}"
             first = 0
             for row, end in zip(form.rows.tolist(), ends.tolist(), strict=True):
                 parts[row], first = text[first:end], end
-        return f"{{\n{b''.join(parts)[:-2].decode()}\n{' ' * depth}}}" if self._forms else "{}"
+        before = " " * (depth + 1)
+        for row, name in enumerate(self._names):
+            if name in self._apart:
+                parts[row] = f"{before}{_key(name)}: {_lines(self._apart[name], depth + 1)},\n".encode()
+        return f"{{\n{b''.join(parts)[:-2].decode()}\n{' ' * depth}}}"
 
 
 def _entry(tree: Tree, row: int) -> dict[str, Any]:
@@ -98,14 +111,14 @@ class _Writer:
         self.parts.append((kind, which))
 
     def column(self, of: Column) -> None:
-        if isinstance(of, np.ndarray) and of.dtype != np.bool_:
+        if isinstance(of, np.ndarray) and of.dtype == np.float64:
             self.text += "[" * (of.ndim == 2)
-            self.values.append(of.reshape(len(of), -1).astype(np.float64))
+            self.values.append(of.reshape(len(of), -1))
             self.part(NUMBERS, self.values[-1].shape[1])
             self.text += "]" * (of.ndim == 2)
             return
-        truths = isinstance(of, np.ndarray)
-        said = ["true" if x else "false" for x in of] if truths else [encode_basestring(x) for x in of]
+        said = [encode_basestring(x) if isinstance(x, str) else _JSON.encode(x) for x in
+                (of.tolist() if isinstance(of, np.ndarray) else of)]  # fmt: skip
         self.of_row.append(np.array([self.number(x) for x in said], dtype=np.int64))
         self.part(WORD, len(self.of_row) - 1)
 
@@ -130,3 +143,45 @@ def _json_rows(form: Form, names: Sequence[str], depth: int) -> tuple[bytes, Int
     writer.parts.append((TEXT, writer.number(writer.text)))
     word = np.ascontiguousarray(np.array(writer.of_row).T)
     return record_rows(Words.of(list(writer.words)), word, np.hstack([np.zeros((n, 0)), *writer.values]), writer.parts)
+
+
+def solution_json(solution: Mapping[str, Any]) -> str:
+    """JSON with one line per entry of a mapping and lists of numbers kept on one line; floats by repr."""
+    return _lines(solution, 0) + "\n"
+
+
+def _lines(value: Any, depth: int) -> str:
+    kind = type(value)
+    if kind is float:
+        return _one(value)
+    if kind is dict and value:
+        before = " " * (depth + 1)
+        inner = ",\n".join([f"{before}{_key(k)}: {_lines(v, depth + 1)}" for k, v in value.items()])
+        return f"{{\n{inner}\n{' ' * depth}}}"
+    if kind is Records:
+        return str(value.lines(depth))
+    if kind is not list:
+        return _one(value)
+    try:
+        text = ", ".join(map(float.__repr__, value))
+    except TypeError:
+        text = "n"
+    if "n" not in text:  # not even of nan or inf
+        return f"[{text}]"
+    kinds = set(map(type, value))
+    if dict in kinds or str in kinds:
+        inner = ",\n".join([" " * (depth + 1) + _lines(v, depth + 1) for v in value])
+        return f"[\n{inner}\n{' ' * depth}]"
+    return f"[{', '.join(map(_one, value))}]"
+
+
+def _one(value: Any) -> str:
+    kind = type(value)
+    if kind is float and isfinite(value):
+        return float.__repr__(value)
+    if kind is int:
+        return int.__repr__(value)
+    return encode_basestring(value) if kind is str else _JSON.encode(value)
+
+
+_key = lru_cache(encode_basestring)
