@@ -303,7 +303,8 @@ def _stations(adjustment: Adjustment, pose: PoseOf, of: PoseColumns) -> Records:
     names: list[tuple[str, ...]] = [("world_from_station", s.station_id) for s in stations]
     alike = [i for i, s in enumerate(stations) if s.motion == "fixed" and not s.table_id and names[i] in of.rows
              and ("mount_from_station", s.station_id) not in of.rows]  # fmt: skip
-    for station in (s for i, s in enumerate(stations) if i not in set(alike)):
+    by_column = set(alike)
+    for station in (s for i, s in enumerate(stations) if i not in by_column):
         name = station.station_id
         entry = {"motion": station.motion} | ({"table": station.table_id} if station.table_id else {})
         entry |= pose(("mount_from_station", name), "mount_from_station")
