@@ -21,7 +21,7 @@ from adjust.statistics.relative_precision import ellipsoid
 from adjust.statistics.result import Ellipsoid
 from adjust.testing.criteria import LevelOptions, noncentrality, sidak
 from adjust.testing.distributions import chi2, fisher
-from adjust.testing.quadratic_forms import pseudo_square, pseudo_square_beside
+from adjust.testing.quadratic_forms import pseudo_precision, pseudo_square, pseudo_square_beside
 
 
 @dataclass(frozen=True)
@@ -206,7 +206,7 @@ def _weights(change: _Change) -> FloatArray:
     Q, G = change.Q, change.G
     if G.shape[1]:
         Q = transformed(change.d, Q, G, np.ones(len(G)))[1]
-    precision = np.diag(pseudo_square(change.d, Q)[2])
+    precision = pseudo_precision(Q, G)
     return np.asarray(np.where(position, precision[position].mean(), precision[~position].mean()))
 
 

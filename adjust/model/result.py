@@ -102,17 +102,25 @@ class ObservationResidual:
     used: bool
 
 
+_OF_COMPONENTS = ("observed", "adjusted", "residual", "sigma", "redundancy", "standardized")
+
+
 @dataclass(frozen=True, eq=False)
 class OtherArrays:
     """What ``Adjustment.other_residuals`` (M) say, as arrays: n_components, used, test, most redundancy of a component.
 
-    All (M,); standardized: (K,) component by component.
+    All (M,); of every component (K,), one observation after the other, the rest.
     """
 
     n_components: IntArray
     used: BoolArray
     test: FloatArray
     redundancy: FloatArray
+    observed: FloatArray
+    adjusted: FloatArray
+    residual: FloatArray
+    sigma: FloatArray
+    redundancies: FloatArray
     standardized: FloatArray
 
     @cached_property
@@ -232,11 +240,11 @@ class Adjustment:
             (np.array([len(o.components) for o in first], dtype=np.int64),
              np.array([o.used for o in first], dtype=np.bool_), np.array([o.test for o in first]),
              np.array([float(o.redundancy.max()) for o in first]),
-             np.concatenate([np.zeros(0), *(o.standardized for o in first)]))
+             *(np.concatenate([np.zeros(0), *(getattr(o, name) for o in first)]) for name in _OF_COMPONENTS))
         ]  # fmt: skip
         if readings is not None:
             one, r = np.ones(len(readings.used), dtype=np.int64), readings
-            parts.append((one, r.used, r.test, r.redundancy, r.standardized))
+            parts.append((one, r.used, r.test, r.redundancy, *(getattr(r, name) for name in _OF_COMPONENTS)))
         return OtherArrays(*(np.concatenate(x) for x in zip(*parts, strict=True)))
 
     def joint(self, names: Sequence[ParameterName]) -> FloatArray:

@@ -20,6 +20,6 @@ extern "C" __attribute__((visibility("default"))) const Entry *images() {
         entry<plane_poses>("plane_poses"), entry<fit_lens>("fit_lens"), entry<turns_by>("turns_by"),
         entry<turns_of>("turns_of"), entry<row_influences>("row_influences"), entry<residual_tests>("residual_tests"),
         entry<controlled_directions>("controlled_directions"), entry<point_tests>("point_tests"),
-        entry<number_rows>("number_rows"), {nullptr, nullptr, nullptr}};
+        entry<number_rows>("number_rows"), entry<record_rows>("record_rows"), {nullptr, nullptr, nullptr}};
     return table;
 }

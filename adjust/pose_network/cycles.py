@@ -66,6 +66,18 @@ def breadth_first(ptr: IntArray, neighbour: IntArray, pair: IntArray, roots: Int
     return Forest(*(np.array(x, dtype=np.int64) for x in (order, parent, by, depth, part)))
 
 
+def connected_parts(n: int, a: IntArray, b: IntArray) -> IntArray:
+    """The connected part (n,) of every station, numbered from 0 in the order of their first stations."""
+    first = np.arange(n)
+    while (first[a] != first[b]).any():
+        least = np.minimum(first[a], first[b])
+        for ends in (a, b):
+            np.minimum.at(first, first[ends], least)  # those before them that the stations are tied to
+        while (first[first] != first).any():
+            first = first[first]
+    return np.unique(first, return_inverse=True)[1].astype(np.int64)
+
+
 def loop_labels(n: int, a: IntArray, b: IntArray) -> IntArray:
     """Of every pair (E,) a number that pairs with the same loops share, 0 where it closes none.
 

@@ -7,12 +7,12 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 from gtsam import Pose3, Rot3
-from scipy.sparse import coo_array
 
 from adjust.model.errors import IndeterminateError, SurveyError, listed
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import BoolArray, Datum, FloatArray, IntArray, PoseParameter, Station, Survey, Treatment
 from adjust.observations.pairs import PairArrays, doubtful
+from adjust.pose_network.cycles import connected_parts
 from adjust.spatial.rigid import nearest_rotation
 
 _FEW = 8
@@ -141,11 +141,7 @@ class PoseNetwork(Topology):
         rows = self.used if used is None else used
         if poses_only:
             rows = rows & self.is_pose
-        ones = np.ones(int(rows.sum()))
-        from scipy.sparse.csgraph import connected_components  # here: a network without pairs starts without it
-
-        graph = coo_array((ones, (self.a_idx[rows], self.b_idx[rows])), shape=(self.n_stations,) * 2)
-        return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+        return connected_parts(self.n_stations, self.a_idx[rows], self.b_idx[rows])
 
 
 def pose_network(

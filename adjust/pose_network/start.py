@@ -1,25 +1,39 @@
 """A start from nothing: rotations first (averaging over the whole network), then positions by one linear system.
 
-Carlone, Tron, Daniilidis and Dellaert, Initialization techniques for 3D SLAM (ICRA 2015). The rotations come from
-GTSAM's fastSyncRot3: the chordal problem with orthogonality relaxed, solved directly; it needs isotropic weights.
+Carlone, Tron, Daniilidis and Dellaert, Initialization techniques for 3D SLAM (ICRA 2015). The rotations come from the
+chordal problem with orthogonality relaxed, solved directly: R_a = R_b R_ba is linear in the rows of R_a and R_b, which
+do not meet each other. It needs isotropic weights, and so do the positions; one elimination serves both.
 """
 
 import gtsam
 import numpy as np
 
-from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.model.errors import IndeterminateError
+from adjust.model.survey import FloatArray, IntArray
+from adjust.native.elimination import PoseFactor, clique_pattern, pair_gradient
 from adjust.pose_network.network import PoseNetwork
 from adjust.spatial.rigid import nearest_rotation
+
+_TIGHT = 1e4
+"""Weight that ties given rotations to each other, that of the median pair being 1."""
+_EVENED = (1.0, 0.5, 0.25, 0.0)
+"""Powers of the weights that are tried in turn, where so uneven ones cost a station its pivot."""
 
 
 def find_network_start(network: PoseNetwork, weights: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
     """``world_from_station`` of all stations, (N, 3, 3) and (N, 3), from the pairs in use alone.
 
     weights: (E,) on the information of the pairs, zero leaves a pair out. The held stations, the stations with a prior,
-    or the given poses of a free network (else its first station at the identity) say where it lies.
+    or the given poses of a free network (else its first station at the identity) say where it lies. Raises
+    IndeterminateError for pairs that do not tie all stations together.
     """
-    R = start_rotations(network, weights)
-    return R, np.zeros((network.n_stations, 3)) if network.rotation_only else start_translations(network, R, weights)
+    for power in _EVENED:
+        average = _Average(network, weights, power)
+        if average.lost < 0:
+            R = average.rotations()
+            return R, np.zeros((network.n_stations, 3)) if network.rotation_only else average.positions(R)
+    lost = (network.station_ids[average.lost],)
+    raise IndeterminateError(f"the pairs in use do not tie station {lost[0]!r} to the others; measure one more", lost)
 
 
 def datum_stations(network: PoseNetwork) -> IntArray:
@@ -33,74 +47,94 @@ def datum_stations(network: PoseNetwork) -> IntArray:
     return network.inner if all_given else np.zeros(0, dtype=np.int64)
 
 
-def start_rotations(network: PoseNetwork, weights: FloatArray | None = None) -> FloatArray:
-    """Rotations (N, 3, 3) by averaging, turned onto the given ones."""
-    rows = np.flatnonzero(network.used if weights is None else network.used & (weights > 1e-9))
-    variance = np.trace(network.cov[rows][:, :3, :3], axis1=1, axis2=2) / 3.0
-    # only ratios matter: a common scale keeps GTSAM's tests of pivots away from rounding
-    variance = variance / np.median(variance)
-    if weights is not None:
-        variance = variance / weights[rows]
-    graph = gtsam.NonlinearFactorGraph()
-    noise: dict[float, gtsam.noiseModel.Isotropic] = {}
-    a, b = network.a_idx[rows].tolist(), network.b_idx[rows].tolist()
-    for i, j, R, v in zip(a, b, network.rotations[rows], np.sqrt(variance).tolist(), strict=True):
-        if v not in noise:
-            noise[v] = gtsam.noiseModel.Isotropic.Sigma(3, v)
-        graph.push_back(gtsam.BetweenFactorRot3(j, i, gtsam.Rot3(R), noise[v]))
-    _tie_datum(network, graph)
-    out = np.tile(np.eye(3), (network.n_stations, 1, 1))
-    found = gtsam.fastSyncRot3(graph, gtsam.Ordering.ColamdNonlinearFactorGraph(graph))
-    keys = np.array(list(found.keys()), dtype=np.int64)
-    out[keys] = np.array([found.atRot3(k).matrix() for k in keys.tolist()]).reshape(-1, 3, 3)
-    datum = datum_stations(network)
-    if len(datum):
-        turn = nearest_rotation(np.einsum("nij,nkj->ik", network.station_rotations[datum], out[datum]))
-    else:
-        turn = out[network.anchor or 0].T
-    out = turn @ out
-    out[network.held] = network.station_rotations[network.held]
-    return np.asarray(out)
+class _Average:
+    """Rows of rotations, and positions, by least squares over pairs: six unknowns a station, and one factor for all.
 
+    Three of the six never meet the other three. lost: a station without a pivot, or -1.
+    """
 
-def _tie_datum(network: PoseNetwork, graph: gtsam.NonlinearFactorGraph) -> None:
-    """Given rotations tie parts together that no pair joins: strong pairs to the first of them."""
-    datum = datum_stations(network) if network.anchor is None else np.zeros(0, dtype=np.int64)
-    if len(datum) < 2:
-        return
-    tight = gtsam.noiseModel.Isotropic.Sigma(3, 1e-2)
-    first = network.station_rotations[datum[0]]
-    for i in datum[1:].tolist():
-        relative = gtsam.Rot3(first.T @ network.station_rotations[i])
-        graph.push_back(gtsam.BetweenFactorRot3(int(datum[0]), i, relative, tight))
+    def __init__(self, network: PoseNetwork, weights: FloatArray | None, power: float) -> None:
+        self.network, self.datum = network, datum_stations(network)
+        self.anchor = int(self.datum[0]) if len(self.datum) and network.anchor is None else network.anchor or 0
+        rows = np.flatnonzero(network.used if weights is None else network.used & (weights > 1e-9))
+        ties = self.datum[self.datum != self.anchor] if network.anchor is None else np.zeros(0, dtype=np.int64)
+        self.rows, self.n_ties, shared = rows, len(ties), 1.0 if weights is None else weights[rows]
+        self.a = np.concatenate([network.a_idx[rows], np.full(len(ties), self.anchor)])
+        self.b = np.concatenate([network.b_idx[rows], ties])
+        given = network.station_rotations
+        self.b_from_a = np.concatenate([network.rotations[rows], np.swapaxes(given[ties], 1, 2) @ given[[self.anchor]]])
+        variance = np.trace(network.cov[rows][:, :3, :3], axis1=1, axis2=2) / 3.0
+        # only ratios matter: a common scale keeps tests of pivots away from rounding
+        turn = np.concatenate([shared * np.median(variance) / variance, np.full(len(ties), _TIGHT)])
+        known = 1.0 / translation_sigmas(network)[rows]  # zero of rotations
+        typical = np.median(known[known > 0.0]) if known.any() else 1.0
+        shift = np.concatenate([shared * (known / typical) ** 2, np.zeros(len(ties))])
+        self.turn, self.shift = (np.sqrt(np.where(w > 0.0, w**power, 0.0)) for w in (turn, shift))
+        self.fixed = np.zeros(network.n_stations, dtype=np.bool_)
+        self.fixed[self.datum if len(self.datum) else self.anchor] = True
+        self._eliminate()
 
+    def _eliminate(self) -> None:
+        n, a, b = self.network.n_stations, self.a, self.b
+        self.by_a, self.by_b = np.zeros((2, len(a), 6, 6))
+        for i in range(3):
+            self.by_a[:, i, i], self.by_a[:, 3 + i, 3 + i] = self.turn, self.shift
+            self.by_b[:, 3 + i, 3 + i] = -self.shift
+        self.by_b[:, :3, :3] = -self.turn[:, None, None] * np.swapaxes(self.b_from_a, 1, 2)
+        own = np.zeros((n, 6, 6))
+        known = np.arange(n) == self.anchor, self.fixed
+        for half, weight, constant in zip((slice(0, 3), slice(3, 6)), (self.turn, self.shift), known, strict=True):
+            self.by_a[constant[a], :, half], self.by_b[constant[b], :, half] = 0.0, 0.0
+            alone = constant | (np.bincount(a, weight, n) + np.bincount(b, weight, n) == 0.0)
+            own[alone, half, half] = np.eye(3)
+        symbolic = gtsam.SymbolicFactorGraph()
+        for ends in zip(a.tolist(), b.tolist(), strict=True):
+            symbolic.push_factor(*ends)
+        ordering = gtsam.Ordering.ColamdSymbolicFactorGraph(symbolic)
+        joined = np.array([ordering.at(i) for i in range(ordering.size())], dtype=np.int64)
+        keys = np.concatenate([joined, np.setdiff1d(np.arange(n), joined)])
+        place = np.argsort(keys)
+        pattern = clique_pattern(n, place[a], place[b])
+        self.keys = keys[pattern.order]
+        self.place = np.argsort(self.keys)
+        self.factor = PoseFactor(pattern)
+        lost = self.factor.eliminate(self.place[a], self.place[b], self.by_a, self.by_b, own[self.keys])
+        self.lost = int(self.keys[lost]) if lost >= 0 else -1
 
-def start_translations(network: PoseNetwork, R: FloatArray, weights: FloatArray | None = None) -> FloatArray:
-    """Positions (N, 3) m with the rotations taken as true: t_a - t_b = R_b t_ba for every pair, one linear system."""
-    keep = network.used & network.is_pose
-    if weights is not None:
-        keep = keep & (weights > 1e-9)
-    rows = np.flatnonzero(keep)
-    a, b = network.a_idx[rows], network.b_idx[rows]
-    observed = np.einsum("nij,nj->ni", R[b], network.translations[rows])
-    sigma = translation_sigmas(network)[rows]
-    if weights is not None:
-        sigma = sigma / np.sqrt(weights[rows])
-    datum = datum_stations(network)
-    fixed = np.zeros(network.n_stations, dtype=np.bool_)
-    t = np.zeros((network.n_stations, 3))
-    if len(datum):
-        fixed[datum], t[datum] = True, network.station_translations[datum]
-    else:
-        fixed[network.anchor or 0] = True
-    graph = _position_graph(a, b, observed, sigma, fixed, t)
-    last = sorted(set(b[fixed[a]].tolist()) | set(a[fixed[b]].tolist()))
-    last = [i for i in last if not fixed[i]]
-    graph_keys = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(graph, last) if last else None
-    delta = graph.optimize(graph_keys) if graph_keys is not None else graph.optimize()
-    free = np.flatnonzero(~fixed)
-    t[free] = delta.vector().reshape(-1, 3)
-    return t
+    def _solved(self, misfit: FloatArray) -> FloatArray:
+        """Six unknowns of every station (N, 6) for weighted misfits (E, 6) where all unknowns are zero."""
+        x = np.zeros((self.network.n_stations, 6))
+        pair_gradient(self.place[self.a], self.place[self.b], misfit, self.by_a, self.by_b, x)
+        self.factor.solve(x)
+        return x[self.place]
+
+    def rotations(self) -> FloatArray:
+        """(N, 3, 3), turned onto the given ones."""
+        network, M = self.network, np.zeros((self.network.n_stations, 3, 3))
+        for i in range(3):
+            misfit = np.zeros((len(self.a), 6))
+            misfit[self.a == self.anchor, i] = self.turn[self.a == self.anchor]
+            of_b = self.b == self.anchor
+            misfit[of_b, :3] = -self.turn[of_b, None] * self.b_from_a[of_b, i]
+            M[:, i] = self._solved(misfit)[:, :3]
+        M[self.anchor] = np.eye(3)
+        out = nearest_rotation(M)
+        if len(self.datum):
+            turn = nearest_rotation(np.einsum("nij,nkj->ik", network.station_rotations[self.datum], out[self.datum]))
+            out = turn @ out
+        out[network.held] = network.station_rotations[network.held]
+        return np.asarray(out)
+
+    def positions(self, R: FloatArray) -> FloatArray:
+        """(N, 3) m with the rotations taken as true: t_a - t_b = R_b t_ba for every pair."""
+        network, t, k = self.network, np.zeros((self.network.n_stations, 3)), len(self.rows)
+        if len(self.datum):
+            t[self.datum] = network.station_translations[self.datum]
+        a, b = self.a[:k], self.b[:k]
+        observed = np.einsum("nij,nj->ni", R[b], np.nan_to_num(network.translations[self.rows]))
+        misfit = np.zeros((len(self.a), 6))
+        misfit[:k, 3:] = self.shift[:k, None] * (t[a] - t[b] - observed)
+        return np.where(self.fixed[:, None], t, self._solved(misfit)[:, 3:])
 
 
 def translation_sigmas(network: PoseNetwork) -> FloatArray:
@@ -109,20 +143,3 @@ def translation_sigmas(network: PoseNetwork) -> FloatArray:
     turn = np.trace(network.cov[:, :3, :3], axis1=1, axis2=2) / 3.0
     length = np.nan_to_num((network.translations**2).sum(axis=1))
     return np.asarray(np.sqrt(np.where(network.is_pose, shift + turn * length, np.inf)))
-
-
-def _position_graph(
-    a: IntArray, b: IntArray, observed: FloatArray, sigma: FloatArray, fixed: BoolArray, t: FloatArray
-) -> gtsam.GaussianFactorGraph:
-    graph, one = gtsam.GaussianFactorGraph(), np.eye(3)
-    noise = gtsam.noiseModel.Unit.Create(3)
-    known = observed + np.where(fixed[b, None], t[b], 0.0) - np.where(fixed[a, None], t[a], 0.0)
-    scale = float(np.median(sigma)) / sigma
-    for i, j, z, s, fa, fb in zip(a.tolist(), b.tolist(), known, scale.tolist(), fixed[a], fixed[b], strict=True):
-        if fa and fb:
-            continue
-        if fa or fb:
-            graph.add(gtsam.JacobianFactor(j if fa else i, (-s if fa else s) * one, s * z, noise))
-        else:
-            graph.add(gtsam.JacobianFactor(i, s * one, j, -s * one, s * z, noise))
-    return graph

@@ -24,8 +24,8 @@ import numpy as np
 from adjust.model.errors import NotConvergedError, SurveyError
 from adjust.model.survey import FloatArray
 from adjust.observations.factors import Jacobians, custom
+from adjust.pose_network.cycles import connected_parts
 from adjust.pose_network.loops import Loops, evaluate_loops
-from adjust.relay.counts import parts
 from adjust.relay.loops import LoopBasis, loop_basis, loop_misclosures
 from adjust.relay.network import MeasuredPairs, gtsam_motion, motions_from_values, prior_factor, station_values
 from adjust.relay.normal_equations import (
@@ -117,7 +117,8 @@ def adjust_loops(network: MeasuredPairs) -> ConditionAdjustment:
     in the elimination would not do. Raises NotConvergedError, naming the loop that closes worst.
     """
     top = network.topology
-    if top.n_pairs - top.n_stations + int(parts(top).max(initial=0)) + 1 <= MAX_HARD_LOOPS:
+    n_parts = int(connected_parts(top.n_stations, top.a_idx, top.b_idx).max(initial=-1)) + 1
+    if top.n_pairs - top.n_stations + n_parts <= MAX_HARD_LOOPS:
         try:
             found = adjust_condition_factors(network)
         except NotConvergedError:

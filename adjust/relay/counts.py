@@ -12,7 +12,7 @@ import scipy.sparse as sp
 
 from adjust.model.errors import listed
 from adjust.model.survey import IntArray
-from adjust.pose_network.cycles import loop_labels
+from adjust.pose_network.cycles import connected_parts, loop_labels
 from adjust.pose_network.network import Topology
 
 _NAMED = 12
@@ -71,7 +71,7 @@ class Counts:
 def count(topology: Topology, loop_equations: int = 3) -> Counts:
     """Count in linear time (triangles: E sqrt(E)). loop_equations: 3 for rotations, 6 for poses."""
     n, m = topology.n_stations, topology.n_pairs
-    part = parts(topology)
+    part = connected_parts(topology.n_stations, topology.a_idx, topology.b_idx)
     c = int(part.max()) + 1 if n else 0
     mark = loop_labels(n, topology.a_idx, topology.b_idx)
     degree = np.bincount(np.concatenate([topology.a_idx, topology.b_idx]), minlength=n)
@@ -84,15 +84,6 @@ def count(topology: Topology, loop_equations: int = 3) -> Counts:
         inseparable_pairs=_inseparable(topology, mark),
         isolated_stations=tuple(topology.station_ids[i] for i in np.flatnonzero(degree == 0)),
     )  # fmt: skip
-
-
-def parts(topology: Topology) -> IntArray:
-    """The connected part (n,) of every station, numbered from 0 in the order of their first stations."""
-    from scipy.sparse.csgraph import connected_components  # here: what needs no counts starts without it
-
-    n = topology.n_stations
-    joined = sp.coo_array((np.ones(topology.n_pairs), (topology.a_idx, topology.b_idx)), shape=(n, n))
-    return np.asarray(connected_components(joined, directed=False)[1], dtype=np.int64)
 
 
 def _groups(label: IntArray, least: int) -> list[IntArray]:

@@ -31,15 +31,30 @@ def pseudo_square_beside(d: FloatArray, Q: FloatArray, held: FloatArray) -> tupl
 
     Q held = 0 and held' d = 0: with N that spans these in sigmas, Q^+ is inv(Q + N N') on d.
     """
+    s, _, factor = _factored(Q, held)
+    if factor is None:
+        return pseudo_square(d, Q)[:2]
+    y = scipy.linalg.lapack.dtrtrs(factor, d / s, lower=0, trans=1)[0]
+    return float(y @ y), len(d) - held.shape[1]
+
+
+def pseudo_precision(Q: FloatArray, held: FloatArray) -> FloatArray:
+    """The diagonal (n,) of ``Q^+`` as :func:`pseudo_square` has it, of a Q (n, n) with nothing open but ``held``."""
+    s, N, factor = _factored(Q, held)
+    if factor is None:
+        return np.diag(pseudo_square(np.zeros(len(Q)), Q)[2])
+    inverse = scipy.linalg.lapack.dpotri(factor, lower=0, overwrite_c=1)[0]
+    return np.asarray((np.diag(inverse) - (N**2).sum(axis=1)) / s**2)
+
+
+def _factored(Q: FloatArray, held: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    """Sigmas s (n,), N (n, k) that spans what is held in sigmas, and R with R'R = Q in sigmas + N N'; None if lost."""
     s = np.sqrt(np.maximum(np.diag(Q), 1e-300))
     N = np.linalg.qr(s[:, None] * held)[0]
     full = Q / np.outer(s, s) + N @ N.T
     norm_1 = float(np.abs(full).sum(axis=0).max(initial=0.0))
-    factor, lost = scipy.linalg.lapack.dpotrf(full.T, lower=0, clean=0, overwrite_a=1) if len(d) else (full, 1)
-    if lost or scipy.linalg.lapack.dpocon(factor, norm_1)[0] < _DETERMINED:
-        return pseudo_square(d, Q)[:2]
-    y = scipy.linalg.lapack.dtrtrs(factor, d / s, lower=0, trans=1)[0]
-    return float(y @ y), len(d) - held.shape[1]
+    factor, lost = scipy.linalg.lapack.dpotrf(full.T, lower=0, clean=0, overwrite_a=1) if len(Q) else (full, 1)
+    return s, N, None if lost or scipy.linalg.lapack.dpocon(factor, norm_1)[0] < _DETERMINED else factor
 
 
 def upper_tail(x: float, weights: FloatArray) -> float:

@@ -34,7 +34,7 @@ from survey.jobs.relay import (
 )
 from survey.project import write_project
 from survey.project.project import DEFINITION_FILE
-from survey.solution.quantities import ARCSEC_PER_RAD, pair_sigmas, pose_dict
+from survey.solution.quantities import ARCSEC_PER_RAD, first_row, pair_sigmas, pose_dict
 
 TRAJECTORIES = "trajectories"
 _ENDINGS = (".csv", ".txt", ".tum")
@@ -189,7 +189,7 @@ def write_pair_project(folder: Path, pairs: Sequence[Pair], title: str) -> Path:
 
 def _entry(b_from_a: Any, cov: FloatArray) -> dict[str, Any]:
     pose = b_from_a if isinstance(b_from_a, Pose3) else Pose3(b_from_a, np.zeros(3))
-    (sigmas,) = pair_sigmas(pose.rotation().matrix()[None], cov[None])
+    sigmas = first_row(pair_sigmas(pose.rotation().matrix()[None], cov[None]))
     return pose_dict(pose) | sigmas | {"cov": cov.tolist()}
 
 

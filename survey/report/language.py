@@ -28,6 +28,7 @@ GROUPS_BY_KIND = frozenset((
 TURNING = {ord(sign): f"\\u{ord(sign):04x}" for sign in "\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e"
            "\u2066\u2067\u2068\u2069"}  # fmt: skip
 """Signs that let what follows them be shown in another order, with what stands for them on a page."""
+_SIGNS = tuple(map(chr, TURNING))
 _current: ContextVar[str] = ContextVar("language", default="en")
 
 
@@ -72,7 +73,12 @@ def language() -> str:
 
 def esc(value: object) -> Markup:
     """Text that cannot be taken for markup, and shows its characters in the order in which they stand."""
-    return value if isinstance(value, Markup) else escape(str(value).translate(TURNING))
+    return value if isinstance(value, Markup) else escape(unturned(str(value), TURNING))
+
+
+def unturned(text: str, shown: Mapping[int, str]) -> str:
+    """The text with what is shown for each sign of ``TURNING``; most have none, and are not walked through."""
+    return text.translate(shown) if not text.isascii() and any(map(text.__contains__, _SIGNS)) else text
 
 
 def t(text: str, **values: Any) -> Markup:

@@ -14,7 +14,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from survey.report.drawing import DARK
-from survey.report.language import TURNING, esc, known, language, localised, t
+from survey.report.language import TURNING, esc, known, language, localised, t, unturned
 from survey.report.modules import looks
 
 MISSING = "–"
@@ -61,7 +61,7 @@ def document(title: str, body: Markup, after: Markup | str = "") -> str:
     style = Markup(looks("colours", "parts") + (_HERE / "style.css").read_text(encoding="utf-8"))
     page: Template = _environment().get_template("document.html")
     values = {"title": title, "style": style, "colours": tuple(DARK.items()), "body": body, "after": after}
-    return page.render(values).translate(TURNING) + "\n"
+    return unturned(page.render(values), TURNING) + "\n"
 
 
 def json_script(anchor: str, value: Any) -> Markup:
@@ -69,7 +69,7 @@ def json_script(anchor: str, value: Any) -> Markup:
     text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     for sign in "<>&\u2028\u2029":
         text = text.replace(sign, f"\\u{ord(sign):04x}")
-    text = text.translate({sign: f"\\{shown}" for sign, shown in TURNING.items()})  # the script shows the escape
+    text = unturned(text, {sign: f"\\{shown}" for sign, shown in TURNING.items()})  # the script shows the escape
     return part("data", anchor, Markup(text))
 
 

@@ -14,7 +14,8 @@ from survey.project.project import RESULTS
 from survey.report import report_html, summary_text
 from survey.report.page import report_pdf
 from survey.solution.covariances import covariance_npz
-from survey.solution.dictionary import RunInfo, solution_dict, solution_json
+from survey.solution.dictionary import RunInfo, solution_dict
+from survey.solution.records import solution_json
 from survey.solution.residual_tables import image_residuals_csv, image_residuals_parquet, other_residuals_csv
 from survey.solution.statistics import Statistics
 

@@ -3,7 +3,7 @@
 Also the view in space, to be turned around on the screen: lines, points and ellipsoids as plain values for the page.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -130,15 +130,14 @@ def _half_angles(adjustment: Adjustment, camera_id: str) -> tuple[float, float]:
 
 
 def _add_stations(scene: Scene, adjustment: Adjustment, scale: Scale) -> None:
-    for name, estimate in adjustment.estimates.items():
-        if name[0] == "world_from_station" and isinstance(estimate.value, Pose3):
-            R = estimate.value.rotation().matrix()
-            cov = scale.factor**2 * R @ estimate.cov[3:, 3:] @ R.T
-            x = np.asarray(estimate.value.translation())
-            if len(name) == 2:
-                scene.spots.append(Spot(name[1], "station", x, cov))
-            else:
-                scene.moves.append(x)
+    found = [(name, e.value, e.cov) for name, e in adjustment.estimates.items()
+             if name[0] == "world_from_station" and isinstance(e.value, Pose3)]  # fmt: skip
+    scene.moves += [np.asarray(pose.translation()) for name, pose, _ in found if len(name) > 2]
+    fixed = [(name[1], pose, cov) for name, pose, cov in found if len(name) == 2]
+    R = np.array([pose.rotation().matrix() for _, pose, _ in fixed]).reshape(-1, 3, 3)
+    covs = R @ np.array([cov[3:, 3:] for *_, cov in fixed]).reshape(-1, 3, 3) @ np.swapaxes(R, 1, 2)
+    scene.spots += [Spot(label, "station", np.asarray(pose.translation()), cov)
+                    for (label, pose, _), cov in zip(fixed, scale.factor**2 * covs, strict=True)]  # fmt: skip
 
 
 def _add_targets(scene: Scene, adjustment: Adjustment, frames: AdjustedFrames, epochs: list[str]) -> None:
@@ -184,7 +183,8 @@ def scene_values(adjustment: Adjustment, scale: Scale, drawn: Scene | None = Non
         "ellipsoid": scale.ellipsoid,
         "images": {"/".join(key): pose.matrix()[:3].ravel() for key, pose in poses.items() if pose is not None},
         "cameras": {s.label: {"index": s.camera_idx, "half_angles_rad": s.half_angles} for s in drawn.shots},
-        "spots": [{"id": s.label, "kind": s.kind, "x": s.x, "cov": s.cov.ravel()} for s in drawn.spots],
+        "spots": [{"id": s.label, "kind": s.kind, "x": x, "cov": cov} for s, x, cov in zip(
+            drawn.spots, drawn.spot_places().tolist(), drawn.spot_covs().reshape(-1, 9).tolist(), strict=True)],
         "outlines": [{"target": label, "x": x} for label, x in drawn.outlines],
         "clouds": [{"target": label, "x": x} for label, x in drawn.clouds],
         "tables": [{"id": table, "world_from_table": pose.matrix()[:3].ravel(), "axes": axes}
@@ -199,8 +199,20 @@ def space(adjustment: Adjustment, scale: Scale, scene: Scene) -> Markup:
     if not len(everything):
         return Markup()
     extent = float(np.linalg.norm(np.ptp(everything, axis=0)))
-    data = scene_values(adjustment, scale, scene) | {"enlarged": enlargement(scene, scale.ellipsoid, extent)}
-    return part("space", of="report.html") + json_script("space-data", _short(data))
+    places, covs = _seven_digits(scene.spot_places()), _seven_digits(scene.spot_covs())
+    spots = [replace(s, x=x, cov=cov) for s, x, cov in zip(scene.spots, places, covs, strict=True)]
+    data = scene_values(adjustment, scale, replace(scene, spots=spots))
+    data |= {"enlarged": enlargement(scene, scale.ellipsoid, extent)}
+    short = {key: value if key == "spots" else _short(value) for key, value in data.items()}
+    return part("space", of="report.html") + json_script("space-data", short)
+
+
+def _seven_digits(x: FloatArray) -> FloatArray:
+    """As :func:`_short` has them, of many numbers at once."""
+    size = np.abs(x)
+    places = 6.0 - np.floor(np.log10(size, out=np.zeros_like(size), where=size > 0.0))
+    power = 10.0 ** np.abs(places)
+    return np.where(places >= 0.0, np.rint(x * power) / power, np.rint(x / power) * power)
 
 
 def _short(value: Any) -> Any:

@@ -1,10 +1,8 @@
 """The solution of a survey as one dictionary of plain values: what ``solution.json`` holds and reports print."""
 
-import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -19,7 +17,8 @@ from survey.project.detected import DetectedImage
 from survey.project.project import LeftOut
 from survey.solution.instruments import instrument_entries
 from survey.solution.left_out import left_out_dict
-from survey.solution.quantities import Scale, SigmaKind, point_entry, pose_entries, scale_of, vector_entry
+from survey.solution.quantities import PoseColumns, Scale, SigmaKind, point_entry, pose_columns, scale_of, vector_entry
+from survey.solution.records import Form, Records
 from survey.solution.statistics import Statistics
 from survey.solution.statistics_dict import statistics_dict
 from survey.solution.verdict import findings, fit_of, suspects, verdict
@@ -29,7 +28,6 @@ CORRELATION_LIMIT = 0.95
 _NEVER_ZERO = {"fx", "fy", "u0", "v0", "c", "xp", "yp"}
 _AS_IT_IS = frozenset((str, int, bool, type(None)))
 _FLOATS = {float}
-_JSON = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
 PoseOf = Callable[[tuple[str, ...], str], dict[str, Any]]
 CONVENTIONS = {
     "poses": "a_from_b takes coordinates in b to coordinates in a; camera x right, y down, z forward",
@@ -69,14 +67,15 @@ class RunInfo:
 def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None = None) -> dict[str, Any]:
     """The whole solution as plain values, floats in full, None where there is no number; ``found``: its statistics."""
     scale = scale_of(adjustment, run.sigmas)
-    poses = _poses(adjustment, scale)
+    columns = pose_columns(adjustment.estimates.values(), scale)
+    poses = _poses(columns)
     solution: dict[str, Any] = plain(
         {
             "format": 1,
             "summary": _summary(adjustment, run, scale, found),
             "conventions": CONVENTIONS,
             "cameras": _cameras(adjustment, poses, scale),
-            "stations": _stations(adjustment, poses),
+            "stations": _stations(adjustment, poses, columns),
             "points": _points(adjustment, scale),
             "tables": _tables(adjustment, poses, scale),
             "targets": _targets(adjustment, poses, scale),
@@ -127,7 +126,7 @@ def _free_datum(adjustment: Adjustment) -> dict[str, Any]:
 def plain(value: Any) -> Any:
     """Only what JSON knows: mappings and sequences kept, numbers as Python's, None for what is not finite."""
     kind = type(value)
-    if kind in _AS_IT_IS:
+    if kind in _AS_IT_IS or kind is Records:
         return value
     if kind is float:
         return value if math.isfinite(value) else None
@@ -255,16 +254,17 @@ def _images(adjustment: Adjustment, camera_id: str, sums: tuple[IntArray, FloatA
     """Number of used image points and RMS residual, of the camera and of each of its images."""
     blocks = adjustment.survey.image_blocks
     mine = [i for i, b in enumerate(blocks) if b.camera_id == camera_id]
-    per_image: dict[str, list[float]] = {}
-    for i, n, squares in zip(mine, *(x[mine].tolist() for x in sums), strict=True):
-        of_image = per_image.setdefault(blocks[i].epoch_id, [0, 0.0])
-        of_image[0], of_image[1] = of_image[0] + n, of_image[1] + squares
-    n_all, squares_of_all = (sum(x) for x in zip((0, 0.0), *per_image.values(), strict=True))
+    place = {epoch: k for k, epoch in enumerate(dict.fromkeys(blocks[i].epoch_id for i in mine))}
+    of = [place[blocks[i].epoch_id] for i in mine]
+    n, squares = (np.bincount(of, x[mine], len(place)) for x in sums)
+    with np.errstate(invalid="ignore"):
+        rms = np.sqrt(squares / (2.0 * n))
+    images = Form(np.arange(len(place)), {"n_image_points": n.astype(np.int64), "rms_residual_px": rms})
     return {
-        "n_images": len(per_image),
-        "n_image_points": n_all,
-        "rms_residual_px": _rms(n_all, squares_of_all),
-        "images": {e: {"n_image_points": n, "rms_residual_px": _rms(n, s)} for e, (n, s) in per_image.items()},
+        "n_images": len(place),
+        "n_image_points": int(n.sum()),
+        "rms_residual_px": _rms(int(n.sum()), sum(squares.tolist())),
+        "images": Records(tuple(place), (images,)),
     }
 
 
@@ -282,29 +282,37 @@ def _rms(n: float, squares: float) -> float:
     return math.sqrt(squares / (2 * n)) if n else math.nan
 
 
-def _poses(adjustment: Adjustment, scale: Scale) -> PoseOf:
+def _poses(of: PoseColumns) -> PoseOf:
     """What is said of a pose: under ``key`` and, where it moves, under ``epochs``; nothing where it is no unknown."""
-    moving: dict[tuple[str, ...], dict[str, dict[str, Any]]] = {}
-    entries = pose_entries(adjustment.estimates.values(), scale)
-    for name, entry in entries.items():
+    moving: dict[tuple[str, ...], list[tuple[str, ...]]] = {}
+    for name in of.rows:
         if len(name) == 3:
-            moving.setdefault(name[:2], {})[name[2]] = entry
+            moving.setdefault(name[:2], []).append(name)
 
     def pose(name: tuple[str, ...], key: str) -> dict[str, Any]:
-        epochs = {epoch: {key: entry} for epoch, entry in moving.get(name, {}).items()}
-        return ({key: entries[name]} if name in entries else {}) | ({"epochs": epochs} if epochs else {})
+        names = moving.get(name, [])
+        epochs = Records([n[2] for n in names], [Form(rows, {key: tree}) for rows, tree in of.trees(names)])
+        return ({key: of.entry(name)} if name in of.rows else {}) | ({"epochs": epochs} if names else {})
 
     return pose
 
 
-def _stations(adjustment: Adjustment, pose: PoseOf) -> dict[str, Any]:
-    out = {}
-    for station in adjustment.survey.stations:
+def _stations(adjustment: Adjustment, pose: PoseOf, of: PoseColumns) -> Records:
+    """Fixed ones with nothing but a pose, of which there may be very many, by columns."""
+    stations, apart = adjustment.survey.stations, dict[str, dict[str, Any]]()
+    names: list[tuple[str, ...]] = [("world_from_station", s.station_id) for s in stations]
+    alike = [i for i, s in enumerate(stations) if s.motion == "fixed" and not s.table_id and names[i] in of.rows
+             and ("mount_from_station", s.station_id) not in of.rows]  # fmt: skip
+    by_column = set(alike)
+    for station in (s for i, s in enumerate(stations) if i not in by_column):
         name = station.station_id
         entry = {"motion": station.motion} | ({"table": station.table_id} if station.table_id else {})
         entry |= pose(("mount_from_station", name), "mount_from_station")
-        out[name] = entry | pose(("world_from_station", name), "world_from_station")
-    return out
+        apart[name] = plain(entry | pose(("world_from_station", name), "world_from_station"))
+    at = np.array(alike, dtype=np.int64)
+    forms = [Form(at[rows], {"motion": ["fixed"] * len(rows), "world_from_station": tree})
+             for rows, tree in of.trees([names[i] for i in alike])]  # fmt: skip
+    return Records([s.station_id for s in stations], forms, apart)
 
 
 def _points(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
@@ -358,7 +366,7 @@ def _targets(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, An
     return out
 
 
-def _pairs(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
+def _pairs(adjustment: Adjustment, scale: Scale) -> Mapping[str, Any]:
     if not adjustment.survey.pairs:
         return {}
     from survey.solution.pairs import pairs_dict  # here: as above
@@ -382,43 +390,3 @@ def _network(adjustment: Adjustment) -> dict[str, Any]:
     listed = loops_dict(loops, left_out, loops_after(adjustment, loops), survey.pair_form, how)
     closures = {"closures": closures_dict(adjustment)} if survey.closures else {}
     return {"network": network_dict(pair_network(survey)), "loops": listed, **closures}
-
-
-def solution_json(solution: Mapping[str, Any]) -> str:
-    """JSON with one line per entry of a mapping and lists of numbers kept on one line; floats by repr."""
-    return _lines(solution, 0) + "\n"
-
-
-def _lines(value: Any, depth: int) -> str:
-    kind = type(value)
-    if kind is float:
-        return _one(value)
-    if kind is dict and value:
-        before = " " * (depth + 1)
-        inner = ",\n".join([f"{before}{_key(k)}: {_lines(v, depth + 1)}" for k, v in value.items()])
-        return f"{{\n{inner}\n{' ' * depth}}}"
-    if kind is not list:
-        return _one(value)
-    try:
-        text = ", ".join(map(float.__repr__, value))
-    except TypeError:
-        text = "n"
-    if "n" not in text:  # not even of nan or inf
-        return f"[{text}]"
-    kinds = set(map(type, value))
-    if dict in kinds or str in kinds:
-        inner = ",\n".join([" " * (depth + 1) + _lines(v, depth + 1) for v in value])
-        return f"[\n{inner}\n{' ' * depth}]"
-    return f"[{', '.join(map(_one, value))}]"
-
-
-def _one(value: Any) -> str:
-    kind = type(value)
-    if kind is float and math.isfinite(value):
-        return float.__repr__(value)
-    if kind is int:
-        return int.__repr__(value)
-    return json.encoder.encode_basestring(value) if kind is str else _JSON.encode(value)
-
-
-_key = lru_cache(json.encoder.encode_basestring)

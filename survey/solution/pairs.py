@@ -1,96 +1,110 @@
 """Measured pairs after the adjustment: adjusted value, sigma, residual and test of each."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from gtsam import Pose3
 
 from adjust.model.observations import frame_text
 from adjust.model.result import Adjustment, ObservationResidual
-from adjust.model.survey import FloatArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.observations.pairs import pair_arrays
 from adjust.precision.precision import Precision
 from adjust.spatial.rigid_motions import Motions
 from adjust.testing.distributions import chi2
 from survey.solution.frames import AdjustedFrames
 from survey.solution.loops import motion_arrays
-from survey.solution.quantities import ARCSEC_PER_RAD, Scale, pair_sigmas, pose_dicts
+from survey.solution.quantities import ARCSEC_PER_RAD, Scale, motion_columns, pair_sigmas
+from survey.solution.records import Column, Form, Records, Tree
 
 UNCONTROLLED = 1e-4
 """Redundancy number below which nothing controls an observation."""
 
 
-def pairs_dict(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
+def pairs_dict(adjustment: Adjustment, scale: Scale) -> Records:
     """Measured and adjusted ``b_from_a`` of every pair with its statistics; a rotation keeps no translation.
 
     Sigmas of the adjusted translation are along the axes of b, those of its rotation and the residuals about and along
     the axes of a. ``misfit``: lengths of the residuals.
     """
-    frames, pairs, factor = AdjustedFrames(adjustment), adjustment.survey.pairs, scale.factor
-    found = {o.ids[0]: o for o in adjustment.other_residuals if o.kind == "pair"}
-    tests = _tests([found[p.pair_id] for p in pairs if p.pair_id in found])
-    ends = [(frame_text(p.a), frame_text(p.b)) for p in pairs]
-    ref = {name: r for p, names in zip(pairs, ends, strict=True) for name, r in zip(names, (p.a, p.b), strict=True)}
-    number = {name: i for i, name in enumerate(ref)}
-    a, b = np.array([(number[i], number[j]) for i, j in ends]).T
-    place = [frames.world_from(r) for r in ref.values()]
-    world = motion_arrays([Pose3() if p is None else p for p in place], 6)
-    now = world[b].inverse() @ world[a]
-    sigmas, adjusted = _sigmas(adjustment, now.rotation, factor), _dicts(now)
-    measured, is_pose = pair_arrays(pairs), [isinstance(p.b_from_a, Pose3) for p in pairs]
-    out: dict[str, Any] = {}
-    known = np.array([p is not None for p in place])
-    rows = zip(pairs, ends, (known[a] & known[b]).tolist(), is_pose, _dicts(measured.motions), adjusted, strict=True)
-    for pair, names, there, whole, before, after in rows:
-        entry: dict[str, Any] = {"a": names[0], "b": names[1], "used": pair.used, "measured": before}
+    pairs, (known, ends, now) = adjustment.survey.pairs, _adjusted(adjustment)
+    covs, n_cov = _covariances(adjustment)
+    tests, n_tested = _tests(adjustment)
+    whole = np.array([isinstance(p.b_from_a, Pose3) for p in pairs])
+    measured, adjusted = _columns(pair_arrays(pairs).motions), _columns(now)
+    used = np.array([p.used for p in pairs])
+
+    def tree(rows: IntArray, is_pose: bool, there: bool, dim: int, size: int) -> Tree:
+        kept = [key for key in measured if is_pose or key != "translation_mm"]
+        out: dict[str, Column | Tree] = {end: [ends[k][i] for i in rows.tolist()] for k, end in enumerate("ab")}
+        out |= {"used": used[rows], "measured": {key: measured[key][rows] for key in kept}}
         if there:
-            entry["adjusted"] = after | sigmas.get(pair.pair_id, {})
-        if not whole:
-            for form in ("measured", "adjusted"):
-                entry.get(form, {}).pop("translation_mm", None)
-        out[pair.pair_id] = entry | tests.get(pair.pair_id, {})
-    return out
+            sigmas = pair_sigmas(now.rotation[rows], covs[rows, :dim, :dim], scale.factor) if dim else {}
+            out["adjusted"] = {key: adjusted[key][rows] for key in kept} | sigmas
+        return out | _tested(tests, rows, size)
+
+    kinds, of_kind = np.unique(np.column_stack([whole, known, n_cov, n_tested]), axis=0, return_inverse=True)
+    rows = [np.flatnonzero(of_kind.ravel() == k) for k in range(len(kinds))]
+    forms = (Form(of, tree(of, bool(w), bool(t), d, s)) for of, (w, t, d, s) in zip(rows, kinds.tolist(), strict=True))
+    return Records([p.pair_id for p in pairs], tuple(forms))
 
 
-def _dicts(of: Motions) -> list[dict[str, Any]]:
-    return pose_dicts(of.rotation, np.zeros((len(of), 3)) if of.translation is None else of.translation)
+def _columns(of: Motions) -> dict[str, FloatArray]:
+    return motion_columns(of.rotation, np.zeros((len(of), 3)) if of.translation is None else of.translation)
 
 
-def _sigmas(adjustment: Adjustment, rotations: FloatArray, factor: float) -> dict[str, dict[str, Any]]:
-    """Of the adjusted pairs by id, where there are covariances. rotations: (E, 3, 3) of all."""
-    precision, out = adjustment.precision, dict[str, dict[str, Any]]()
-    covs = precision.pair_covariances() if isinstance(precision, Precision) else {}
-    names = [p.pair_id for p in adjustment.survey.pairs]
-    for dim in (3, 6):
-        rows = [e for e, name in enumerate(names) if name in covs and len(covs[name]) == dim]
-        of = np.array([covs[names[e]] for e in rows]).reshape(-1, dim, dim)
-        out |= zip([names[e] for e in rows], pair_sigmas(rotations[rows], of, factor), strict=True)
-    return out
+def _adjusted(adjustment: Adjustment) -> tuple[FloatArray, tuple[list[str], list[str]], Motions]:
+    """Of which pairs (E,) both ends are known; names of these; the adjusted ``b_from_a``, nonsense for the others."""
+    frames, pairs = AdjustedFrames(adjustment), adjustment.survey.pairs
+    ends = [frame_text(p.a) for p in pairs], [frame_text(p.b) for p in pairs]
+    ref = dict(zip(ends[0] + ends[1], [*(p.a for p in pairs), *(p.b for p in pairs)], strict=True))
+    number = {name: i for i, name in enumerate(ref)}
+    a, b = (np.array([number[name] for name in names], dtype=np.int64) for names in ends)
+    place = [frames.world_from(r) for r in ref.values()]
+    known = np.array([p is not None for p in place])
+    world = motion_arrays([Pose3() if p is None else p for p in place], 6)
+    return known[a] & known[b], ends, world[b].inverse() @ world[a]
 
 
-def _tests(pairs: Sequence[ObservationResidual]) -> dict[str, dict[str, Any]]:
-    """Residuals, redundancy numbers and tests by id."""
-    size = np.array([len(o.residual) for o in pairs], dtype=np.int64)
-    v, redundancy, w = np.zeros((len(pairs), 6)), np.zeros((len(pairs), 6)), np.zeros((len(pairs), 6))
+def _covariances(adjustment: Adjustment) -> tuple[FloatArray, IntArray]:
+    """Of the adjusted pairs (E, 6, 6), and how many components of them there are (E,), 0 where none."""
+    precision, pairs = adjustment.precision, adjustment.survey.pairs
+    found = precision.pair_covariances() if isinstance(precision, Precision) else {}
+    covs = [found.get(p.pair_id) for p in pairs]
+    out, size = np.zeros((len(pairs), 6, 6)), np.array([0 if c is None else len(c) for c in covs], dtype=np.int64)
     for dim in (3, 6):
         rows = np.flatnonzero(size == dim)
-        for into, name in ((v, "residual"), (redundancy, "redundancy"), (w, "standardized")):
-            into[rows, :dim] = np.array([getattr(pairs[i], name) for i in rows.tolist()]).reshape(-1, dim)
-    test, used = np.array([o.test for o in pairs], dtype=float), np.array([o.used for o in pairs], dtype=np.bool_)
-    controlled = ~used | (redundancy.max(axis=1, initial=-np.inf) > UNCONTROLLED)
-    p = np.where(controlled, chi2.sf(test, np.maximum(size, 1)), np.nan).tolist()
-    turn, shift = ARCSEC_PER_RAD * v[:, :3], 1e3 * v[:, 3:]
-    misfit, apart = (f * np.linalg.norm(x, axis=1) for f, x in ((ARCSEC_PER_RAD, v[:, :3]), (1e3, v[:, 3:])))
-    test, turns, shifts = np.where(controlled, test, np.nan).tolist(), turn.tolist(), shift.tolist()
-    numbers, ws, known = redundancy.tolist(), w.tolist(), controlled.tolist()
-    out = {}
-    for i, (o, k) in enumerate(zip(pairs, size.tolist(), strict=True)):
-        entry: dict[str, Any] = {"residual_rotation_arcsec": turns[i], "misfit_arcsec": float(misfit[i])}
-        if k == 6:
-            entry |= {"residual_translation_mm": shifts[i], "misfit_mm": float(apart[i])}
-        out[o.ids[0]] = entry | {
-            "redundancy": numbers[i][:k], "standardized": ws[i][:k], "controlled": known[i], "test": test[i],
-            "p_value": p[i],
-        }  # fmt: skip
-    return out
+        out[rows, :dim, :dim] = np.array([covs[e] for e in rows.tolist()]).reshape(-1, dim, dim)
+    return out, size
+
+
+def _tests(adjustment: Adjustment) -> tuple[dict[str, FloatArray], IntArray]:
+    """Residuals, redundancy numbers and tests (E, ...) of all pairs, and how many components they have (E,)."""
+    pairs = adjustment.survey.pairs
+    found: dict[str, ObservationResidual] = {o.ids[0]: o for o in adjustment.other_residuals if o.kind == "pair"}
+    of: Sequence[ObservationResidual | None] = [found.get(p.pair_id) for p in pairs]
+    size = np.array([0 if o is None else len(o.residual) for o in of], dtype=np.int64)
+    out = {name: np.zeros((len(pairs), 6)) for name in ("residual", "redundancy", "standardized")}
+    for dim in (3, 6):
+        rows = np.flatnonzero(size == dim)
+        for name, into in out.items():
+            into[rows, :dim] = np.array([getattr(of[i], name) for i in rows.tolist()]).reshape(-1, dim)
+    test = np.array([np.nan if o is None else o.test for o in of], dtype=float)
+    used = np.array([o is not None and o.used for o in of])
+    controlled = ~used | (out["redundancy"].max(axis=1, initial=-np.inf) > UNCONTROLLED)
+    p = np.where(controlled, chi2.sf(test, np.maximum(size, 1)), np.nan)
+    return out | {"controlled": controlled, "test": np.where(controlled, test, np.nan), "p_value": p}, size
+
+
+def _tested(found: dict[str, FloatArray], rows: IntArray, size: int) -> dict[str, Column]:
+    """What is said of the tests of pairs with so many components; nothing with none."""
+    if not size:
+        return {}
+    out: dict[str, Column] = {}
+    parts = (("rotation_arcsec", slice(0, 3), ARCSEC_PER_RAD), ("translation_mm", slice(3, 6), 1e3))
+    for name, of, factor in parts[: size // 3]:
+        v = found["residual"][rows, of]
+        out[f"residual_{name}"] = factor * v
+        out[f"misfit_{name.rpartition('_')[2]}"] = factor * np.linalg.norm(v, axis=1)
+    out |= {name: found[name][rows, :size] for name in ("redundancy", "standardized")}
+    return out | {name: found[name][rows] for name in ("controlled", "test", "p_value")}

@@ -4,8 +4,9 @@ Everything that a report or a result file says about the precision of an unknown
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Estimate, ParameterName
-from adjust.model.survey import FloatArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.model.tables import harmonic
 from adjust.testing.distributions import chi2, fisher
 from survey.project.project import SIGMA_KINDS
@@ -80,6 +81,12 @@ def sigma_unit_for_people(unit: str, component: str = "") -> tuple[str, float]:
     return ("arcsec", ARCSEC_PER_RAD) if unit == "rad" else unit_for_people(component, unit)
 
 
+@lru_cache
+def units_for_people(component: str, unit: str) -> tuple[str, float, str, float]:
+    """Both: of its value, and of its residuals and sigmas."""
+    return *unit_for_people(component, unit), *sigma_unit_for_people(unit)
+
+
 def key_of(component: str, unit: str) -> str:
     """``component_unit``, with powers spelt: ``K1_per_mm2``."""
     power = re.fullmatch(r"(?:1/)?([A-Za-z]+)\^?(-?\d*)", unit)
@@ -115,8 +122,8 @@ def vector_entry(estimate: Estimate, scale: Scale) -> dict[str, Any]:
     return entry | {"status": dict(zip(estimate.components, estimate.status, strict=True))}
 
 
-def pose_dicts(rotations: FloatArray, translations: FloatArray) -> list[dict[str, Any]]:
-    """Of each of n poses (n, 3, 3), (n, 3) m what :func:`pose_dict` says."""
+def motion_columns(rotations: FloatArray, translations: FloatArray) -> dict[str, FloatArray]:
+    """Of n poses (n, 3, 3), (n, 3) m what :func:`pose_dict` says, by columns (n, 3) or (n, 4)."""
     signs = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
     squares = 1.0 + np.diagonal(rotations, axis1=1, axis2=2) @ signs.T  # 4 w^2, 4 x^2, 4 y^2, 4 z^2
     q = np.zeros((len(rotations), 4, 4))  # four times its products; the row of the largest is the best conditioned
@@ -131,18 +138,42 @@ def pose_dicts(rotations: FloatArray, translations: FloatArray) -> list[dict[str
     y = np.arctan2(-R[2, 0], np.hypot(R[2, 1], R[2, 2]))
     # of the first two turns alone, which a quarter turn about y does not hide
     z = np.arctan2(np.sin(x) * R[0, 2] - np.cos(x) * R[0, 1], np.cos(x) * R[1, 1] - np.sin(x) * R[1, 2])
-    rows = (1e3 * translations).tolist(), wxyz.tolist(), np.degrees(np.column_stack([x, y, z])).tolist()
-    names = "translation_mm", "rotation_quaternion_wxyz", "rotation_euler_xyz_deg"
-    return [dict(zip(names, row, strict=True)) for row in zip(*rows, strict=True)]
+    turns = {"rotation_quaternion_wxyz": wxyz, "rotation_euler_xyz_deg": np.degrees(np.column_stack([x, y, z]))}
+    return {"translation_mm": 1e3 * translations} | turns
 
 
 def pose_dict(pose: Pose3) -> dict[str, Any]:
     """Translation, unit quaternion with w >= 0, and Euler angles with R = Rz(z) Ry(y) Rx(x)."""
-    return pose_dicts(pose.rotation().matrix()[None], pose.translation()[None])[0]
+    return first_row(motion_columns(pose.rotation().matrix()[None], pose.translation()[None]))
 
 
-def pose_entries(estimates: Iterable[Estimate], scale: Scale) -> dict[ParameterName, dict[str, Any]]:
-    """Of poses ``a_from_b`` by name: sigmas of their origins along the axes of a, of their rotations about those of b.
+@dataclass(frozen=True, eq=False)
+class PoseColumns:
+    """Poses ``a_from_b`` by columns (n, 3) or (n, 4). rows: by name. status: of each."""
+
+    rows: dict[ParameterName, int]
+    columns: dict[str, FloatArray]
+    status: list[Any]
+
+    def entry(self, name: ParameterName) -> dict[str, Any]:
+        """What is said of one."""
+        row = self.rows[name]
+        return {key: column[row].tolist() for key, column in self.columns.items()} | {"status": self.status[row]}
+
+    def trees(self, names: Sequence[ParameterName]) -> list[tuple[IntArray, dict[str, Any]]]:
+        """Of these, which by number have a word as their status, or one for each component, and their columns."""
+        rows = np.array([self.rows[name] for name in names], dtype=np.int64)
+        whole = np.array([isinstance(self.status[row], str) for row in rows.tolist()], dtype=np.bool_)
+        out = []
+        for alike in (np.flatnonzero(whole), np.flatnonzero(~whole)):
+            said = [self.status[row] for row in rows[alike].tolist()]
+            words = {c: [s[c] for s in said] for c in said[0]} if said and isinstance(said[0], dict) else said
+            out.append((alike, {key: column[rows[alike]] for key, column in self.columns.items()} | {"status": words}))
+        return out
+
+
+def pose_columns(estimates: Iterable[Estimate], scale: Scale) -> PoseColumns:
+    """Of poses ``a_from_b``: sigmas of their origins along the axes of a, of their rotations about those of b.
 
     The tangent of the covariance is in b; the translation part is turned into a: ``R cov R'``.
     """
@@ -152,11 +183,8 @@ def pose_entries(estimates: Iterable[Estimate], scale: Scale) -> dict[ParameterN
     cov = np.array([e.cov for e, _ in found]).reshape(-1, 6, 6)
     shift = 1e3 * scale.factor * np.sqrt(_variances(R @ cov[:, 3:, 3:] @ np.swapaxes(R, 1, 2)))
     turn = ARCSEC_PER_RAD * scale.factor * np.sqrt(_variances(cov[:, :3, :3]))
-    rows = zip(found, pose_dicts(R, t), shift.tolist(), turn.tolist(), strict=True)
-    return {
-        e.name: entry | {"sigma_translation_mm": mm, "sigma_rotation_arcsec": arcsec, "status": status_of(e)}
-        for (e, _), entry, mm, arcsec in rows
-    }
+    columns = motion_columns(R, t) | {"sigma_translation_mm": shift, "sigma_rotation_arcsec": turn}
+    return PoseColumns({e.name: i for i, (e, _) in enumerate(found)}, columns, [status_of(e) for e, _ in found])
 
 
 def _variances(cov: FloatArray) -> FloatArray:
@@ -166,20 +194,24 @@ def _variances(cov: FloatArray) -> FloatArray:
 
 def pose_entry(estimate: Estimate, scale: Scale) -> dict[str, Any]:
     """The same of one; raises KeyError where it is no pose."""
-    return pose_entries([estimate], scale)[estimate.name]
+    return pose_columns([estimate], scale).entry(estimate.name)
 
 
-def pair_sigmas(rotations: FloatArray, covs: FloatArray, factor: float = 1.0) -> list[dict[str, Any]]:
-    """Sigmas of n ``b_from_a`` times factor: rotation about the axes of a, translation along the axes of b.
+def pair_sigmas(rotations: FloatArray, covs: FloatArray, factor: float = 1.0) -> dict[str, FloatArray]:
+    """Sigmas (n, 3) of n ``b_from_a`` times factor: rotation about the axes of a, translation along the axes of b.
 
     rotations: (n, 3, 3) of ``b_from_a``. covs: (n, 6, 6) or (n, 3, 3) in the tangent in frame a.
     """
-    turn = ARCSEC_PER_RAD * factor * np.sqrt(_variances(covs[:, :3, :3]))
-    out: list[dict[str, Any]] = [{"sigma_rotation_arcsec": row} for row in turn.tolist()]
+    out = {"sigma_rotation_arcsec": ARCSEC_PER_RAD * factor * np.sqrt(_variances(covs[:, :3, :3]))}
     if covs.shape[1] == 6:
-        shift = 1e3 * factor * np.sqrt(_variances(rotations @ covs[:, 3:, 3:] @ np.swapaxes(rotations, 1, 2)))
-        out = [entry | {"sigma_translation_mm": row} for entry, row in zip(out, shift.tolist(), strict=True)]
+        turned = rotations @ covs[:, 3:, 3:] @ np.swapaxes(rotations, 1, 2)
+        out["sigma_translation_mm"] = 1e3 * factor * np.sqrt(_variances(turned))
     return out
+
+
+def first_row(columns: Mapping[str, FloatArray]) -> dict[str, Any]:
+    """What columns say of the first of their rows."""
+    return {name: column[0].tolist() for name, column in columns.items()}
 
 
 def point_entry(estimate: Estimate, scale: Scale) -> dict[str, Any]:

@@ -5,9 +5,8 @@ Rows are made by the core: a million image points take a fraction of a second.
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import chain, groupby
 from math import isfinite
 from typing import Any
@@ -15,15 +14,15 @@ from typing import Any
 import numpy as np
 
 from adjust.model.observations import Reading
-from adjust.model.result import Adjustment, ImageResiduals, ObservationResidual, ReadingResiduals
+from adjust.model.result import Adjustment, ImageResiduals, ObservationResidual
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.parallel import side_by_side
-from adjust.native.text import Words, number_rows
+from adjust.native.text import NUMBERS, TEXT, WORD, Words, number_rows, record_rows
 from adjust.observations.terrestrial.statistics import reading_names, reading_unit
 from survey.folder.text import cell_text
 from survey.project.tables.arrow import parquet_bytes
 from survey.project.tables.reading import TextColumn
-from survey.solution.quantities import sigma_unit_for_people, unit_for_people
+from survey.solution.quantities import units_for_people
 
 IMAGE_COLUMNS = (
     "epoch_id,camera_id,target_id,point_id,u_px,v_px,residual_u_px,residual_v_px,sigma_u_px,sigma_v_px,"
@@ -133,56 +132,66 @@ def _quoted(word: str) -> str:
 
 def other_residuals_csv(adjustment: Adjustment) -> bytes:
     """``residuals_other.csv``: values in mm and degrees, residuals and sigmas in mm and arcseconds."""
-    out = io.StringIO()
-    writer, readings = csv.writer(out, lineterminator="\n"), adjustment.reading_residuals
-    writer.writerow(OTHER_COLUMNS.split(","))
+    readings, arrays = adjustment.reading_residuals, adjustment.other_arrays
     n = len(adjustment.other_residuals) - (0 if readings is None else len(readings.observed))
-    for alike, some in groupby(adjustment.other_residuals[:n], lambda o: (o.kind, o.components, o.units)):
-        writer.writerows(_other_rows(alike[0], list(map(_units, *alike[1:])), list(some)))
+    out, first, at = [OTHER_COLUMNS.encode() + b"\n"], 0, 0
+    columns = np.column_stack([arrays.observed, arrays.adjusted, arrays.residual, arrays.sigma, arrays.redundancies,
+                               arrays.standardized, arrays.test[arrays.observation]])  # fmt: skip
+    for _, alike in groupby(adjustment.other_residuals[:n], lambda o: (o.kind, o.components, o.units)):
+        some = list(alike)
+        end = at + len(some) * len(some[0].components)
+        out.append(_other_rows(some, columns[at:end], arrays.used[first : first + len(some)]))
+        first, at = first + len(some), end
     if readings is not None:
-        writer.writerows(_reading_rows(adjustment.survey.readings, readings))
-    return out.getvalue().encode()
+        out.append(_reading_rows(adjustment.survey.readings, columns[at:], readings.used))
+    return b"".join(out)
 
 
-def _other_rows(
-    kind: str, units: Sequence[tuple[str, float, str, float]], some: Sequence[ObservationResidual]
-) -> Iterator[tuple[str | int, ...]]:
-    """Of observations with the same components, column by column."""
-    names, factor, small_names, small = (list(x) for x in zip(*units, strict=True))
-    k, components = len(units), list(some[0].components)
-    values: list[list[float]] = [
-        (np.array([getattr(o, name) for o in some], dtype=float).reshape(-1, k) * scale).ravel().tolist()
-        for name, scale in (("observed", factor), ("adjusted", factor), ("residual", small), ("sigma", small),
-                            ("redundancy", 1.0), ("standardized", 1.0))
-    ]  # fmt: skip
-    observed, adjusted, *rest = (map(_number, column) for column in values)
-    of = ((cell_text(o.group), cell_text(" ".join(o.ids)), _number(o.test), int(o.used)) for o in some)
-    groups, ids, tests, used = zip(*(row for row in of for _ in range(k)), strict=True)
-    each = (components, names, small_names)
-    component, value_unit, small_unit = (x * len(some) for x in each)
-    return zip([kind] * len(ids), groups, ids, component, value_unit, observed, adjusted, small_unit, *rest, tests,
-               used, strict=True)  # fmt: skip
+def _other_rows(some: Sequence[ObservationResidual], columns: FloatArray, used: BoolArray) -> bytes:
+    """Of observations with the same components."""
+    kind, components, k = some[0].kind, some[0].components, len(some[0].components)
+    names, factor, small_names, small = zip(*map(units_for_people, components, some[0].units), strict=True)
+    heads = [_cells(kind, o.group, " ".join(o.ids)) for o in some]
+    own = np.tile(np.arange(k), len(some))
+    which = np.repeat(np.arange(len(some)), k), own, own
+    return _rows(heads, list(map(_cells, components, names)), small_names, which, (np.array(factor), np.array(small)),
+                 columns, np.repeat(used, k))  # fmt: skip
 
 
-def _reading_rows(readings: Sequence[Reading], found: ReadingResiduals) -> Iterator[tuple[str | int, ...]]:
-    """The same of readings, which are many and have one component, column by column."""
-    kinds = [r.kind for r in readings]
-    value_units, factors, small_units, smalls = zip(*(_units(k, reading_unit(k)) for k in kinds), strict=True)
-    factor, small = np.array(factors), np.array(smalls)
-    observed, adjusted, residual, sigma, *numbers = (
-        list(map(_number, x.tolist()))
-        for x in (found.observed * factor, found.adjusted * factor, found.residual * small, found.sigma * small,
-                  found.redundancy, found.standardized, found.test)
-    )  # fmt: skip
-    groups, ids = [cell_text(r.group) for r in readings], [cell_text(" ".join(reading_names(r))) for r in readings]
-    return zip(kinds, groups, ids, kinds, value_units, observed, adjusted, small_units, residual, sigma, *numbers,
-               found.used.astype(int).tolist(), strict=True)  # fmt: skip
+def _reading_rows(readings: Sequence[Reading], columns: FloatArray, used: BoolArray) -> bytes:
+    """The same of readings, which are many and have one component."""
+    of = [(r.kind, *units_for_people(r.kind, reading_unit(r.kind))) for r in readings]
+    kinds = list(dict.fromkeys(of))
+    number = {kind: i for i, kind in enumerate(kinds)}
+    own = np.array([number[kind] for kind in of], dtype=np.int64)
+    names, units, factor, small_units, small = zip(*kinds, strict=True)
+    heads = [_cells(r.kind, r.group, " ".join(reading_names(r))) for r in readings]
+    which = np.arange(len(readings)), own, own
+    return _rows(heads, list(map(_cells, names, units)), small_units, which, (np.array(factor), np.array(small)),
+                 columns, used)  # fmt: skip
 
 
-@lru_cache
-def _units(component: str, unit: str) -> tuple[str, float, str, float]:
-    return *unit_for_people(component, unit), *sigma_unit_for_people(unit)
+def _cells(*words: str) -> str:
+    return ",".join(_quoted(cell_text(word)) for word in words)
 
 
-def _number(value: float) -> str:
-    return f"{value:.12g}" if isfinite(value) else ""
+def _rows(
+    heads: Sequence[str], middles: Sequence[str], units: Sequence[str], which: tuple[IntArray, IntArray, IntArray],
+    factors: tuple[FloatArray, FloatArray], columns: FloatArray, used: BoolArray,
+) -> bytes:  # fmt: skip
+    """Rows of ``residuals_other.csv``: words of each, numbers with 12 digits, blank where there is none, used or not.
+
+    heads: kind, group and ids; middles: component and its unit; units: of the residual. which: of these, by row (n,).
+    factors: from SI to the unit of the value and of the residual, by component. columns: (n, 7) in the table's order.
+    """
+    factor, small = (x[which[1]] for x in factors)
+    one = np.ones(len(columns))
+    words = ["", ",", ",1\n", ",0\n", *heads, *middles, *units]
+    first = 4 + np.cumsum([0, len(heads), len(middles)])
+    word = np.column_stack([*(i + at for i, at in zip(which, first.tolist(), strict=True)), np.where(used, 2, 3)])
+    comma, number = (TEXT, 1), (NUMBERS, 1)
+    value = [comma, number]
+    parts = [(WORD, 0), comma, (WORD, 1), *value, *value, comma, (WORD, 2), *value * 5, (WORD, 3)]
+    values = columns * np.column_stack([factor, factor, small, small, one, one, one])
+    return record_rows(Words.of(words), word, values, parts, 12)[0]
+

@@ -119,6 +119,8 @@ def _images() -> None:
     point_tests.point_tests(points, lambda0, tuple(np.zeros((n,) if i < 5 else (n, 2)) for i in range(9)))
     words = text.Words.of(["a", "bc", ""])
     text.number_rows(words, np.array([0, 1, 2]), words, np.array([1, 1, 0]), points.v[:3], [3, 0])
+    parts = [(text.WORD, 0), (text.NUMBERS, 2), (text.TEXT, 1)]
+    text.record_rows(words, np.array([[1], [2], [0]]), points.v[:3], parts)
     names = list(graph.unknowns.by_name)
     precision.joint([names[0], names[-1]])
     batch = graph.images

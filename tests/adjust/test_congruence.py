@@ -16,7 +16,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import Datum, FloatArray, PointParameter, PoseParameter, Station, Survey
 from adjust.precision.s_transformation import transformed
-from adjust.testing.quadratic_forms import pseudo_square, pseudo_square_beside
+from adjust.testing.quadratic_forms import pseudo_precision, pseudo_square, pseudo_square_beside
 from tests.adjust import helpers as h
 from tests.adjust import statistics_networks as net
 
@@ -192,7 +192,10 @@ def test_the_statistic_by_elimination_is_that_of_the_eigenvectors() -> None:
     root, G = rng.standard_normal((12, 12)) * np.repeat([1.0, 1e-4], 6), rng.standard_normal((12, 3))
     weights = np.repeat([1.0, 0.0], [8, 4])
     d, Q = transformed(rng.standard_normal(12), root @ root.T, G, weights)
-    found = pseudo_square_beside(d[:8], Q[:8, :8], (weights[:, None] * G)[:8])
+    held = (weights[:, None] * G)[:8]
+    diagonal = np.diag(pseudo_square(d[:8], Q[:8, :8])[2])
+    assert pseudo_precision(Q[:8, :8], held) == pytest.approx(diagonal, rel=1e-8)
+    found = pseudo_square_beside(d[:8], Q[:8, :8], held)
     assert found == (pytest.approx(pseudo_square(d[:8], Q[:8, :8])[0], rel=1e-8), 5)
     singular = np.outer(root[0], root[0]) + np.outer(root[1], root[1])
     assert pseudo_square_beside(root[0], singular, np.zeros((12, 0)))[1] == 2

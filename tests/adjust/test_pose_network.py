@@ -4,6 +4,8 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -15,11 +17,12 @@ from adjust.model.observations import FrameRef, Pair
 from adjust.model.result import Adjustment
 from adjust.model.survey import Datum, FloatArray, Point, PointParameter, PoseParameter, Station, Survey
 from adjust.pose_network import pose_network
-from adjust.pose_network.cycles import loop_labels
+from adjust.pose_network.cycles import connected_parts, loop_labels
 from adjust.pose_network.from_survey import network_from_survey, network_of_pairs
 from adjust.pose_network.network import PoseNetwork
 from adjust.pose_network.network import survey_of as survey_of_network
 from adjust.pose_network.solve import minimize
+from adjust.pose_network.start import find_network_start
 from adjust.spatial.rigid_motions import Motions
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.outliers.snooping import Snooping
@@ -279,6 +282,26 @@ def test_loop_labels_name_bridges() -> None:
     mark = loop_labels(4, np.array([0, 1, 2, 2]), np.array([1, 2, 0, 3]))
     assert (mark != 0).tolist() == [1, 1, 1, 0]
     assert len(set(mark[:3])) == 1
+
+
+@pytest.mark.parametrize(("n", "pairs"), [(1, 0), (7, 0), (60, 40), (300, 280), (300, 900)])
+def test_connected_parts_are_those_of_scipy(n: int, pairs: int) -> None:
+    a, b = np.random.default_rng(n + pairs).integers(0, n, (2, pairs))
+    joined = coo_array((np.ones(pairs), (a, b)), shape=(n, n))
+    assert connected_parts(n, a, b).tolist() == connected_components(joined, directed=False)[1].tolist()
+
+
+@pytest.mark.parametrize("rotations_only", [False, True])
+def test_a_start_with_weights_of_any_spread(rotations_only: bool) -> None:
+    sim = simulate(5, 4, rotations_only=rotations_only, sigma_rad=1e-9, sigma_m=1e-9)
+    spread = 10.0 ** np.random.default_rng(3).uniform(-9.0, 9.0, sim.network.n_pairs)
+    R, t = find_network_start(sim.network, spread)
+    assert pytest.approx(sim.rotations, abs=1e-7) == R
+    if not rotations_only:
+        assert pytest.approx(sim.translations, abs=1e-6) == t
+    weights = np.ones(sim.network.n_pairs)
+    weights[(sim.network.a_idx == 7) | (sim.network.b_idx == 7)] = 0.0  # is tied to nothing, and stays where it is
+    assert np.delete(find_network_start(sim.network, weights)[0], 7, 0) == pytest.approx(np.delete(sim.rotations, 7, 0))
 
 
 def test_what_floats_is_named() -> None:

@@ -15,13 +15,14 @@ from scipy.spatial.transform import Rotation
 from adjust.adjustment import adjust
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment, Estimate, GlobalTest
-from adjust.native.text import Words, number_rows
+from adjust.native.text import NUMBERS, TEXT, WORD, Words, number_rows, record_rows
 from survey.report.results import ReportOptions, write_results
 from survey.simulate import head_on_table
 from survey.solution.covariances import covariance_npz, read_covariances
-from survey.solution.dictionary import RunInfo, correlated, solution_dict, solution_json
+from survey.solution.dictionary import RunInfo, correlated, solution_dict
 from survey.solution.frames import AdjustedFrames, table_from_mount
 from survey.solution.quantities import ellipsoid, key_of, pose_entry, scale_of, vector_entry
+from survey.solution.records import Form, Records, solution_json
 from survey.solution.residual_tables import image_residuals_csv, image_residuals_parquet, other_residuals_csv
 from survey.solution.statistics import statistics_of
 from survey.solution.verdict import suspects, verdict
@@ -323,6 +324,55 @@ def test_names_with_commas_and_numbers_that_are_missing(adjustment: Adjustment) 
     rows = rows_of(image_residuals_csv(changed))
     assert rows[3]["test"] == ""
     assert {r["point_id"] for r in rows if r["target_id"] == "board"} <= set(board.point_ids)
+
+
+def test_numbers_in_full_are_what_python_prints() -> None:
+    rng = np.random.default_rng(1)
+    bits = rng.integers(0, 2**63 - 1, 20_000, dtype=np.int64).view(np.float64)  # every exponent
+    powers = np.ldexp(1.0, np.arange(-1074, 1024))  # the next smaller double is nearer than the next larger
+    tens = np.array([float(f"1e{k}") for k in range(-320, 309)])
+    few = [0.0, 5e-324, 1e15, 1e16, 1e17, 9007199254740993.0, 1e-4, 1e-5, 0.1 + 0.2, 100.0, 1.7976931348623157e308]
+    near = np.nextafter(powers, 1.0)
+    values = np.concatenate([bits[np.isfinite(bits)], powers, near, tens, few, rng.normal(size=999)])
+    values = np.concatenate([values, -values])
+    none = np.zeros((len(values), 0), dtype=np.int64)
+    lines = Words.of(["null", "\n"])
+    made, ends = record_rows(lines, none, values[:, None], [(NUMBERS, 1), (TEXT, 1)])
+    assert made.decode().split() == list(map(repr, values.tolist()))
+    assert ends[-1] == len(made)
+    some = values[np.abs(values) > 1e-300]
+    twelve = record_rows(lines, none[: len(some)], some[:, None], [(NUMBERS, 1), (TEXT, 1)], 12)[0].decode().split()
+    assert [float(x) for x in twelve] == pytest.approx(some, rel=5.000001e-12)
+    some = rng.normal(size=5000) * 10.0 ** rng.integers(-20, 20, 5000)
+    twelve = record_rows(lines, none[:5000], some[:, None], [(NUMBERS, 1), (TEXT, 1)], 12)[0].decode().split()
+    assert twelve == [f"{x:.12g}" for x in some.tolist()]
+
+
+def test_records_are_written_part_by_part() -> None:
+    words, word = Words.of(["null", "[", "]", "a", "é"]), np.array([[4, 3], [3, 3]])
+    values = np.array([[1.0, np.nan, 3.5], [np.inf, -2.0, 0.0]])
+    parts = [(WORD, 0), (TEXT, 1), (NUMBERS, 2), (TEXT, 2), (NUMBERS, 1), (WORD, 1)]
+    made, ends = record_rows(words, word, values, parts)
+    assert made.decode() == "é[1.0, null]3.5aa[null, -2.0]0.0a"
+    assert ends.tolist() == [len("é[1.0, null]3.5a".encode()), len(made)]
+    for wrong in ([(WORD, 2)], [(TEXT, 5)], [(NUMBERS, 4)]):
+        with pytest.raises(IndexError):
+            record_rows(words, word, values, wrong)
+
+
+def test_entries_by_columns_are_those_one_by_one() -> None:
+    x = np.array([1.5, np.nan])
+    tree = {"word": ["a", 'say "b"'], "n": np.array([3, 4]), "yes": np.array([True, False]), "x": x,
+            "inner": {"list": np.array([[1.0, np.inf], [2.5, -0.0]])}}  # fmt: skip
+    records = Records(["p", "q", "r", "s"], [Form(np.array([2, 0]), tree), Form(np.array([3]), {"x": x[:1]})],
+                      {"q": {"x": None}})  # fmt: skip
+    one, two = ({"word": 'say "b"', "n": 4, "yes": False, "x": None, "inner": {"list": [2.5, -0.0]}},
+                {"word": "a", "n": 3, "yes": True, "x": 1.5, "inner": {"list": [1.0, None]}})  # fmt: skip
+    assert list(records) == ["p", "q", "r", "s"]
+    assert records == {"p": one, "q": {"x": None}, "r": two, "s": {"x": 1.5}}
+    assert solution_json({"all": records, "none": Records([], [])}) == solution_json({"all": dict(records), "none": {}})
+    with pytest.raises(KeyError):
+        records["t"]
 
 
 @pytest.mark.parametrize("decimals", [0, 2, 6])

@@ -98,7 +98,7 @@ class Node:
 
     def has(self, *keys: str) -> bool:
         """Whether any of the keys is given."""
-        return any(key in self.values for key in keys)
+        return not self.values.keys().isdisjoint(keys)
 
     def value(self, key: str, default: Any = _REQUIRED) -> Any:
         """The raw value of a key."""

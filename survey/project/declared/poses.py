@@ -50,6 +50,8 @@ def rotation_from_euler(xyz: FloatArray) -> Rot3:
 
 def read_pose(node: Node) -> PoseParameter:
     """A pose with its treatment; an absent table is a free pose without start."""
+    if not node.values:
+        return PoseParameter()
     node.allow(*POSE_KEYS)
     treatment = _treatment(node)
     held = _held(node, treatment, _COMPONENTS)
@@ -122,7 +124,7 @@ def _treatment(node: Node) -> Treatment:
 
 
 def _refuse_sigmas(node: Node, treatment: str, keys: tuple[str, ...]) -> None:
-    for key in keys:
+    for key in keys if node.has(*keys) else ():
         if node.has(key):
             raise node.error(f'the treatment is "{treatment}", which has no sigma; write treatment = "prior"', key)
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 from markupsafe import Markup
 
 from survey.report.context import Context
@@ -177,7 +178,9 @@ def pairs(c: Context) -> Markup:
     every = c.solution["pairs"]
     if not every:
         return Markup()
-    order = sorted(every, key=lambda p: -_size(every[p]))[:_MOST_PAIRS]
+    tests = np.nan_to_num(list(every.numbers("test").values()), nan=-1.0)
+    names = list(every)
+    order = [names[i] for i in np.argsort(-tests, kind="stable")[:_MOST_PAIRS].tolist()]
     poses = any("translation_mm" in every[p]["measured"] for p in order)
     rows = [_pair_row(p, every[p], poses) for p in order]
     columns = ["<Pair, from a to b", "Residual", *(["[mm]"] if poses else []), "Redundancy", "Largest std."]
@@ -192,11 +195,6 @@ def pairs(c: Context) -> Markup:
     ) + more
     classes = ["off" if not every[p]["used"] else "" for p in order]
     return section("pairs", "Adjusted pairs", table(columns, rows, "", classes), note)
-
-
-def _size(entry: dict[str, Any]) -> float:
-    test = entry.get("test")
-    return -1.0 if test is None else float(test)
 
 
 def _pair_row(pair_id: str, e: dict[str, Any], poses: bool) -> list[str]:

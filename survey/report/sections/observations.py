@@ -34,7 +34,7 @@ from survey.report.markup import (
     table,
     value_text,
 )
-from survey.solution.quantities import sigma_unit_for_people, unit_for_people
+from survey.solution.quantities import units_for_people
 
 _MOST_OTHER = 200
 _MOST_IMAGE = 30
@@ -87,8 +87,7 @@ def others(c: Context) -> Markup:
 
 
 def _other_row(o: ObservationResidual, i: int, suspect: bool) -> list[str]:
-    unit, factor = unit_for_people(o.components[i], o.units[i])
-    sigma_unit, sigma_factor = sigma_unit_for_people(o.units[i])
+    unit, factor, sigma_unit, sigma_factor = units_for_people(o.components[i], o.units[i])
     shown_sigma = float(o.sigma[i] * factor)
     residual, sigma = float(o.residual[i] * sigma_factor), float(o.sigma[i] * sigma_factor)
     # an r of zero means that nothing controls the observation: its residual says nothing
@@ -265,23 +264,25 @@ def _every_image(c: Context, k: IntArray, i: IntArray) -> _Rows:
 
 def _every_other(c: Context, observation: IntArray, component: IntArray) -> _Rows:
     """Of these components of other observations."""
-    rows = [_other_values(c, k, i) for k, i in zip(observation.tolist(), component.tolist(), strict=True)]
-    texts, values = np.empty((len(_NAMES), len(rows)), dtype=object), np.empty((_N_VALUES, len(rows)))
-    for j, (row, numbers) in enumerate(rows):
-        texts[:, j], values[:, j] = row, numbers
+    arrays, every = c.adjustment.other_arrays, c.adjustment.other_residuals
+    at = (np.cumsum(arrays.n_components) - arrays.n_components)[observation] + component
+    seen, of = np.unique(observation, return_inverse=True)
+    some = [every[k] for k in seen.tolist()]
+    said = [(known(o.kind.replace("_", " ")), group_name(o.group), " · ".join(o.ids)) for o in some]
+    units = [(o.components[i], *units_for_people(o.components[i], o.units[i]))
+             for o, i in zip((some[k] for k in of.tolist()), component.tolist(), strict=True)]  # fmt: skip
+    own, unit, factor, small_unit, small = zip(*units, strict=True) if units else ((),) * 5
+    texts = np.empty((len(_NAMES), len(at)), dtype=object)
+    texts[:3], texts[3] = np.array(said, dtype=object).reshape(-1, 3)[of].T, ""
+    texts[4], texts[5], texts[6] = own, unit, small_unit
+    used, w = arrays.used[observation], arrays.standardized[at]
+    suspect = np.abs(w) > c.solution["summary"]["suspects"]["standardized_limit"]
+    values = np.stack([
+        arrays.observed[at], arrays.adjusted[at], arrays.sigma[at], arrays.residual[at], arrays.redundancies[at], w,
+        used, np.array(factor), np.array(small), np.where(used, suspect, 2),
+        len(c.adjustment.image_residuals.test) + observation, component,
+    ])  # fmt: skip
     return texts, values
-
-
-def _other_values(c: Context, k: int, i: int) -> tuple[tuple[str, ...], tuple[float, ...]]:
-    o = c.adjustment.other_residuals[k]
-    unit, factor = unit_for_people(o.components[i], o.units[i])
-    sigma_unit, sigma_factor = sigma_unit_for_people(o.units[i])
-    suspect = abs(o.standardized[i]) > c.solution["summary"]["suspects"]["standardized_limit"]
-    kind, where = known(o.kind.replace("_", " ")), " · ".join(o.ids)
-    return (kind, group_name(o.group), where, "", o.components[i], unit, sigma_unit), (
-        o.observed[i], o.adjusted[i], o.sigma[i], o.residual[i], o.redundancy[i], o.standardized[i], o.used,
-        factor, sigma_factor, 2 if not o.used else int(suspect), len(c.adjustment.image_residuals.test) + k, i,
-    )  # fmt: skip
 
 
 def _numbers(values: FloatArray) -> dict[str, FloatArray]:

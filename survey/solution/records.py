@@ -1,0 +1,187 @@
+"""Result files as JSON; many entries with the same keys are kept by columns and written by the core.
+
+Such entries are dictionaries where they are asked for.
+"""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from json.encoder import encode_basestring
+from math import isfinite
+from typing import Any
+
+import numpy as np
+
+from adjust.model.survey import FloatArray, IntArray
+from adjust.native.text import NUMBERS, TEXT, WORD, Words, record_rows
+
+Column = np.ndarray[Any, Any] | Sequence[str]
+"""Of n records: floats, whole numbers or truths (n,), lists of floats (n, k), or n words."""
+Tree = Mapping[str, "Column | Tree"]
+_JSON = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Form:
+    """Records with the same keys. rows: (n,) their numbers among all. tree: columns by key, nested as they are."""
+
+    rows: IntArray
+    tree: Tree
+
+
+class Records(Mapping[str, dict[str, Any]]):
+    """Entries by name, in the order of ``names``; every one is of one form, or stands apart with plain values."""
+
+    def __init__(
+        self, names: Sequence[str], forms: Sequence[Form], apart: Mapping[str, dict[str, Any]] | None = None
+    ) -> None:
+        self._forms, self._names, self._apart = [f for f in forms if len(f.rows)], tuple(names), dict(apart or {})
+        of = {row: (f, r) for f, form in enumerate(self._forms) for r, row in enumerate(form.rows.tolist())}
+        self._place = {name: of.get(row) for row, name in enumerate(self._names)}
+
+    def __getitem__(self, name: str) -> dict[str, Any]:
+        place = self._place[name]
+        return self._apart[name] if place is None else _entry(self._forms[place[0]].tree, place[1])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._place)
+
+    def __len__(self) -> int:
+        return len(self._place)
+
+    def numbers(self, key: str) -> dict[str, float]:
+        """What all records have under a key of theirs by name, without making them; nan where one has none."""
+        out = np.full(len(self._names), np.nan)
+        for form in self._forms:
+            column = form.tree.get(key)
+            if isinstance(column, np.ndarray):
+                out[form.rows] = column
+        return dict(zip(self._names, out.tolist(), strict=True))
+
+    def lines(self, depth: int) -> str:
+        """As JSON, one line per entry of a mapping, the whole beginning in a line indented by so many spaces."""
+        if not self._names:
+            return "{}"
+        parts = [b""] * len(self._names)
+        for form in self._forms:
+            text, ends = _json_rows(form, [self._names[row] for row in form.rows.tolist()], depth + 1)
+            if len(form.rows) == len(self._names):
+                return f"{{\n{text[:-2].decode()}\n{' ' * depth}}}"
+            first = 0
+            for row, end in zip(form.rows.tolist(), ends.tolist(), strict=True):
+                parts[row], first = text[first:end], end
+        before = " " * (depth + 1)
+        for row, name in enumerate(self._names):
+            if name in self._apart:
+                parts[row] = f"{before}{_key(name)}: {_lines(self._apart[name], depth + 1)},\n".encode()
+        return f"{{\n{b''.join(parts)[:-2].decode()}\n{' ' * depth}}}"
+
+
+def _entry(tree: Tree, row: int) -> dict[str, Any]:
+    return {key: _entry(of, row) if isinstance(of, Mapping) else _value(of, row) for key, of in tree.items()}
+
+
+def _value(column: Column, row: int) -> Any:
+    if not isinstance(column, np.ndarray):
+        return column[row]
+    value = column[row].tolist()
+    if isinstance(value, list):
+        return [x if isfinite(x) else None for x in value]
+    return value if value is True or value is False or isfinite(value) else None
+
+
+class _Writer:
+    """The parts of a record of one form, with the words and values that they name."""
+
+    def __init__(self) -> None:
+        self.words, self.text = {"null": 0}, ""
+        self.parts: list[tuple[int, int]] = []
+        self.of_row: list[IntArray] = []
+        self.values: list[FloatArray] = []
+
+    def number(self, word: str) -> int:
+        return self.words.setdefault(word, len(self.words))
+
+    def part(self, kind: int, which: int) -> None:
+        """What stands in every record comes before it, in one."""
+        if self.text:
+            self.parts.append((TEXT, self.number(self.text)))
+            self.text = ""
+        self.parts.append((kind, which))
+
+    def column(self, of: Column) -> None:
+        if isinstance(of, np.ndarray) and of.dtype == np.float64:
+            self.text += "[" * (of.ndim == 2)
+            self.values.append(of.reshape(len(of), -1))
+            self.part(NUMBERS, self.values[-1].shape[1])
+            self.text += "]" * (of.ndim == 2)
+            return
+        said = [encode_basestring(x) if isinstance(x, str) else _JSON.encode(x) for x in
+                (of.tolist() if isinstance(of, np.ndarray) else of)]  # fmt: skip
+        self.of_row.append(np.array([self.number(x) for x in said], dtype=np.int64))
+        self.part(WORD, len(self.of_row) - 1)
+
+    def tree(self, of: Tree, depth: int) -> None:
+        for i, (key, value) in enumerate(of.items()):
+            self.text += f"{',' if i else '{'}\n{' ' * (depth + 1)}{encode_basestring(key)}: "
+            if isinstance(value, Mapping):
+                self.tree(value, depth + 1)
+            else:
+                self.column(value)
+        self.text += f"\n{' ' * depth}}}"
+
+
+def _json_rows(form: Form, names: Sequence[str], depth: int) -> tuple[bytes, IntArray]:
+    """The records one after the other, each with a comma and a line's end, and where each ends."""
+    writer, n = _Writer(), len(names)
+    writer.text = " " * depth
+    writer.column(names)
+    writer.text += ": "
+    writer.tree(form.tree, depth)
+    writer.text += ",\n"
+    writer.parts.append((TEXT, writer.number(writer.text)))
+    word = np.ascontiguousarray(np.array(writer.of_row).T)
+    return record_rows(Words.of(list(writer.words)), word, np.hstack([np.zeros((n, 0)), *writer.values]), writer.parts)
+
+
+def solution_json(solution: Mapping[str, Any]) -> str:
+    """JSON with one line per entry of a mapping and lists of numbers kept on one line; floats by repr."""
+    return _lines(solution, 0) + "\n"
+
+
+def _lines(value: Any, depth: int) -> str:
+    kind = type(value)
+    if kind is float:
+        return _one(value)
+    if kind is dict and value:
+        before = " " * (depth + 1)
+        inner = ",\n".join([f"{before}{_key(k)}: {_lines(v, depth + 1)}" for k, v in value.items()])
+        return f"{{\n{inner}\n{' ' * depth}}}"
+    if kind is Records:
+        return str(value.lines(depth))
+    if kind is not list:
+        return _one(value)
+    try:
+        text = ", ".join(map(float.__repr__, value))
+    except TypeError:
+        text = "n"
+    if "n" not in text:  # not even of nan or inf
+        return f"[{text}]"
+    kinds = set(map(type, value))
+    if dict in kinds or str in kinds:
+        inner = ",\n".join([" " * (depth + 1) + _lines(v, depth + 1) for v in value])
+        return f"[\n{inner}\n{' ' * depth}]"
+    return f"[{', '.join(map(_one, value))}]"
+
+
+def _one(value: Any) -> str:
+    kind = type(value)
+    if kind is float and isfinite(value):
+        return float.__repr__(value)
+    if kind is int:
+        return int.__repr__(value)
+    return encode_basestring(value) if kind is str else _JSON.encode(value)
+
+
+_key = lru_cache(encode_basestring)
