@@ -16,7 +16,14 @@ from adjust.model.errors import NotConvergedError, listed
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, Survey
 from adjust.observations.terrestrial.statistics import JoinedResiduals, reading_residuals
-from adjust.precision.precision import Precision, global_test, group_summaries, image_residuals, other_residuals
+from adjust.precision.precision import (
+    Precision,
+    global_test,
+    group_summaries,
+    image_residuals,
+    joint_of,
+    other_residuals,
+)
 from adjust.start import Start, find_start
 from adjust.start.choice import Begun, adjusted_from_own_start
 from adjust.start.given import GivenStarts, given_starts, moved_onto
@@ -242,7 +249,9 @@ def estimates(precision: Precision) -> dict[ParameterName, Estimate]:
         out[name] = Estimate(name, pose, POSE_COMPONENTS, POSE_UNITS, cov, status)
     for name, vector in u.vectors.items():
         cov = np.zeros((len(vector.names),) * 2)
-        if vector.key is not None:
+        if vector.borrowed:
+            cov = joint_of(precision, [u.spread(name)], [len(vector.names)])
+        elif vector.key is not None:
             cov = vector.matrix @ found[vector.key] @ vector.matrix.T
         out[name] = Estimate(name, vector.full(values), vector.names, vector.units, cov, vector.status)
     for point in graph.survey.points:

@@ -1,16 +1,17 @@
 """The calibrated head and its beacons, out of an adjustment, with their joint covariance."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from gtsam import Pose3
 
-from adjust.frames.unknowns import VectorMap
-from adjust.lenses.models import camera_constants
+from adjust.frames.lens_states import LensTimes
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, PoseParameter, Survey
 from adjust.navigation.model import Beacons, Head, HeadCamera, HeadTable
+from adjust.precision.precision import joint_of
 
 
 def head_of(survey: Survey) -> str | None:
@@ -22,6 +23,9 @@ def head_of(survey: Survey) -> str | None:
 
 def head_and_beacons(adjustment: Adjustment, station_id: str, known: Beacons | None = None) -> tuple[Head, Beacons]:
     """Head ``station_id`` and the beacons of an adjustment (or those given), values and joint covariance.
+
+    Lenses that change and images that are cropped are taken as they were left: in the last block, or at the reference
+    temperature.
 
     Raises SurveyError where the station carries no camera, or there is no beacon.
     """
@@ -38,7 +42,8 @@ def head_and_beacons(adjustment: Adjustment, station_id: str, known: Beacons | N
         table_id = str(next(s for s in survey.stations if s.station_id == station_id).table_id)
         names += [("world_from_table", table_id), ("table_geometry", table_id), ("mount_from_station", station_id)]
     points = [("point", p.point_id) for p in survey.points] if known is None else []
-    cov, sizes = _joint(adjustment, [*names, *points], _full_sizes(cameras, table, len(points)))
+    sizes = _full_sizes(cameras, table, len(points))
+    cov = joint_of(adjustment.precision, _spreads(adjustment, [*names, *points]), sizes)
     p = sum(sizes[: len(names)])
     head = Head(cameras, cov[:p, :p], table)
     if known is not None:
@@ -56,11 +61,12 @@ def _full_sizes(cameras: Sequence[HeadCamera], table: HeadTable | None, n_points
 
 def _camera(adjustment: Adjustment, camera_id: str) -> HeadCamera:
     camera = next(c for c in adjustment.survey.cameras if c.camera_id == camera_id)
-    lens = _vector(adjustment, ("lens", camera_id))
+    times = LensTimes(adjustment.survey)
+    lens, constants = times.lens(camera, None, partial(_known, adjustment))
     pose = _pose(adjustment, ("station_from_camera", camera_id), camera.station_from_camera)
     if pose is None:
         raise SurveyError(f"camera {camera_id}: the adjustment does not tell how it sits on its station")
-    return HeadCamera(camera_id, camera.image_size, camera.lens.model, lens, camera_constants(camera), pose)
+    return HeadCamera(camera_id, times.size(camera, None), camera.lens.model, lens, constants, pose)
 
 
 def _table(adjustment: Adjustment, station_id: str) -> HeadTable | None:
@@ -89,6 +95,10 @@ def _pose(adjustment: Adjustment, name: ParameterName, parameter: PoseParameter)
     return parameter.value
 
 
+def _known(adjustment: Adjustment, name: ParameterName) -> FloatArray | None:
+    return _vector(adjustment, name) if name in adjustment.estimates else None
+
+
 def _vector(adjustment: Adjustment, name: ParameterName) -> FloatArray:
     value = adjustment.estimates[name].value
     if isinstance(value, Pose3):
@@ -96,25 +106,8 @@ def _vector(adjustment: Adjustment, name: ParameterName) -> FloatArray:
     return np.asarray(value, dtype=float)
 
 
-def _joint(
-    adjustment: Adjustment, names: Sequence[ParameterName], sizes: Sequence[int]
-) -> tuple[FloatArray, Sequence[int]]:
-    """Joint covariance with the full components of every parameter; zero where one is held."""
-    unknowns = adjustment.precision.graph.unknowns
-    free = [name for name in names if name in unknowns.by_name]
-    joint = adjustment.precision.joint(free) if free else np.zeros((0, 0))
-    starts = dict(zip(names, np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(int), strict=True))
-    spread = np.zeros((sum(sizes), len(joint)))
-    column = 0
-    for name in free:
-        dim = unknowns.by_name[name].dim
-        full = _full(unknowns.vectors, name, dim)
-        spread[starts[name] : starts[name] + len(full), column : column + dim] = full
-        column += dim
-    return np.asarray(spread @ joint @ spread.T), sizes
-
-
-def _full(vectors: Mapping[ParameterName, VectorMap], name: ParameterName, dim: int) -> FloatArray:
-    """From free components to all of a parameter (n, dim)."""
-    vector = vectors.get(name)
-    return np.eye(dim) if vector is None else vector.matrix
+def _spreads(adjustment: Adjustment, names: Sequence[ParameterName]) -> list[dict[int, FloatArray]]:
+    """How every parameter follows from the unknowns, of a lens as it was left."""
+    graph, values = adjustment.precision.graph, adjustment.precision.solved.values
+    unknowns, lenses = graph.unknowns, graph.state.lens_states
+    return [lenses.spread(lenses.last(n[1]), values, unknowns) if n[0] == "lens" else unknowns.spread(n) for n in names]

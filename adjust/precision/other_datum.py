@@ -191,5 +191,7 @@ def _moved(graph: AdjustmentGraph, estimate: Estimate, values: gtsam.Values, new
     vector = graph.unknowns.vectors.get(estimate.name)
     if vector is None:
         return replace(estimate, value=np.asarray(values.atVector(unknown.key)), cov=new.cov(estimate.name))
+    if vector.borrowed:  # a lens, which no datum changes
+        return estimate
     return replace(estimate, value=vector.full(values), cov=vector.matrix @ new.cov(estimate.name) @ vector.matrix.T)
 

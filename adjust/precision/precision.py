@@ -7,7 +7,7 @@ Q_vv P. For an image point both components are tested together: v' Q_vv^-1 v, ch
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import gtsam
 import numpy as np
@@ -36,6 +36,17 @@ from adjust.testing.distributions import chi2
 
 if TYPE_CHECKING:
     from adjust.observations.pairs import PairStatistics
+
+
+class JointPrecision(Protocol):
+    """What gives joint covariances of a graph's unknowns."""
+
+    @property
+    def graph(self) -> AdjustmentGraph:
+        """The graph."""
+
+    def joint(self, names: Sequence[ParameterName]) -> FloatArray:
+        """As :meth:`Precision.joint`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,6 +248,20 @@ class Precision:
         """Whitened residual (k,), whitened A Q A' (k, k), and the square root information's inverse (k, k)."""
         rows = self.rows(item)
         return rows.e, rows.influence, rows.root
+
+
+def joint_of(
+    precision: "JointPrecision", spreads: Sequence[Mapping[int, FloatArray]], sizes: Sequence[int]
+) -> FloatArray:
+    """Joint covariance of quantities that follow from unknowns: each (n, dim) by key; n of each in ``sizes``."""
+    keys = list(dict.fromkeys(key for by_key in spreads for key in by_key))
+    rows, at = np.cumsum([0, *sizes]), stacking(precision.graph, keys)
+    L = np.zeros((int(rows[-1]), at.n))
+    for first, by_key in zip(rows.tolist(), spreads, strict=False):
+        for key, part in by_key.items():
+            L[first : first + len(part), at.at[key]] = part
+    names = [precision.graph.unknowns.by_key[key].name for key in keys]
+    return np.asarray(L @ precision.joint(names) @ L.T) if keys else L @ L.T
 
 
 def rotations_only(adjustment: Adjustment) -> bool:

@@ -14,7 +14,7 @@ from adjust.model.result import Adjustment, Estimate, GroupSummary, ImageResidua
 from adjust.model.survey import FloatArray, IntArray
 from adjust.precision.precision import in_conditions
 from adjust.testing.distributions import norm
-from adjust.testing.significance import Significance, significance_of_drift, significances
+from adjust.testing.significance import Significance, significance_of_lens, significances
 from survey.project.detected import DetectedImage
 from survey.project.project import LeftOut
 from survey.solution.instruments import instrument_entries
@@ -245,7 +245,9 @@ def _cameras(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, An
         if lens is not None:
             entry["lens"] = _lens(lens, camera.lens.model, scale)
         if camera.lens.drift is not None:
-            entry["lens_drift"] = _drift(adjustment, camera.camera_id, scale)
+            entry["lens_drift"] = _changes(adjustment, camera.camera_id, "lens_drift", "changes", scale)
+        if camera.lens.crops:
+            entry["lens_crop"] = _changes(adjustment, camera.camera_id, "lens_crop", "crops", scale)
         entry |= pose(("station_from_camera", camera.camera_id), "station_from_camera")
         out[camera.camera_id] = entry | _images(adjustment, camera.camera_id, sums)
     return out
@@ -325,12 +327,12 @@ def _tables(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, Any
     return out
 
 
-def _drift(adjustment: Adjustment, camera_id: str, scale: Scale) -> dict[str, Any]:
-    """How a lens changes: by the epoch at which a block begins, or per kelvin; and whether it changes at all."""
-    found = {n: e for n, e in adjustment.estimates.items() if n[:2] == ("lens_drift", camera_id)}
-    test = significance_of_drift(adjustment, camera_id, scale.sigmas == "a_posteriori")
+def _changes(adjustment: Adjustment, camera_id: str, kind: str, key: str, scale: Scale) -> dict[str, Any]:
+    """How a lens changes or images are cropped: by the epoch from which on, or per kelvin; and whether they do at all."""
+    found = {n: e for n, e in adjustment.estimates.items() if n[:2] == (kind, camera_id)}
+    test = significance_of_lens(adjustment, camera_id, kind, scale.sigmas == "a_posteriori")
     parts = {n[2] if len(n) > 2 else "per_kelvin": vector_entry(e, scale) for n, e in found.items()}
-    return {"changes": parts, "significance": {} if test is None else {test.term: _test(test)}}
+    return {key: parts, "significance": {} if test is None else {test.term: _test(test)}}
 
 
 def _test(s: Significance) -> dict[str, Any]:
