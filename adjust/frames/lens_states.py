@@ -1,6 +1,6 @@
 """Which lens an image was taken with: that of its camera, as it had changed by then and as the image was cropped."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -126,8 +126,8 @@ class LensTimes:
     ) -> FloatArray | None:  # fmt: skip
         reference = drift.reference_temperature
         if reference is not None:
-            rates = value(("lens_drift", camera.camera_id))
-            return None if rates is None else (self.survey.temperatures.get(str(epoch_id), reference) - reference) * rates
+            rates, now = value(("lens_drift", camera.camera_id)), self.survey.temperatures.get(str(epoch_id), reference)
+            return None if rates is None else (now - reference) * rates
         start = _at(self._blocks[camera.camera_id], epoch_id)
         return None if start is None else value(("lens_drift", camera.camera_id, start))
 
@@ -283,7 +283,8 @@ class LensStates:
                                   "none; give it under temperatures_degC")  # fmt: skip
             warming = {e: survey.temperatures[e] - drift.reference_temperature for e in starts}
             return {e: (e, ((rates, by),)) for e, by in warming.items()}
-        out, before = {}, None
+        out: dict[str, tuple[str, tuple[tuple[VectorMap, float], ...]]] = {}
+        before: ParameterName | None = None
         for start in dict.fromkeys(s for s in starts.values() if s is not None):
             name: ParameterName = ("lens_drift", camera.camera_id, start)
             change = _registered(camera, drift, name, unknowns)

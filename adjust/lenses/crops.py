@@ -1,8 +1,8 @@
 """The lens of images that show a part of the sensor, or in another size.
 
-Pixel (u, v) of the whole image is ``scale (u + 1/2 - left) - 1/2`` of such an image, v likewise: the centre of the first
-pixel is (0, 0), so the image's edge is at -1/2. Focal lengths scale together, the principal point scales and shifts, and
-distortion stays what it is in normalised coordinates: its coefficients in 1/mm^n go with ``scale^-n``.
+Pixel u of the whole image is ``scale (u + 1/2 - left) - 1/2`` of such an image, v likewise with the top: the centre of
+the first pixel is (0, 0), the edge of the image at -1/2. Focal lengths scale together, the principal point scales and
+shifts, and distortion stays what it is in normalised coordinates: coefficients in 1/mm^n go with ``scale^-n``.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ UNITS = ("1", "px", "px")
 
 @dataclass(frozen=True, eq=False)
 class CroppedLens:
-    """values (n,), constants (4,); by_lens (n,): of each value by that of the whole image, by_crop (n, 3): by ``CROP``."""
+    """values (n,), constants (4,); by_lens (n,): by those of the whole image, by_crop (n, 3): by ``CROP``."""
 
     values: FloatArray
     constants: FloatArray
@@ -65,9 +65,13 @@ def cropped_size(camera: Camera, crop: ImageCrop) -> tuple[int, int]:
     return width, height
 
 
+def possible_sizes(camera: Camera) -> list[tuple[int, int]]:
+    """Width and height in px that images of a camera may have."""
+    return [camera.image_size, *(cropped_size(camera, crop) for crop in camera.lens.crops.values())]
+
+
 def _power(unit: str) -> int:
     """The power of the scale with which a parameter of that unit goes."""
     if unit in ("px", "mm"):
         return 1
     return 0 if unit == "1" else -int(unit.removeprefix("1/mm").removeprefix("^") or 1)
-

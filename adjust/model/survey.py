@@ -128,10 +128,11 @@ CROP = ("scale", "left", "top")
 
 @dataclass(frozen=True, eq=False)
 class ImageCrop:
-    """Images that show a part of the sensor, or in another size: pixel u of the whole is ``scale (u + 1/2 - left) - 1/2``.
+    """Images that show a part of the sensor, or in another size.
 
-    parameters: names as in ``CROP`` (1, px, px of the whole image). size: (width, height) of these images in px, None
-    where the whole image was cut at the left and at the top only.
+    Pixel u of the whole image is ``scale (u + 1/2 - left) - 1/2`` of these, v likewise with the top. parameters: names
+    as in ``CROP`` (1, px, px of the whole image). size: (width, height) of these images in px, None where the whole
+    image was cut at the left and at the top only.
     """
 
     parameters: VectorParameter

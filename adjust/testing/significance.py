@@ -71,7 +71,9 @@ def significances(adjustment: Adjustment, estimate: Estimate, estimated_sigma0: 
     return tuple(out)
 
 
-def significance_of_lens(adjustment: Adjustment, camera_id: str, kind: str, estimated_sigma0: bool) -> Significance | None:
+def significance_of_lens(
+    adjustment: Adjustment, camera_id: str, kind: str, estimated_sigma0: bool
+) -> Significance | None:
     """Whether a lens changes at all, or images are cropped otherwise than is given: of all its estimates together.
 
     kind: ``lens_drift`` or ``lens_crop``. None where none is estimated.

@@ -80,7 +80,7 @@ def test_start_values_see_whole_images() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("free", "given"), [((), TRUE), (CROP, TRUE + [0.002, 3.0, -2.0])], ids=["given", "free"])
 def test_crops_are_found_within_their_sigmas(free: tuple[str, ...], given: FloatArray) -> None:
-    survey, truth = cropped(*stereo(4, n_pairs=16), free, given)
+    survey, _ = cropped(*stereo(4, n_pairs=16), free, given)
     result = adjust(survey)
     assert result.global_test is not None
     assert result.global_test.passed
@@ -100,8 +100,8 @@ def test_a_prior_on_a_crop_is_an_observation() -> None:
     ((since, crop),) = camera.lens.crops.items()
     prior = VectorPrior(("left",), np.array([121.0]), np.array([[1e-8]]))
     crops = {since: replace(crop, parameters=replace(crop.parameters, prior=prior))}
-    graph = h.build(replace(survey, cameras=(survey.cameras[0], replace(camera, lens=replace(camera.lens, crops=crops)))),
-                    h.start_at(truth))  # fmt: skip
+    cameras = (survey.cameras[0], replace(camera, lens=replace(camera.lens, crops=crops)))
+    graph = h.build(replace(survey, cameras=cameras), h.start_at(truth))
     solved = h.solve(graph, h.SolveOptions())
     value = graph.unknowns.vectors["lens_crop", "right", since].full(solved.values)
     assert value[1] == pytest.approx(121.0, abs=1e-3)
