@@ -11,7 +11,7 @@ from adjust.frames.lens_states import LensTimes
 from adjust.frames.tables import table_motions
 from adjust.frames.unknowns import FrameTree, Unknowns
 from adjust.graph.assembly import StartValues
-from adjust.lenses.models import MODELS, project
+from adjust.lenses.models import MODELS, camera_constants, project
 from adjust.model.boards import deformed, warming_of
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
@@ -152,8 +152,8 @@ class Prediction:
         """(n, 3) m of its points, with the warp that was found."""
         return deformed(target, self._value(("warp", target.target_id), {}), warming_of(self.survey, target, epoch_id))
 
-    def _lens(self, block: ImageBlock, altered: Altered) -> tuple[FloatArray, FloatArray] | None:
-        """The lens (n,) at the epoch of a block, and its constants (4,)."""
+    def _lens(self, block: ImageBlock, altered: Altered) -> FloatArray | None:
+        """The lens (n,) at the epoch of a block."""
         camera = self._cameras[block.camera_id]
         if self._value(("lens", block.camera_id), altered) is None:
             return None
@@ -191,10 +191,10 @@ class Prediction:
         return pose @ target.matrix() if isinstance(target, Pose3) else pose
 
     def _project(self, block: ImageBlock, x_in_camera: FloatArray, altered: Altered) -> FloatArray | None:
-        found = self._lens(block, altered)
-        if found is None:
+        lens, camera = self._lens(block, altered), self._cameras[block.camera_id]
+        if lens is None:
             return None
-        model, (lens, constants) = MODELS[self._cameras[block.camera_id].lens.model], found
+        model, constants = MODELS[camera.lens.model], camera_constants(camera)
         known, uv = np.isfinite(x_in_camera).all(axis=1), np.full((len(x_in_camera), 2), np.nan)
         try:
             uv[known] = project(model, lens, constants, x_in_camera[known])

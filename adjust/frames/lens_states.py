@@ -7,12 +7,22 @@ import gtsam
 import numpy as np
 
 from adjust.frames.unknowns import Unknowns, VectorMap, vector_map
-from adjust.lenses.crops import UNITS, CroppedLens, cropped_lens, cropped_size, whole_image
+from adjust.lenses.crops import UNITS, CroppedLens, crop_size, cropped_lens, whole_image
 from adjust.lenses.models import MODELS, LensModel, camera_constants
 from adjust.model.errors import SurveyError
 from adjust.model.result import ParameterName
-from adjust.model.survey import CROP, BoolArray, Camera, FloatArray, ImageCrop, LensDrift, LensSharing, Survey
-from adjust.native.lenses import AICON, MAX_LENS
+from adjust.model.survey import (
+    CROP,
+    BoolArray,
+    Camera,
+    FloatArray,
+    ImageCrop,
+    LensDrift,
+    LensSharing,
+    Survey,
+    VectorParameter,
+)
+from adjust.native.lenses import MAX_LENS
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +91,7 @@ def _starts(survey: Survey, camera: Camera, begins: Iterable[str], key: str) -> 
 
 
 class LensTimes:
-    """Which lens the images of a survey have: of an epoch without image, what the last one has."""
+    """Which lens the images of a survey have: of an epoch without image, or of none (None), what the last one has."""
 
     def __init__(self, survey: Survey) -> None:
         self.survey = survey
@@ -96,29 +106,28 @@ class LensTimes:
     def size(self, camera: Camera, epoch_id: str | None) -> tuple[int, int]:
         """Width and height in px of a camera's image."""
         crop = self.crop(camera, epoch_id)
-        return camera.image_size if crop is None else cropped_size(camera, crop[1])
+        return camera.image_size if crop is None else crop_size(camera.image_size, crop[1])
 
     def lens(
         self, camera: Camera, epoch_id: str | None, value: Callable[[ParameterName], FloatArray | None]
-    ) -> tuple[FloatArray, FloatArray]:
-        """A lens (n,) and its constants (4,), from the values of ``lens``, ``lens_drift`` and ``lens_crop``.
+    ) -> FloatArray:
+        """A lens (n,) from the values of ``lens``, ``lens_drift`` and ``lens_crop``.
 
         Of an epoch without temperature: at the reference temperature. Raises SurveyError where the lens has no value.
         """
         own, model = value(("lens", camera.camera_id)), MODELS[camera.lens.model]
         if own is None:
             raise SurveyError(f"camera {camera.camera_id!r}: its lens has no values yet; adjust the project first")
-        out, constants, drift = own.copy(), camera_constants(camera), camera.lens.drift
+        out, drift = own.copy(), camera.lens.drift
         if drift is not None and (change := self._change(camera, drift, epoch_id, value)) is not None:
             by = dict(zip(drift.parameters, change, strict=True))
             by |= {tie.name: tie.factor * by[tie.to] for tie in camera.lens.ties if tie.to in by}
             out[[model.names.index(x) for x in by]] += list(by.values())
         if (crop := self.crop(camera, epoch_id)) is None:
-            return out, constants
+            return out
         found = value(("lens_crop", camera.camera_id, crop[0]))
         given = np.asarray(crop[1].parameters.values, dtype=float)
-        cropped = cropped_lens(model, out, constants, given if found is None else found)
-        return cropped.values, cropped.constants
+        return cropped_lens(model, out, camera_constants(camera), given if found is None else found).values
 
     def _change(
         self, camera: Camera, drift: LensDrift, epoch_id: str | None,
@@ -126,7 +135,9 @@ class LensTimes:
     ) -> FloatArray | None:  # fmt: skip
         reference = drift.reference_temperature
         if reference is not None:
-            rates, now = value(("lens_drift", camera.camera_id)), self.survey.temperatures.get(str(epoch_id), reference)
+            last = next(reversed(self._blocks[camera.camera_id]), "")
+            now = self.survey.temperatures.get(last if epoch_id is None else epoch_id, reference)
+            rates = value(("lens_drift", camera.camera_id))
             return None if rates is None else (now - reference) * rates
         start = _at(self._blocks[camera.camera_id], epoch_id)
         return None if start is None else value(("lens_drift", camera.camera_id, start))
@@ -303,22 +314,22 @@ class LensStates:
                 continue
             given, name = camera.lens.crops[start].parameters, ("lens_crop", camera.camera_id, start)
             if name not in unknowns.vectors:
-                _check_crop(camera, given.free, len(unknowns.vectors["lens", camera.camera_id].free))
+                _check_crop(camera, given, len(unknowns.vectors["lens", camera.camera_id].free))
                 unknowns.vectors[name] = vector_map(given, UNITS, unknowns, name)
             out[epoch] = start, CropState(unknowns.vectors[name], model, camera_constants(camera))
         return out
 
 
-def _check_crop(camera: Camera, free: tuple[str, ...], n_lens: int) -> None:
-    what = f"camera {camera.camera_id!r}"
+def _check_crop(camera: Camera, crop: VectorParameter, n_lens: int) -> None:
+    what, free = f"camera {camera.camera_id!r}", crop.free
     if wrong := [x for x in free if x not in CROP]:
         raise SurveyError(f"{what}: a crop has no parameter {wrong[0]!r}; it has {', '.join(CROP)}")
     if n_lens + len(free) > MAX_LENS:
         raise SurveyError(f"{what}: {n_lens + len(free)} parameters of lens and crop are free, more than {MAX_LENS}; "
                           "hold some")  # fmt: skip
-    if "scale" in free and MODELS[camera.lens.model].kind == AICON and camera.lens.balance_radius_mm:
-        raise SurveyError(f"{what}: the scale of a crop cannot be free where the lens has a balance radius; give it, "
-                          "or set balance_radius_mm = 0")  # fmt: skip
+    if ("scale" in free or crop.values[0] != 1.0) and camera.lens.balance_radius_mm:
+        raise SurveyError(f"{what}: a lens with a balance radius holds for one scale of images; set balance_radius_mm "
+                          "= 0, or make another camera of those of another size")  # fmt: skip
 
 
 def _registered(camera: Camera, drift: LensDrift, name: ParameterName, unknowns: Unknowns) -> VectorMap:

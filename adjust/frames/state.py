@@ -148,7 +148,6 @@ class State:
             if state.crop is not None:
                 k, lenses = self.lenses.n_map[i], self.lenses
                 lenses.factor[i, :k] = self.lens_states.by_free(i, values)[lenses.source[i, :k], lenses.column[i, :k]]
-                lenses.constants[i] = state.crop.lens(full, values).constants
         for i, warp_map in enumerate(self.warp_maps):
             if warp_map is not None:
                 self.warps.values[i, [list(BOARD).index(name) for name in warp_map.names]] = warp_map.full(values)

@@ -19,16 +19,18 @@ UNITS = ("1", "px", "px")
 
 @dataclass(frozen=True, eq=False)
 class CroppedLens:
-    """values (n,), constants (4,); by_lens (n,): by those of the whole image, by_crop (n, 3): by ``CROP``."""
+    """values (n,); by_lens (n,): by those of the whole image, by_crop (n, 3): by ``CROP``."""
 
     values: FloatArray
-    constants: FloatArray
     by_lens: FloatArray
     by_crop: FloatArray
 
 
 def cropped_lens(model: LensModel, values: FloatArray, constants: FloatArray, crop: FloatArray) -> CroppedLens:
-    """The lens (n,) of a whole image, with its constants (4,), as it is in images of that crop (3,)."""
+    """The lens (n,) of a whole image, with its constants (4,), as it is in images of that crop (3,).
+
+    The constants stay: a balance radius, which would not, is not for images of another scale.
+    """
     scale, edges = crop[0], crop[1:]
     power = np.array([_power(unit) for unit in model.units])
     by_lens = scale**power
@@ -39,7 +41,7 @@ def cropped_lens(model: LensModel, values: FloatArray, constants: FloatArray, cr
     new[at] = per_px * (scale * from_edge - 0.5 - centre)
     by_crop[at, 0] = per_px * from_edge
     by_crop[at, [1, 2]] = -per_px * scale
-    return CroppedLens(new, constants * np.array([1.0, 1.0, 1.0, scale]), by_lens, by_crop)
+    return CroppedLens(new, by_lens, by_crop)
 
 
 def principal_components(model: LensModel, constants: FloatArray) -> tuple[list[int], FloatArray, FloatArray]:
@@ -56,18 +58,18 @@ def whole_image(uv: FloatArray, crop: FloatArray) -> FloatArray:
     return np.asarray((uv + 0.5) / crop[0] + crop[1:] - 0.5)
 
 
-def cropped_size(camera: Camera, crop: ImageCrop) -> tuple[int, int]:
-    """Width and height in px of the images of a crop, as it is given."""
+def crop_size(whole: tuple[int, int], crop: ImageCrop) -> tuple[int, int]:
+    """Width and height in px of the images of a crop, as it is given, from those of whole images."""
     if crop.size is not None:
         return crop.size
     scale, *edges = np.asarray(crop.parameters.values).tolist()
-    width, height = (round(scale * (n - edge)) for n, edge in zip(camera.image_size, edges, strict=True))
+    width, height = (round(scale * (n - edge)) for n, edge in zip(whole, edges, strict=True))
     return width, height
 
 
 def possible_sizes(camera: Camera) -> list[tuple[int, int]]:
     """Width and height in px that images of a camera may have."""
-    return [camera.image_size, *(cropped_size(camera, crop) for crop in camera.lens.crops.values())]
+    return [camera.image_size, *(crop_size(camera.image_size, crop) for crop in camera.lens.crops.values())]
 
 
 def _power(unit: str) -> int:

@@ -36,11 +36,11 @@ def cropped(
 def test_every_model_images_what_the_crop_of_its_image_shows(model: str) -> None:
     """Projection by the lens of the crop against the crop of the projection, and derivatives against differences."""
     lens, size, pixel = h.lens_values(model), (1280, 1024), 0.006
-    constants = lens_constants(model, size, pixel, 2.0 if model == "aicon" else 0.0)
+    constants = lens_constants(model, size, pixel)
     x = np.random.default_rng(1).uniform((-0.3, -0.25, 1.0), (0.3, 0.25, 1.5), (50, 3))
     seen = project(MODELS[model], lens, constants, x)
     small = cropped_lens(MODELS[model], lens, constants, TRUE)
-    uv = project(MODELS[model], small.values, small.constants, x)
+    uv = project(MODELS[model], small.values, constants, x)
     np.testing.assert_allclose(uv, TRUE[0] * (seen + 0.5 - TRUE[1:]) - 0.5, atol=1e-6)
     np.testing.assert_allclose(whole_image(uv, TRUE), seen, atol=1e-6)
     for by, values, crop in ((small.by_crop, lens, TRUE), (np.diag(small.by_lens), lens, TRUE)):
@@ -113,7 +113,7 @@ def test_the_lens_at_an_epoch_is_that_of_its_images() -> None:
     times, states = LensTimes(survey), graph.state.lens_states
     for camera in survey.cameras:
         for epoch in (b.epoch_id for b in survey.image_blocks if b.camera_id == camera.camera_id):
-            lens, _ = times.lens(camera, epoch, lambda n: truth.get(n))
+            lens = times.lens(camera, epoch, lambda n: truth.get(n))
             np.testing.assert_allclose(lens, states.full(states.of(camera.camera_id, epoch), graph.start), rtol=1e-12)
     assert times.size(survey.cameras[1], None) == (840, 640)
     assert times.size(survey.cameras[0], None) == survey.cameras[0].image_size

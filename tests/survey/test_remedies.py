@@ -290,3 +290,36 @@ def test_keys_of_remedies_are_written_where_they_belong(tmp_path: Path) -> None:
     after = edited(("tables", "turntable", "harmonics", "tilt_2"), 1)
     assert "\nharmonics = {" in after
     assert tomllib.loads(after)["tables"]["turntable"]["harmonics"] == {"angle_2": 2, "tilt_2": 1}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scale", "shift", "said", "free"),
+    [
+        (1.0, (40.0, -20.0), "another crop of the sensor", ("left", "top")),
+        (0.8, (0.0, 0.0), "times the size", ("scale",)),
+        (1.0, (3.0, -1.5), "another crop of the sensor", ("left", "top")),
+    ],
+)
+def test_a_crop_that_the_diagnosis_names_becomes_keys(
+    tmp_path: Path, scale: float, shift: tuple[float, float], said: str, free: tuple[str, ...]
+) -> None:
+    survey, _ = stereo(3, n_pairs=14)
+    mine = [b.epoch_id for b in survey.image_blocks if b.camera_id == "right"]
+    later = mine[6:]
+    blocks = tuple(
+        replace(b, uv=scale * (b.uv + 0.5) - 0.5 + shift) if b.camera_id == "right" and b.epoch_id in later else b
+        for b in survey.image_blocks
+    )
+    write_project(tmp_path, replace(survey, image_blocks=blocks))
+    assert said in try_job(tmp_path, 1)
+    camera = read(tmp_path).survey.cameras[1]
+    ((since, crop),) = camera.lens.crops.items()
+    assert since == later[0]
+    assert crop.parameters.free == free
+    solution = labsurvey.adjust(tmp_path)
+    assert solution.adjustment.global_test is not None
+    assert solution.adjustment.global_test.passed
+    found = solution.as_dict["cameras"]["right"]["lens_crop"]["crops"][since]
+    assert found["scale"] == pytest.approx(scale, abs=5 * found["sigma_scale"] + 1e-12)
+    assert solution.as_dict["cameras"]["right"]["lens_crop"]["significance"]
