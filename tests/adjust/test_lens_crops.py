@@ -78,7 +78,10 @@ def test_start_values_see_whole_images() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("free", "given"), [((), TRUE), (CROP, TRUE + [0.002, 3.0, -2.0])], ids=["given", "free"])
+@pytest.mark.parametrize(
+    ("free", "given"), [((), TRUE), (CROP, TRUE + [0.2, 0.0, 0.0]), (CROP, TRUE + [0.0, 250.0, 100.0])],
+    ids=["given", "another size", "another region"],
+)
 def test_crops_are_found_within_their_sigmas(free: tuple[str, ...], given: FloatArray) -> None:
     survey, _ = cropped(*stereo(4, n_pairs=16), free, given)
     result = adjust(survey)
