@@ -242,7 +242,9 @@ def estimates(precision: Precision) -> dict[ParameterName, Estimate]:
         out[name] = Estimate(name, pose, POSE_COMPONENTS, POSE_UNITS, cov, status)
     for name, vector in u.vectors.items():
         cov = np.zeros((len(vector.names),) * 2)
-        if vector.key is not None:
+        if vector.borrowed:
+            cov = precision.whole([name], [len(vector.names)])
+        elif vector.key is not None:
             cov = vector.matrix @ found[vector.key] @ vector.matrix.T
         out[name] = Estimate(name, vector.full(values), vector.names, vector.units, cov, vector.status)
     for point in graph.survey.points:

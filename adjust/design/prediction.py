@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from gtsam import Pose3
 
+from adjust.frames.lens_states import LensTimes
 from adjust.graph.assembly import GraphBuilder, StartValues
 from adjust.lenses.models import MODELS, camera_constants, lens_residuals, project
 from adjust.model.boards import deformed, warming_of
@@ -42,7 +43,7 @@ class Predictor:
     def __init__(self, survey: Survey, start: StartValues) -> None:
         builder = GraphBuilder(survey, start.lenses)
         self.survey, self.graph, self.frames = survey, builder.build(start), builder.frames
-        self.values = self.graph.start
+        self.values, self.times = self.graph.start, LensTimes(survey)
         self.cameras = {c.camera_id: c for c in survey.cameras}
         self.targets = {t.target_id: t for t in survey.targets}
 
@@ -82,7 +83,9 @@ class Predictor:
         """The block with what is visible of it, at its predicted place; None where that is too little."""
         uv, q = self.image(block)
         camera = self.cameras[block.camera_id]
-        keep = _inside(camera, uv, seeing.margin_px) & (q[:, 2] >= seeing.nearest_m) & (q[:, 2] <= seeing.farthest_m)
+        size = self.times.size(camera, block.epoch_id)
+        keep = _inside(size, uv, seeing.margin_px)
+        keep &= (q[:, 2] >= seeing.nearest_m) & (q[:, 2] <= seeing.farthest_m)
         if keep.any():
             keep[keep] = grows_outwards(camera, self.lens(camera, block.epoch_id), q[keep])
         if block.target_id is not None:
@@ -161,10 +164,9 @@ def grows_outwards(camera: Camera, lens: FloatArray, q: FloatArray) -> BoolArray
     return np.asarray((np.diff(radius, axis=0) > 0.0).all(axis=0) | (radius[-1] < 1.0))
 
 
-def _inside(camera: Camera, uv: FloatArray, margin: float) -> BoolArray:
-    size = np.array(camera.image_size, dtype=float)
+def _inside(size: tuple[int, int], uv: FloatArray, margin: float) -> BoolArray:
     with np.errstate(invalid="ignore"):
-        return np.asarray(np.all((uv >= margin) & (uv <= size - 1.0 - margin), axis=1))
+        return np.asarray(np.all((uv >= margin) & (uv <= np.array(size) - 1.0 - margin), axis=1))
 
 
 def _is_flat(target: Target) -> bool:

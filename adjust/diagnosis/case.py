@@ -10,6 +10,7 @@ from gtsam import Pose3
 
 from adjust.adjustment import AdjustOptions, adjust, start_values
 from adjust.diagnosis.prediction import Altered, Prediction, adjusted_values, started_values
+from adjust.frames.lens_states import whole_images
 from adjust.graph.assembly import StartValues, values_of
 from adjust.graph.solver import SolveOptions
 from adjust.model.boards import deformed
@@ -222,7 +223,7 @@ def own_lens(survey: Survey, camera: Camera) -> FloatArray:
     """Start values (n,) of a lens from the camera's images of targets alone; SurveyError where they give none."""
     points = {t.target_id: deformed(t) for t in survey.targets}
     mine = [
-        (i, b) for i, b in enumerate(survey.image_blocks)
+        (i, b) for i, b in enumerate(whole_images(survey).image_blocks)
         if b.camera_id == camera.camera_id and b.target_id is not None
     ]  # fmt: skip
     seen = [Sighting(i, points[str(b.target_id)][b.point_idx[b.mask]], b.uv[b.mask]) for i, b in mine]
@@ -242,6 +243,7 @@ def own_lenses(survey: Survey) -> dict[str, FloatArray]:
 
 def single_views(survey: Survey, lenses: Mapping[str, FloatArray]) -> Views:
     """Every block of a target with three used points or more that has a pose."""
+    survey = whole_images(survey)
     points = {t.target_id: deformed(t) for t in survey.targets}
     known = replace(survey, cameras=tuple(c for c in survey.cameras if c.camera_id in lenses))
     focal = {c.camera_id: focal_px(c, lenses[c.camera_id]) for c in known.cameras}

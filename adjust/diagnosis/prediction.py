@@ -7,16 +7,16 @@ from functools import cached_property
 import numpy as np
 from gtsam import Pose3
 
-from adjust.frames.lens_states import block_starts
+from adjust.frames.lens_states import LensTimes
 from adjust.frames.tables import table_motions
 from adjust.frames.unknowns import FrameTree, Unknowns
 from adjust.graph.assembly import StartValues
-from adjust.lenses.models import LensModel, camera_constants, lens_model, project
+from adjust.lenses.models import MODELS, camera_constants, project
 from adjust.model.boards import deformed, warming_of
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment, ParameterName
-from adjust.model.survey import FloatArray, Survey, Target
+from adjust.model.survey import Camera, FloatArray, Survey, Target
 from adjust.spatial.rigid import inverse, rigid
 
 Altered = Mapping[ParameterName, Pose3 | FloatArray]
@@ -141,8 +141,8 @@ class Prediction:
         return {}
 
     @cached_property
-    def _lenses(self) -> dict[str, tuple[LensModel, FloatArray]]:
-        return {c.camera_id: (lens_model(c.lens.model), camera_constants(c)) for c in self.survey.cameras}
+    def _cameras(self) -> dict[str, Camera]:
+        return {c.camera_id: c for c in self.survey.cameras}
 
     @cached_property
     def _targets(self) -> dict[str, Target]:
@@ -152,31 +152,16 @@ class Prediction:
         """(n, 3) m of its points, with the warp that was found."""
         return deformed(target, self._value(("warp", target.target_id), {}), warming_of(self.survey, target, epoch_id))
 
-    @cached_property
-    def _drifting(self) -> dict[str, dict[str, str | None]]:
-        """Of cameras whose lens changes by blocks, by epoch where the block begins."""
-        return {c.camera_id: block_starts(self.survey, c) for c in self.survey.cameras if c.lens.drift is not None}
-
     def _lens(self, block: ImageBlock, altered: Altered) -> FloatArray | None:
         """The lens (n,) at the epoch of a block."""
-        own = self._value(("lens", block.camera_id), altered)
-        starts = self._drifting.get(block.camera_id)
-        if own is None or starts is None:
-            return own
-        camera = next(c for c in self.survey.cameras if c.camera_id == block.camera_id)
-        drift = camera.lens.drift
-        reference = drift.reference_temperature if drift is not None else None
-        start = starts.get(block.epoch_id) or ""
-        name: ParameterName = ("lens_drift", block.camera_id, *(() if reference is not None else (start,)))
-        found = self._value(name, altered)
-        if found is None or drift is None:
-            return own
-        factor = 1.0 if reference is None else self.survey.temperatures[block.epoch_id] - reference
-        names, out = self._lenses[block.camera_id][0].names, own.copy()
-        change = dict(zip(drift.parameters, factor * found, strict=True))
-        change |= {tie.name: tie.factor * change[tie.to] for tie in camera.lens.ties if tie.to in change}
-        out[[names.index(x) for x in change]] += list(change.values())
-        return out
+        camera = self._cameras[block.camera_id]
+        if self._value(("lens", block.camera_id), altered) is None:
+            return None
+        return self._times.lens(camera, block.epoch_id, lambda name: self._value(name, altered))
+
+    @cached_property
+    def _times(self) -> LensTimes:
+        return LensTimes(self.survey)
 
     @cached_property
     def _stations(self) -> dict[str, str]:
@@ -206,10 +191,10 @@ class Prediction:
         return pose @ target.matrix() if isinstance(target, Pose3) else pose
 
     def _project(self, block: ImageBlock, x_in_camera: FloatArray, altered: Altered) -> FloatArray | None:
-        lens = self._lens(block, altered)
+        lens, camera = self._lens(block, altered), self._cameras[block.camera_id]
         if lens is None:
             return None
-        model, constants = self._lenses[block.camera_id]
+        model, constants = MODELS[camera.lens.model], camera_constants(camera)
         known, uv = np.isfinite(x_in_camera).all(axis=1), np.full((len(x_in_camera), 2), np.nan)
         try:
             uv[known] = project(model, lens, constants, x_in_camera[known])

@@ -1,24 +1,56 @@
-"""Which lens an image was taken with: that of its camera, as it had changed by then."""
+"""Which lens an image was taken with: that of its camera, as it had changed by then and as the image was cropped."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
-from adjust.frames.unknowns import Unknowns, VectorMap
-from adjust.lenses.models import MODELS
+from adjust.frames.unknowns import Unknowns, VectorMap, vector_map
+from adjust.lenses.crops import UNITS, CroppedLens, crop_size, cropped_lens, whole_image
+from adjust.lenses.models import MODELS, LensModel, camera_constants
 from adjust.model.errors import SurveyError
 from adjust.model.result import ParameterName
-from adjust.model.survey import Camera, FloatArray, LensDrift, Survey
+from adjust.model.survey import (
+    CROP,
+    BoolArray,
+    Camera,
+    FloatArray,
+    ImageCrop,
+    LensDrift,
+    LensSharing,
+    Survey,
+    VectorParameter,
+)
+from adjust.native.lenses import MAX_LENS
+
+
+@dataclass(frozen=True, eq=False)
+class CropState:
+    """How images are cropped: ``CROP``, for a lens model with the constants (4,) of the whole image."""
+
+    vector: VectorMap
+    model: LensModel
+    constants: FloatArray
+
+    @property
+    def pattern(self) -> BoolArray:
+        """Which parameters (n,) of a lens follow from which free ones (k,) of the crop."""
+        generic = cropped_lens(self.model, np.ones(self.model.n), self.constants, np.array([1.3, 0.7, 0.9]))
+        return np.asarray((generic.by_crop != 0.0) @ (self.vector.matrix != 0.0))
+
+    def lens(self, whole: FloatArray, values: gtsam.Values) -> CroppedLens:
+        """The lens of the whole image (n,), as it is in these."""
+        return cropped_lens(self.model, whole, self.constants, self.vector.full(values))
 
 
 @dataclass(frozen=True, eq=False)
 class LensState:
-    """The lens of a camera (its number) and what is added to it: changes, each times a factor."""
+    """The lens of a camera (its number), what is added to it (changes, each times a factor), and how it is cropped."""
 
     camera: int
     changes: tuple[tuple[VectorMap, float], ...] = ()
+    crop: CropState | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,21 +65,136 @@ class LensPart:
 
 
 def block_starts(survey: Survey, camera: Camera) -> dict[str, str | None]:
-    """By epoch of a camera's images, in their order: the epoch at which its block began, None in the first one.
+    """By epoch of a camera's images, in their order: the epoch at which its lens last changed, None in the first block.
 
-    Raises SurveyError for a beginning at which the camera has no image.
+    Raises SurveyError for a change at which the camera has no image.
     """
-    drift = camera.lens.drift
+    return _starts(survey, camera, () if camera.lens.drift is None else camera.lens.drift.begins, "drift.begins")
+
+
+def crop_starts(survey: Survey, camera: Camera) -> dict[str, str | None]:
+    """Likewise: the epoch from which on its images are cropped as they are, None where they are whole."""
+    return _starts(survey, camera, camera.lens.crops, "crops")
+
+
+def _starts(survey: Survey, camera: Camera, begins: Iterable[str], key: str) -> dict[str, str | None]:
     epochs = dict.fromkeys(b.epoch_id for b in survey.image_blocks if b.camera_id == camera.camera_id)
-    if drift is not None and (missing := [e for e in drift.begins if e not in epochs]):
+    if missing := [e for e in begins if epochs and e not in epochs]:
         raise SurveyError(f"camera {camera.camera_id!r}: its lens is to change at epoch {missing[0]!r}, at which it "
-                          "has no image; correct drift.begins")  # fmt: skip
+                          f"has no image; correct {key}")  # fmt: skip
     out: dict[str, str | None] = {}
     start: str | None = None
     for epoch in epochs:
-        start = epoch if drift is not None and epoch in drift.begins else start
+        start = epoch if epoch in begins else start
         out[epoch] = start
     return out
+
+
+class LensTimes:
+    """Which lens the images of a survey have: of an epoch without image, or of none (None), what the last one has."""
+
+    def __init__(self, survey: Survey) -> None:
+        self.survey = survey
+        self._blocks = {c.camera_id: block_starts(survey, c) for c in survey.cameras if c.lens.drift is not None}
+        self._crops = {c.camera_id: crop_starts(survey, c) for c in survey.cameras if c.lens.crops}
+
+    def crop(self, camera: Camera, epoch_id: str | None) -> tuple[str, ImageCrop] | None:
+        """Since when and how a camera's image is cropped."""
+        start = _at(self._crops.get(camera.camera_id, {}), epoch_id)
+        return None if start is None else (start, camera.lens.crops[start])
+
+    def size(self, camera: Camera, epoch_id: str | None) -> tuple[int, int]:
+        """Width and height in px of a camera's image."""
+        crop = self.crop(camera, epoch_id)
+        return camera.image_size if crop is None else crop_size(camera.image_size, crop[1])
+
+    def lens(
+        self, camera: Camera, epoch_id: str | None, value: Callable[[ParameterName], FloatArray | None]
+    ) -> FloatArray:
+        """A lens (n,) from the values of ``lens``, ``lens_drift`` and ``lens_crop``.
+
+        Of an epoch without temperature: at the reference temperature. Raises SurveyError where the lens has no value.
+        """
+        own, model = value(("lens", camera.camera_id)), MODELS[camera.lens.model]
+        if own is None:
+            raise SurveyError(f"camera {camera.camera_id!r}: its lens has no values yet; adjust the project first")
+        out, drift = own.copy(), camera.lens.drift
+        if drift is not None and (change := self._change(camera, drift, epoch_id, value)) is not None:
+            by = dict(zip(drift.parameters, change, strict=True))
+            by |= {tie.name: tie.factor * by[tie.to] for tie in camera.lens.ties if tie.to in by}
+            out[[model.names.index(x) for x in by]] += list(by.values())
+        if (crop := self.crop(camera, epoch_id)) is None:
+            return out
+        found = value(("lens_crop", camera.camera_id, crop[0]))
+        given = np.asarray(crop[1].parameters.values, dtype=float)
+        return cropped_lens(model, out, camera_constants(camera), given if found is None else found).values
+
+    def _change(
+        self, camera: Camera, drift: LensDrift, epoch_id: str | None,
+        value: Callable[[ParameterName], FloatArray | None],
+    ) -> FloatArray | None:  # fmt: skip
+        reference = drift.reference_temperature
+        if reference is not None:
+            last = next(reversed(self._blocks[camera.camera_id]), "")
+            now = self.survey.temperatures.get(last if epoch_id is None else epoch_id, reference)
+            rates = value(("lens_drift", camera.camera_id))
+            return None if rates is None else (now - reference) * rates
+        start = _at(self._blocks[camera.camera_id], epoch_id)
+        return None if start is None else value(("lens_drift", camera.camera_id, start))
+
+
+def _at(starts: Mapping[str, str | None], epoch_id: str | None) -> str | None:
+    return starts[str(epoch_id)] if str(epoch_id) in starts else [None, *starts.values()][-1]
+
+
+def whole_images(survey: Survey) -> Survey:
+    """The survey with its image points in pixels of whole images, by the crops as they are given."""
+    cameras = {c.camera_id: (crop_starts(survey, c), c.lens.crops) for c in survey.cameras if c.lens.crops}
+    if not cameras:
+        return survey
+    blocks = []
+    for block in survey.image_blocks:
+        starts, crops = cameras.get(block.camera_id, ({}, {}))
+        if (start := starts.get(block.epoch_id)) is not None:
+            crop = np.asarray(crops[start].parameters.values)
+            block = replace(block, uv=whole_image(block.uv, crop), cov=block.cov / crop[0] ** 2)
+        blocks.append(block)
+    lenses = [replace(c.lens, crops={}) for c in survey.cameras]
+    return replace(survey, image_blocks=tuple(blocks),
+                   cameras=tuple(replace(c, lens=x) for c, x in zip(survey.cameras, lenses, strict=True)))  # fmt: skip
+
+
+def lenders(survey: Survey) -> dict[str, tuple[str, tuple[str, ...]]]:
+    """By camera the one whose unknowns some parameters of its lens are, and which.
+
+    Where the camera that is named is not part of the survey, the first of those that name it takes its place. Raises
+    SurveyError for a lens that cannot be shared.
+    """
+    cameras, out = {c.camera_id: c for c in survey.cameras}, dict[str, tuple[str, tuple[str, ...]]]()
+    stands_for: dict[str, str] = {}
+    for camera in survey.cameras:
+        sharing = camera.lens.shared
+        if sharing is None:
+            continue
+        name = sharing.camera_id
+        lender = name if name in cameras else stands_for.setdefault(name, camera.camera_id)
+        if lender != camera.camera_id:
+            _check_shared(camera, cameras[lender], sharing)
+            out[camera.camera_id] = lender, sharing.parameters
+    return out
+
+
+def _check_shared(camera: Camera, lender: Camera, sharing: LensSharing) -> None:
+    what = f"camera {camera.camera_id!r} shares its lens with {lender.camera_id!r}"
+    if lender.camera_id == sharing.camera_id and lender.lens.shared is not None:
+        raise SurveyError(f"{what}, which shares its own; name {lender.lens.shared.camera_id!r}")
+    if camera.lens.model != lender.lens.model:
+        raise SurveyError(f"{what}, but they are {camera.lens.model!r} and {lender.lens.model!r}; take one model")
+    for name in sharing.parameters:
+        if name not in camera.lens.free or name not in lender.lens.free:
+            raise SurveyError(f"{what}, but {name} is not free in both; add it to free")
+        if camera.lens.prior is not None and name in camera.lens.prior.names:
+            raise SurveyError(f"{what}, and {name} has a prior here; give it to {lender.camera_id!r}")
 
 
 class LensStates:
@@ -60,16 +207,25 @@ class LensStates:
         """Steps of random walks: of the second change (of none) to the first, with their sigmas."""
         self._at: dict[tuple[str, str], int] = {}
         for i, camera in enumerate(survey.cameras):
-            if camera.lens.drift is not None:
-                self._add(survey, i, camera, camera.lens.drift, unknowns)
+            if camera.lens.drift is not None or camera.lens.crops:
+                self._add(survey, i, camera, unknowns)
         self._cameras = {c.camera_id: i for i, c in enumerate(survey.cameras)}
 
     def of(self, camera_id: str, epoch_id: str) -> int:
         """The number of the state in which a camera was at an epoch."""
         return self._at.get((camera_id, epoch_id), self._cameras[camera_id])
 
+    def last(self, camera_id: str) -> int:
+        """The number of the state in which a camera was left."""
+        return next((i for (c, _), i in reversed(self._at.items()) if c == camera_id), self._cameras[camera_id])
+
     def full(self, i: int, values: gtsam.Values) -> FloatArray:
         """All parameters (n,) of state i at these values."""
+        whole, crop = self.whole(i, values), self.states[i].crop
+        return whole if crop is None else crop.lens(whole, values).values
+
+    def whole(self, i: int, values: gtsam.Values) -> FloatArray:
+        """All parameters (n,) of state i, of the whole image."""
         own = self.maps[self.states[i].camera]
         out = own.full(values)
         for change, factor in self.states[i].changes:
@@ -79,37 +235,101 @@ class LensStates:
 
     def parts(self, i: int) -> list[LensPart]:
         """Where the free parameters of state i come from."""
-        own = self.maps[self.states[i].camera]
+        own, state = self.maps[self.states[i].camera], self.states[i]
         out = [] if own.key is None else [LensPart(own.key, 0, 0, len(own.free), 1.0)]
-        for change, factor in self.states[i].changes:
+        if own.borrowed:
+            out = [LensPart(key, first, within, 1, 1.0) for first, (key, within) in enumerate(own.sources)]
+        for change, factor in state.changes:
             if change.key is not None:
                 out += [LensPart(change.key, own.free.index(x), j, 1, factor) for j, x in enumerate(change.names)]
+        if state.crop is not None and state.crop.vector.key is not None:
+            out.append(LensPart(state.crop.vector.key, len(own.free), 0, len(state.crop.vector.free), 1.0))
         return out
 
-    def _add(self, survey: Survey, i: int, camera: Camera, drift: LensDrift, unknowns: Unknowns) -> None:
+    def pattern(self, i: int) -> BoolArray:
+        """Which parameters (n,) of state i follow from which of its free ones (k,): see :meth:`by_free`."""
+        own, crop = self.maps[self.states[i].camera], self.states[i].crop
+        return own.matrix != 0.0 if crop is None else np.hstack([own.matrix != 0.0, crop.pattern])
+
+    def by_free(self, i: int, values: gtsam.Values) -> FloatArray:
+        """Derivative (n, k) of all parameters of state i by its free ones, those of its crop last."""
+        own, crop = self.maps[self.states[i].camera], self.states[i].crop
+        if crop is None:
+            return own.matrix
+        lens = crop.lens(self.whole(i, values), values)
+        return np.hstack([lens.by_lens[:, None] * own.matrix, lens.by_crop @ crop.vector.matrix])
+
+    def spread(self, i: int, values: gtsam.Values, unknowns: Unknowns) -> dict[int, FloatArray]:
+        """How all parameters (n,) of state i follow from unknowns: (n, dim) by key."""
+        J, out = self.by_free(i, values), dict[int, FloatArray]()
+        for p in self.parts(i):
+            by_key = out.setdefault(p.key, np.zeros((len(J), unknowns.by_key[p.key].dim)))
+            by_key[:, p.within : p.within + p.n] += p.factor * J[:, p.first : p.first + p.n]
+        return out
+
+    def _add(self, survey: Survey, i: int, camera: Camera, unknowns: Unknowns) -> None:
+        changes, crops = self._changes(survey, camera, unknowns), self._crops(survey, camera, unknowns)
+        numbers: dict[tuple[int | str, ...], int] = {}
+        for epoch in block_starts(survey, camera):
+            named, change = changes.get(epoch, ("", ()))
+            start, crop = crops.get(epoch, ("", None))
+            if (named, start) not in numbers:
+                numbers[named, start] = len(self.states) if named or start else i
+                self.states += [LensState(i, change, crop)] if named or start else []
+            self._at[camera.camera_id, epoch] = numbers[named, start]
+
+    def _changes(
+        self, survey: Survey, camera: Camera, unknowns: Unknowns
+    ) -> dict[str, tuple[str, tuple[tuple[VectorMap, float], ...]]]:
+        """By epoch what is added to the lens, and a name of it."""
+        drift, starts = camera.lens.drift, block_starts(survey, camera)
+        if drift is None:
+            return {}
         if wrong := [x for x in drift.parameters if x not in camera.lens.free]:
             raise SurveyError(f"camera {camera.camera_id!r}: {wrong[0]} is to change, but is not free; add it to free")
-        starts = block_starts(survey, camera)
         if drift.reference_temperature is not None:
             rates = _registered(camera, drift, ("lens_drift", camera.camera_id), unknowns)
-            for epoch in starts:
-                if epoch not in survey.temperatures:
-                    raise SurveyError(f"camera {camera.camera_id!r} changes with temperature, but epoch {epoch!r} has "
-                                      "none; give it under temperatures_degC")  # fmt: skip
-                self._state(i, camera, [epoch], rates, survey.temperatures[epoch] - drift.reference_temperature)
-            return
+            if cold := [e for e in starts if e not in survey.temperatures]:
+                raise SurveyError(f"camera {camera.camera_id!r} changes with temperature, but epoch {cold[0]!r} has "
+                                  "none; give it under temperatures_degC")  # fmt: skip
+            warming = {e: survey.temperatures[e] - drift.reference_temperature for e in starts}
+            return {e: (e, ((rates, by),)) for e, by in warming.items()}
+        out: dict[str, tuple[str, tuple[tuple[VectorMap, float], ...]]] = {}
         before: ParameterName | None = None
         for start in dict.fromkeys(s for s in starts.values() if s is not None):
             name: ParameterName = ("lens_drift", camera.camera_id, start)
             change = _registered(camera, drift, name, unknowns)
-            self._state(i, camera, [e for e, s in starts.items() if s == start], change, 1.0)
+            out |= {e: (start, ((change, 1.0),)) for e, s in starts.items() if s == start}
             if drift.step_sigmas is not None:
                 self.priors.append((name, before, drift.step_sigmas))
             before = name
+        return out
 
-    def _state(self, i: int, camera: Camera, epochs: Sequence[str], change: VectorMap, factor: float) -> None:
-        self._at |= dict.fromkeys(((camera.camera_id, e) for e in epochs), len(self.states))
-        self.states.append(LensState(i, ((change, factor),)))
+    @staticmethod
+    def _crops(survey: Survey, camera: Camera, unknowns: Unknowns) -> dict[str, tuple[str, CropState]]:
+        """By epoch how the image is cropped, and since when."""
+        out, model = dict[str, tuple[str, CropState]](), MODELS[camera.lens.model]
+        for epoch, start in crop_starts(survey, camera).items():
+            if start is None:
+                continue
+            given, name = camera.lens.crops[start].parameters, ("lens_crop", camera.camera_id, start)
+            if name not in unknowns.vectors:
+                _check_crop(camera, given, len(unknowns.vectors["lens", camera.camera_id].free))
+                unknowns.vectors[name] = vector_map(given, UNITS, unknowns, name)
+            out[epoch] = start, CropState(unknowns.vectors[name], model, camera_constants(camera))
+        return out
+
+
+def _check_crop(camera: Camera, crop: VectorParameter, n_lens: int) -> None:
+    what, free = f"camera {camera.camera_id!r}", crop.free
+    if wrong := [x for x in free if x not in CROP]:
+        raise SurveyError(f"{what}: a crop has no parameter {wrong[0]!r}; it has {', '.join(CROP)}")
+    if n_lens + len(free) > MAX_LENS:
+        raise SurveyError(f"{what}: {n_lens + len(free)} parameters of lens and crop are free, more than {MAX_LENS}; "
+                          "hold some")  # fmt: skip
+    if ("scale" in free or crop.values[0] != 1.0) and camera.lens.balance_radius_mm:
+        raise SurveyError(f"{what}: a lens with a balance radius holds for one scale of images; set balance_radius_mm "
+                          "= 0, or make another camera of those of another size")  # fmt: skip
 
 
 def _registered(camera: Camera, drift: LensDrift, name: ParameterName, unknowns: Unknowns) -> VectorMap:

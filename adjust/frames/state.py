@@ -6,14 +6,14 @@ from contextlib import contextmanager
 import gtsam
 import numpy as np
 
-from adjust.frames.lens_states import LensStates
+from adjust.frames.lens_states import LensStates, lenders
 from adjust.frames.tables import table_motions
 from adjust.frames.unknowns import TableSlot, Unknowns, VectorMap, vector_map
 from adjust.lenses.models import MODELS, camera_constants
 from adjust.model.boards import BOARD, checked_warp, extent
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, IntArray, Survey, VectorParameter
-from adjust.native.images import LensArrays, WarpArrays
+from adjust.native.images import MAX_MAP, LensArrays, WarpArrays
 from adjust.native.lenses import MAX_LENS
 
 
@@ -62,23 +62,24 @@ class State:
         states = self.lens_states
         n = len(states.states)
         cameras = [survey.cameras[s.camera] for s in states.states]
-        maps = [states.maps[s.camera] for s in states.states]
-        integers = (np.zeros((n, MAX_LENS), dtype=np.int64), np.zeros((n, MAX_LENS), dtype=np.int64))
+        patterns = [states.pattern(i) for i in range(n)]
+        integers = (np.zeros((n, MAX_MAP), dtype=np.int64), np.zeros((n, MAX_MAP), dtype=np.int64))
         arrays = LensArrays(
             np.array([MODELS[c.lens.model].kind for c in cameras], dtype=np.int64),
             np.zeros((n, MAX_LENS)),
             np.zeros((n, 4)),
-            np.array([len(m.free) for m in maps], dtype=np.int64),
+            np.array([p.shape[1] for p in patterns], dtype=np.int64),
             np.zeros(n, dtype=np.int64),
             *integers,
-            np.zeros((n, MAX_LENS)),
+            np.zeros((n, MAX_MAP)),
         )
         for i, camera in enumerate(cameras):
             arrays.constants[i] = camera_constants(camera)
-            sources, columns = np.nonzero(maps[i].matrix)
+            sources, columns = np.nonzero(patterns[i])
             k = arrays.n_map[i] = len(sources)
             arrays.source[i, :k], arrays.column[i, :k] = sources, columns
-            arrays.factor[i, :k] = maps[i].matrix[sources, columns]
+            if states.states[i].crop is None:  # else they depend on the values
+                arrays.factor[i, :k] = states.maps[states.states[i].camera].matrix[sources, columns]
         return arrays
 
     def _warp_arrays(self, survey: Survey) -> WarpArrays:
@@ -141,9 +142,12 @@ class State:
             self.points[:] = x if len(x) == len(self.points) else [values.atPoint3(key) for key in self.point_rows]
 
     def _load_lenses(self, values: gtsam.Values) -> None:
-        for i in range(len(self.lens_states.states)):
+        for i, state in enumerate(self.lens_states.states):
             full = self.lens_states.full(i, values)
             self.lenses.values[i, : full.size] = full
+            if state.crop is not None:
+                k, lenses = self.lenses.n_map[i], self.lenses
+                lenses.factor[i, :k] = self.lens_states.by_free(i, values)[lenses.source[i, :k], lenses.column[i, :k]]
         for i, warp_map in enumerate(self.warp_maps):
             if warp_map is not None:
                 self.warps.values[i, [list(BOARD).index(name) for name in warp_map.names]] = warp_map.full(values)
@@ -182,9 +186,10 @@ class State:
 def collect_vectors(survey: Survey, unknowns: Unknowns, lenses: dict[str, FloatArray]) -> None:
     """Register the lenses and board warps. ``lenses`` gives the full start vector of every camera.
 
-    Raises SurveyError where a target's warp or a lens has components that there are not.
+    Raises SurveyError where a target's warp or a lens has components that there are not, or a lens cannot be shared.
     """
-    for camera in survey.cameras:
+    lent = lenders(survey)
+    for camera in sorted(survey.cameras, key=lambda c: c.camera_id in lent):
         model = MODELS[camera.lens.model]
         unknown_names = set(camera.lens.free) - set(model.names)
         if unknown_names:
@@ -195,8 +200,11 @@ def collect_vectors(survey: Survey, unknowns: Unknowns, lenses: dict[str, FloatA
         parameter = VectorParameter(
             model.names, lenses[camera.camera_id], camera.lens.free, camera.lens.prior, camera.lens.ties
         )
-        name = ("lens", camera.camera_id)
-        unknowns.vectors[name] = vector_map(parameter, model.units, unknowns, name)
+        name, borrowed = ("lens", camera.camera_id), dict[str, tuple[int, int]]()
+        if camera.camera_id in lent:
+            lender = unknowns.vectors["lens", lent[camera.camera_id][0]]
+            borrowed = {x: lender.sources[lender.free.index(x)] for x in lent[camera.camera_id][1]}
+        unknowns.vectors[name] = vector_map(parameter, model.units, unknowns, name, borrowed)
     for target in survey.targets:
         if (warp := checked_warp(target)) is not None:
             name = ("warp", target.target_id)

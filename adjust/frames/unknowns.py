@@ -6,6 +6,7 @@ each taken forward or inverse; the links that are held at identity are left out.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import TypeVar
 
 import gtsam
@@ -41,7 +42,11 @@ class Unknown:
 
 @dataclass(frozen=True, eq=False)
 class VectorMap:
-    """A parameter vector from its unknown: full = base + matrix @ free; ``key`` is None when all is held."""
+    """A parameter vector from its unknown: full = base + matrix @ free; ``key`` is None when all is held.
+
+    borrowed: by free component (its number) the key and the component of it that it is, where that is another vector's;
+    the other free components are those of ``key``, in their order.
+    """
 
     names: tuple[str, ...]
     units: tuple[str, ...]
@@ -50,9 +55,24 @@ class VectorMap:
     key: int | None
     free: tuple[str, ...]
     status: tuple[str, ...]
+    borrowed: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+
+    @property
+    def own(self) -> tuple[str, ...]:
+        """The free components that are those of ``key``."""
+        return tuple(x for i, x in enumerate(self.free) if i not in self.borrowed)
+
+    @property
+    def sources(self) -> list[tuple[int, int]]:
+        """Of every free component the key, and which component of it."""
+        own = self.own
+        return [self.borrowed[i] if i in self.borrowed else (int(self.key or 0), own.index(x))
+                for i, x in enumerate(self.free)]  # fmt: skip
 
     def full(self, values: gtsam.Values) -> FloatArray:
         """The whole vector (n,) at these values."""
+        if self.borrowed:
+            return np.asarray(self.base + self.matrix @ [values.atVector(key)[j] for key, j in self.sources])
         if self.key is None:
             return self.base
         return np.asarray(self.base + self.matrix @ values.atVector(self.key))
@@ -112,13 +132,6 @@ class Unknowns:
         if names:
             self.held[unknown.key] = tuple(i for i, x in enumerate(unknown.components) if x in names)
 
-    def spread(self, name: ParameterName) -> FloatArray:
-        """Of an unknown, how its tangent moves all components (n, dim) of its parameter; zero rows of held ones."""
-        vector, unknown = self.vectors.get(name), self.by_name[name]
-        out = np.eye(unknown.dim) if vector is None else vector.matrix.copy()
-        out[list(self.held.get(unknown.key, ()))] = 0.0
-        return out
-
     def status(self, key: int | None, treatment: str, dim: int) -> tuple[str, ...]:
         """Per component: the treatment of the whole, or "held"."""
         held = self.held.get(key, ()) if key is not None else ()
@@ -156,6 +169,20 @@ class Unknowns:
         found = [self.slot_key[slot]] if table is None else [table.angles_key, table.geometry.key]
         return [key for key in found if key is not None]
 
+    def spread(self, name: ParameterName) -> dict[int, FloatArray]:
+        """How all n components of a parameter follow from unknowns: (n, dim) by key; none of what is held."""
+        vector, out = self.vectors.get(name), dict[int, FloatArray]()
+        if vector is None:
+            found = self.by_name.get(name)
+            if found is not None:
+                out[found.key] = np.eye(found.dim)
+                out[found.key][list(self.held.get(found.key, ()))] = 0.0
+            return out
+        for column, (key, component) in enumerate(vector.sources):
+            part = out.setdefault(key, np.zeros((len(vector.names), self.by_key[key].dim)))
+            part[:, component] += vector.matrix[:, column]
+        return out
+
     def tidy(self, chain: list[Link]) -> Chain:
         """Leave out identities and links that meet their own inverse."""
         out: list[Link] = []
@@ -175,9 +202,13 @@ def inverse(chain: Chain) -> list[Link]:
 
 
 def vector_map(
-    parameter: VectorParameter, units: tuple[str, ...], unknowns: Unknowns, name: ParameterName
-) -> VectorMap:
-    """Resolve free, held and tied components; registers the unknown where any component is free."""
+    parameter: VectorParameter, units: tuple[str, ...], unknowns: Unknowns, name: ParameterName,
+    lent: Mapping[str, tuple[int, int]] = MappingProxyType({}),
+) -> VectorMap:  # fmt: skip
+    """Resolve free, held and tied components; registers the unknown where any component is free.
+
+    lent: free components that are those of another key already.
+    """
     n = len(parameter.names)
     free = tuple(x for x in parameter.names if x in parameter.free)
     tied = {tie.name: tie for tie in parameter.ties}
@@ -190,14 +221,16 @@ def vector_map(
             status.append("tied")
         elif component in free:
             base[i], matrix[i, free.index(component)] = 0.0, 1.0
-            status.append("prior" if parameter.prior and component in parameter.prior.names else "free")
+            known = parameter.prior is not None and component in parameter.prior.names
+            status.append("tied" if component in lent else "prior" if known else "free")
         else:
             status.append("held")
-    key = None
-    if free:
-        free_units = tuple(units[parameter.names.index(x)] for x in free)
-        key = unknowns.add(name, "vector", free, free_units).key
-    return VectorMap(parameter.names, units, base, matrix, key, free, tuple(status))
+    key, own = None, tuple(x for x in free if x not in lent)
+    if own:
+        own_units = tuple(units[parameter.names.index(x)] for x in own)
+        key = unknowns.add(name, "vector", own, own_units).key
+    borrowed = {i: lent[x] for i, x in enumerate(free) if x in lent}
+    return VectorMap(parameter.names, units, base, matrix, key, free, tuple(status), borrowed)
 
 
 class FrameTree:

@@ -545,6 +545,8 @@ class GraphBuilder:
                             ("m",) * int(known.sum()), np.asarray(p.value)[known])  # fmt: skip
         owners: list[tuple[ParameterName, VectorPrior | None]]
         owners = [(("lens", c.camera_id), c.lens.prior) for c in self.survey.cameras]
+        owners += [(("lens_crop", c.camera_id, e), x.parameters.prior) for c in self.survey.cameras
+                   for e, x in c.lens.crops.items()]  # fmt: skip
         owners += [(("table_geometry", t.table_id), t.geometry.prior) for t in self.survey.tables]
         owners += [(("warp", t.target_id), t.warp.prior) for t in self.survey.targets if t.warp]
         owners += [(("beam", b.beam_id), b.parameters.prior) for b in self.survey.beams]
@@ -620,13 +622,16 @@ class GraphBuilder:
             full = self.vector_starts[name]
         elif name[0] == "lens_drift":
             full = np.zeros(len(vector.names))
+        elif name[0] == "lens_crop":
+            lens = next(c.lens for c in self.survey.cameras if c.camera_id == name[1])
+            full = lens.crops[name[2]].parameters.values
         elif name[0] in ("vertical", "instrument", "orientation", "centring"):
             full = full_start(name, self.survey)
         elif name[0] == "table_geometry":
             full = next(t.geometry.values for t in self.survey.tables if t.table_id == name[1])
         else:
             full = next(t.warp.values for t in self.survey.targets if t.target_id == name[1] and t.warp)
-        return np.array([full[vector.names.index(x)] for x in vector.free], dtype=float)
+        return np.array([full[vector.names.index(x)] for x in vector.own], dtype=float)
 
 
 def inner_datum_keys(survey: Survey, unknowns: Unknowns) -> list[int]:

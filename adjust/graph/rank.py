@@ -32,6 +32,7 @@ def readable(unknown: Unknown) -> str:
     owner = {
         "lens": "lens of camera {}",
         "lens_drift": "change of the lens of camera {}",
+        "lens_crop": "crop of the images of camera {}",
         "station_from_camera": "pose of camera {} on its station",
         "mount_from_station": "pose of station {} on the table's mount",
         "world_from_station": "pose of station {}",

@@ -24,8 +24,8 @@ _SIGMA_ROUNDS, _SIGMA_CHANGE = 3, 1e-6
 """Sigmas that depend on distances (target centring) follow the solution until they change by no more than this."""
 
 _LATE = frozenset((
-    "lens", "lens_drift", "station_from_camera", "mount_from_station", "world_from_table", "table_geometry", "warp",
-    "instrument", "vertical", "beam", "surface",
+    "lens", "lens_drift", "lens_crop", "station_from_camera", "mount_from_station", "world_from_table",
+    "table_geometry", "warp", "instrument", "vertical", "beam", "surface",
 ))  # fmt: skip
 """What many observations share is eliminated last."""
 

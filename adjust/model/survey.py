@@ -112,6 +112,33 @@ class LensDrift:
     reference_temperature: float | None = None
 
 
+@dataclass(frozen=True)
+class LensSharing:
+    """Free parameters of a lens that are those of another camera: one unknown with several users.
+
+    camera_id: of the camera whose unknowns they are. It shares none itself and has a lens of the same model.
+    """
+
+    camera_id: str
+    parameters: tuple[str, ...]
+
+
+CROP = ("scale", "left", "top")
+
+
+@dataclass(frozen=True, eq=False)
+class ImageCrop:
+    """Images that show a part of the sensor, or in another size.
+
+    Pixel u of the whole image is ``scale (u + 1/2 - left) - 1/2`` of these, v likewise with the top. parameters: names
+    as in ``CROP`` (1, px, px of the whole image). size: (width, height) of these images in px, None where the whole
+    image was cut at the left and at the top only.
+    """
+
+    parameters: VectorParameter
+    size: tuple[int, int] | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class LensParameter:
     """The lens of a camera and how it is treated.
@@ -121,6 +148,8 @@ class LensParameter:
     free: the parameters to be estimated; the others are held at ``values`` (zero where those are None).
     pixel_size_mm: needed by the models whose parameters are in millimetres.
     balance_radius_mm: where the radial distortion of the model "aicon" is zero (its r0); no other model uses it.
+    crops: by the epoch from which on images are such, as the camera's images are ordered; the lens and ``image_size``
+    are those of the whole image.
     """
 
     model: str
@@ -131,6 +160,8 @@ class LensParameter:
     pixel_size_mm: float | None = None
     balance_radius_mm: float = 0.0
     drift: LensDrift | None = None
+    shared: LensSharing | None = None
+    crops: Mapping[str, ImageCrop] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

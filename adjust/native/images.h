@@ -11,6 +11,7 @@ namespace {
 constexpr int CHUNK = 64;      // points evaluated together: their rows stay in the first two caches
 constexpr int N_WARP = 7;      // components of a warp: bent along x, along y, twisted; scale x, scale y, shear; expansion
 constexpr int MAX_LOCAL = 28;  // local unknowns and residual of a block: 14 + 6 + 7 + 1
+constexpr int MAX_MAP = 24;    // parameters of a lens times free ones that they follow from
 constexpr int N_SHAPE = 4;     // parameters of a target's shape
 constexpr int MAX_KEY = 64;    // components of a key that a pose follows from: a table's geometry
 enum Kind : int64_t { LENS, POSE, TABLE, WARP };
@@ -146,7 +147,7 @@ template <class Lens> inline void local_columns(const Batch &B, int64_t b, const
     const int64_t *source = &B.lenses.source(c, 0), *column = &B.lenses.column(c, 0);
     const double *R = &B.poses.R(b, 0, 0), *t = &B.poses.t(b, 0);
     const Warp warp(B, b);
-    bool seen[MAX_LENS] = {}, again[MAX_LENS];  // does a parameter share the column of one before it
+    bool seen[MAX_LENS] = {}, again[MAX_MAP];  // does a parameter share the column of one before it
     for (int i = 0; i < n_map; ++i) again[i] = std::exchange(seen[column[i]], true);
     const int full = chunk.full;
     for (int p = 0; p < full; p += W) {

@@ -16,11 +16,14 @@ from adjust.native.trees import TREE, TreeArrays
 SEGMENT_LENS, SEGMENT_POSE, SEGMENT_TABLE, SEGMENT_WARP = 0, 1, 2, 3
 MAX_LOCAL = 28
 """Local unknowns and residual of a block, at most."""
+MAX_MAP = 24
+"""Parameters of a lens times free ones that they follow from, at most: 13 of the lens, 7 of its crop."""
 N_SHAPE = 4
 """Parameters of a target's shape."""
 
 BLOCKS = "ptr[B+1] camera[B] warp_id[B] n_warp[B] warming[B]"
-LENSES = "kind[c] values[c,14] constants[c,4] n_free[c] n_map[c] source[c,14] column[c,14] factor[c,14]"
+_MAPS = " ".join(f"{name}[c,{MAX_MAP}]" for name in ("source", "column", "factor"))
+LENSES = f"kind[c] values[c,14] constants[c,4] n_free[c] n_map[c] {_MAPS}"
 WARPS = "warp[T,7] extent[T,4] of_warp[T,7]"
 SEGMENTS = "segment_ptr[B+1] segment_kind[S] link[S] table[S] start[S] n[S] place[S] within[S] dim[S] factor[S]"
 _BATCH = f"{BLOCKS} X[3,N] uv[2,N] W[3,N] {LENSES} R[B,3,3] t[B,3] {WARPS}"

@@ -1,14 +1,19 @@
 """The calibrated head and its beacons, out of an adjustment, with their joint covariance."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from types import MappingProxyType
 
 import numpy as np
 from gtsam import Pose3
 
-from adjust.lenses.models import camera_constants
+from adjust.frames.lens_states import LensTimes
+from adjust.lenses.crops import crop_size, cropped_lens
+from adjust.lenses.models import MODELS, camera_constants
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
-from adjust.model.survey import FloatArray, PoseParameter, Survey
+from adjust.model.survey import Camera, FloatArray, ImageCrop, PoseParameter, Survey
 from adjust.navigation.model import Beacons, Head, HeadCamera, HeadTable
 
 
@@ -19,13 +24,20 @@ def head_of(survey: Survey) -> str | None:
     return next((choice[0] for choice in (turned, carrying) if len(choice) == 1), None)
 
 
-def head_and_beacons(adjustment: Adjustment, station_id: str, known: Beacons | None = None) -> tuple[Head, Beacons]:
+def head_and_beacons(
+    adjustment: Adjustment, station_id: str, known: Beacons | None = None,
+    epochs: Mapping[str, str] = MappingProxyType({}), crops: Mapping[str, ImageCrop] = MappingProxyType({}),
+) -> tuple[Head, Beacons]:  # fmt: skip
     """Head ``station_id`` and the beacons of an adjustment (or those given), values and joint covariance.
+
+    epochs: by camera that whose lens is taken; else it is as at its last image. crops: by camera how the images are
+    cropped for which the head is, where that is given.
 
     Raises SurveyError where the station carries no camera, or there is no beacon.
     """
     survey = adjustment.survey
-    cameras = tuple(_camera(adjustment, c.camera_id) for c in survey.cameras if c.station_id == station_id)
+    mine = [c for c in survey.cameras if c.station_id == station_id]
+    cameras = tuple(_camera(adjustment, c, epochs.get(c.camera_id)) for c in mine)
     if not cameras:
         stations = sorted({c.station_id for c in survey.cameras})
         raise SurveyError(f"station {station_id!r} carries no camera; stations with cameras: {', '.join(stations)}")
@@ -38,7 +50,9 @@ def head_and_beacons(adjustment: Adjustment, station_id: str, known: Beacons | N
         names += [("world_from_table", table_id), ("table_geometry", table_id), ("mount_from_station", station_id)]
     points = [("point", p.point_id) for p in survey.points] if known is None else []
     sizes = _full_sizes(cameras, table, len(points))
-    cov = adjustment.precision.whole([*names, *points], sizes)
+    cov = adjustment.precision.following(_spreads(adjustment, [*names, *points], epochs), sizes)
+    cameras, by_lens = _cropped(cameras, crops, sizes)
+    cov = by_lens[:, None] * cov * by_lens
     p = sum(sizes[: len(names)])
     head = Head(cameras, cov[:p, :p], table)
     if known is not None:
@@ -54,13 +68,28 @@ def _full_sizes(cameras: Sequence[HeadCamera], table: HeadTable | None, n_points
     return sizes + ([6, len(table.geometry), 6] if table is not None else []) + [3] * n_points
 
 
-def _camera(adjustment: Adjustment, camera_id: str) -> HeadCamera:
-    camera = next(c for c in adjustment.survey.cameras if c.camera_id == camera_id)
-    lens = _vector(adjustment, ("lens", camera_id))
+def _cropped(
+    cameras: Sequence[HeadCamera], crops: Mapping[str, ImageCrop], sizes: Sequence[int]
+) -> tuple[tuple[HeadCamera, ...], FloatArray]:
+    """The cameras with their images cropped, and what the components of all parameters are multiplied with."""
+    out, factors, starts = [], np.ones(sum(sizes)), np.cumsum([0, *sizes])
+    for i, camera in enumerate(cameras):
+        if (crop := crops.get(camera.camera_id)) is not None:
+            lens = cropped_lens(MODELS[camera.model], camera.lens, camera.constants, np.asarray(crop.parameters.values))
+            factors[starts[2 * i] : starts[2 * i + 1]] = lens.by_lens
+            size = crop_size(camera.image_size, crop)
+            camera = replace(camera, lens=lens.values, image_size=size)
+        out.append(camera)
+    return tuple(out), factors
+
+
+def _camera(adjustment: Adjustment, camera: Camera, epoch_id: str | None) -> HeadCamera:
+    camera_id, times = camera.camera_id, LensTimes(adjustment.survey)
+    lens = times.lens(camera, epoch_id, partial(_known, adjustment))
     pose = _pose(adjustment, ("station_from_camera", camera_id), camera.station_from_camera)
     if pose is None:
         raise SurveyError(f"camera {camera_id}: the adjustment does not tell how it sits on its station")
-    return HeadCamera(camera_id, camera.image_size, camera.lens.model, lens, camera_constants(camera), pose)
+    return HeadCamera(camera_id, times.size(camera, epoch_id), camera.lens.model, lens, camera_constants(camera), pose)
 
 
 def _table(adjustment: Adjustment, station_id: str) -> HeadTable | None:
@@ -89,8 +118,27 @@ def _pose(adjustment: Adjustment, name: ParameterName, parameter: PoseParameter)
     return parameter.value
 
 
+def _known(adjustment: Adjustment, name: ParameterName) -> FloatArray | None:
+    return _vector(adjustment, name) if name in adjustment.estimates else None
+
+
 def _vector(adjustment: Adjustment, name: ParameterName) -> FloatArray:
     value = adjustment.estimates[name].value
     if isinstance(value, Pose3):
         raise SurveyError(f"{'/'.join(name)} is a pose where numbers were expected")
     return np.asarray(value, dtype=float)
+
+
+def _spreads(
+    adjustment: Adjustment, names: Sequence[ParameterName], epochs: Mapping[str, str]
+) -> list[dict[int, FloatArray]]:
+    """How every parameter follows from the unknowns, of a lens at its epoch or as it was left."""
+    graph, values = adjustment.precision.graph, adjustment.precision.solved.values
+    unknowns, lenses, out = graph.unknowns, graph.state.lens_states, []
+    for name in names:
+        if name[0] != "lens":
+            out.append(unknowns.spread(name))
+        else:
+            at = lenses.of(name[1], epochs[name[1]]) if name[1] in epochs else lenses.last(name[1])
+            out.append(lenses.spread(at, values, unknowns))
+    return out

@@ -218,7 +218,8 @@ def _rotation_residual(predicted: ChainPose, measured: Rot3) -> Residual:
 def vector_prior_factor(prior: VectorPrior, vector: VectorMap) -> gtsam.NonlinearFactor:
     """Prior on some components of a lens, table or warp; linear in the free components."""
     index = [vector.names.index(name) for name in prior.names]
-    M, base, key = vector.matrix[index], vector.base[index], vector.key
+    own = [i for i in range(len(vector.free)) if i not in vector.borrowed]
+    M, base, key = vector.matrix[np.ix_(index, own)], vector.base[index], vector.key
     if key is None:
         raise ValueError("a prior on a vector without free components has no unknown")
 

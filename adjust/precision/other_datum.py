@@ -176,6 +176,8 @@ def _moved(graph: AdjustmentGraph, estimate: Estimate, values: gtsam.Values, new
         x = np.asarray(values.atPoint3(unknown.key))
         return replace(estimate, value=x, cov=cov, status=status)
     vector = graph.unknowns.vectors.get(estimate.name)
+    if vector is not None and vector.borrowed:  # a lens, which no datum changes
+        return estimate
     value = np.asarray(values.atVector(unknown.key)) if vector is None else vector.full(values)
     return replace(estimate, value=value, cov=cov)
 

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import gtsam
 import numpy as np
 from gtsam import Pose3, Rot3
-from scipy.linalg import block_diag
 
 from adjust.frames.unknowns import Unknowns
 from adjust.graph.assembly import AdjustmentGraph
@@ -83,14 +82,18 @@ class Covariances(ABC):
 
     def whole(self, names: Sequence[ParameterName], sizes: Sequence[int]) -> FloatArray:
         """The same of all components, so many of each of these parameters; zero where one is held."""
-        free = [i for i, name in enumerate(names) if name in self.unknowns.by_name]
-        start = np.cumsum([0, *sizes])
-        out = np.zeros((int(start[-1]),) * 2)
-        if free:
-            at = np.concatenate([np.arange(start[i], start[i + 1]) for i in free])
-            J = block_diag(*(self.unknowns.spread(names[i]) for i in free))
-            out[np.ix_(at, at)] = J @ self.joint([names[i] for i in free]) @ J.T
-        return out
+        return self.following([self.unknowns.spread(name) for name in names], sizes)
+
+    def following(self, spreads: Sequence[Mapping[int, FloatArray]], sizes: Sequence[int]) -> FloatArray:
+        """Joint covariance of quantities that follow from unknowns: each (n, dim) by key; n of each in ``sizes``."""
+        unknowns = [self.unknowns.by_key[key] for key in dict.fromkeys(key for by_key in spreads for key in by_key)]
+        rows, columns = np.cumsum([0, *sizes]), np.cumsum([0, *(u.dim for u in unknowns)])
+        at = {u.key: slice(*columns[i : i + 2]) for i, u in enumerate(unknowns)}
+        J = np.zeros((int(rows[-1]), int(columns[-1])))
+        for first, by_key in zip(rows[:-1].tolist(), spreads, strict=True):
+            for key, part in by_key.items():
+                J[first : first + len(part), at[key]] = part
+        return np.asarray(J @ self.joint([u.name for u in unknowns]) @ J.T) if unknowns else J @ J.T
 
 
 class Precision(Covariances):

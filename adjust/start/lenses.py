@@ -1,7 +1,8 @@
 """A start for the lens of one camera, from the targets it sees."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
@@ -61,8 +62,10 @@ class LensStart:
     excluded: dict[int, str]
 
 
-def start_lens(camera: Camera, sightings: Sequence[Sighting]) -> LensStart:
-    """Lens values from the given ones, or from the images of known points.
+def start_lens(
+    camera: Camera, sightings: Sequence[Sighting], lent: Mapping[str, float] = MappingProxyType({})
+) -> LensStart:
+    """Lens values from the given ones, or from the images of known points; ``lent``: those that another camera tells.
 
     Planar targets: Zhang's closed form, or the best of a scan of focal lengths, then lens and poses together on at most
     30 well-spread images. Raises SurveyError naming the camera where nothing determines its focal length.
@@ -71,7 +74,7 @@ def start_lens(camera: Camera, sightings: Sequence[Sighting]) -> LensStart:
     if camera.lens.values is not None:
         _check_given(camera, model)
         return LensStart(np.array(camera.lens.values, dtype=float), "lens as given", {})
-    return _LensSearch(camera, model).run(sightings)
+    return _LensSearch(camera, model, lent).run(sightings)
 
 
 def _check_given(camera: Camera, model: LensModel) -> None:
@@ -89,13 +92,13 @@ def _check_given(camera: Camera, model: LensModel) -> None:
 class _LensSearch:
     """The search for one camera; keeps what does not change on the way."""
 
-    def __init__(self, camera: Camera, model: LensModel) -> None:
+    def __init__(self, camera: Camera, model: LensModel, lent: Mapping[str, float]) -> None:
         self.camera, self.model, self.size = camera, model, camera.image_size
         self.constants = camera_constants(camera)
         self._plane: dict[int, FloatArray | None] = {}
-        self.prior = {}
+        self.prior = dict(lent)
         if camera.lens.prior is not None:
-            self.prior = dict(zip(camera.lens.prior.names, camera.lens.prior.mean, strict=True))
+            self.prior |= dict(zip(camera.lens.prior.names, camera.lens.prior.mean, strict=True))
         self.tied = {tie.name: tie for tie in camera.lens.ties}
         free = set(camera.lens.free) | {t.name for t in camera.lens.ties if t.to in camera.lens.free}
         for name in model.names:

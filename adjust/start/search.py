@@ -11,7 +11,9 @@ from types import MappingProxyType
 import numpy as np
 from gtsam import Pose3, Rot3
 
+from adjust.frames.lens_states import lenders, whole_images
 from adjust.frames.unknowns import FrameTree, Unknowns
+from adjust.lenses.models import MODELS
 from adjust.model.boards import deformed
 from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.result import ParameterName
@@ -74,7 +76,7 @@ def find_start(survey: Survey) -> Start:
     network = _network_start(survey)
     if network is not None:
         return network
-    search = _Search(survey)
+    search = _Search(whole_images(survey))
     search.solve()
     search.settle()
     return search.result()
@@ -87,7 +89,7 @@ def turns_of_views(survey: Survey, turned: Mapping[str, FloatArray]) -> dict[int
     that is named as the others are, else 1 + the position of the motion; no entry where nothing tells.
     Raises SurveyError as :func:`find_start`.
     """
-    search = _Search(survey, turned)
+    search = _Search(whole_images(survey), turned)
     search.solve()
     out = {}
     for view in search.views:
@@ -203,12 +205,17 @@ class _Search:
                 s = Sighting(i, self.points.x[rows[i][some]], s.uv[some])
             if len(s.x):
                 mine.setdefault(self.survey.image_blocks[i].camera_id, []).append(s)
-        for camera in self.survey.cameras:
+        shared, known_of = lenders(self.survey), dict[tuple[str, str], float]()
+        for camera in sorted(self.survey.cameras, key=lambda c: -len(mine.get(c.camera_id, ())) if shared else 0):
             if camera.camera_id not in mine and camera.lens.values is None and self.points.release():
                 self._find_lenses(seen, rows)  # no target shows it: the points as they are given have to do
                 return
-            found = start_lens(camera, mine.get(camera.camera_id, []))
+            lender, names = shared.get(camera.camera_id, (camera.camera_id, MODELS[camera.lens.model].names))
+            lent = {x: known_of[lender, x] for x in names if (lender, x) in known_of}
+            found = start_lens(camera, mine.get(camera.camera_id, []), lent)
             self.lenses[camera.camera_id] = found.values
+            values = dict(zip(MODELS[camera.lens.model].names, found.values.tolist(), strict=True))
+            known_of.update({(lender, x): values[x] for x in names})
             self.notes.append(f"camera {camera.camera_id!r}: {found.note}")
             for i, reason in found.excluded.items():
                 self.reasons[i] = f"{block_text(self.survey.image_blocks[i])}: {reason}"

@@ -71,14 +71,26 @@ def significances(adjustment: Adjustment, estimate: Estimate, estimated_sigma0: 
     return tuple(out)
 
 
-def significance_of_drift(adjustment: Adjustment, camera_id: str, estimated_sigma0: bool) -> Significance | None:
-    """Whether a lens changes at all: of all its changes together; None where none is estimated."""
-    found = [(n, e) for n, e in adjustment.estimates.items() if n[:2] == ("lens_drift", camera_id)]
-    if not found or adjustment.precision is None:
+def significance_of_lens(
+    adjustment: Adjustment, camera_id: str, kind: str, estimated_sigma0: bool
+) -> Significance | None:
+    """Whether a lens changes at all, or images are cropped otherwise than is given: of all its estimates together.
+
+    kind: ``lens_drift`` or ``lens_crop``. None where none is estimated.
+    """
+    lens = next(c.lens for c in adjustment.survey.cameras if c.camera_id == camera_id)
+    found = [(n, e) for n, e in adjustment.estimates.items() if n[:2] == (kind, camera_id)]
+    names = [n for n, e in found if not set(e.status) <= {"held"}]
+    if not names or adjustment.precision is None:
         return None
-    x = np.concatenate([np.asarray(e.value, dtype=float) for _, e in found])
+    parts = []
+    for name, estimate in found:
+        given = np.zeros(len(estimate.components)) if kind == "lens_drift" else lens.crops[name[2]].parameters.values
+        free = [s != "held" for s in estimate.status]
+        parts.append((np.asarray(estimate.value, dtype=float) - given)[free])
     factor = adjustment.sigma0**2 if estimated_sigma0 else 1.0
-    cov = factor * np.asarray(adjustment.precision.joint([n for n, _ in found]))
+    cov = factor * np.asarray(adjustment.precision.joint(names))
     level = LEVEL if adjustment.global_test is None else adjustment.global_test.alpha
-    statistic, freedom, p = zero_test(x, cov, adjustment.redundancy if estimated_sigma0 else None)
-    return Significance("lens_drift", found[0][1].components, statistic, freedom, p, p < level)
+    redundancy = adjustment.redundancy if estimated_sigma0 else None
+    statistic, freedom, p = zero_test(np.concatenate(parts), cov, redundancy)
+    return Significance(kind, found[0][1].components, statistic, freedom, p, p < level)

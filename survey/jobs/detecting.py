@@ -14,6 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from adjust.lenses.crops import possible_sizes
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from survey.folder.replacing import changing, replace_parts
@@ -348,15 +349,15 @@ def remember_images(folder: Path, place: Path) -> dict[ImageKey, DetectedImage]:
 
 
 def _blocks(definition: Definition, reports: "Sequence[ImageReport]") -> tuple[list[ImageBlock], list[SpotBlock]]:
-    sizes = {c.camera_id: c.image_size for c in definition.survey.cameras}
+    sizes = {c.camera_id: possible_sizes(c) for c in definition.survey.cameras}
     blocks, spots = [], []
     for report in reports:
         size = report.image_size
-        if size is not None and size != sizes[report.camera_id]:
+        if size is not None and size not in sizes[report.camera_id]:
+            said = " or ".join(f"{width} x {height}" for width, height in dict.fromkeys(sizes[report.camera_id]))
             raise SurveyError(
                 f"{report.path}: the image is {size[0]} x {size[1]} px, but survey.toml says camera "
-                f"{report.camera_id!r} has {sizes[report.camera_id][0]} x {sizes[report.camera_id][1]}; correct "
-                "image_size_px or take the right image"
+                f"{report.camera_id!r} has {said}; correct image_size_px or take the right image"
             )
         for target_id, found in report.detections.items():
             if len(found):

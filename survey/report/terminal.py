@@ -143,16 +143,20 @@ def _lens(lens: dict[str, Any] | None) -> str:
     return ", ".join(parts)
 
 
+_SAID = {"": ("significant", "not significant"), "lens_shared": ("does not hold", "holds")}
+
+
 def _terms(solution: dict[str, Any]) -> Iterator[str]:
     """Terms of boards and tables that are estimated, and whether they differ from zero."""
     owners = [(f"target {k}", e["warp"]) for k, e in solution["targets"].items() if "warp" in e]
     owners += [(f"table {k}", e["geometry"]) for k, e in solution["tables"].items() if "geometry" in e]
-    owners += [(f"camera {k}", e["lens_drift"]) for k, e in solution["cameras"].items() if "lens_drift" in e]
+    owners += [(f"camera {k}", e[key]) for k, e in solution["cameras"].items()
+               for key in ("lens_drift", "lens_crop", "lens_shared") if key in e]  # fmt: skip
     rows = [(k, term, test) for k, e in owners for term, test in e.get("significance", {}).items()]
     if rows:
         yield ""
     for name, term, test in rows[:_MOST_TERMS]:
-        said = "significant" if test["significant"] else "not significant"
+        said = _SAID.get(term, _SAID[""])[not test["significant"]]
         yield f"  {_cut(name, 26):<26}  {_cut(term.replace('_', ' '), 24):<24}  {said}, p {test['p_value']:.2g}"
     if len(rows) > _MOST_TERMS:
         yield f"  and {len(rows) - _MOST_TERMS} more terms"

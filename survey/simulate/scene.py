@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from gtsam import Pose3
 
-from adjust.frames.lens_states import block_starts
+from adjust.frames.lens_states import block_starts, crop_starts
 from adjust.model.boards import BOARD
 from adjust.model.observations import FrameRef, PositionRef
 from adjust.model.result import ParameterName
@@ -209,7 +209,18 @@ class Scene:
         # OpenCV ignores the skew of its camera matrix, so its part is added here from the normalized coordinates
         distorted = cv2.projectPoints(x[ahead], np.zeros(3), np.zeros(3), np.eye(3), distortion)[0].reshape(-1, 2)
         uv[ahead] = distorted @ matrix[:2, :2].T + matrix[:2, 2]
-        return uv
+        return self._cropped(camera_id, epoch_id, uv)
+
+    def _cropped(self, camera_id: str, epoch_id: str, uv: FloatArray) -> FloatArray:
+        """Pixels of the image as it was cropped by then, from those of the whole."""
+        camera = self._cameras[camera_id]
+        start = crop_starts(self.survey, camera).get(epoch_id) if camera.lens.crops else None
+        if start is None:
+            return uv
+        name = ("lens_crop", camera_id, start)
+        given = np.asarray(camera.lens.crops[start].parameters.values, dtype=float)
+        scale, *edges = self.vector(*name) if name in self.truth else given
+        return np.asarray(scale * (uv + 0.5 - edges) - 0.5)
 
     def inside(self, camera_id: str, uv: FloatArray, margin_px: float) -> BoolArray:
         """Which of the image points (n, 2) lie in the image, at least ``margin_px`` from its border."""

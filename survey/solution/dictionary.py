@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from adjust.diagnosis.effects.ties import SharedLens, shared_lenses
 from adjust.epochs.states import datum_carriers, open_directions
 from adjust.model.result import Adjustment, Estimate, GroupSummary, ImageResiduals
 from adjust.model.survey import FloatArray, IntArray
 from adjust.precision.precision import in_conditions
 from adjust.testing.distributions import norm
-from adjust.testing.significance import Significance, significance_of_drift, significances
+from adjust.testing.significance import Significance, significance_of_lens, significances
 from survey.project.detected import DetectedImage
 from survey.project.project import LeftOut
 from survey.solution.instruments import instrument_entries
@@ -238,13 +239,18 @@ def _lens(estimate: Estimate, model: str, scale: Scale) -> dict[str, Any]:
 def _cameras(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, Any]:
     sums = _sums_of_blocks(adjustment.image_residuals)
     out: dict[str, Any] = {}
+    shared = {s.camera: s for s in shared_lenses(adjustment, scale.sigmas == "a_posteriori")}
     for camera in adjustment.survey.cameras:
         entry: dict[str, Any] = {"station": camera.station_id, "image_size_px": list(camera.image_size)}
         lens = adjustment.estimates.get(("lens", camera.camera_id))
         if lens is not None:
             entry["lens"] = _lens(lens, camera.lens.model, scale)
         if camera.lens.drift is not None:
-            entry["lens_drift"] = _drift(adjustment, camera.camera_id, scale)
+            entry["lens_drift"] = _changes(adjustment, camera.camera_id, "lens_drift", "changes", scale)
+        if camera.lens.crops:
+            entry["lens_crop"] = _changes(adjustment, camera.camera_id, "lens_crop", "crops", scale)
+        if camera.camera_id in shared:
+            entry["lens_shared"] = _shared(shared[camera.camera_id], scale)
         entry |= pose(("station_from_camera", camera.camera_id), "station_from_camera")
         out[camera.camera_id] = entry | _images(adjustment, camera.camera_id, sums)
     return out
@@ -333,12 +339,20 @@ def _tables(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, Any
     return out
 
 
-def _drift(adjustment: Adjustment, camera_id: str, scale: Scale) -> dict[str, Any]:
-    """How a lens changes: by the epoch at which a block begins, or per kelvin; and whether it changes at all."""
-    found = {n: e for n, e in adjustment.estimates.items() if n[:2] == ("lens_drift", camera_id)}
-    test = significance_of_drift(adjustment, camera_id, scale.sigmas == "a_posteriori")
+def _changes(adjustment: Adjustment, camera_id: str, kind: str, key: str, scale: Scale) -> dict[str, Any]:
+    """How a lens changes or images are cropped: by the epoch from which on, or per kelvin; and whether it is clear."""
+    found = {n: e for n, e in adjustment.estimates.items() if n[:2] == (kind, camera_id)}
+    test = significance_of_lens(adjustment, camera_id, kind, scale.sigmas == "a_posteriori")
     parts = {n[2] if len(n) > 2 else "per_kelvin": vector_entry(e, scale) for n, e in found.items()}
-    return {"changes": parts, "significance": {} if test is None else {test.term: _test(test)}}
+    return {key: parts, "significance": {} if test is None else {test.term: _test(test)}}
+
+
+def _shared(found: SharedLens, scale: Scale) -> dict[str, Any]:
+    """Whose parameters they are, by how much its own would differ from them, and whether they do."""
+    name, k = ("lens", found.camera), len(found.names)
+    differences = Estimate(name, found.difference, found.names, found.units, found.cov, ("free",) * k)
+    return {"camera": found.lender, "parameters": list(found.names), "differences": vector_entry(differences, scale),
+            "significance": {found.test.term: _test(found.test)}}  # fmt: skip
 
 
 def _test(s: Significance) -> dict[str, Any]:

@@ -14,11 +14,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from adjust.adjustment import adjust
+from adjust.diagnosis.effects.ties import shared_lenses
+from adjust.lenses.models import MODELS
 from adjust.model.result import Adjustment, ParameterName
-from adjust.model.survey import FloatArray, LensDrift, Survey, VectorParameter
+from adjust.model.survey import CROP, FloatArray, ImageCrop, LensDrift, LensSharing, Survey, VectorParameter
 from adjust.model.tables import harmonic_names
 from adjust.testing.distributions import chi2
-from adjust.testing.significance import Significance, significance_of_drift, significances
+from adjust.testing.significance import Significance, significance_of_lens, significances
 from survey.simulate import Truth, head_on_table, resample, stereo
 
 
@@ -91,12 +93,46 @@ def lens(name: str, changes: dict[str, FloatArray], drift: LensDrift) -> Remedy:
     return Remedy(name, survey, truth | keys, truth | none, next(iter(keys)), "lens_drift")
 
 
+def crop(name: str, given: FloatArray, true: FloatArray) -> Remedy:
+    """A stereo rig whose second camera is read at another size and region from its eighth image on."""
+    survey, truth = stereo(24, n_pairs=16)
+    camera = survey.cameras[1]
+    crops = {"e09": ImageCrop(VectorParameter(CROP, given, CROP), (900, 760))}
+    changed = replace(camera, lens=replace(camera.lens, crops=crops))
+    key = ("lens_crop", camera.camera_id, "e09")
+    survey = replace(survey, cameras=(survey.cameras[0], changed))
+    return Remedy(name, survey, truth | {key: true}, truth | {key: given}, key, "lens_crop")
+
+
+def shared(name: str, parameters: tuple[str, ...], difference: FloatArray) -> Remedy:
+    """A stereo rig whose cameras are taken to have the same lens, and have not; the term is what differs."""
+    survey, truth = stereo(25, n_pairs=14)
+    first, second = survey.cameras
+    lens = replace(second.lens, shared=LensSharing(first.camera_id, parameters))
+    survey = replace(survey, cameras=(first, replace(second, lens=lens)))
+    same, key = np.array(truth["lens", second.camera_id]), ("lens", second.camera_id)
+    at = [MODELS["brown"].names.index(x) for x in parameters]
+    same[at] = np.asarray(truth["lens", first.camera_id])[at]
+    another = same.copy()
+    another[at] += difference
+    return Remedy(name, survey, truth | {key: another}, truth | {key: same}, key, "lens_shared")
+
+
+def _of_tie(result: Adjustment, remedy: Remedy, truth: Truth) -> tuple[FloatArray, FloatArray, Significance]:
+    (found,) = shared_lenses(result, estimated_sigma0=True)
+    at = [MODELS["brown"].names.index(x) for x in found.names]
+    true = (np.asarray(truth[remedy.of]) - np.asarray(truth["lens", found.lender]))[at]
+    return found.difference - true, found.cov, found.test
+
+
 def _estimated(result: Adjustment, remedy: Remedy, truth: Truth) -> tuple[FloatArray, FloatArray, Significance]:
     """What was found less what is true, its covariance, and the test of the term."""
-    if remedy.term == "lens_drift":
+    if remedy.term == "lens_shared":
+        return _of_tie(result, remedy, truth)
+    if remedy.term in ("lens_drift", "lens_crop"):
         names = [n for n in result.estimates if n[:2] == remedy.of[:2]]
         d = np.concatenate([np.asarray(result.estimates[n].value) - np.asarray(truth[n]) for n in names])
-        test = significance_of_drift(result, remedy.of[1], estimated_sigma0=True)
+        test = significance_of_lens(result, remedy.of[1], remedy.term, estimated_sigma0=True)
         assert test is not None
         return d, np.asarray(result.precision.joint(names)), test
     estimate = result.estimates[remedy.of]
@@ -122,6 +158,10 @@ REMEDIES: dict[str, Callable[[], Remedy]] = {
     "lens with temperature": lambda: lens(
         "lens with temperature", {"": np.array([0.5, 0.1])}, LensDrift(("fx", "u0"), (), None, 20.0)
     ),
+    "images cropped": lambda: crop(
+        "images cropped", np.array([0.75, 120.0, 80.0]), np.array([0.7512, 121.5, 79.0])
+    ),
+    "lens shared": lambda: shared("lens shared", ("fx", "fy", "k1"), np.array([2.0, 2.0, 0.004])),
     "axis wobbles": lambda: table(
         "axis wobbles", "tilt_2_order_+2", {"tilt_2": 2, "axial_2": 1}, {"tilt_2_re_p2": 3e-4, "axial_2_cos_1": 1e-4}
     ),

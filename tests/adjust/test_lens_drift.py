@@ -48,7 +48,7 @@ def check_gradient(graph: AdjustmentGraph, values: gtsam.Values) -> None:
     linear = graph.linearized(graph.prepare(values, jacobians=True, reduced=False))
     gradient = linear.gradientAtZero()
     for name, unknown in graph.unknowns.by_name.items():
-        if name[0] not in ("lens", "lens_drift"):
+        if name[0] not in ("lens", "lens_drift", "lens_crop"):
             continue
         steps = 0.1 * h.steps_of(unknown, values)
         numeric = h.differences(lambda v: np.array([0.5 * graph.omega(v)]), values, unknown.key, steps)[0]

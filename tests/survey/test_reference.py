@@ -40,7 +40,11 @@ EVERYTHING: dict[str, Any] = {
             "model": "brown", "free": ["fx"], "values": {"fx": 1000, "fy": 1000, "u0": 320, "v0": 240},
             "prior": {"fx": {"value": 1000, "sigma": 1}}, "tie": {"fy": {"to": "fx"}},
             "drift": {"parameters": ["fx"], "begins": ["e2"], "sigma": {"fx": 0.1}},
+            "shared": {"camera": "Y", "parameters": ["fx"]},
+            "crops": {"e3": {"scale": 0.5, "left_px": 10, "free": ["scale"], "sigma": {"scale": 0.1}}},
         }},
+        "Y": {"station": "head", "image_size_px": [640, 480], "lens": {"model": "brown", "free": ["fx"], "values": {
+            "fx": 1000, "fy": 1000, "u0": 320, "v0": 240}}},
     },
     "targets": {
         "board": {"kind": "checkerboard", "columns": 9, "rows": 6, "square_mm": 10, "warp": {"sigma_mm": 1.0}},
@@ -72,6 +76,8 @@ PLACES: dict[str, tuple[str, ...]] = {
     "lens_values": ("cameras", "X", "lens", "values"), "lens_prior": ("cameras", "X", "lens", "prior", "fx"),
     "lens_tie": ("cameras", "X", "lens", "tie", "fy"),
     "lens_drift": ("cameras", "X", "lens", "drift"), "lens_step": ("cameras", "X", "lens", "drift", "sigma"),
+    "lens_shared": ("cameras", "X", "lens", "shared"), "lens_crops": ("cameras", "X", "lens", "crops"),
+    "lens_crop": ("cameras", "X", "lens", "crops", "e3"),
     "station": ("stations", "carried"),
     "pose": ("stations", "head", "world_from_station"), "poses": ("stations", "head", "epochs"),
     "turntable": ("tables", "tt"), "turntable_geometry": ("tables", "tt", "geometry"),
@@ -147,7 +153,7 @@ def test_every_declared_key_is_read_and_its_kind_checked_by_both(
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PLACES)
 def test_what_is_not_declared_is_refused_by_both(name: str, tmp_path: Path, validator: Any) -> None:
-    if name in ("identification", "poses"):
+    if name in ("identification", "poses", "lens_crops"):
         pytest.skip("any name is allowed there")
     values = _project(tmp_path, {"nonsense": {}}, PLACES[name])
     with pytest.raises(SurveyError, match="nonsense"):

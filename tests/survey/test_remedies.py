@@ -10,10 +10,23 @@ import pytest
 
 import survey as labsurvey
 from adjust.diagnosis.hypothesis import Hypothesis, Place, SetKey
+from adjust.lenses.models import MODELS
 from adjust.model.errors import SurveyError
-from adjust.model.survey import TABLE_GEOMETRY, LensDrift, Survey, Table, VectorParameter, VectorPrior
+from adjust.model.survey import (
+    CROP,
+    TABLE_GEOMETRY,
+    ImageCrop,
+    LensDrift,
+    LensSharing,
+    Survey,
+    Table,
+    VectorParameter,
+    VectorPrior,
+)
 from adjust.model.tables import harmonic_names
 from survey.jobs.adjusting.edits import changed_files
+from survey.jobs.adjusting.steps import adjust_project
+from survey.jobs.adjusting.trying import try_job
 from survey.project import read, write_project
 from survey.report.page import report_html
 from survey.report.terminal import summary_text
@@ -76,6 +89,89 @@ def test_lenses_that_change_are_written_and_reported(tmp_path: Path, drift: Lens
     page = report_html(solution.adjustment, solution.run)
     assert ("Change per kelvin" if drift.reference_temperature is not None else "Change from epoch e03 on") in page
     assert "lens drift" in summary_text(solution.adjustment, solution.run)
+
+
+CROPS = {
+    "given": ImageCrop(VectorParameter(CROP, np.array([0.5, 100.0, 60.0])), (500, 420)),
+    "free": ImageCrop(VectorParameter(CROP, np.array([0.5, 100.0, 60.0]), CROP, VectorPrior(
+        ("scale",), np.array([0.5]), np.array([[1e-4]])))),
+}
+
+
+@pytest.mark.parametrize("kind", list(CROPS))
+def test_cropped_images_are_written_and_reported(tmp_path: Path, kind: str) -> None:
+    survey, truth = stereo(3, n_pairs=8)
+    crop, right = CROPS[kind], survey.cameras[1]
+    survey = replace(survey, cameras=(survey.cameras[0], replace(right, lens=replace(right.lens, crops={"e05": crop}))))
+    survey = resample(survey, truth, 1)
+    write_project(tmp_path, survey)
+    assert differences(read(tmp_path).survey.cameras[1].lens.crops, {"e05": crop}) == []
+    solution = labsurvey.adjust(tmp_path)
+    entry = solution.as_dict["cameras"]["right"]["lens_crop"]
+    found = entry["crops"]["e05"]
+    if kind == "given":
+        assert (found["scale"], found["left_px"], found["sigma_top_px"]) == (0.5, 100.0, 0.0)
+        assert entry["significance"] == {}
+        return
+    assert abs(found["left_px"] - 100.0) < 5.0 * found["sigma_left_px"]
+    assert abs(found["scale"] - 0.5) < 5.0 * found["sigma_scale"]
+    assert not entry["significance"]["lens_crop"]["significant"]  # as given
+    assert "Images cropped from epoch e05 on" in report_html(solution.adjustment, solution.run)
+    assert "lens crop" in summary_text(solution.adjustment, solution.run)
+
+
+@pytest.mark.parametrize("same", [True, False], ids=["same", "another"])
+def test_shared_lenses_are_written_and_tested(tmp_path: Path, same: bool) -> None:
+    survey, truth = stereo(3, n_pairs=8)
+    left, right = survey.cameras
+    shared = LensSharing("left", ("fx", "fy", "k1"))
+    survey = replace(survey, cameras=(left, replace(right, lens=replace(right.lens, shared=shared))))
+    lens = np.array(truth["lens", "right"])
+    at = [MODELS["brown"].names.index(x) for x in shared.parameters]
+    lens[at] = np.asarray(truth["lens", "left"])[at] + (0.0 if same else np.array([30.0, 30.0, 0.0]))
+    write_project(tmp_path, resample(survey, truth | {("lens", "right"): lens}, 1))
+    assert read(tmp_path).survey.cameras[1].lens.shared == shared
+    solution = labsurvey.adjust(tmp_path)
+    left_entry, right_entry = (solution.as_dict["cameras"][c] for c in ("left", "right"))
+    assert right_entry["lens"]["fx_px"] == left_entry["lens"]["fx_px"]
+    assert right_entry["lens"]["sigma_fx_px"] == pytest.approx(left_entry["lens"]["sigma_fx_px"], rel=1e-9)
+    entry = right_entry["lens_shared"]
+    assert entry["camera"] == "left"
+    assert entry["significance"]["lens_shared"]["significant"] != same
+    found, text = entry["differences"], summary_text(solution.adjustment, solution.run)
+    if same:
+        assert "lens shared               holds" in text
+        return
+    assert "lens shared               does not hold" in text
+    assert "does not hold" in report_html(solution.adjustment, solution.run)
+    assert abs(found["fx_px"] - 30.0) < 4.0 * found["sigma_fx_px"] + 1.5  # linear at the tied solution
+    diagnosis = adjust_project(read(tmp_path), False).diagnosis
+    assert diagnosis is not None
+    assert diagnosis.candidates[0].hypothesis.name == "lens not shared"
+    assert "fx +" in diagnosis.candidates[0].hypothesis.cause
+    try_job(tmp_path, 1)
+    again = labsurvey.adjust(tmp_path)
+    assert again.adjustment.global_test is not None
+    assert again.adjustment.global_test.passed
+    assert "lens_shared" not in again.as_dict["cameras"]["right"]
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ('shared = { camera = "right" }', "unknown camera"),
+        ('shared = { camera = "left", parameters = ["k3"] }', "unknown free parameter 'k3'"),
+        ("crops.e03 = { scale = 0 }", "the scale must be positive"),
+        ('crops.e03 = { free = ["zoom"] }', "unknown parameter 'zoom'"),
+        ("crops.e03 = { size_px = [0, 10] }", "expected whole numbers"),
+    ],
+)
+def test_lenses_that_cannot_be_meant_are_refused(tmp_path: Path, table: str, said: str) -> None:
+    write_project(tmp_path, stereo(3, n_pairs=8)[0])
+    path = tmp_path / "survey.toml"
+    path.write_text(path.read_text().replace("[cameras.right.lens]", f"[cameras.right.lens]\n{table}"))
+    with pytest.raises(SurveyError, match=rf"survey\.toml:\d+: cameras\.right\.lens\.(shared|crops).*{said}"):
+        read(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -196,3 +292,36 @@ def test_keys_of_remedies_are_written_where_they_belong(tmp_path: Path) -> None:
     after = edited(("tables", "turntable", "harmonics", "tilt_2"), 1)
     assert "\nharmonics = {" in after
     assert tomllib.loads(after)["tables"]["turntable"]["harmonics"] == {"angle_2": 2, "tilt_2": 1}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scale", "shift", "said", "free"),
+    [
+        (1.0, (40.0, -20.0), "another crop of the sensor", ("left", "top")),
+        (0.8, (0.0, 0.0), "times the size", ("scale",)),
+        (1.0, (3.0, -1.5), "another crop of the sensor", ("left", "top")),
+    ],
+)
+def test_a_crop_that_the_diagnosis_names_becomes_keys(
+    tmp_path: Path, scale: float, shift: tuple[float, float], said: str, free: tuple[str, ...]
+) -> None:
+    survey, _ = stereo(3, n_pairs=14)
+    mine = [b.epoch_id for b in survey.image_blocks if b.camera_id == "right"]
+    later = mine[6:]
+    blocks = tuple(
+        replace(b, uv=scale * (b.uv + 0.5) - 0.5 + shift) if b.camera_id == "right" and b.epoch_id in later else b
+        for b in survey.image_blocks
+    )
+    write_project(tmp_path, replace(survey, image_blocks=blocks))
+    assert said in try_job(tmp_path, 1)
+    camera = read(tmp_path).survey.cameras[1]
+    ((since, crop),) = camera.lens.crops.items()
+    assert since == later[0]
+    assert crop.parameters.free == free
+    solution = labsurvey.adjust(tmp_path)
+    assert solution.adjustment.global_test is not None
+    assert solution.adjustment.global_test.passed
+    found = solution.as_dict["cameras"]["right"]["lens_crop"]["crops"][since]
+    assert found["scale"] == pytest.approx(scale, abs=5 * found["sigma_scale"] + 1e-12)
+    assert solution.as_dict["cameras"]["right"]["lens_crop"]["significance"]

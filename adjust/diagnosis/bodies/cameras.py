@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from gtsam import Pose3
@@ -9,8 +10,9 @@ from gtsam import Pose3
 from adjust.diagnosis.bodies.series import Step
 from adjust.diagnosis.bodies.split import split_camera
 from adjust.diagnosis.bodies.targets import motion_text
-from adjust.diagnosis.hypothesis import Hypothesis, LeaveOut, Place
+from adjust.diagnosis.hypothesis import Edit, Hypothesis, LeaveOut, Place
 from adjust.diagnosis.images.maps import TURNED, turned
+from adjust.diagnosis.lens_keys import block_keys, crop_keys, key_text
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 from adjust.spatial.rigid import rotation_log
@@ -64,7 +66,7 @@ def changed_camera(survey: Survey, step: Step, epochs: tuple[str, ...]) -> Hypot
             return ()
         seen = replace(step, motion=found.motion.inverse().matrix())
         turned = turned_images(survey, seen, epochs) if step.motion is None else ()
-        return (*turned, _named(hypothesis, found))
+        return (*turned, _named(survey, hypothesis, found))
 
     return replace(hypothesis, follow=told)
 
@@ -100,7 +102,7 @@ def turned_images(survey: Survey, step: Step, epochs: tuple[str, ...]) -> Iterat
             yield turned(survey, step.name[1], epochs, TURNED[back], evidence, step.cuts)
 
 
-def _named(hypothesis: Hypothesis, found: Difference) -> Hypothesis:
+def _named(survey: Survey, hypothesis: Hypothesis, found: Difference) -> Hypothesis:
     """The same survey under the name of the simplest change that agrees with what was adjusted."""
     camera, first = hypothesis.place.ids[0], hypothesis.place.epochs[0]
     n, begin = len(found.names), f"camera {hypothesis.place.ids[0]}: from epoch {hypothesis.place.epochs[0]} on "
@@ -111,15 +113,19 @@ def _named(hypothesis: Hypothesis, found: Difference) -> Hypothesis:
     by = {name: f"{value:+.2f}" for name, value in zip(found.names, found.d, strict=False)}
     if centre and found.vanishes([*focal, *other, *place]):
         shift = ", ".join(by[found.names[i]] for i in centre)
-        return replace(hypothesis, name="images shifted", parameters=3,
+        keys = crop_keys(survey, camera, first, 1.0, found.d[centre]) if len(centre) == 2 else ()
+        return replace(hypothesis, name="images shifted", parameters=3, **_keyed(hypothesis, keys),
                        cause=f"{begin}its images are shifted by ({shift}) px: another crop of the sensor")  # fmt: skip
     if focal:
         ratio = 1.0 + found.d[focal[0]] / found.before[focal[0]]
         if found.vanishes([*focal[1:], *centre, *other, *place], _resized(found)):
             return replace(hypothesis, name="images resized", parameters=2,
+                           **_keyed(hypothesis, crop_keys(survey, camera, first, float(ratio))),
                            cause=f"{begin}its images have {ratio:.5g} times the size")  # fmt: skip
         if found.vanishes([*other, *place]):
+            names = [found.names[i] for i in (*focal, *centre)]
             return replace(hypothesis, name="focus touched", parameters=5,
+                           **_keyed(hypothesis, block_keys(survey, camera, names, (first,))),
                            cause=f"{begin}its focal length is {ratio:.5f} times the former one: focus or zoom was "
                            "touched")  # fmt: skip
     if found.vanishes([*focal, *centre, *other]):
@@ -127,6 +133,13 @@ def _named(hypothesis: Hypothesis, found: Difference) -> Hypothesis:
                        cause=f"camera {camera} was moved on its station before epoch {first} "
                        f"{motion_text(found.motion)}")  # fmt: skip
     return hypothesis
+
+
+def _keyed(hypothesis: Hypothesis, keys: tuple[Edit, ...]) -> dict[str, Any]:
+    """Keys in place of what is left out, and said before it."""
+    if not keys:
+        return {}
+    return {"edits": keys, "change": f"let the adjustment find it: {key_text(keys)}; or {hypothesis.change}"}
 
 
 def _resized(found: Difference) -> FloatArray:

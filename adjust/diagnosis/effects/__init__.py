@@ -16,6 +16,7 @@ from adjust.diagnosis.effects.effect import Effect
 from adjust.diagnosis.effects.pixels import pixels
 from adjust.diagnosis.effects.shapes import shapes
 from adjust.diagnosis.effects.steps import steps
+from adjust.diagnosis.effects.ties import untied
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.model.errors import SurveyError
 from adjust.testing.criteria import sidak
@@ -27,9 +28,10 @@ _MOST = 6
 
 
 def hypotheses(case: Case) -> Iterator[Hypothesis]:
-    """The few changes that explain most for what they cost, each kind once; bent targets, axes that run unevenly."""
+    """The few changes that explain most for what they cost, each once; bent targets, uneven axes, lenses not shared."""
     yield from bent_targets(case)
     yield from unsteady_axes(case)
+    yield from untied(case)
     yield from _scored(case)
 
 

@@ -10,7 +10,8 @@ from gtsam import Pose3
 from adjust.diagnosis.bodies.targets import motion_text
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect
-from adjust.diagnosis.hypothesis import Edit, Hypothesis, LeaveOut, Place, SetKey
+from adjust.diagnosis.hypothesis import Edit, Hypothesis, LeaveOut, Place
+from adjust.diagnosis.lens_keys import block_keys, crop_keys, key_text
 from adjust.diagnosis.prediction import Prediction, adjusted_values
 from adjust.diagnosis.score import Linear, Part, Score, drift_times
 from adjust.diagnosis.sequences import with_pairs
@@ -158,10 +159,11 @@ def _step(case: Case, course: _Course, cut: int, first: Score, looked_at: int) -
         alike = f" (or table {tables[0]}: its images cannot tell)" if name == "target moved" and tables else ""
         return f"{what.format(thing)} {before} {since}{_amount(course.name[0], theta, sigmas)}{alike}"
 
-    hypothesis = Hypothesis(
-        name, "", f"leave out what was observed from {since} on, or give it a name of its own there", place,
-        case.survey, _edits(case.survey, course, later), 1.0, 1, looked_at,
-    )  # fmt: skip
+    keys = _lens_keys(case, course, since, first)
+    change = f"leave out what was observed from {since} on, or give it a name of its own there"
+    change = f"let the adjustment find it: {key_text(keys)}; or {change}" if keys else change
+    edits = keys or _edits(case.survey, course, later)
+    hypothesis = Hypothesis(name, "", change, place, case.survey, edits, 1.0, 1, looked_at)
     chosen = frozenset(later)
     return Effect(
         hypothesis, first,
@@ -200,11 +202,10 @@ def _drift(case: Case, course: _Course, first: Score) -> Effect:
         by = ", ".join(f"{n} {t:+.2f} +- {s:.2f}" for n, t, s in zip(names, theta, sigmas, strict=False))
         return f"camera {thing}: its lens drifts from epoch {course.labels[0]} to {course.labels[-1]} by {by} px"
 
-    n, lens = len(course.labels), next((c.lens for c in case.survey.cameras if c.camera_id == thing), None)
-    edits = () if course.kind != "image" or lens is None or lens.drift is not None or n < 6 else (
-        SetKey(("cameras", thing, "lens", "drift", "parameters"), tuple(x for x in names if x in lens.free)),
-        SetKey(("cameras", thing, "lens", "drift", "begins"), (course.labels[n // 3], course.labels[2 * n // 3])),
-    )  # fmt: skip
+    n = len(course.labels)
+    edits: tuple[Edit, ...] = ()
+    if course.kind == "image" and n >= 6:
+        edits = block_keys(case.survey, thing, names, (course.labels[n // 3], course.labels[2 * n // 3]))
     hypothesis = Hypothesis(
         "lens drifts", "", "let the camera warm up, or adjust its lens by blocks of epochs: lens.drift",
         Place("camera", (thing,), "lens"), case.survey, edits, 1.0, 0,
@@ -245,6 +246,16 @@ def _amount(kind: str, theta: FloatArray, sigmas: FloatArray) -> str:
     if kind == "point":
         return f" by ({', '.join(f'{1e3 * t:+.2f}' for t in theta)}) mm"
     return f" {motion_text(Pose3.Expmap(theta))}" if len(theta) == 6 else ""
+
+
+def _lens_keys(case: Case, course: _Course, since: str, first: Score) -> tuple[Edit, ...]:
+    """What lets a lens be another one since then; none of other things."""
+    if course.name[0] != "lens":
+        return ()
+    names = [c for c in course.components if c in _components(case, course.name)]
+    if course.components == CENTRE:
+        return crop_keys(case.survey, course.name[1], since, 1.0, first.theta) if len(names) == 2 else ()
+    return block_keys(case.survey, course.name[1], names, (since,))
 
 
 def _edits(survey: Survey, course: _Course, later: Sequence[str]) -> tuple[Edit, ...]:

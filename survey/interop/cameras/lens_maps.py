@@ -46,14 +46,14 @@ def mapped_lens(
     """The lens (n,) of a camera in one of the allowed forms, ``choices``: model name to its usable parameters.
 
     The first exact choice is taken; where none is, the lens is fitted over the whole image by
-    ``adjust.lenses.conversion`` in the first model, a fisheye's in a fisheye where that is among the choices. Raises
-    SurveyError where no lens of that form fits.
+    ``adjust.lenses.conversion`` in the first model, a fisheye's in a fisheye where that is among the choices. Of a lens
+    that changes the note says which one it is. Raises SurveyError where no lens of that form fits.
     """
-    model = MODELS[camera.lens.model]
+    model, taken = MODELS[camera.lens.model], _which(camera)
     if model.name in choices:
         usable = choices[model.name]
         if all(v == 0.0 or n in usable for n, v in zip(model.names, values, strict=True)):
-            return MappedLens(model.name, dict(zip(model.names, map(float, values), strict=True)), cov)
+            return MappedLens(model.name, dict(zip(model.names, map(float, values), strict=True)), cov, note=taken)
     wanted = MODELS[model.name if model.name in choices else next(iter(choices))]
     usable = choices[wanted.name]
     # three rational terms beside three others cannot be told apart: fit without them
@@ -70,5 +70,15 @@ def mapped_lens(
     )
     return MappedLens(
         wanted.name, dict(zip(wanted.names, map(float, found.values), strict=True)), found.cov,
-        max(largest, _EXACT_PX), note,
+        max(largest, _EXACT_PX), note if taken is None else f"{taken}; {note}",
     )  # fmt: skip
+
+
+def _which(camera: Camera) -> str | None:
+    """Which lens is written of one that changes or whose images are cropped."""
+    lens, parts = camera.lens, []
+    if lens.drift is not None:
+        temperature = lens.drift.reference_temperature
+        parts.append("of the first block of epochs" if temperature is None else f"at {temperature:g} degC")
+    parts += ["of whole images"] if lens.crops else []
+    return f"camera {camera.camera_id}: its lens is written as it is {' and '.join(parts)}" if parts else None

@@ -20,6 +20,7 @@ from survey.folder.replacing import changing, replace_parts
 from survey.jobs.adjusting.job import run_info
 from survey.jobs.adjusting.probable_causes import explained, with_probable_causes
 from survey.jobs.navigating.calibration import Calibration, digest, keep, kept
+from survey.jobs.navigating.lenses import lenses_taken
 from survey.jobs.navigating.task import (
     NavigateRequest,
     calibrating,
@@ -197,11 +198,11 @@ def _calibrate(project: Project, station: str, epochs: Sequence[str], there: Pat
     """
     others = others_to_navigate(project, station, epochs)
     try:
-        return _calibrated(project, station, [*epochs, *others], there, new)
+        return _calibrated(project, station, epochs, [*epochs, *others], there, new)
     except SurveyError as error:
         if others:
             with contextlib.suppress(SurveyError):
-                return replace(_calibrated(project, station, epochs, there, new), helped_by=tuple(others))
+                return replace(_calibrated(project, station, epochs, epochs, there, new), helped_by=tuple(others))
         if not isinstance(error, IndeterminateError):
             raise
         raise SurveyError(
@@ -210,12 +211,15 @@ def _calibrate(project: Project, station: str, epochs: Sequence[str], there: Pat
         ) from error
 
 
-def _calibrated(project: Project, station: str, without: Sequence[str], there: Path, new: Path) -> Calibration:
-    """From everything but these epochs of the station."""
+def _calibrated(
+    project: Project, station: str, epochs: Sequence[str], without: Sequence[str], there: Path, new: Path
+) -> Calibration:
+    """From everything but some epochs of the station, with the lenses of those that are navigated."""
     survey = calibrating(project, station, without)
+    taken = lenses_taken(project.survey, survey, station, epochs)
     run = run_info(project, {})
     options = AdjustOptions(project.options.alpha, project.options.reject_blocks, project.options.reject_points)
-    key = digest(survey, options, run.versions, station)
+    key = digest(survey, options, run.versions, station, taken)
     found = kept(there, key)
     if found is not None:
         return found
@@ -226,7 +230,7 @@ def _calibrated(project: Project, station: str, without: Sequence[str], there: P
         if said is error:
             raise
         raise said from error
-    head, beacons = head_and_beacons(adjustment, station)
+    head, beacons = head_and_beacons(adjustment, station, None, taken.epochs, taken.crops)
     said_of = tuple(w for w in adjustment.warnings if w.startswith("probable cause"))
     calibration = Calibration(head, beacons, adjustment.sigma0 if adjustment.redundancy > 0 else None, causes=said_of)
     if not said_of:  # what is wrong is told every time

@@ -14,6 +14,7 @@ from adjust.model.survey import Survey
 from adjust.navigation import NavigationEpoch, Spots, head_of
 from adjust.statistics.outliers.supported import supported
 from survey.folder.text import decode, read_bytes
+from survey.jobs.navigating.lenses import with_images_left
 from survey.project import Project
 
 
@@ -121,7 +122,8 @@ def calibrating(project: Project, station: str, epochs: Sequence[str]) -> Survey
     blocks = tuple(b for b in survey.image_blocks if not (b.camera_id in own and b.epoch_id in out))
     carried = next(s for s in survey.stations if s.station_id == station).table_id
     readings = tuple(r for r in survey.table_readings if not (r.table_id == carried and r.epoch_id in out))
-    return supported(_with_known_points(replace(survey, image_blocks=blocks, table_readings=readings)))[0]
+    left = with_images_left(survey, replace(survey, image_blocks=blocks, table_readings=readings))
+    return supported(_with_known_points(left))[0]
 
 
 def _with_known_points(survey: Survey) -> Survey:

@@ -20,6 +20,7 @@ WARP_UNITS = {
     "warp_x": "mm", "warp_y": "mm", "warp_xy": "mm", "scale_x": "ppm", "scale_y": "ppm", "shear": "ppm",
     "expansion": "ppm_per_K",
 }  # fmt: skip
+CROP_UNITS = {"scale": "1", "left": "px", "top": "px"}
 SURFACE_UNITS: dict[str, dict[str, str]] = {
     "plane": {"normal_1": "deg", "normal_2": "deg", "distance": "mm"},
     "line": {"direction_1": "deg", "direction_2": "deg", "offset_1": "mm", "offset_2": "mm"},
@@ -126,6 +127,33 @@ DECLARATIONS: tuple[Declared, ...] = (
             Key("pixel_size_mm", "number", "needed by the models in mm", positive=True),
             Key("balance_radius_mm", "number", "model aicon: where the radial distortion is zero", 0.0),
             Key("drift", "table", "parameters that change in the course of the session", table="lens_drift"),
+            Key("shared", "table", "parameters that are those of another camera", table="lens_shared"),
+            Key("crops", "table", "images that are cropped or resized, by the epoch from which on: crops.EPOCH",
+                table="lens_crops"),
+        ),
+    ),
+    Declared(
+        "lens_shared", "cameras.ID.lens.shared", "One unknown for several cameras of the same model (remedies.md).",
+        (
+            Key("camera", "text", "whose parameters they are; it shares none itself", REQUIRED, refers="cameras"),
+            Key("parameters", "names", "which, free in both; [] for none, default: all that are free here"),
+        ),
+    ),
+    Declared(
+        "lens_crops", "cameras.ID.lens.crops", "Crops by epoch: crops.e11 = { scale = 0.5 }. Lens and "
+        "image_size_px are those of the whole image.",
+        free_keys=Key("EPOCH", "table", "from this epoch on, until the next", table="lens_crop"),
+    ),
+    Declared(
+        "lens_crop", "cameras.ID.lens.crops.EPOCH", "A part of the image, or another size of it (remedies.md).",
+        (
+            Key("size_px", "numbers", "width, height of these images; default: all that is right of left_px and below "
+                "top_px, times scale", size=(2,)),
+            *vector_keys_declared(CROP_UNITS, {
+                "scale": "px of these images per px of the whole image, 1 unless given",
+                "left": "what is cut off at the left, px of the whole image",
+                "top": "and at the top",
+            }, ()),
         ),
     ),
     Declared(

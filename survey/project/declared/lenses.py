@@ -5,10 +5,11 @@ from typing import Any
 import numpy as np
 
 from adjust.lenses.models import MODELS
-from adjust.model.survey import FloatArray, LensDrift, LensParameter, Tie, VectorPrior
+from adjust.model.survey import FloatArray, ImageCrop, LensDrift, LensParameter, LensSharing, Tie, VectorPrior
 from survey.folder.text import suggestion
-from survey.project.declared.declarations import keys_of
+from survey.project.declared.declarations import CROP_UNITS, keys_of
 from survey.project.declared.node import Node
+from survey.project.declared.vectors import read_vector, vector_to_toml
 from survey.project.tables.covariance import covariance_problem
 
 # Without these a lens images nothing: they are never zero by silence.
@@ -34,7 +35,33 @@ def read_lens(node: Node) -> LensParameter:
         raise node.error(f"pixel_size_mm is missing; the model {model} is in millimetres", "pixel_size_mm")
     drift = _drift(node.table("drift"), free) if node.has("drift") else None
     balance = _balance(node, model)
-    return LensParameter(model, free, values, _prior(node, names, free), ties, pixel_size_mm, balance, drift)
+    shared = _shared(node.table("shared"), free) if node.has("shared") else None
+    crops = {epoch: _crop(crop) for epoch, crop in node.tables("crops")}
+    prior = _prior(node, names, free)
+    return LensParameter(model, free, values, prior, ties, pixel_size_mm, balance, drift, shared, crops)
+
+
+def _shared(node: Node, free: tuple[str, ...]) -> LensSharing | None:
+    """None where it names no parameter."""
+    node.allow(*keys_of("lens_shared"))
+    camera, parameters = node.text("camera"), node.references("parameters", free, "free parameter", free)
+    return LensSharing(camera, parameters) if parameters else None
+
+
+def _crop(node: Node) -> ImageCrop:
+    node.allow(*keys_of("lens_crop"))
+    parameters = read_vector(node, CROP_UNITS, (), np.array([1.0, 0.0, 0.0]))
+    if parameters.values[0] <= 0.0:
+        raise node.error(f"found {parameters.values[0]:g}; the scale must be positive", "scale")
+    return ImageCrop(parameters, read_size(node, "size_px") if node.has("size_px") else None)
+
+
+def read_size(node: Node, key: str) -> tuple[int, int]:
+    """Width and height of an image, px."""
+    width, height = node.numbers(key, (2,))
+    if min(width, height) < 1 or width % 1 or height % 1:
+        raise node.error(f"found [{width:g}, {height:g}]; expected whole numbers, [width, height]", key)
+    return int(width), int(height)
 
 
 def _drift(node: Node, free: tuple[str, ...]) -> LensDrift:
@@ -153,7 +180,17 @@ def lens_to_toml(lens: LensParameter) -> dict[str, Any]:
         table["balance_radius_mm"] = lens.balance_radius_mm
     if lens.drift is not None:
         table["drift"] = _drift_to_toml(lens.drift)
+    if lens.shared is not None:
+        table["shared"] = {"camera": lens.shared.camera_id, "parameters": list(lens.shared.parameters)}
+    if lens.crops:
+        table["crops"] = {epoch: _crop_to_toml(epoch, crop) for epoch, crop in lens.crops.items()}
     return table
+
+
+def _crop_to_toml(epoch: str, crop: ImageCrop) -> dict[str, Any]:
+    table = vector_to_toml(crop.parameters, CROP_UNITS, f"crop at epoch {epoch}")
+    table["free"] = list(table["free"])
+    return table | ({} if crop.size is None else {"size_px": list(crop.size)})
 
 
 def _drift_to_toml(drift: LensDrift) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from adjust.model.tables import HARMONICS, HIGHEST, harmonic_names, in_order, un
 from survey.folder.text import suggestion
 from survey.folder.units import to_si
 from survey.project.declared.declarations import keys_of
-from survey.project.declared.lenses import read_lens
+from survey.project.declared.lenses import read_lens, read_size
 from survey.project.declared.node import Node
 from survey.project.declared.poses import read_pose
 
@@ -31,14 +31,15 @@ def read_cameras(root: Node, station_ids: tuple[str, ...]) -> tuple[Camera, ...]
     for camera_id, node in root.tables("cameras"):
         node.allow(*keys_of("camera"))
         station_id = node.reference("station", station_ids, "station")
-        width, height = node.numbers("image_size_px", (2,))
-        if min(width, height) < 1 or width % 1 or height % 1:
-            raise node.error(f"found [{width:g}, {height:g}]; expected whole numbers, [width, height]", "image_size_px")
+        size = read_size(node, "image_size_px")
         if not node.has("lens"):
             raise node.error(f"the table [cameras.{camera_id}.lens] is missing; add it", "lens")
         lens = read_lens(node.table("lens"))
+        if node.table("lens").has("shared"):
+            others = [c for c, _ in root.tables("cameras") if c != camera_id]
+            node.table("lens").table("shared").reference("camera", others, "camera")
         pose = read_pose(node.table("station_from_camera"))
-        cameras.append(Camera(camera_id, station_id, (int(width), int(height)), lens, pose))
+        cameras.append(Camera(camera_id, station_id, size, lens, pose))
     return tuple(cameras)
 
 

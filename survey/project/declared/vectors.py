@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from adjust.model.errors import SurveyError
-from adjust.model.survey import VectorParameter, VectorPrior
+from adjust.model.survey import FloatArray, VectorParameter, VectorPrior
 from survey.folder.text import suggestion
 from survey.folder.units import from_si, to_si
 from survey.project.declared.node import Node
@@ -29,8 +29,9 @@ def key_of(name: str, units: Units) -> str:
 
 
 def read_vector(
-    node: Node, units: Units, free: tuple[str, ...], missing: float = 0.0, chosen: tuple[str, ...] | None = None
-) -> VectorParameter:
+    node: Node, units: Units, free: tuple[str, ...], missing: float | FloatArray = 0.0,
+    chosen: tuple[str, ...] | None = None,
+) -> VectorParameter:  # fmt: skip
     """The parameters of a table; ``free`` where it does not say, ``missing`` for what has no value.
 
     chosen: those that are free, where the caller has read that.

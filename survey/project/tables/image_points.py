@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from adjust.lenses.crops import possible_sizes
 from adjust.model.names import natural_key
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import BoolArray, FloatArray, IntArray
@@ -134,7 +135,7 @@ def _ranks(column: TextColumn, blank_last: bool = False) -> IntArray:
 def _measured(
     table: Table, cameras: TextColumn, epochs: TextColumn, names: Names, sigmas: Sigmas, groups: TextColumn
 ) -> _Rows:
-    sizes = {camera.camera_id: camera.image_size for camera in names.survey.cameras}
+    sizes = {camera.camera_id: np.max(possible_sizes(camera), axis=0) for camera in names.survey.cameras}
     for code, name in enumerate(cameras.names):
         if name not in sizes:
             row = first_row(cameras.codes == code)

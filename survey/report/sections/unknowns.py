@@ -85,6 +85,8 @@ def _tests(found: dict[str, Any]) -> Markup:
     parts = []
     for term, test in found.items():
         kind = pill("quiet", t("significant")) if test["significant"] else pill("warn", t("not significant"))
+        if term == "lens_shared":
+            kind = pill("warn", t("does not hold")) if test["significant"] else pill("quiet", t("holds"))
         said = t("{term}: {statistic} with {freedom} degrees of freedom, p {p}", term=term.replace("_", " "),
                  statistic=general(test["statistic"], 4), freedom=", ".join(map(count, test["freedom"])),
                  p=general(test["p_value"], 2))  # fmt: skip
@@ -174,7 +176,7 @@ def _camera(camera_id: str, entry: dict[str, Any], residuals: charts.CameraResid
     facts += " · " + t("RMS residual {rms} px", rms=fixed(entry["rms_residual_px"], 3))
     lens = entry.get("lens")
     shown = Markup() if lens is None else vector_table(lens, lens["value_over_sigma"]) + _remarks(lens)
-    shown += _drift(entry["lens_drift"]) if "lens_drift" in entry else Markup()
+    shown += joined(_changes(entry[key], part) for key, part in _OF_LENS.items() if key in entry)
     makers = (charts.vector_field, charts.mean_field, charts.histogram)
     drawn = [make(residuals) for make in makers] if len(residuals.uv) else []
     rows = [row[:1] + row[2:] for row in map(_pose_row, _poses(camera_id, entry))]
@@ -182,13 +184,22 @@ def _camera(camera_id: str, entry: dict[str, Any], residuals: charts.CameraResid
     return part("camera", camera_id, facts, shown, drawn, poses, of="report.html")
 
 
-def _drift(entry: dict[str, Any]) -> Markup:
-    """How the lens changes: a table for every block, or of what it does per kelvin."""
-    changes = list(entry["changes"].items())
-    heads = [t("Change per kelvin") if name == "per_kelvin" else t("Change from epoch {name} on", name=name)
-             for name, _ in changes]  # fmt: skip
-    parts = [note(head) + vector_table(change) for head, (_, change) in zip(heads, changes, strict=True)]
+_OF_LENS = {"lens_drift": "changes", "lens_crop": "crops", "lens_shared": "differences"}
+
+
+def _changes(entry: dict[str, Any], key: str) -> Markup:
+    """How the lens changes, images are cropped or a shared lens would differ: a table for each, and what is clear."""
+    changes = [(entry["camera"], entry[key])] if key == "differences" else list(entry[key].items())
+    parts = [note(_change_head(key, name)) + vector_table(change) for name, change in changes]
     return joined((*parts[:_MOST_BLOCKS], _more(len(parts) - _MOST_BLOCKS))) + _tests(entry["significance"])
+
+
+def _change_head(key: str, name: str) -> Markup | str:
+    if key == "differences":
+        return t("Shared with camera {name}; a lens of its own would differ by", name=name)
+    if key == "crops":
+        return t("Images cropped from epoch {name} on", name=name)
+    return t("Change per kelvin") if name == "per_kelvin" else t("Change from epoch {name} on", name=name)
 
 
 def _remarks(lens: dict[str, Any]) -> Markup:
