@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.model.boards import BENT
-from adjust.model.result import Adjustment, Estimate
+from adjust.model.clocks import CLOCK, CLOCKS
+from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import FloatArray
 from adjust.model.tables import harmonic
 from adjust.testing.distributions import chi2, fisher
@@ -44,7 +45,11 @@ def zero_test(x: FloatArray, cov: FloatArray, redundancy: int | None = None) -> 
 
 def terms_of(estimate: Estimate) -> Mapping[str, Sequence[str]]:
     """The terms of an estimate that may be zero, with their components that are estimated; none for most."""
-    known: Mapping[str, Sequence[str]] = _BOARD if estimate.name[0] == "warp" else _harmonics(estimate.components)
+    known: Mapping[str, Sequence[str]] = _harmonics(estimate.components)
+    if estimate.name[0] == "warp":
+        known = _BOARD
+    elif estimate.name[0] in CLOCKS:
+        known = {f"clock_{name}": (name,) for name in CLOCK}
     free = {c for c, status in zip(estimate.components, estimate.status, strict=True) if status not in ("held", "tied")}
     return {term: kept for term, names in known.items() if (kept := [n for n in names if n in free])}
 
@@ -71,9 +76,12 @@ def significances(adjustment: Adjustment, estimate: Estimate, estimated_sigma0: 
     return tuple(out)
 
 
-def significance_of_drift(adjustment: Adjustment, camera_id: str, estimated_sigma0: bool) -> Significance | None:
-    """Whether a lens changes at all: of all its changes together; None where none is estimated."""
-    found = [(n, e) for n, e in adjustment.estimates.items() if n[:2] == ("lens_drift", camera_id)]
+def significance_of_changes(
+    adjustment: Adjustment, of: ParameterName, term: str, estimated_sigma0: bool
+) -> Significance | None:
+    """Whether something changes at all: of all changes whose names begin so together; None where none is estimated."""
+    found = [(n, e) for n, e in adjustment.estimates.items() if n[:2] == of and "held" not in e.status]
+    found = [(n, e) for n, e in found if of[0] not in CLOCKS or len(n) > 2]
     if not found or adjustment.precision is None:
         return None
     x = np.concatenate([np.asarray(e.value, dtype=float) for _, e in found])
@@ -81,4 +89,4 @@ def significance_of_drift(adjustment: Adjustment, camera_id: str, estimated_sigm
     cov = factor * np.asarray(adjustment.precision.joint([n for n, _ in found]))
     level = LEVEL if adjustment.global_test is None else adjustment.global_test.alpha
     statistic, freedom, p = zero_test(x, cov, adjustment.redundancy if estimated_sigma0 else None)
-    return Significance("lens_drift", found[0][1].components, statistic, freedom, p, p < level)
+    return Significance(term, found[0][1].components, statistic, freedom, p, p < level)

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from adjust.epochs.states import datum_carriers, open_directions
-from adjust.model.result import Adjustment, Estimate, GroupSummary, ImageResiduals
+from adjust.model.result import Adjustment, Estimate, GroupSummary, ImageResiduals, ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.precision.precision import in_conditions
 from adjust.testing.distributions import norm
-from adjust.testing.significance import Significance, significance_of_drift, significances
+from adjust.testing.significance import Significance, significance_of_changes, significances
 from survey.project.detected import DetectedImage
 from survey.project.project import LeftOut
 from survey.solution.instruments import instrument_entries
@@ -76,7 +76,7 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
             "summary": _summary(adjustment, run, scale, found),
             "conventions": CONVENTIONS,
             "cameras": _cameras(adjustment, poses, scale),
-            "stations": _stations(adjustment, poses),
+            "stations": _stations(adjustment, poses, scale),
             "points": _points(adjustment, scale),
             "tables": _tables(adjustment, poses, scale),
             "targets": _targets(adjustment, poses, scale),
@@ -246,6 +246,7 @@ def _cameras(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, An
             entry["lens"] = _lens(lens, camera.lens.model, scale)
         if camera.lens.drift is not None:
             entry["lens_drift"] = _drift(adjustment, camera.camera_id, scale)
+        entry |= _clock(adjustment, ("camera_clock", camera.camera_id), scale)
         entry |= pose(("station_from_camera", camera.camera_id), "station_from_camera")
         out[camera.camera_id] = entry | _images(adjustment, camera.camera_id, sums)
     return out
@@ -297,11 +298,12 @@ def _poses(adjustment: Adjustment, scale: Scale) -> PoseOf:
     return pose
 
 
-def _stations(adjustment: Adjustment, pose: PoseOf) -> dict[str, Any]:
+def _stations(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, Any]:
     out = {}
     for station in adjustment.survey.stations:
         name = station.station_id
         entry = {"motion": station.motion} | ({"table": station.table_id} if station.table_id else {})
+        entry |= _clock(adjustment, ("pose_clock", name), scale)
         entry |= pose(("mount_from_station", name), "mount_from_station")
         out[name] = entry | pose(("world_from_station", name), "world_from_station")
     return out
@@ -320,6 +322,7 @@ def _tables(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, Any
         geometry = adjustment.estimates.get(("table_geometry", name))
         if geometry is not None:
             entry["geometry"] = _terms(adjustment, geometry, scale)
+        entry |= _clock(adjustment, ("table_clock", name), scale)
         angles = {n[2]: e for n, e in adjustment.estimates.items() if n[:2] == ("table_angles", name)}
         out[name] = entry | {"epochs": {epoch: vector_entry(e, scale) for epoch, e in angles.items()}}
     return out
@@ -328,9 +331,24 @@ def _tables(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, Any
 def _drift(adjustment: Adjustment, camera_id: str, scale: Scale) -> dict[str, Any]:
     """How a lens changes: by the epoch at which a block begins, or per kelvin; and whether it changes at all."""
     found = {n: e for n, e in adjustment.estimates.items() if n[:2] == ("lens_drift", camera_id)}
-    test = significance_of_drift(adjustment, camera_id, scale.sigmas == "a_posteriori")
+    test = significance_of_changes(
+        adjustment, ("lens_drift", camera_id), "lens_drift", scale.sigmas == "a_posteriori"
+    )
     parts = {n[2] if len(n) > 2 else "per_kelvin": vector_entry(e, scale) for n, e in found.items()}
     return {"changes": parts, "significance": {} if test is None else {test.term: _test(test)}}
+
+
+def _clock(adjustment: Adjustment, name: ParameterName, scale: Scale) -> dict[str, Any]:
+    """The clock of a camera, a table or a station's poses, the times of single epochs about it, and their tests."""
+    estimate = adjustment.estimates.get(name)
+    if estimate is None:
+        return {}
+    entry = _terms(adjustment, estimate, scale)
+    own = {n[2]: vector_entry(e, scale) for n, e in adjustment.estimates.items() if n[:2] == name and len(n) > 2}
+    test = significance_of_changes(adjustment, name, "clock_jitter", scale.sigmas == "a_posteriori")
+    if test is not None:
+        entry["significance"] = entry.get("significance", {}) | {test.term: _test(test)}
+    return {"clock": entry | ({"epochs": own} if own else {})}
 
 
 def _test(s: Significance) -> dict[str, Any]:

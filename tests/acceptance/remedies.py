@@ -18,7 +18,7 @@ from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, LensDrift, Survey, VectorParameter
 from adjust.model.tables import harmonic_names
 from adjust.testing.distributions import chi2
-from adjust.testing.significance import Significance, significance_of_drift, significances
+from adjust.testing.significance import Significance, significance_of_changes, significances
 from survey.simulate import Truth, head_on_table, resample, stereo
 
 
@@ -96,7 +96,7 @@ def _estimated(result: Adjustment, remedy: Remedy, truth: Truth) -> tuple[FloatA
     if remedy.term == "lens_drift":
         names = [n for n in result.estimates if n[:2] == remedy.of[:2]]
         d = np.concatenate([np.asarray(result.estimates[n].value) - np.asarray(truth[n]) for n in names])
-        test = significance_of_drift(result, remedy.of[1], estimated_sigma0=True)
+        test = significance_of_changes(result, ("lens_drift", remedy.of[1]), "lens_drift", estimated_sigma0=True)
         assert test is not None
         return d, np.asarray(result.precision.joint(names)), test
     estimate = result.estimates[remedy.of]

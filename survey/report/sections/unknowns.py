@@ -175,6 +175,7 @@ def _camera(camera_id: str, entry: dict[str, Any], residuals: charts.CameraResid
     lens = entry.get("lens")
     shown = Markup() if lens is None else vector_table(lens, lens["value_over_sigma"]) + _remarks(lens)
     shown += _drift(entry["lens_drift"]) if "lens_drift" in entry else Markup()
+    shown += _clock(entry)
     makers = (charts.vector_field, charts.mean_field, charts.histogram)
     drawn = [make(residuals) for make in makers] if len(residuals.uv) else []
     rows = [row[:1] + row[2:] for row in map(_pose_row, _poses(camera_id, entry))]
@@ -189,6 +190,19 @@ def _drift(entry: dict[str, Any]) -> Markup:
              for name, _ in changes]  # fmt: skip
     parts = [note(head) + vector_table(change) for head, (_, change) in zip(heads, changes, strict=True)]
     return joined((*parts[:_MOST_BLOCKS], _more(len(parts) - _MOST_BLOCKS))) + _tests(entry["significance"])
+
+
+def _clock(entry: dict[str, Any], owner: str = "") -> Markup:
+    """The clock of a camera, a table or a station's poses, where it has one; the times of single epochs folded in."""
+    clock = entry.get("clock")
+    if clock is None:
+        return Markup()
+    own = [(epoch, *found) for epoch, e in clock.get("epochs", {}).items() for found in _components(e)]
+    rows = [[e, _value_in(unit, v, s, s_unit), sigma_text(s), unit] for e, _, v, unit, s, s_unit, _ in own]
+    head = t("Clock of {name}", name=owner) if owner else t("Clock")
+    title = t("{n} epochs: times of their own", n=count(len(rows)))
+    epochs = part("details", title, _limited(("<Epoch", "Value", "σ", "<Unit"), rows, list), False) if rows else Markup()
+    return element("h3", head) + vector_table(clock) + epochs
 
 
 def _remarks(lens: dict[str, Any]) -> Markup:
@@ -221,6 +235,7 @@ def stations(c: Context) -> Markup:
     if many:
         title = t("{n} poses by epoch", n=count(len(by_epoch)))
         body += part("details", title, _limited(_POSE_COLUMNS, by_epoch, _pose_row), False)
+    body += joined(_clock(e, k) for k, e in c.solution["stations"].items())
     return section("poses", "Poses of stations, tables and targets", body, t(_POSE_NOTE))
 
 
@@ -232,6 +247,7 @@ def tables(c: Context) -> Markup:
         body = element("h3", joined((table_id, t("axes {axes}", axes=axes)), ", "))
         if "geometry" in entry:
             body += vector_table(entry["geometry"])
+        body += _clock(entry, table_id)
         if entry["epochs"]:
             names = list(next(iter(entry["epochs"].values()))["status"])
             columns = ("<Epoch", *(x for n in names for x in (f"{n} [°]", "σ [″]")))
