@@ -1,6 +1,6 @@
 """Where things are between the epochs: bodies and tables at the time of a clock, from the epochs around.
 
-With Lagrange's weights w over the times of the epoch e and up to two epochs before and after it, a body is at
+With Lagrange's weights w over the times of the epoch e and the ``_AROUND`` epochs nearest to it, a body is at
 
     T(dt) = T_e Exp(sum_k w_k(dt) Log(T_e^-1 T_k)),    d T / d T_k = w_k Jr(xi) Jr^-1(L_k)
 
@@ -9,24 +9,26 @@ camera sees tells of several epochs at once. Epochs further apart than ``_GAP`` 
 one epoch no motion is known, and things stand still there.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
 
 import gtsam
 import numpy as np
 
-from adjust.frames.unknowns import Chain, Link, ShiftedSlot, Unknowns, VectorMap, vector_map
-from adjust.model.clocks import CLOCK, EpochTimes, clocks_of, epoch_times
+from adjust.frames.unknowns import Chain, FrameTree, Link, ShiftedSlot, Unknowns, VectorMap, vector_map
+from adjust.model.clocks import CLOCK, EpochTimes, clock_text, clocks_of, epoch_times
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock, Pair, TableReading
 from adjust.model.result import ParameterName
-from adjust.model.survey import FloatArray, Survey
+from adjust.model.survey import Clock, FloatArray, Survey
 from adjust.spatial.rigid_motions import Motions, exp, right_jacobian, right_jacobian_inverse
 
 Reading = Callable[[gtsam.Values], tuple[FloatArray, list[tuple[int, FloatArray]]]]
 
 _GAP = 3.0
-_AROUND = 2
+_AROUND = 4
 _MOVING = ("world_from_station", "carrier_from_target", "table_motion")
 
 
@@ -53,7 +55,6 @@ class Shifts:
         self._jitter = {name: clock.jitter for name, clock in clocks_of(survey) if clock.jitter > 0.0}
         self.jitters: dict[ParameterName, float] = {}
         """Sigmas of the single epochs' own times."""
-        self._observers: dict[ParameterName, set[ParameterName]] = {}
 
     def _neighbours(self) -> Iterable[tuple[int, list[int]]]:
         """Of every slot of an epoch itself, and the slots of the same body at the epochs around."""
@@ -67,14 +68,12 @@ class Shifts:
                 self._epoch[slot], self._epoch_ids[slot] = (body, time), name[2]
         for found in series.values():
             found.sort()
-            t, slots = np.array([x[0] for x in found]), [x[1] for x in found]
-            if not (np.diff(t) > 0.0).all():
-                body, _ = self._epoch[slots[0]]
-                raise SurveyError(f"{' '.join(body)}: two of its epochs have the same time; correct times_s")
-            run = np.cumsum(np.append(0.0, np.diff(t) > _GAP * np.median(np.diff(t)) if len(t) > 1 else []))
-            for i, slot in enumerate(slots):
-                near = range(max(0, i - _AROUND), min(len(slots), i + _AROUND + 1))
-                yield slot, [slot, *(slots[j] for j in near if j != i and run[j] == run[i])]
+            slots = [slot for _, slot in found]
+            for run in _runs([t for t, _ in found], self._epoch[slots[0]][0]):
+                for i in run:
+                    first = min(max(run.start, i - _AROUND // 2), max(run.start, run.stop - 1 - _AROUND))
+                    near = range(first, min(run.stop, first + _AROUND + 1))
+                    yield slots[i], [slots[i], *(slots[j] for j in near if j != i)]
 
     def of_image(self, block: ImageBlock, chain: Chain) -> list[tuple[ImageBlock, Chain]]:
         """Parts of an image block that were exposed at one moment each, in its order, and their chains."""
@@ -92,9 +91,6 @@ class Shifts:
 
     def shifted(self, chain: Chain, clock: ParameterName, row: float = 0.0) -> Chain:
         """A chain at the time of a clock; itself where there is no such clock."""
-        self._observers.setdefault(clock, set()).update(
-            self._epoch[x.slot][0] for x in chain if len(self._around.get(x.slot, ())) > 1
-        )
         vector = self.unknowns.vectors.get(clock)
         if vector is None:
             return chain
@@ -142,27 +138,6 @@ class Shifts:
             u.vectors[name] = VectorMap(("jitter",), (self.times.unit,), np.zeros(1), one, key, ("jitter",), ("prior",))
         return u.vectors[name]
 
-    def check_reference(self) -> None:
-        """Raises SurveyError where all that see some moving things have free offsets, or drifts: no clock is the time."""
-        for component in ("offset", "drift"):
-            groups: list[tuple[set[ParameterName], set[ParameterName]]] = []
-            for clock, bodies in self._observers.items():
-                mine = ({clock}, set(bodies))
-                for other in [g for g in groups if g[1] & bodies] if bodies else ():
-                    groups.remove(other)
-                    mine = mine[0] | other[0], mine[1] | other[1]
-                groups += [mine] if bodies else []
-            for clocks, _ in groups:
-                if all(self._is_free(c, component) for c in clocks):
-                    said = ", ".join(" ".join(c).replace("_", " ") for c in sorted(clocks))
-                    raise SurveyError(f"{said}: the {component} of every clock that sees the same motion is unknown, and "
-                                      "none of them is the time; take one out of free, or give one a sigma")  # fmt: skip
-
-    def _is_free(self, clock: ParameterName, component: str) -> bool:
-        vector = self.unknowns.vectors.get(clock)
-        status = {} if vector is None else dict(zip(vector.names, vector.status, strict=True))
-        return status.get(component) == "free"
-
 
 def _parts(u: Unknowns, nodes: Sequence[int], clocks: Sequence[VectorMap]) -> list[tuple[int, int, int]]:
     """Where the derivatives of a shifted slot stand: by the pose or angles of every node, geometry, clocks."""
@@ -179,6 +154,120 @@ def _parts(u: Unknowns, nodes: Sequence[int], clocks: Sequence[VectorMap]) -> li
         parts += [] if clock.key is None else [(clock.key, at, len(clock.free))]
         at += len(clock.free)
     return parts
+
+
+def _runs(times: Sequence[float], body: ParameterName) -> list[range]:
+    """Runs of epochs at ascending times. Raises SurveyError where two of a body's are the same."""
+    steps = np.diff(times)
+    if not (steps > 0.0).all():
+        raise SurveyError(f"{' '.join(body)}: two of its epochs have the same time; correct times_s")
+    ends = np.flatnonzero(steps > _GAP * np.median(steps)) + 1 if len(steps) else []
+    borders = [0, *map(int, ends), len(times)]
+    return [range(a, b) for a, b in pairwise(borders)]
+
+
+def within_motion(survey: Survey) -> Survey:
+    """The survey less what late clocks saw at the ends of runs, of which it is not known how things moved there.
+
+    It is predicted where others tell where things were at the epoch, else left out. Raises SurveyError where no clock is
+    the time, or nothing of a late one is left.
+    """
+    clocks = dict(clocks_of(survey))
+    late = {name for name, clock in clocks.items() if _is_late(clock)}
+    if not late:
+        return survey
+    items, given = _observers(survey)
+    _check_reference(clocks, items)
+    left, out = set(range(len(items))), set[int]()
+    while True:
+        ends = _ends(set().union(given, *(items[i][1] for i in left)), epoch_times(survey))
+        out = {i for i in left if items[i][0] in late and items[i][1] & ends}
+        told = set().union(given, *(items[i][1] for i in left - out))
+        lost = {i for i in out if not items[i][1] <= told}
+        if not lost:
+            break
+        left -= lost
+    used = {clock for i, (clock, places) in enumerate(items) if i in left - out or not places}
+    if lost_clocks := [c for c in sorted(late) if c not in used and any(items[i][0] == c for i in range(len(items)))]:
+        raise SurveyError(f"clock of {clock_text(lost_clocks[0])}: at no epoch is it known how what it sees moves, for that "
+                          "takes an epoch before and one after; take the clock out, or measure while things move")
+    kept, first = dict[str, tuple[Any, ...]](), 0
+    for field in ("image_blocks", "table_readings", "pairs"):
+        every = getattr(survey, field)
+        number = dict(enumerate(every, first))
+        kept[field] = tuple(_unused(x) if i in out else x for i, x in number.items() if i in left)
+        first += len(every)
+    return replace(survey, **kept)
+
+
+_Place = tuple[ParameterName, str]
+"""A body or table, and an epoch."""
+
+
+def _observers(survey: Survey) -> tuple[list[tuple[ParameterName, set[_Place]]], set[_Place]]:
+    """Of every image block, table reading and pair its clock and what it sees moving; what is known without them."""
+    u, moving = Unknowns(), dict[int, _Place]()
+    tree = FrameTree(survey, u)
+    slots = [{link.slot for link in tree.of_image(b)} for b in survey.image_blocks]
+    for name, slot in u.slot_of.items():
+        if name[0] in _MOVING and len(name) == 3:
+            moving[slot] = name[:2], name[2]
+    items: list[tuple[ParameterName, set[_Place]]] = [
+        (("camera_clock", b.camera_id), {moving[s] for s in of if s in moving})
+        for b, of in zip(survey.image_blocks, slots, strict=True)
+    ]
+    items += [(("table_clock", r.table_id), {(("table_motion", r.table_id), r.epoch_id)}) for r in survey.table_readings]
+    for pair in survey.pairs:
+        ends = [(f.frame_id, str(f.epoch_id)) for f in (pair.a, pair.b) if f.kind == "station" and f.epoch_id]
+        clock = ("pose_clock", ends[0][0] if ends else "")
+        items.append((clock, {(("world_from_station", station), epoch) for station, epoch in ends}))
+    return items, {(n[:2], n[2]) for n, p in u.parameters.items() if len(n) == 3 and p.treatment != "free"}
+
+
+def _check_reference(clocks: Mapping[ParameterName, Clock], items: Iterable[tuple[ParameterName, set[_Place]]]) -> None:
+    """Raises SurveyError where all that see the same motion have free offsets, or drifts: no clock is the time."""
+    seen: dict[ParameterName, set[ParameterName]] = {}
+    for clock, places in items:
+        seen.setdefault(clock, set()).update(body for body, _ in places)
+    groups: list[tuple[set[ParameterName], set[ParameterName]]] = []
+    for clock, bodies in seen.items():
+        mine = ({clock}, bodies)
+        for other in [g for g in groups if g[1] & bodies]:
+            groups.remove(other)
+            mine = mine[0] | other[0], mine[1] | other[1]
+        groups += [mine] if bodies else []
+    for component in ("offset", "drift"):
+        free = {name for name, c in clocks.items() if component in c.parameters.free and not (
+            c.parameters.prior is not None and component in c.parameters.prior.names)}  # fmt: skip
+        for together, _ in groups:
+            if together <= free:
+                said = ", ".join(clock_text(c) for c in sorted(together))
+                raise SurveyError(f"clocks of {said}: the {component} of every clock that sees the same motion is unknown, "
+                                  "so none of them is the time; take one out of free, or give it a sigma")  # fmt: skip
+
+
+def _unused(observed: Any) -> Any:
+    """An image block, reading or pair that is predicted only."""
+    return replace(observed, used=np.zeros(len(observed.uv), dtype=np.bool_) if hasattr(observed, "uv") else False)
+
+
+def _is_late(clock: Clock) -> bool:
+    given = zip(clock.parameters.names, clock.parameters.values.tolist(), strict=True)
+    return clock.jitter > 0.0 or any(n != "line_time" and (n in clock.parameters.free or v != 0.0) for n, v in given)
+
+
+def _ends(places: Iterable[_Place], times: EpochTimes) -> set[_Place]:
+    """The first and the last epoch of every run of every body."""
+    bodies: dict[ParameterName, list[tuple[float, str]]] = {}
+    for body, epoch in places:
+        if epoch in times.of:
+            bodies.setdefault(body, []).append((times.of[epoch], epoch))
+    out = set()
+    for body, found in bodies.items():
+        found.sort()
+        for run in _runs([t for t, _ in found], body):
+            out |= {(body, found[i][1]) for i in (run.start, run.stop - 1)}
+    return out
 
 
 def weights(times: FloatArray, dt: FloatArray) -> tuple[FloatArray, FloatArray]:

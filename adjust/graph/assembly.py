@@ -400,7 +400,6 @@ class GraphBuilder:
         chains = {i: shifts.of_pair(self.survey.pairs[i], chain) for i, chain in pairs.items()}
         for reading in self.survey.table_readings:
             shifts.reading(reading)
-        shifts.check_reference()
         return parts, chains
 
     def _parts(

@@ -39,11 +39,18 @@ def clocks_of(survey: Survey) -> Iterator[tuple[ParameterName, Clock]]:
         if clock is None:
             continue
         known = CLOCKS[kind]
+        name = (kind, owner)
         if wrong := set(clock.parameters.names) - set(known):
-            raise SurveyError(f"{kind.replace('_', ' ')} {owner!r}: has no {sorted(wrong)}; it has {', '.join(known)}")
+            raise SurveyError(f"clock of {clock_text(name)}: has no {sorted(wrong)}; it has {', '.join(known)}")
         if clock.parameters.ties:
-            raise SurveyError(f"{kind.replace('_', ' ')} {owner!r}: components of a clock cannot be tied to each other")
-        yield (kind, owner), clock
+            raise SurveyError(f"clock of {clock_text(name)}: its components cannot be tied to each other")
+        yield name, clock
+
+
+def clock_text(name: ParameterName) -> str:
+    """Whose clock it is, as people say it."""
+    return {"camera_clock": "camera {}", "table_clock": "table {}", "pose_clock": "the poses of station {}"}[
+        name[0]].format(name[1])  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -73,4 +80,4 @@ def epoch_times(survey: Survey) -> EpochTimes:
         return EpochTimes({e: i * (step or 1.0) for i, e in enumerate(order)}, INTERVALS if step is None else "s")
     if missing := [e for e in order if e not in survey.times]:
         raise SurveyError(f"epoch {missing[0]!r} has no time, but others have; give it under times_s")
-    return EpochTimes({e: survey.times[e] for e in order}, "s")
+    return EpochTimes(dict(survey.times), "s")
