@@ -4,32 +4,28 @@ With Lagrange's weights w over the times of the epoch e and the ``_AROUND`` epoc
 
     T(dt) = T_e Exp(sum_k w_k(dt) Log(T_e^-1 T_k)),    d T / d T_k = w_k Jr(xi) Jr^-1(L_k)
 
-a time dt after e, and a table at angles ``sum_k w_k(dt) a_k``. All of these are unknowns of the one graph, so what a late
-camera sees tells of several epochs at once. Epochs further apart than ``_GAP`` typical steps are another run: of a run of
-one epoch no motion is known, and things stand still there.
+a time dt after e, and a table at angles ``sum_k w_k(dt) a_k``. All of these are unknowns of the one graph, so what a
+late camera sees tells of several epochs at once. Epochs far apart are another run (:mod:`adjust.frames.runs`).
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
-from adjust.frames.unknowns import Chain, FrameTree, Link, ShiftedSlot, Unknowns, VectorMap, vector_map
-from adjust.model.clocks import CLOCK, EpochTimes, clock_text, clocks_of, epoch_times
+from adjust.frames.runs import MOVING, runs
+from adjust.frames.unknowns import Chain, Link, ShiftedSlot, Unknowns, VectorMap, vector_map
+from adjust.model.clocks import CLOCK, EpochTimes, clocks_of, epoch_times
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock, Pair, TableReading
 from adjust.model.result import ParameterName
-from adjust.model.survey import Clock, FloatArray, Survey
+from adjust.model.survey import FloatArray, Survey
 from adjust.spatial.rigid_motions import Motions, exp, right_jacobian, right_jacobian_inverse
 
 Reading = Callable[[gtsam.Values], tuple[FloatArray, list[tuple[int, FloatArray]]]]
 
-_GAP = 3.0
 _AROUND = 4
-_MOVING = ("world_from_station", "carrier_from_target", "table_motion")
 
 
 def collect_clocks(survey: Survey, unknowns: Unknowns) -> EpochTimes | None:
@@ -62,14 +58,14 @@ class Shifts:
         self._epoch: dict[int, tuple[ParameterName, float]] = {}
         self._epoch_ids: dict[int, str] = {}
         for name, slot in self.unknowns.slot_of.items():
-            if name[0] in _MOVING and len(name) == 3:
+            if name[0] in MOVING and len(name) == 3:
                 body, time = name[:2], self.times.of[name[2]]
                 series.setdefault(body, []).append((time, slot))
                 self._epoch[slot], self._epoch_ids[slot] = (body, time), name[2]
         for found in series.values():
             found.sort()
             slots = [slot for _, slot in found]
-            for run in _runs([t for t, _ in found], self._epoch[slots[0]][0]):
+            for run in runs([t for t, _ in found], self._epoch[slots[0]][0]):
                 for i in run:
                     first = min(max(run.start, i - _AROUND // 2), max(run.start, run.stop - 1 - _AROUND))
                     near = range(first, min(run.stop, first + _AROUND + 1))
@@ -83,8 +79,8 @@ class Shifts:
         if whole == chain or vector is None or "line_time" not in vector.names:
             return [(block, whole)]
         if block.target_id is None:
-            raise SurveyError(f"camera {block.camera_id!r}: its rows are read one after the other, which is modelled for "
-                              "points of targets alone; take line_time out of its clock")  # fmt: skip
+            raise SurveyError(f"camera {block.camera_id!r}: its rows are read one after the other, which is modelled "
+                              "for points of targets alone; take line_time out of its clock")  # fmt: skip
         rows = np.split(np.arange(len(block.uv)), np.flatnonzero(np.diff(block.uv[:, 1])) + 1)
         late = [float(block.uv[r[0], 1]) - self.middle_row[block.camera_id] for r in rows if len(r)]
         return [(block.part(r), self.shifted(chain, name, t)) for r, t in zip(rows, late, strict=True)]
@@ -156,120 +152,6 @@ def _parts(u: Unknowns, nodes: Sequence[int], clocks: Sequence[VectorMap]) -> li
     return parts
 
 
-def _runs(times: Sequence[float], body: ParameterName) -> list[range]:
-    """Runs of epochs at ascending times. Raises SurveyError where two of a body's are the same."""
-    steps = np.diff(times)
-    if not (steps > 0.0).all():
-        raise SurveyError(f"{' '.join(body)}: two of its epochs have the same time; correct times_s")
-    ends = np.flatnonzero(steps > _GAP * np.median(steps)) + 1 if len(steps) else []
-    borders = [0, *map(int, ends), len(times)]
-    return [range(a, b) for a, b in pairwise(borders)]
-
-
-def within_motion(survey: Survey) -> Survey:
-    """The survey less what late clocks saw at the ends of runs, of which it is not known how things moved there.
-
-    It is predicted where others tell where things were at the epoch, else left out. Raises SurveyError where no clock is
-    the time, or nothing of a late one is left.
-    """
-    clocks = dict(clocks_of(survey))
-    late = {name for name, clock in clocks.items() if _is_late(clock)}
-    if not late:
-        return survey
-    items, given = _observers(survey)
-    _check_reference(clocks, items)
-    left, out = set(range(len(items))), set[int]()
-    while True:
-        ends = _ends(set().union(given, *(items[i][1] for i in left)), epoch_times(survey))
-        out = {i for i in left if items[i][0] in late and items[i][1] & ends}
-        told = set().union(given, *(items[i][1] for i in left - out))
-        lost = {i for i in out if not items[i][1] <= told}
-        if not lost:
-            break
-        left -= lost
-    used = {clock for i, (clock, places) in enumerate(items) if i in left - out or not places}
-    if lost_clocks := [c for c in sorted(late) if c not in used and any(items[i][0] == c for i in range(len(items)))]:
-        raise SurveyError(f"clock of {clock_text(lost_clocks[0])}: at no epoch is it known how what it sees moves, for that "
-                          "takes an epoch before and one after; take the clock out, or measure while things move")
-    kept, first = dict[str, tuple[Any, ...]](), 0
-    for field in ("image_blocks", "table_readings", "pairs"):
-        every = getattr(survey, field)
-        number = dict(enumerate(every, first))
-        kept[field] = tuple(_unused(x) if i in out else x for i, x in number.items() if i in left)
-        first += len(every)
-    return replace(survey, **kept)
-
-
-_Place = tuple[ParameterName, str]
-"""A body or table, and an epoch."""
-
-
-def _observers(survey: Survey) -> tuple[list[tuple[ParameterName, set[_Place]]], set[_Place]]:
-    """Of every image block, table reading and pair its clock and what it sees moving; what is known without them."""
-    u, moving = Unknowns(), dict[int, _Place]()
-    tree = FrameTree(survey, u)
-    slots = [{link.slot for link in tree.of_image(b)} for b in survey.image_blocks]
-    for name, slot in u.slot_of.items():
-        if name[0] in _MOVING and len(name) == 3:
-            moving[slot] = name[:2], name[2]
-    items: list[tuple[ParameterName, set[_Place]]] = [
-        (("camera_clock", b.camera_id), {moving[s] for s in of if s in moving})
-        for b, of in zip(survey.image_blocks, slots, strict=True)
-    ]
-    items += [(("table_clock", r.table_id), {(("table_motion", r.table_id), r.epoch_id)}) for r in survey.table_readings]
-    for pair in survey.pairs:
-        ends = [(f.frame_id, str(f.epoch_id)) for f in (pair.a, pair.b) if f.kind == "station" and f.epoch_id]
-        clock = ("pose_clock", ends[0][0] if ends else "")
-        items.append((clock, {(("world_from_station", station), epoch) for station, epoch in ends}))
-    return items, {(n[:2], n[2]) for n, p in u.parameters.items() if len(n) == 3 and p.treatment != "free"}
-
-
-def _check_reference(clocks: Mapping[ParameterName, Clock], items: Iterable[tuple[ParameterName, set[_Place]]]) -> None:
-    """Raises SurveyError where all that see the same motion have free offsets, or drifts: no clock is the time."""
-    seen: dict[ParameterName, set[ParameterName]] = {}
-    for clock, places in items:
-        seen.setdefault(clock, set()).update(body for body, _ in places)
-    groups: list[tuple[set[ParameterName], set[ParameterName]]] = []
-    for clock, bodies in seen.items():
-        mine = ({clock}, bodies)
-        for other in [g for g in groups if g[1] & bodies]:
-            groups.remove(other)
-            mine = mine[0] | other[0], mine[1] | other[1]
-        groups += [mine] if bodies else []
-    for component in ("offset", "drift"):
-        free = {name for name, c in clocks.items() if component in c.parameters.free and not (
-            c.parameters.prior is not None and component in c.parameters.prior.names)}  # fmt: skip
-        for together, _ in groups:
-            if together <= free:
-                said = ", ".join(clock_text(c) for c in sorted(together))
-                raise SurveyError(f"clocks of {said}: the {component} of every clock that sees the same motion is unknown, "
-                                  "so none of them is the time; take one out of free, or give it a sigma")  # fmt: skip
-
-
-def _unused(observed: Any) -> Any:
-    """An image block, reading or pair that is predicted only."""
-    return replace(observed, used=np.zeros(len(observed.uv), dtype=np.bool_) if hasattr(observed, "uv") else False)
-
-
-def _is_late(clock: Clock) -> bool:
-    given = zip(clock.parameters.names, clock.parameters.values.tolist(), strict=True)
-    return clock.jitter > 0.0 or any(n != "line_time" and (n in clock.parameters.free or v != 0.0) for n, v in given)
-
-
-def _ends(places: Iterable[_Place], times: EpochTimes) -> set[_Place]:
-    """The first and the last epoch of every run of every body."""
-    bodies: dict[ParameterName, list[tuple[float, str]]] = {}
-    for body, epoch in places:
-        if epoch in times.of:
-            bodies.setdefault(body, []).append((times.of[epoch], epoch))
-    out = set()
-    for body, found in bodies.items():
-        found.sort()
-        for run in _runs([t for t, _ in found], body):
-            out |= {(body, found[i][1]) for i in (run.start, run.stop - 1)}
-    return out
-
-
 def weights(times: FloatArray, dt: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Lagrange's weights (s, n) at dt (s,) over times (s, n) that differ, and their derivatives by dt."""
     n = times.shape[1]
@@ -301,8 +183,11 @@ def interpolated(slots: Sequence[ShiftedSlot], values: gtsam.Values) -> Interpol
     return Interpolated(w, by_dt, np.array([s.by_clocks for s in slots]))
 
 
-def moved_poses(own: Motions, others: Motions, at: Interpolated) -> tuple[Motions, FloatArray]:
-    """Poses (s,) between those of s epochs and others (s (n - 1)) around; derivatives (s, 6, 6 n + c) by all and clocks."""
+def moved_poses(own: Motions, others: Motions, at: Interpolated) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """R (s, 3, 3), t (s, 3) between poses of s epochs and others (s (n - 1)) around.
+
+    Then their derivatives (s, 6, 6 n + c) by all of these and the clocks.
+    """
     s, n = at.w.shape
     first = Motions(np.repeat(own.rotation, n - 1, axis=0), np.repeat(_t(own), n - 1, axis=0))
     L = (first.inverse() @ others).log()
@@ -314,7 +199,8 @@ def moved_poses(own: Motions, others: Motions, at: Interpolated) -> tuple[Motion
     speed = (right @ np.einsum("sk,ski->si", at.by_dt[:, 1:], L.reshape(s, n - 1, 6))[..., None])[..., 0]
     by_nodes = np.swapaxes(np.concatenate([by_own[:, None], J], axis=1), 1, 2).reshape(s, 6, 6 * n)
     by_clock = speed[:, :, None] * at.by_clock[:, None, :]
-    return own @ exp(xi), np.concatenate([by_nodes, by_clock], axis=2)
+    moved = own @ exp(xi)
+    return moved.rotation, _t(moved), np.concatenate([by_nodes, by_clock], axis=2)
 
 
 def _t(motions: Motions) -> FloatArray:

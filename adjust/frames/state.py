@@ -26,8 +26,8 @@ class State:
     GTSAM is served with it only inside :meth:`serving`, by which a caller says that it asks at the values of that
     evaluation; asked at any other time, a factor evaluates itself.
 
-    slot_R (S, 3, 3), slot_t (S, 3): poses of all slots. D (derived slots, 6, k): derivative of the motion of a table, or
-    at the time of a clock, by what it follows from, as the slot's ``parts`` say. lenses, warps: see LensArrays and
+    slot_R (S, 3, 3), slot_t (S, 3): poses of all slots. D (derived slots, 6, k): derivative of the motion of a table,
+    or at the time of a clock, by what it follows from, as the slot's ``parts`` say. lenses, warps: see LensArrays and
     WarpArrays.
     points (P, 3) m: the free ones in the order of their keys, ``point_rows`` says where.
     """
@@ -42,7 +42,7 @@ class State:
         self.slot_R, self.slot_t = np.zeros((n, 3, 3)), np.zeros((n, 3))
         for slot, pose in enumerate(unknowns.slot_pose):
             self._set(slot, pose)
-        derived = {**unknowns.table_slots, **unknowns.shifted_slots}
+        derived: dict[int, TableSlot | ShiftedSlot] = {**unknowns.table_slots, **unknowns.shifted_slots}
         self.derived_index: IntArray = np.full(n, -1, dtype=np.int64)
         self.derived_index[list(derived)] = np.arange(len(derived))
         most = max((start + k for s in derived.values() for _, start, k in s.parts), default=6)
@@ -200,9 +200,8 @@ class State:
                 R, t, D = self._between_readings(values, of, at)
             else:
                 own, others = [s.nodes[0] for s in of], [n for s in of for n in s.nodes[1:]]
-                found, D = moved_poses(Motions(self.slot_R[own], self.slot_t[own]),
-                                       Motions(self.slot_R[others], self.slot_t[others]), at)  # fmt: skip
-                R, t = found.rotation, found.translation
+                R, t, D = moved_poses(Motions(self.slot_R[own], self.slot_t[own]),
+                                      Motions(self.slot_R[others], self.slot_t[others]), at)  # fmt: skip
             self.slot_R[i], self.slot_t[i] = R, t
             self.D[self.derived_index[i], :, : D.shape[2]] = D
 

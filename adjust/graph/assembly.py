@@ -17,7 +17,7 @@ from adjust.model.clocks import CLOCKS, EpochTimes, clocks_of
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Coordinates, FrameRef, ImageBlock, Pair, PositionRef, frame_text, position_text
 from adjust.model.result import Adjustment, ParameterName
-from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey, VectorPrior
+from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey, VectorParameter, VectorPrior
 from adjust.observations.factors import (
     ChainPose,
     ObservationFactor,
@@ -59,7 +59,7 @@ class StartValues:
 
 
 def values_of(adjustment: Adjustment, survey: Survey | None = None) -> StartValues:
-    """Adjusted values as start values; for another survey, whose tables, boards, clocks have other components in part."""
+    """Adjusted values as start values; for another survey, whose tables, boards, clocks may have other components."""
     estimates = adjustment.estimates
     poses = {n: e.value for n, e in estimates.items() if isinstance(e.value, Pose3)}
     arrays = {n: np.asarray(e.value) for n, e in estimates.items() if not isinstance(e.value, Pose3)}
@@ -72,9 +72,10 @@ def values_of(adjustment: Adjustment, survey: Survey | None = None) -> StartValu
 
 
 def _by_component(adjustment: Adjustment, survey: Survey | None) -> dict[ParameterName, FloatArray]:
-    """Of tables, boards, clocks, in the order of their components in the survey: adjusted where they were, else given."""
+    """Of tables, boards, clocks, in the order of their components in the survey: adjusted, else as given."""
     if survey is None:
         return {}
+    owners: dict[ParameterName, VectorParameter]
     owners = {("table_geometry", t.table_id): t.geometry for t in survey.tables}
     owners |= {("warp", t.target_id): t.warp for t in survey.targets if t.warp is not None}
     owners |= {name: clock.parameters for name, clock in clocks_of(survey)}
@@ -513,6 +514,7 @@ class GraphBuilder:
         for reading in self.survey.table_readings:
             unknown = self.unknowns.by_name.get(("table_angles", reading.table_id, reading.epoch_id))
             if unknown is not None:
+                factor: gtsam.NonlinearFactor
                 factor = gtsam.PriorFactorVector(unknown.key, reading.angles, gaussian(reading.cov))
                 shifted = None if self.shifts is None else self.shifts.reading(reading)
                 if shifted is not None:

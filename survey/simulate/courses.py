@@ -54,7 +54,9 @@ class Courses:
         body = name[:2]
         if body in self._places:
             return
-        mine = sorted((self.times.of[n[2]], n) for n in self.truth if n[:2] == body and len(n) == 3 and n[2] in self.times.of)
+        mine = sorted(
+            (self.times.of[n[2]], n) for n in self.truth if n[:2] == body and len(n) == 3 and n[2] in self.times.of
+        )
         t, values = np.array([t for t, _ in mine]), [self.truth[n] for _, n in mine]
         poses = [v for v in values if isinstance(v, Pose3)]
         if poses:

@@ -202,7 +202,7 @@ class Scene:
         return lens
 
     def image(self, block: ImageBlock) -> FloatArray:
-        """Image coordinates (n, 2) px of what a block shows, when its camera truly exposes, row by row where it does."""
+        """Image coordinates (n, 2) px of what a block shows when its camera truly exposes, row by row."""
         camera, name, epoch = self._cameras[block.camera_id], ("camera_clock", block.camera_id), block.epoch_id
         uv = self._seen(block, block.point_idx, self.courses.late(name, camera.clock, epoch))
         if not rolls(camera):

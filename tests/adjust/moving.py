@@ -43,8 +43,9 @@ def _with_images(survey: Survey, truth: Truth, sigma_px: float) -> Survey:
     """The survey with all points of its target in every image."""
     target, epochs = survey.targets[0], [e for e in survey.times if e[0] == "e"]
     n = len(target.x_in_target)
+    cov = np.tile(sigma_px**2 * np.eye(2), (n, 1, 1))
     blank = [
-        ImageBlock(c.camera_id, e, target.target_id, np.arange(n), np.zeros((n, 2)), np.tile(sigma_px**2 * np.eye(2), (n, 1, 1)))
+        ImageBlock(c.camera_id, e, target.target_id, np.arange(n), np.zeros((n, 2)), cov)
         for e in epochs for c in survey.cameras
     ]  # fmt: skip
     scene = Scene(survey, truth)
@@ -60,9 +61,9 @@ def board_before_cameras(
     survey, truth = stereo(21, n_pairs=1)
     truth = {name: v for name, v in truth.items() if name[0] != "carrier_from_target"} | (true or {})
     half = 0.5 * np.ptp(survey.targets[0].x_in_target, axis=0)
-    middle = Pose3(Rot3(), [0.05, 0.0, 0.75]).compose(Pose3(Rot3(), -half))
-    truth |= {("carrier_from_target", "board", e): Pose3(Rot3(), [0.05, 0.0, 0.75]).compose(course(k, 0.35, 0.07)).compose(
-        Pose3(Rot3(), [0.05, 0.0, 0.75]).inverse()).compose(middle) for k, e in enumerate(_epochs(n))}  # fmt: skip
+    place = Pose3(Rot3(), [0.05, 0.0, 0.75])
+    for k, e in enumerate(_epochs(n)):
+        truth["carrier_from_target", "board", e] = place.compose(course(k, 0.35, 0.07)).compose(Pose3(Rot3(), -half))
     cameras = tuple(replace(c, clock=(clocks or {}).get(c.camera_id)) for c in survey.cameras)
     survey = replace(survey, cameras=cameras, times=_times(_epochs(n)))
     return _resampled(survey, truth, sigma_px)
@@ -107,14 +108,18 @@ def camera_on_hand(
     hand_eye = Pose3(Rot3.Expmap(np.array([0.1, -0.2, 1.5])), [0.05, 0.02, 0.04])
     half = 0.5 * np.ptp(board.x_in_target, axis=0)
     truth = {name: v for name, v in truth.items() if name == ("lens", "left")} | (true or {})
-    truth |= {("station_from_camera", "left"): hand_eye, ("carrier_from_target", "board"): Pose3(Rot3(), [0.4, 0.1, 0.5])}
+    truth |= {
+        ("station_from_camera", "left"): hand_eye,
+        ("carrier_from_target", "board"): Pose3(Rot3(), [0.4, 0.1, 0.5]),
+    }
     look = Pose3(Rot3(), [0.4, 0.1, 0.5]).compose(Pose3(Rot3(), half))
     truth |= {("world_from_station", "hand", e): look.compose(course(k, 0.4, 0.06)).compose(
         Pose3(Rot3(), [0.0, 0.0, -0.8])).compose(hand_eye.inverse()) for k, e in enumerate(epochs)}  # fmt: skip
     cov = np.diag([2e-4**2] * 3 + [2e-4**2] * 3)
     survey = Survey(
         (camera,), (Station("hand", "epoch", clock=clocks.get("hand")),), targets=(board,),
-        pairs=tuple(Pair(f"p{e}", FrameRef("world"), FrameRef("station", "hand", e), Pose3(), cov) for e in epochs if e[0] == "e"),
+        pairs=tuple(Pair(f"p{e}", FrameRef("world"), FrameRef("station", "hand", e), Pose3(), cov)
+                    for e in epochs if e[0] == "e"),
         times=_times(epochs),
     )  # fmt: skip
     return _resampled(survey, truth, sigma_px)
@@ -123,5 +128,3 @@ def camera_on_hand(
 def _resampled(survey: Survey, truth: Truth, sigma_px: float) -> tuple[Survey, Truth]:
     survey = _with_images(survey, truth, sigma_px)
     return resample(survey, truth, 1), truth
-
-

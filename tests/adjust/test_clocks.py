@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from adjust.adjustment import adjust
-from adjust.frames.clocks import weights, within_motion
+from adjust.frames.clocks import weights
+from adjust.frames.runs import within_motion
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
@@ -149,4 +150,4 @@ def test_times_that_cannot_be_are_refused() -> None:
     with pytest.raises(SurveyError, match="epoch 'e03' has no time"):
         adjust(replace(survey, times={e: t for e, t in survey.times.items() if e != "e03"}))
     with pytest.raises(SurveyError, match="two of its epochs have the same time"):
-        adjust(replace(survey, times={e: 0.0 for e in survey.times}))
+        adjust(replace(survey, times=dict.fromkeys(survey.times, 0.0)))

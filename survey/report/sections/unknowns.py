@@ -192,6 +192,9 @@ def _drift(entry: dict[str, Any]) -> Markup:
     return joined((*parts[:_MOST_BLOCKS], _more(len(parts) - _MOST_BLOCKS))) + _tests(entry["significance"])
 
 
+_OWN_TIMES = ("<Epoch", "Value", "σ", "<Unit")
+
+
 def _clock(entry: dict[str, Any], owner: str = "") -> Markup:
     """The clock of a camera, a table or a station's poses, where it has one; the times of single epochs folded in."""
     clock = entry.get("clock")
@@ -201,8 +204,8 @@ def _clock(entry: dict[str, Any], owner: str = "") -> Markup:
     rows = [[e, _value_in(unit, v, s, s_unit), sigma_text(s), unit] for e, _, v, unit, s, s_unit, _ in own]
     head = t("Clock of {name}", name=owner) if owner else t("Clock")
     title = t("{n} epochs: times of their own", n=count(len(rows)))
-    epochs = part("details", title, _limited(("<Epoch", "Value", "σ", "<Unit"), rows, list), False) if rows else Markup()
-    return element("h3", head) + vector_table(clock) + epochs
+    shown = element("h3", head) + vector_table(clock)
+    return shown + (part("details", title, _limited(_OWN_TIMES, rows, list), False) if rows else Markup())
 
 
 def _remarks(lens: dict[str, Any]) -> Markup:
