@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from gtsam import Pose3
 
+from adjust.frames.runs import within_motion
 from adjust.frames.tables import check_harmonics
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS
 from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
@@ -52,6 +53,7 @@ def adjust(
     them. progress: called with (iteration, v'Pv). Raises SurveyError, IndeterminateError, NotConvergedError.
     """
     check_harmonics(survey)
+    survey = within_motion(survey)
     network = _network(survey)
     if network is not None:
         return _adjusted_network(network, survey, start, options, progress)

@@ -1,20 +1,22 @@
 """The current values of all slots, lenses and warps as plain arrays, for the compiled kernels."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 import gtsam
 import numpy as np
 
+from adjust.frames.clocks import Interpolated, interpolated, moved_poses
 from adjust.frames.lens_states import LensStates, lenders
 from adjust.frames.tables import table_motions
-from adjust.frames.unknowns import TableSlot, Unknowns, VectorMap, vector_map
+from adjust.frames.unknowns import ShiftedSlot, TableSlot, Unknowns, VectorMap, vector_map
 from adjust.lenses.models import MODELS, camera_constants
 from adjust.model.boards import BOARD, checked_warp, extent
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, IntArray, Survey, VectorParameter
 from adjust.native.images import MAX_MAP, LensArrays, WarpArrays
 from adjust.native.lenses import MAX_LENS
+from adjust.spatial.rigid_motions import Motions
 
 
 class State:
@@ -24,8 +26,9 @@ class State:
     GTSAM is served with it only inside :meth:`serving`, by which a caller says that it asks at the values of that
     evaluation; asked at any other time, a factor evaluates itself.
 
-    slot_R (S, 3, 3), slot_t (S, 3): poses of all slots. D (table slots, 6, k): derivative of a table's motion by its
-    free angles and free geometry, ``angles`` columns first. lenses, warps: see LensArrays and WarpArrays.
+    slot_R (S, 3, 3), slot_t (S, 3): poses of all slots. D (derived slots, 6, k): derivative of the motion of a table,
+    or at the time of a clock, by what it follows from, as the slot's ``parts`` say. lenses, warps: see LensArrays and
+    WarpArrays.
     points (P, 3) m: the free ones in the order of their keys, ``point_rows`` says where.
     """
 
@@ -39,16 +42,16 @@ class State:
         self.slot_R, self.slot_t = np.zeros((n, 3, 3)), np.zeros((n, 3))
         for slot, pose in enumerate(unknowns.slot_pose):
             self._set(slot, pose)
-        self.table_index: IntArray = np.full(n, -1, dtype=np.int64)
-        for i, table_slot in enumerate(unknowns.table_slots):
-            self.table_index[table_slot] = i
-        most = max((len(s.axes) + len(s.geometry.free) for s in unknowns.table_slots.values()), default=6)
-        self.D = np.zeros((max(1, len(unknowns.table_slots)), 6, most))
+        derived: dict[int, TableSlot | ShiftedSlot] = {**unknowns.table_slots, **unknowns.shifted_slots}
+        self.derived_index: IntArray = np.full(n, -1, dtype=np.int64)
+        self.derived_index[list(derived)] = np.arange(len(derived))
+        most = max((start + k for s in derived.values() for _, start, k in s.parts), default=6)
+        self.D = np.zeros((max(1, len(derived)), 6, most))
         self.warps = self._warp_arrays(survey)
         self._free_slots = [
             (slot, key)
             for slot, key in enumerate(unknowns.slot_key)
-            if key is not None and slot not in unknowns.table_slots
+            if key is not None and unknowns.derived(slot) is None
         ]
         self._pose_keys = {key for _, key in self._free_slots}
         self.evaluation = 0
@@ -116,12 +119,16 @@ class State:
             self._load_poses(values)
             self._load_points(values)
             self._move_tables(values, self.unknowns.table_slots.values())
+            self._shift(values, self.unknowns.shifted_slots.values())
         else:
-            asked = list(slots)
+            shifted = [s for slot in slots if (s := self.unknowns.shifted_slots.get(slot)) is not None]
+            asked = list(dict.fromkeys([*slots, *(n for s in shifted for n in s.nodes)]))
             self._move_tables(values, [t for s, t in self.unknowns.table_slots.items() if s in asked])
             for slot in asked:
-                if slot not in self.unknowns.table_slots and (found := self.unknowns.slot_key[slot]) is not None:
+                found = self.unknowns.slot_key[slot]
+                if found is not None and self.unknowns.derived(slot) is None:
                     self._set(slot, values.atPose3(found))
+            self._shift(values, shifted)
         if lenses:
             self._load_lenses(values)
 
@@ -154,14 +161,11 @@ class State:
 
     def by_keys(self, slot: int, by_slot: FloatArray) -> list[tuple[int, FloatArray]]:
         """From a derivative (n, 6) by a slot's pose to those by the unknowns behind it (none where it is held)."""
-        table = self.unknowns.table_slots.get(slot)
-        if table is None:
+        derived = self.unknowns.derived(slot)
+        if derived is None:
             return [(key, by_slot) for key in self.unknowns.link_keys(slot)]
-        k, D = len(table.axes), self.D[self.table_index[slot]]
-        out = [(table.angles_key, by_slot @ D[:, :k])]
-        if table.geometry.key is not None:
-            out.append((table.geometry.key, by_slot @ D[:, k : k + len(table.geometry.free)]))
-        return out
+        D = self.D[self.derived_index[slot]]
+        return [(key, by_slot @ D[:, start : start + n]) for key, start, n in derived.parts]
 
     def _move_tables(self, values: gtsam.Values, slots: Iterable[TableSlot]) -> None:
         by_table: dict[str, list[TableSlot]] = {}
@@ -172,15 +176,50 @@ class State:
 
     def _move_table(self, values: gtsam.Values, slots: list[TableSlot]) -> None:
         """Poses of one table's slots, and their derivatives into D."""
-        axes, geometry = slots[0].axes, slots[0].geometry
-        k, at = len(axes), [s.slot for s in slots]
+        at = [s.slot for s in slots]
         angles = np.array([values.atVector(s.angles_key) for s in slots])
+        self.slot_R[at], self.slot_t[at], derivative = self._of_table(values, slots[0], angles)
+        self.D[self.derived_index[at], :, : derivative.shape[2]] = derivative
+
+    @staticmethod
+    def _of_table(
+        values: gtsam.Values, slot: TableSlot, angles: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Motions of the table of a slot at angles (n, k): R, t, and derivatives by these and the free geometry."""
+        k, geometry = angles.shape[1], slot.geometry
         given = dict(zip(geometry.names, geometry.full(values).tolist(), strict=True))
-        self.slot_R[at], self.slot_t[at], derivative = table_motions(axes, given, angles)
-        by_geometry = derivative[:, :, k:] @ geometry.matrix
-        rows = self.table_index[at]
-        self.D[rows, :, :k] = derivative[:, :, :k]
-        self.D[rows, :, k : k + by_geometry.shape[2]] = by_geometry
+        R, t, derivative = table_motions(slot.axes, given, angles)
+        return R, t, np.concatenate([derivative[:, :, :k], derivative[:, :, k:] @ geometry.matrix], axis=2)
+
+    def _shift(self, values: gtsam.Values, slots: Iterable[ShiftedSlot]) -> None:
+        """Poses of slots at the times of clocks, and their derivatives into D; what they follow from is there."""
+        alike: dict[tuple[str, int, int], list[ShiftedSlot]] = {}
+        for s in slots:
+            table = self.unknowns.table_slots.get(s.nodes[0])
+            place = "" if table is None else table.table_id, len(s.nodes), len(s.by_clocks)
+            alike.setdefault(place, []).append(s)
+        for (table_id, *_), of in alike.items():
+            at, i = interpolated(of, values), [s.slot for s in of]
+            if table_id:
+                R, t, D = self._between_readings(values, of, at)
+            else:
+                own, others = [s.nodes[0] for s in of], [n for s in of for n in s.nodes[1:]]
+                R, t, D = moved_poses(Motions(self.slot_R[own], self.slot_t[own]),
+                                      Motions(self.slot_R[others], self.slot_t[others]), at)  # fmt: skip
+            self.slot_R[i], self.slot_t[i] = R, t
+            self.D[self.derived_index[i], :, : D.shape[2]] = D
+
+    def _between_readings(
+        self, values: gtsam.Values, slots: Sequence[ShiftedSlot], at: Interpolated
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Of slots of one table R, t, and derivatives by the angles of all nodes, free geometry and clocks."""
+        tables = [[self.unknowns.table_slots[n] for n in s.nodes] for s in slots]
+        angles = np.array([[values.atVector(t.angles_key) for t in nodes] for nodes in tables])
+        R, t, D = self._of_table(values, tables[0][0], np.einsum("sk,ska->sa", at.w, angles))
+        by_angles, k = D[:, :, : angles.shape[2]], angles.shape[2]
+        by_nodes = np.einsum("sk,sia->sika", at.w, by_angles).reshape(len(slots), 6, -1)
+        speed = by_angles @ np.einsum("sk,ska->sa", at.by_dt, angles)[..., None]
+        return R, t, np.concatenate([by_nodes, D[:, :, k:], speed * at.by_clock[:, None, :]], axis=2)
 
 
 def collect_vectors(survey: Survey, unknowns: Unknowns, lenses: dict[str, FloatArray]) -> None:

@@ -100,6 +100,37 @@ class TableSlot:
     angles_key: int
     geometry: VectorMap
 
+    @property
+    def parts(self) -> list[tuple[int, int, int]]:
+        """Of every unknown that it follows from the key, its first column among the derivatives, and their number."""
+        k, geometry = len(self.axes), self.geometry
+        angles = (self.angles_key, 0, k)
+        return [angles] if geometry.key is None else [angles, (geometry.key, k, len(geometry.free))]
+
+
+@dataclass(frozen=True, eq=False)
+class ShiftedSlot:
+    """A slot that is another one, the first of ``nodes``, at another time than its epoch's.
+
+    nodes: slots of the same body at n epochs around. times: of the other n - 1 after the first, in the unit of clocks.
+    clocks: vectors whose components, each times a number, add up to the time. parts: as of a table's.
+    """
+
+    slot: int
+    nodes: tuple[int, ...]
+    times: tuple[float, ...]
+    clocks: tuple[tuple[VectorMap, tuple[float, ...]], ...]
+    parts: list[tuple[int, int, int]]
+
+    def time(self, values: gtsam.Values) -> float:
+        """By how much later it is than the epoch."""
+        return float(sum(np.dot(rates, vector.full(values)) for vector, rates in self.clocks))
+
+    @property
+    def by_clocks(self) -> FloatArray:
+        """(c,) derivatives of the time by the free components of all clocks."""
+        return np.concatenate([np.asarray(rates) @ vector.matrix for vector, rates in self.clocks])
+
 
 @dataclass(eq=False)
 class Unknowns:
@@ -112,6 +143,7 @@ class Unknowns:
     slot_pose: list[Pose3] = field(default_factory=list)
     slot_identity: list[bool] = field(default_factory=list)
     table_slots: dict[int, TableSlot] = field(default_factory=dict)
+    shifted_slots: dict[int, ShiftedSlot] = field(default_factory=dict)
     vectors: dict[ParameterName, VectorMap] = field(default_factory=dict)
     held_points: dict[str, FloatArray] = field(default_factory=dict)
     parameters: dict[ParameterName, PoseParameter] = field(default_factory=dict)
@@ -164,10 +196,15 @@ class Unknowns:
         return self.slot_of[name]
 
     def link_keys(self, slot: int) -> list[int]:
-        """The unknowns that a slot depends on: its pose, or a table's angles and geometry; none where all is held."""
-        table = self.table_slots.get(slot)
-        found = [self.slot_key[slot]] if table is None else [table.angles_key, table.geometry.key]
-        return [key for key in found if key is not None]
+        """The unknowns that a slot depends on: its pose, or all those that it follows from; none where all is held."""
+        found, key = self.derived(slot), self.slot_key[slot]
+        if found is not None:
+            return [key for key, _, _ in found.parts]
+        return [] if key is None else [key]
+
+    def derived(self, slot: int) -> TableSlot | ShiftedSlot | None:
+        """What a slot follows from that is no unknown itself."""
+        return self.table_slots.get(slot) or self.shifted_slots.get(slot)
 
     def spread(self, name: ParameterName) -> dict[int, FloatArray]:
         """How all n components of a parameter follow from unknowns: (n, dim) by key; none of what is held."""

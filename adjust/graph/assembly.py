@@ -9,18 +9,21 @@ import gtsam
 import numpy as np
 from gtsam import Pose3, Rot3
 
+from adjust.frames.clocks import Shifts, collect_clocks, reading_residual
 from adjust.frames.state import State, collect_vectors
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Chain, FrameTree, Unknowns
 from adjust.model.boards import deformation, warming_of
+from adjust.model.clocks import CLOCKS, EpochTimes, clocks_of
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Coordinates, FrameRef, ImageBlock, Pair, PositionRef, frame_text, position_text
 from adjust.model.result import Adjustment, ParameterName
-from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey, VectorPrior
+from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey, VectorParameter, VectorPrior
 from adjust.observations.factors import (
     ChainPose,
     ObservationFactor,
     Position,
     coordinates_factor,
+    custom,
     distance_factor,
     gaussian,
     hold_factor,
@@ -56,7 +59,7 @@ class StartValues:
 
 
 def values_of(adjustment: Adjustment, survey: Survey | None = None) -> StartValues:
-    """Adjusted values as start values; for another survey, whose tables and boards have other components in part."""
+    """Adjusted values as start values; for another survey, whose tables, boards, clocks may have other components."""
     estimates = adjustment.estimates
     poses = {n: e.value for n, e in estimates.items() if isinstance(e.value, Pose3)}
     arrays = {n: np.asarray(e.value) for n, e in estimates.items() if not isinstance(e.value, Pose3)}
@@ -69,11 +72,13 @@ def values_of(adjustment: Adjustment, survey: Survey | None = None) -> StartValu
 
 
 def _by_component(adjustment: Adjustment, survey: Survey | None) -> dict[ParameterName, FloatArray]:
-    """Of tables and boards, in the order of their components in the survey: adjusted where they were, else as given."""
+    """Of tables, boards, clocks, in the order of their components in the survey: adjusted, else as given."""
     if survey is None:
         return {}
+    owners: dict[ParameterName, VectorParameter]
     owners = {("table_geometry", t.table_id): t.geometry for t in survey.tables}
     owners |= {("warp", t.target_id): t.warp for t in survey.targets if t.warp is not None}
+    owners |= {name: clock.parameters for name, clock in clocks_of(survey)}
     out: dict[ParameterName, FloatArray] = {}
     for name, owner in owners.items():
         if name in adjustment.estimates:
@@ -319,6 +324,8 @@ class GraphBuilder:
         """measured: the pairs of the survey as arrays, where these and :attr:`simple` are known."""
         self.survey, self.unknowns, self.measured = survey, Unknowns(), measured
         collect_vectors(survey, self.unknowns, dict(lenses))
+        self.times = collect_clocks(survey, self.unknowns)
+        self.shifts: Shifts | None = None
         self.terrestrial = collect_terrestrial(survey, self.unknowns)
         self.frames = FrameTree(survey, self.unknowns)
         self.point_ids = [p.point_id for p in survey.points]
@@ -336,6 +343,9 @@ class GraphBuilder:
         chains = {i: self.frames.of_image(block) for i, _, block in split}
         positions, pair_chains = self._chains_of_others()
         geometry = GeometryFactors(self.survey, self.unknowns, self.frames)
+        parts_of = {i: [(block, chains[i])] for i, _, block in split}
+        if self.times is not None:
+            parts_of, pair_chains = self._at_their_times(self.times, parts_of, pair_chains)
         self.vector_starts |= geometry.starts
         state = State(self.survey, self.unknowns)
         pairs = self._pair_batch(state)
@@ -356,18 +366,18 @@ class GraphBuilder:
                 others.add(item.factor)
         for factor in self._holds():
             others.add(factor)
-        known = [(i, b) for i, free, b in split if not free]
-        x_in_world = self._world_points() if any(b.target_id is None for _, b in known) else np.zeros((0, 3))
-        images = ImageBatch(self.survey, state, [b for _, b in known], [chains[i] for i, _ in known], x_in_world)
+        known = [part for i, free, _ in split if not free for part in parts_of[i]]
+        x_in_world = self._world_points() if any(b.target_id is None for b, _ in known) else np.zeros((0, 3))
+        images = ImageBatch(self.survey, state, [b for b, _ in known], [chain for _, chain in known], x_in_world)
         # unused observations too: they are predicted with the joint covariance of their unknowns
         outside = {k for item in self.others for k in list(item.factor.keys())} | set(self.unknowns.held)
         outside |= set() if pairs is None else pairs.keys()
         outside |= readings.keys if readings is not None else set()
         of_images = set(images.of_blocks.key.tolist())
-        unknown = [(i, b) for i, free, b in split if free]
-        parts = self._parts([b for _, b in unknown], [chains[i] for i, _ in unknown], outside | of_images)
+        unknown = [(i, *parts_of[i][0]) for i, free, _ in split if free]
+        parts = self._parts([b for _, b, _ in unknown], [chain for *_, chain in unknown], outside | of_images)
         bundles = tuple(
-            BundleBatch(self.unknowns, state, [unknown[k][1] for k in part], [chains[unknown[k][0]] for k in part],
+            BundleBatch(self.unknowns, state, [unknown[k][1] for k in part], [unknown[k][2] for k in part],
                         self.point_ids, outside | of_images | shared)
             for part, shared in parts
         )  # fmt: skip
@@ -381,6 +391,17 @@ class GraphBuilder:
             survey, self.unknowns, state, values, images, bundles, order, self.others, others, readings, reduced,
             pairs, first_pair,
         )  # fmt: skip
+
+    def _at_their_times(
+        self, times: EpochTimes, images: Mapping[int, list[tuple[ImageBlock, Chain]]], pairs: Mapping[int, Chain]
+    ) -> tuple[dict[int, list[tuple[ImageBlock, Chain]]], dict[int, Chain]]:
+        """Image blocks, in parts of one moment each, and pairs, with their chains when the clocks say."""
+        self.shifts = shifts = Shifts(self.survey, self.unknowns, times)
+        parts = {i: shifts.of_image(*whole) for i, (whole,) in images.items()}
+        chains = {i: shifts.of_pair(self.survey.pairs[i], chain) for i, chain in pairs.items()}
+        for reading in self.survey.table_readings:
+            shifts.reading(reading)
+        return parts, chains
 
     def _parts(
         self, blocks: Sequence[ImageBlock], chains: Sequence[Chain], outside: set[int]
@@ -493,7 +514,12 @@ class GraphBuilder:
         for reading in self.survey.table_readings:
             unknown = self.unknowns.by_name.get(("table_angles", reading.table_id, reading.epoch_id))
             if unknown is not None:
+                factor: gtsam.NonlinearFactor
                 factor = gtsam.PriorFactorVector(unknown.key, reading.angles, gaussian(reading.cov))
+                shifted = None if self.shifts is None else self.shifts.reading(reading)
+                if shifted is not None:
+                    keys, residual = reading_residual(shifted, self.unknowns, reading.angles)
+                    factor = custom(keys, reading.cov, residual)
                 self._other(factor, "table", reading.group, (reading.table_id, reading.epoch_id), unknown.components,
                             unknown.units, reading.angles, reading.used)  # fmt: skip
         first_pair = len(self.others)
@@ -552,7 +578,11 @@ class GraphBuilder:
         owners += [(("beam", b.beam_id), b.parameters.prior) for b in self.survey.beams]
         owners += [(("surface", s.surface_id), s.parameters.prior) for s in self.survey.surfaces if s.parameters]
         owners += [(("vertical",), self.survey.vertical.tilt.prior)]
+        owners += [(name, clock.parameters.prior) for name, clock in clocks_of(self.survey)]
         owners += self.terrestrial.priors.items()
+        for name, sigma in ({} if self.shifts is None else self.shifts.jitters).items():
+            factor = step_factor(u.vectors[name], None, np.array([sigma]))
+            self._other(factor, "prior", "prior", name, ("jitter",), u.vectors[name].units, np.zeros(1))
         for name, before, sigmas in state.lens_states.priors:
             change = u.vectors[name]
             factor = step_factor(change, None if before is None else u.vectors[before], sigmas)
@@ -629,6 +659,8 @@ class GraphBuilder:
             full = full_start(name, self.survey)
         elif name[0] == "table_geometry":
             full = next(t.geometry.values for t in self.survey.tables if t.table_id == name[1])
+        elif name[0] in CLOCKS:
+            full = next((c.parameters.values for owner, c in clocks_of(self.survey) if owner == name), np.zeros(1))
         else:
             full = next(t.warp.values for t in self.survey.targets if t.target_id == name[1] and t.warp)
         return np.array([full[vector.names.index(x)] for x in vector.own], dtype=float)

@@ -48,6 +48,9 @@ def readable(unknown: Unknown) -> str:
         "centring": "centring of setup {}",
         "beam": "laser beam {}",
         "surface": "surface {}",
+        "camera_clock": "clock of camera {}",
+        "table_clock": "clock of table {}",
+        "pose_clock": "clock of the poses of station {}",
     }[kind].format(*ids)
     return owner + (f" at epoch {ids[1]}" if len(ids) > 1 else "")
 

@@ -25,7 +25,7 @@ _SIGMA_ROUNDS, _SIGMA_CHANGE = 3, 1e-6
 
 _LATE = frozenset((
     "lens", "lens_drift", "lens_crop", "station_from_camera", "mount_from_station", "world_from_table",
-    "table_geometry", "warp", "instrument", "vertical", "beam", "surface",
+    "table_geometry", "warp", "instrument", "vertical", "beam", "surface", "camera_clock", "table_clock", "pose_clock",
 ))  # fmt: skip
 """What many observations share is eliminated last."""
 

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 # ("lens", camera) ("station_from_camera", camera) ("world_from_station", station[, epoch])
 # ("mount_from_station", station) ("world_from_table", table) ("table_geometry", table) ("table_angles", table, epoch)
 # ("carrier_from_target", target[, epoch]) ("warp", target) ("point", point) ("vertical",) ("instrument", instrument)
-# ("orientation", setup) ("centring", setup) ("beam", beam) ("surface", surface)
+# ("orientation", setup) ("centring", setup) ("beam", beam) ("surface", surface) ("camera_clock", camera)
+# ("table_clock", table) ("pose_clock", station)
 ParameterName = tuple[str, ...]
 
 

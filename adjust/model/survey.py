@@ -165,6 +165,17 @@ class LensParameter:
 
 
 @dataclass(frozen=True, eq=False)
+class Clock:
+    """When a camera exposes, or readings are taken: components of ``adjust.model.clocks.CLOCK``.
+
+    jitter: s, sigma of every single epoch's own time about that; 0: none.
+    """
+
+    parameters: VectorParameter
+    jitter: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
 class Camera:
     """A camera, x right, y down, z forward, fixed on a station. ``image_size`` is (width, height) in pixels."""
 
@@ -173,6 +184,8 @@ class Camera:
     image_size: tuple[int, int]
     lens: LensParameter
     station_from_camera: PoseParameter = PoseParameter()
+    clock: Clock | None = None
+    """When it exposes; None: at the epochs' times."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,6 +203,8 @@ class Station:
     epochs: Mapping[str, PoseParameter] = field(default_factory=dict)
     table_id: str | None = None
     mount_from_station: PoseParameter = PoseParameter()
+    clock: Clock | None = None
+    """When its measured poses (pairs at its epochs, as of a robot) were read."""
 
 
 TABLE_GEOMETRY = ("non_orthogonality", "axis_offset", "zero_1", "zero_2")
@@ -212,6 +227,8 @@ class Table:
             TABLE_GEOMETRY, np.zeros(4), free=("non_orthogonality", "axis_offset")
         )
     )
+    clock: Clock | None = None
+    """When its axes were read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -402,6 +419,9 @@ class Survey:
     """Mounts (``adjust.model.observations.Closure``) whose play the covariances of their pairs already contain."""
     temperatures: Mapping[str, float] = field(default_factory=dict)
     """degC by epoch, where it matters: of targets that expand."""
+    times: Mapping[str, float] = field(default_factory=dict)
+    """s by epoch, where it matters: to clocks. Without any, epochs are ``epoch_interval`` (s; None: unknown) apart."""
+    epoch_interval: float | None = None
 
     @property
     def others(self) -> Mapping[str, tuple[Observation, ...]]:

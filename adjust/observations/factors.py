@@ -188,7 +188,7 @@ def pair_factor(observation: Pair, unknowns: Unknowns, state: State, chain: Chai
     if isinstance(measured, Rot3):
         residual = _rotation_residual(predicted, measured)
         return custom(predicted.keys, observation.cov, residual)
-    if simple and not any(link.slot in unknowns.table_slots for link in chain):
+    if simple and all(unknowns.derived(link.slot) is None for link in chain):
         b, a = keys
         if a is not None and b is not None and a != b:
             return gtsam.BetweenFactorPose3(b, a, measured, gaussian(observation.cov))

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.model.boards import BENT
-from adjust.model.result import Adjustment, Estimate
+from adjust.model.clocks import CLOCK, CLOCKS
+from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import FloatArray
 from adjust.model.tables import harmonic
 from adjust.testing.distributions import chi2, fisher
@@ -44,7 +45,11 @@ def zero_test(x: FloatArray, cov: FloatArray, redundancy: int | None = None) -> 
 
 def terms_of(estimate: Estimate) -> Mapping[str, Sequence[str]]:
     """The terms of an estimate that may be zero, with their components that are estimated; none for most."""
-    known: Mapping[str, Sequence[str]] = _BOARD if estimate.name[0] == "warp" else _harmonics(estimate.components)
+    known: Mapping[str, Sequence[str]] = _harmonics(estimate.components)
+    if estimate.name[0] == "warp":
+        known = _BOARD
+    elif estimate.name[0] in CLOCKS:
+        known = {f"clock_{name}": (name,) for name in CLOCK}
     free = {c for c, status in zip(estimate.components, estimate.status, strict=True) if status not in ("held", "tied")}
     return {term: kept for term, names in known.items() if (kept := [n for n in names if n in free])}
 
@@ -71,21 +76,21 @@ def significances(adjustment: Adjustment, estimate: Estimate, estimated_sigma0: 
     return tuple(out)
 
 
-def significance_of_lens(
-    adjustment: Adjustment, camera_id: str, kind: str, estimated_sigma0: bool
+def significance_of_changes(
+    adjustment: Adjustment, of: ParameterName, term: str, estimated_sigma0: bool
 ) -> Significance | None:
-    """Whether a lens changes at all, or images are cropped otherwise than is given: of all its estimates together.
+    """Whether something changes at all, or images are cropped otherwise than is given: of all such estimates together.
 
-    kind: ``lens_drift`` or ``lens_crop``. None where none is estimated.
+    of: how their names begin. None where none is estimated.
     """
-    lens = next(c.lens for c in adjustment.survey.cameras if c.camera_id == camera_id)
-    found = [(n, e) for n, e in adjustment.estimates.items() if n[:2] == (kind, camera_id)]
+    found = [(n, e) for n, e in adjustment.estimates.items() if n[:2] == of and (of[0] not in CLOCKS or len(n) > 2)]
     names = [n for n, e in found if not set(e.status) <= {"held"}]
     if not names or adjustment.precision is None:
         return None
     parts = []
+    crops = {c.camera_id: c.lens.crops for c in adjustment.survey.cameras} if of[0] == "lens_crop" else {}
     for name, estimate in found:
-        given = np.zeros(len(estimate.components)) if kind == "lens_drift" else lens.crops[name[2]].parameters.values
+        given = crops[name[1]][name[2]].parameters.values if crops else np.zeros(len(estimate.components))
         free = [s != "held" for s in estimate.status]
         parts.append((np.asarray(estimate.value, dtype=float) - given)[free])
     factor = adjustment.sigma0**2 if estimated_sigma0 else 1.0
@@ -93,4 +98,4 @@ def significance_of_lens(
     level = LEVEL if adjustment.global_test is None else adjustment.global_test.alpha
     redundancy = adjustment.redundancy if estimated_sigma0 else None
     statistic, freedom, p = zero_test(np.concatenate(parts), cov, redundancy)
-    return Significance(kind, found[0][1].components, statistic, freedom, p, p < level)
+    return Significance(term, found[0][1].components, statistic, freedom, p, p < level)

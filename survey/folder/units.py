@@ -11,7 +11,8 @@ RAD_PER_DEG = math.pi / 180.0
 RAD_PER_ARCSEC = math.pi / 648000.0
 RAD_PER_GON = math.pi / 200.0
 _PER_UNIT = {"gon": RAD_PER_GON, "mgon": RAD_PER_GON / 1e3, "cc": RAD_PER_GON / 1e4}
-_UNITS = ("mm", "m", "deg", "arcsec", "gon", "mgon", "cc", "px", "rad", "mm2", "ppm", "mm_per_m", "ppm_per_K", "1")
+_UNITS = ("mm", "m", "deg", "arcsec", "gon", "mgon", "cc", "px", "rad", "mm2", "ppm", "mm_per_m", "ppm_per_K", "ms",
+          "us", "s", "1")  # fmt: skip
 
 
 def to_si(value: npt.ArrayLike, unit: str) -> FloatArray:
@@ -30,9 +31,11 @@ def to_si(value: npt.ArrayLike, unit: str) -> FloatArray:
             return np.asarray(x * _PER_UNIT[unit])
         case "ppm" | "ppm_per_K":
             return np.asarray(x / 1e6)
-        case "mm_per_m":
+        case "mm_per_m" | "ms":
             return np.asarray(x / 1e3)
-        case "m" | "rad" | "px" | "1":
+        case "us":
+            return np.asarray(x / 1e6)
+        case "m" | "rad" | "px" | "s" | "1":
             return x
     raise ValueError(f"unknown unit {unit!r}; known: {_UNITS}")
 
@@ -42,7 +45,7 @@ def from_si(x: npt.ArrayLike, unit: str) -> FloatArray:
     x = np.asarray(x, dtype=float)
     factors = {
         "mm": 1e3, "mm2": 1e6, "deg": 1 / RAD_PER_DEG, "arcsec": 1 / RAD_PER_ARCSEC, "ppm": 1e6, "mm_per_m": 1e3,
-        "ppm_per_K": 1e6,
+        "ppm_per_K": 1e6, "ms": 1e3, "us": 1e6,
     }  # fmt: skip
     factor = ({name: 1 / rad for name, rad in _PER_UNIT.items()} | factors).get(unit, 1.0)
     first = np.asarray(x * factor)

@@ -13,6 +13,7 @@ from adjust.model.names import natural_key
 from adjust.model.survey import Datum, FloatArray, Point, PointParameter, Survey
 from survey.folder.locking import settled
 from survey.folder.text import id_problem, suggestion
+from survey.project.declared.clocks import are_timed, read_times
 from survey.project.declared.declarations import keys_of
 from survey.project.declared.instruments import (
     read_beams,
@@ -235,10 +236,11 @@ def _read_definition(folder: Path, text: str | None = None) -> tuple[Definition,
     _check_format(root)
     root.allow(*keys_of("root"))
     inputs = {DEFINITION_FILE: digest}
-    tables, table_sigmas = read_tables(root)
-    stations = read_stations(root, tuple(table.table_id for table in tables))
+    times = read_times(root)
+    tables, table_sigmas = read_tables(root, are_timed(times))
+    stations = read_stations(root, tuple(table.table_id for table in tables), are_timed(times))
     station_ids = tuple(station.station_id for station in stations)
-    cameras = read_cameras(root, station_ids)
+    cameras = read_cameras(root, station_ids, are_timed(times))
     camera_ids = tuple(camera.camera_id for camera in cameras)
     targets, kinds, seen_by = read_targets(root, station_ids, camera_ids, inputs)
     dimensions = root.integer("dimensions", 1, 3)
@@ -254,7 +256,7 @@ def _read_definition(folder: Path, text: str | None = None) -> tuple[Definition,
         bearings=read_bearings(root.table("bearings")), instruments=instruments,
         setups=read_setups(root, tuple(i.instrument_id for i in instruments), accuracies),
         beams=read_beams(root, station_ids, table_ids), surfaces=read_surfaces(root),
-        temperatures={epoch_id: node.number(epoch_id) for epoch_id in node.values},
+        temperatures={epoch_id: node.number(epoch_id) for epoch_id in node.values}, **times,
     )  # fmt: skip
     tie_points = root.flag("tie_points", False)
     if not tie_points:

@@ -72,7 +72,7 @@ def write_project(
     sections = [(path, {**values, **seen_by.get(path, {})}) for path, values in survey_sections(survey, kinds, sigmas)]
     text = toml_text(
         [
-            head_section(title, tie_points),
+            head_section(title, tie_points, survey),
             *sections,
             *task_sections(alignment_tasks),
             *option_sections(options or AdjustmentOptions(), spots_request, sigmas),

@@ -147,11 +147,13 @@ _SAID = {"": ("significant", "not significant"), "lens_shared": ("does not hold"
 
 
 def _terms(solution: dict[str, Any]) -> Iterator[str]:
-    """Terms of boards and tables that are estimated, and whether they differ from zero."""
+    """Terms of boards, tables, lenses and clocks that are estimated, and whether they differ from zero."""
     owners = [(f"target {k}", e["warp"]) for k, e in solution["targets"].items() if "warp" in e]
     owners += [(f"table {k}", e["geometry"]) for k, e in solution["tables"].items() if "geometry" in e]
     owners += [(f"camera {k}", e[key]) for k, e in solution["cameras"].items()
                for key in ("lens_drift", "lens_crop", "lens_shared") if key in e]  # fmt: skip
+    owners += [(f"{kind[:-1]} {k}", e["clock"]) for kind in ("cameras", "tables", "stations")
+               for k, e in solution[kind].items() if "clock" in e]  # fmt: skip
     rows = [(k, term, test) for k, e in owners for term, test in e.get("significance", {}).items()]
     if rows:
         yield ""

@@ -8,7 +8,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.design.noise import moved, with_drawn_priors
 from adjust.design.readings import draw
-from adjust.model.observations import Pair
+from adjust.model.observations import Pair, TableReading
 from adjust.model.survey import FloatArray, Survey
 from survey.simulate.readings import fresh_readings
 from survey.simulate.scene import Scene, Truth
@@ -72,9 +72,7 @@ def _ideal(scene: Scene) -> _Ideal:
     images: list[FloatArray] = [np.zeros((0, 2))]
     factors: list[FloatArray] = [np.zeros((0, 2, 2))]
     for block in survey.image_blocks:
-        name, epoch_id = block.target_id, block.epoch_id
-        x = scene.world_points() if name is None else scene.target_points(name, epoch_id)
-        images.append(scene.project(block.camera_id, block.epoch_id, x[block.point_idx]))
+        images.append(scene.image(block))
         factors.append(np.asarray(np.linalg.cholesky(block.cov), dtype=np.float64))
     uv = np.concatenate(images)
     if np.isnan(uv).any():
@@ -84,13 +82,23 @@ def _ideal(scene: Scene) -> _Ideal:
         uv,
         np.concatenate(factors),
         np.cumsum([len(block.uv) for block in survey.image_blocks]).tolist(),
-        [scene.vector("table_angles", r.table_id, r.epoch_id) for r in survey.table_readings],
+        [_true_angles(scene, r) for r in survey.table_readings],
         [_true_pair(scene, pair) for pair in survey.pairs],
         [float(np.linalg.norm(scene.position(d.b) - scene.position(d.a))) for d in survey.distances],
         [np.array([scene.position(p) for p in c.positions]) for c in survey.coordinates],
     )
 
 
+def _true_angles(scene: Scene, reading: TableReading) -> FloatArray:
+    """Of a table when it was read."""
+    table = next(t for t in scene.survey.tables if t.table_id == reading.table_id)
+    late = scene.courses.late(("table_clock", table.table_id), table.clock, reading.epoch_id)
+    return scene.angles(table.table_id, reading.epoch_id, late)
+
+
 def _true_pair(scene: Scene, pair: Pair) -> Pose3 | Rot3:
-    b_from_a = np.linalg.inv(scene.world_from_frame(pair.b)) @ scene.world_from_frame(pair.a)
+    clocks = {s.station_id: s.clock for s in scene.survey.stations if s.clock is not None}
+    moving = [f for f in (pair.a, pair.b) if f.kind == "station" and f.epoch_id and f.frame_id in clocks]
+    late = sum(scene.courses.late(("pose_clock", f.frame_id), clocks[f.frame_id], str(f.epoch_id)) for f in moving[:1])
+    b_from_a = np.linalg.inv(scene.world_from_frame(pair.b, late)) @ scene.world_from_frame(pair.a, late)
     return Rot3(b_from_a[:3, :3]) if isinstance(pair.b_from_a, Rot3) else Pose3(b_from_a)

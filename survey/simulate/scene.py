@@ -14,9 +14,10 @@ from gtsam import Pose3
 
 from adjust.frames.lens_states import block_starts, crop_starts
 from adjust.model.boards import BOARD
-from adjust.model.observations import FrameRef, PositionRef
+from adjust.model.observations import FrameRef, ImageBlock, PositionRef
 from adjust.model.result import ParameterName
-from adjust.model.survey import BoolArray, Camera, FloatArray, Station, Survey, Table, Target
+from adjust.model.survey import BoolArray, Camera, FloatArray, IntArray, Station, Survey, Table, Target
+from survey.simulate.courses import Courses, rolls
 
 Truth = dict[ParameterName, Pose3 | FloatArray]
 BROWN = ("fx", "fy", "skew", "u0", "v0", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -98,6 +99,7 @@ class Scene:
     _stations: Mapping[str, Station] = field(init=False, repr=False)
     _tables: Mapping[str, Table] = field(init=False, repr=False)
     _targets: Mapping[str, Target] = field(init=False, repr=False)
+    courses: Courses = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         survey = self.survey
@@ -105,8 +107,11 @@ class Scene:
         object.__setattr__(self, "_stations", {s.station_id: s for s in survey.stations})
         object.__setattr__(self, "_tables", {t.table_id: t for t in survey.tables})
         object.__setattr__(self, "_targets", {t.target_id: t for t in survey.targets})
+        object.__setattr__(self, "courses", Courses(survey, self.truth))
 
-    def _pose(self, *name: str) -> FloatArray:
+    def _pose(self, *name: str, late: float = 0.0) -> FloatArray:
+        if late != 0.0 and len(name) == 3:
+            return self.courses.pose(name, late)
         pose = self.truth[name]
         if not isinstance(pose, Pose3):
             raise TypeError(f"the truth of {name} is not a pose")
@@ -137,8 +142,8 @@ class Scene:
             @ rotation_about(inner, angles[1] + g["zero_2"])
         )
 
-    def world_from_station(self, station_id: str, epoch_id: str | None = None) -> FloatArray:
-        """(4, 4) at an epoch: by the table where it was read then, else the station's own pose."""
+    def world_from_station(self, station_id: str, epoch_id: str | None = None, late: float = 0.0) -> FloatArray:
+        """(4, 4) at an epoch, or a time after it: by the table where it was read then, else the station's own pose."""
         station = self._stations[station_id]
         if station.motion == "fixed":
             return self._pose("world_from_station", station_id)
@@ -146,33 +151,39 @@ class Scene:
             raise ValueError(f"station {station_id} moves; an epoch is needed")
         reading = ("table_angles", str(station.table_id), epoch_id)
         if station.motion == "epoch" or reading not in self.truth:
-            return self._pose("world_from_station", station_id, epoch_id)
+            return self._pose("world_from_station", station_id, epoch_id, late=late)
         return (
             self._pose("world_from_table", reading[1])
-            @ self.table_from_mount(reading[1], self.vector(*reading))
+            @ self.table_from_mount(reading[1], self.angles(reading[1], epoch_id, late))
             @ self._pose("mount_from_station", station_id)
         )
 
-    def world_from_camera(self, camera_id: str, epoch_id: str | None = None) -> FloatArray:
-        """(4, 4) of a camera at an epoch."""
-        station_id = self._cameras[camera_id].station_id
-        return self.world_from_station(station_id, epoch_id) @ self._pose("station_from_camera", camera_id)
+    def angles(self, table_id: str, epoch_id: str, late: float = 0.0) -> FloatArray:
+        """(k,) rad of a table at an epoch, or a time after it."""
+        name = ("table_angles", table_id, epoch_id)
+        return self.vector(*name) if late == 0.0 else self.courses.angles(name, late)
 
-    def world_from_target(self, target_id: str, epoch_id: str | None = None) -> FloatArray:
-        """(4, 4) of a target at an epoch."""
+    def world_from_camera(self, camera_id: str, epoch_id: str | None = None, late: float = 0.0) -> FloatArray:
+        """(4, 4) of a camera at an epoch, or a time after it."""
+        station_id = self._cameras[camera_id].station_id
+        return self.world_from_station(station_id, epoch_id, late) @ self._pose("station_from_camera", camera_id)
+
+    def world_from_target(self, target_id: str, epoch_id: str | None = None, late: float = 0.0) -> FloatArray:
+        """(4, 4) of a target at an epoch, or a time after it."""
         target = self._targets[target_id]
         name: tuple[str, ...] = ("carrier_from_target", target_id)
         if target.motion == "epoch":
             name = (*name, str(epoch_id))
-        carrier = np.eye(4) if target.station_id is None else self.world_from_station(target.station_id, epoch_id)
-        return carrier @ self._pose(*name)
+        on = target.station_id
+        carrier = np.eye(4) if on is None else self.world_from_station(on, epoch_id, late)
+        return carrier @ self._pose(*name, late=late)
 
-    def target_points(self, target_id: str, epoch_id: str | None = None) -> FloatArray:
+    def target_points(self, target_id: str, epoch_id: str | None = None, late: float = 0.0) -> FloatArray:
         """The target's points in the world, (n, 3) m."""
         target = self._targets[target_id]
         warp, warmth = ("warp", target_id), self.survey.temperatures.get(str(epoch_id), target.reference_temperature)
         x = _warped(target, self.vector(*warp), warmth) if warp in self.truth else target.x_in_target
-        return transform(self.world_from_target(target_id, epoch_id), x)
+        return transform(self.world_from_target(target_id, epoch_id, late), x)
 
     def world_points(self) -> FloatArray:
         """All of the survey's points, (n, 3) m, in its order."""
@@ -195,9 +206,27 @@ class Scene:
                 lens[parameter] += factor * value
         return lens
 
-    def project(self, camera_id: str, epoch_id: str, x_in_world: FloatArray) -> FloatArray:
+    def image(self, block: ImageBlock) -> FloatArray:
+        """Image coordinates (n, 2) px of what a block shows when its camera truly exposes, row by row."""
+        camera, name, epoch = self._cameras[block.camera_id], ("camera_clock", block.camera_id), block.epoch_id
+        uv = self._seen(block, block.point_idx, self.courses.late(name, camera.clock, epoch))
+        if not rolls(camera):
+            return uv
+        middle = 0.5 * (camera.image_size[1] - 1)
+        for _ in range(4):  # a row is where the point is when it is read
+            for i, point in enumerate(block.point_idx):
+                late = self.courses.late(name, camera.clock, epoch, float(uv[i, 1]) - middle)
+                uv[i] = self._seen(block, np.array([point]), late)[0]
+        return uv
+
+    def _seen(self, block: ImageBlock, points: IntArray, late: float) -> FloatArray:
+        name, epoch = block.target_id, block.epoch_id
+        x = self.world_points() if name is None else self.target_points(name, epoch, late)
+        return self.project(block.camera_id, epoch, x[points], late)
+
+    def project(self, camera_id: str, epoch_id: str, x_in_world: FloatArray, late: float = 0.0) -> FloatArray:
         """Image coordinates (n, 2) px by OpenCV, NaN where a point is behind the camera or far outside its field."""
-        world_from_camera = self.world_from_camera(camera_id, epoch_id)
+        world_from_camera = self.world_from_camera(camera_id, epoch_id, late)
         x = transform(np.linalg.inv(world_from_camera).astype(np.float64), x_in_world)
         ahead = (x[:, 2] > 1e-3) & (np.hypot(x[:, 0], x[:, 1]) < _WIDEST_TANGENT * x[:, 2])
         uv = np.full((len(x), 2), np.nan)
@@ -229,12 +258,12 @@ class Scene:
             within: BoolArray = np.all((uv >= margin_px) & (uv <= size - 1.0 - margin_px), axis=1)
         return within
 
-    def world_from_frame(self, frame: FrameRef) -> FloatArray:
-        """(4, 4) of any named frame."""
+    def world_from_frame(self, frame: FrameRef, late: float = 0.0) -> FloatArray:
+        """(4, 4) of any named frame, of stations also a time after their epoch."""
         if frame.kind == "world":
             return np.eye(4)
         if frame.kind == "station":
-            return self.world_from_station(frame.frame_id, frame.epoch_id)
+            return self.world_from_station(frame.frame_id, frame.epoch_id, late if frame.epoch_id else 0.0)
         if frame.kind == "camera":
             return self.world_from_camera(frame.frame_id, frame.epoch_id)
         if frame.kind == "target":

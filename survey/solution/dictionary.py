@@ -9,11 +9,11 @@ import numpy as np
 
 from adjust.diagnosis.effects.ties import SharedLens, shared_lenses
 from adjust.epochs.states import datum_carriers, open_directions
-from adjust.model.result import Adjustment, Estimate, GroupSummary, ImageResiduals
+from adjust.model.result import Adjustment, Estimate, GroupSummary, ImageResiduals, ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.precision.precision import in_conditions
 from adjust.testing.distributions import norm
-from adjust.testing.significance import Significance, significance_of_lens, significances
+from adjust.testing.significance import Significance, significance_of_changes, significances
 from survey.project.detected import DetectedImage
 from survey.project.project import LeftOut
 from survey.solution.instruments import instrument_entries
@@ -76,7 +76,7 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
             "summary": _summary(adjustment, run, scale, found),
             "conventions": CONVENTIONS,
             "cameras": _cameras(adjustment, poses, scale),
-            "stations": _stations(adjustment, poses, columns),
+            "stations": _stations(adjustment, poses, columns, scale),
             "points": _points(adjustment, scale),
             "tables": _tables(adjustment, poses, scale),
             "targets": _targets(adjustment, poses, scale),
@@ -251,6 +251,7 @@ def _cameras(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, An
             entry["lens_crop"] = _changes(adjustment, camera.camera_id, "lens_crop", "crops", scale)
         if camera.camera_id in shared:
             entry["lens_shared"] = _shared(shared[camera.camera_id], scale)
+        entry |= _clock(adjustment, ("camera_clock", camera.camera_id), scale)
         entry |= pose(("station_from_camera", camera.camera_id), "station_from_camera")
         out[camera.camera_id] = entry | _images(adjustment, camera.camera_id, sums)
     return out
@@ -303,7 +304,7 @@ def _poses(of: PoseColumns) -> PoseOf:
     return pose
 
 
-def _stations(adjustment: Adjustment, pose: PoseOf, of: PoseColumns) -> Records:
+def _stations(adjustment: Adjustment, pose: PoseOf, of: PoseColumns, scale: Scale) -> Records:
     """Fixed ones with nothing but a pose, of which there may be very many, by columns."""
     stations, apart = adjustment.survey.stations, dict[str, dict[str, Any]]()
     names: list[tuple[str, ...]] = [("world_from_station", s.station_id) for s in stations]
@@ -313,6 +314,7 @@ def _stations(adjustment: Adjustment, pose: PoseOf, of: PoseColumns) -> Records:
     for station in (s for i, s in enumerate(stations) if i not in by_column):
         name = station.station_id
         entry = {"motion": station.motion} | ({"table": station.table_id} if station.table_id else {})
+        entry |= _clock(adjustment, ("pose_clock", name), scale)
         entry |= pose(("mount_from_station", name), "mount_from_station")
         apart[name] = plain(entry | pose(("world_from_station", name), "world_from_station"))
     at = np.array(alike, dtype=np.int64)
@@ -334,6 +336,7 @@ def _tables(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, Any
         geometry = adjustment.estimates.get(("table_geometry", name))
         if geometry is not None:
             entry["geometry"] = _terms(adjustment, geometry, scale)
+        entry |= _clock(adjustment, ("table_clock", name), scale)
         angles = {n[2]: e for n, e in adjustment.estimates.items() if n[:2] == ("table_angles", name)}
         out[name] = entry | {"epochs": {epoch: vector_entry(e, scale) for epoch, e in angles.items()}}
     return out
@@ -342,7 +345,7 @@ def _tables(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, Any
 def _changes(adjustment: Adjustment, camera_id: str, kind: str, key: str, scale: Scale) -> dict[str, Any]:
     """How a lens changes or images are cropped: by the epoch from which on, or per kelvin; and whether it is clear."""
     found = {n: e for n, e in adjustment.estimates.items() if n[:2] == (kind, camera_id)}
-    test = significance_of_lens(adjustment, camera_id, kind, scale.sigmas == "a_posteriori")
+    test = significance_of_changes(adjustment, (kind, camera_id), kind, scale.sigmas == "a_posteriori")
     parts = {n[2] if len(n) > 2 else "per_kelvin": vector_entry(e, scale) for n, e in found.items()}
     return {key: parts, "significance": {} if test is None else {test.term: _test(test)}}
 
@@ -353,6 +356,19 @@ def _shared(found: SharedLens, scale: Scale) -> dict[str, Any]:
     differences = Estimate(name, found.difference, found.names, found.units, found.cov, ("free",) * k)
     return {"camera": found.lender, "parameters": list(found.names), "differences": vector_entry(differences, scale),
             "significance": {found.test.term: _test(found.test)}}  # fmt: skip
+
+
+def _clock(adjustment: Adjustment, name: ParameterName, scale: Scale) -> dict[str, Any]:
+    """The clock of a camera, a table or a station's poses, the times of single epochs about it, and their tests."""
+    estimate = adjustment.estimates.get(name)
+    if estimate is None:
+        return {}
+    entry = _terms(adjustment, estimate, scale)
+    own = {n[2]: vector_entry(e, scale) for n, e in adjustment.estimates.items() if n[:2] == name and len(n) > 2}
+    test = significance_of_changes(adjustment, name, "clock_jitter", scale.sigmas == "a_posteriori")
+    if test is not None:
+        entry["significance"] = entry.get("significance", {}) | {test.term: _test(test)}
+    return {"clock": entry | ({"epochs": own} if own else {})}
 
 
 def _test(s: Significance) -> dict[str, Any]:

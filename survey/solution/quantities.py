@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3
 
+from adjust.model.clocks import INTERVALS
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import FloatArray, IntArray
@@ -59,7 +60,7 @@ SMALL_ANGLES = {
     "non_orthogonality", "tilt_1", "tilt_2", "vertical_index", "inclination", "across_1", "across_2",
 }  # fmt: skip
 
-PARTS_PER_MILLION = {"distance_scale", "scale_x", "scale_y", "shear"}
+PARTS_PER_MILLION = {"distance_scale", "scale_x", "scale_y", "shear", "drift"}
 
 
 def unit_for_people(component: str, unit: str) -> tuple[str, float]:
@@ -71,6 +72,10 @@ def unit_for_people(component: str, unit: str) -> tuple[str, float]:
         return ("arcsec", ARCSEC_PER_RAD) if small else ("deg", 180.0 / np.pi)
     if component in PARTS_PER_MILLION:
         return "ppm", 1e6
+    if unit == "s":
+        return ("us", 1e6) if component == "line_time" else ("ms", 1e3)
+    if unit == INTERVALS:
+        return "intervals", 1.0
     if unit == "1/K":
         return "ppm_per_K", 1e6
     return ("" if unit in ("1", "") else unit.replace("/K", "_per_K")), 1.0

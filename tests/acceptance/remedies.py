@@ -20,8 +20,11 @@ from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import CROP, FloatArray, ImageCrop, LensDrift, LensSharing, Survey, VectorParameter
 from adjust.model.tables import harmonic_names
 from adjust.testing.distributions import chi2
-from adjust.testing.significance import Significance, significance_of_lens, significances
+from adjust.testing.significance import Significance, significance_of_changes, significances
 from survey.simulate import Truth, head_on_table, resample, stereo
+from tests.adjust.moving import board_before_cameras, camera_on_hand, clock, head_on_moving_table
+
+Made = Callable[..., tuple[Survey, Truth]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +37,8 @@ class Remedy:
     innocent: Truth
     of: ParameterName
     term: str
+    drawn: Callable[[Truth, np.random.Generator], Truth] = lambda truth, _: truth
+    """The truth of one repeat, where the term is random itself."""
 
 
 @dataclass(frozen=True)
@@ -123,16 +128,42 @@ def _of_tie(result: Adjustment, remedy: Remedy, truth: Truth) -> tuple[FloatArra
     at = [MODELS["brown"].names.index(x) for x in found.names]
     true = (np.asarray(truth[remedy.of]) - np.asarray(truth["lens", found.lender]))[at]
     return found.difference - true, found.cov, found.test
+def creeping(name: str, sigmas: dict[str, float], begins: tuple[str, ...]) -> Remedy:
+    """A stereo rig whose second lens takes a step of these sigmas (px) at given epochs."""
+    steps = np.array(list(sigmas.values()))
+    zero = dict.fromkeys(begins, np.zeros(len(steps)))
+    made = lens(name, zero, LensDrift(tuple(sigmas), begins, steps))
+    camera = made.of[1]
+
+    def walked(truth: Truth, rng: np.random.Generator) -> Truth:
+        walk = np.cumsum(rng.normal(0.0, steps, (len(begins), len(steps))), axis=0)
+        return truth | {("lens_drift", camera, e): w for e, w in zip(begins, walk, strict=True)}
+
+    return replace(made, truth=dict(made.truth), drawn=walked)
+
+
+def late(name: str, made: Made, of: ParameterName, values: dict[str, float], jitter: float = 0.0) -> Remedy:
+    """Things that move smoothly, and a clock that is late; the last of its components, or the jitter, is the term."""
+    true = np.array(list(values.values()))
+    survey, truth = made(clocks={of[1]: clock(jitter, **values)}, true={of: true})
+
+    def own(truth: Truth, rng: np.random.Generator) -> Truth:
+        epochs = dict.fromkeys(b.epoch_id for b in survey.image_blocks)
+        return truth | {(*of, e): rng.normal(0.0, jitter, 1) for e in epochs}
+
+    term = "clock_jitter" if jitter else f"clock_{list(values)[-1]}"
+    none = truth | {of: np.append(true[:-1], 0.0) if not jitter else true}
+    return Remedy(name, survey, truth, none, of, term, own if jitter else lambda truth, _: truth)
 
 
 def _estimated(result: Adjustment, remedy: Remedy, truth: Truth) -> tuple[FloatArray, FloatArray, Significance]:
     """What was found less what is true, its covariance, and the test of the term."""
     if remedy.term == "lens_shared":
         return _of_tie(result, remedy, truth)
-    if remedy.term in ("lens_drift", "lens_crop"):
+    if remedy.term in ("lens_drift", "lens_crop", "clock_jitter"):
         names = [n for n in result.estimates if n[:2] == remedy.of[:2]]
-        d = np.concatenate([np.asarray(result.estimates[n].value) - np.asarray(truth[n]) for n in names])
-        test = significance_of_lens(result, remedy.of[1], remedy.term, estimated_sigma0=True)
+        d = np.concatenate([np.asarray(result.estimates[n].value) - np.asarray(truth.get(n, 0.0)) for n in names])
+        test = significance_of_changes(result, remedy.of[:2], remedy.term, estimated_sigma0=True)
         assert test is not None
         return d, np.asarray(result.precision.joint(names)), test
     estimate = result.estimates[remedy.of]
@@ -141,6 +172,7 @@ def _estimated(result: Adjustment, remedy: Remedy, truth: Truth) -> tuple[FloatA
     return (np.asarray(estimate.value) - np.asarray(truth[remedy.of]))[at], estimate.cov[np.ix_(at, at)], test
 
 
+_RIGHT = ("camera_clock", "right")
 REMEDIES: dict[str, Callable[[], Remedy]] = {
     "board bent": lambda: board("board bent", "bend", {"warp_x": 3e-4, "warp_y": -2e-4, "warp_xy": 5e-5}),
     "board stretched": lambda: board("board stretched", "stretch", {"scale_y": 6e-4, "shear": -4e-4}),
@@ -165,14 +197,27 @@ REMEDIES: dict[str, Callable[[], Remedy]] = {
     "axis wobbles": lambda: table(
         "axis wobbles", "tilt_2_order_+2", {"tilt_2": 2, "axial_2": 1}, {"tilt_2_re_p2": 3e-4, "axial_2_cos_1": 1e-4}
     ),
-}
+    "lens creeps": lambda: creeping("lens creeps", {"fx": 1.5, "u0": 0.6}, ("e05", "e09", "e13", "e17")),
+    "camera late": lambda: late("camera late", board_before_cameras, _RIGHT, {"offset": 4e-4}),
+    "camera's clock drifts": lambda: late(
+        "camera's clock drifts", board_before_cameras, _RIGHT, {"offset": 0.01, "drift": 5e-4}),
+    "rows one by one": lambda: late("rows one by one", board_before_cameras, _RIGHT, {"line_time": 2.5e-6}),
+    "late, rows one by one": lambda: late(
+        "late, rows one by one", board_before_cameras, _RIGHT, {"offset": 0.02, "line_time": 4e-6}),
+    "epochs at times of their own": lambda: late(
+        "epochs at times of their own", board_before_cameras, _RIGHT, {"offset": 0.01}, 2e-3),
+    "table read late": lambda: late(
+        "table read late", head_on_moving_table, ("table_clock", "turntable"), {"offset": 8e-4}),
+    "robot read late": lambda: late("robot read late", camera_on_hand, ("pose_clock", "hand"), {"offset": 2.5e-3}),
+}  # fmt: skip
 
 
 def outcome(remedy: Remedy, repeats: int, seed: int = 1) -> Outcome:
     """Adjusted again and again with fresh noise, with the terms and without."""
     squares, found, false, k = [], 0, 0, 0
     for i in range(repeats):
-        for truth in (remedy.truth, remedy.innocent):
+        here = remedy.drawn(remedy.truth, np.random.default_rng(seed + i))
+        for truth in (here, remedy.innocent):
             result = adjust(resample(remedy.survey, truth, 1000 * seed + i))
             d, cov, test = _estimated(result, remedy, truth)
             if truth is remedy.innocent:

@@ -1,7 +1,7 @@
 """What is not observed at the same time: an offset or a drift between clocks, rows read one after the other; gears.
 
 The unit of time is the interval between epochs; speeds are those of the observations themselves, by differences of
-neighbouring epochs. A value that was read dt late is ``f(t + dt) = f + dt f' + dt^2 f''/2``.
+neighbouring epochs. What is tried are clocks as unknowns (:mod:`adjust.diagnosis.late`).
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,8 +17,9 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect, Shifts, of_others, of_shifts
 from adjust.diagnosis.hypothesis import Hypothesis, Place
+from adjust.diagnosis.late import Freed, as_unknowns
 from adjust.diagnosis.score import Linear, Score, drift_times
-from adjust.diagnosis.sequences import hand_poses, with_pairs
+from adjust.diagnosis.sequences import hand_poses
 from adjust.model.observations import ImageBlock, TableReading
 from adjust.model.survey import FloatArray, Survey
 
@@ -89,22 +90,27 @@ def _with_row(_: int, n: int, block: ImageBlock, height: int) -> FloatArray:
     return np.asarray((block.uv[:, 1] + 0.5) / height - 0.5)
 
 
+_CAMERAS: Sequence[tuple[str, Any, tuple[str, ...]]] = (
+    ("cameras not simultaneous", _always, ("offset",)), ("clock drift", _with_time, ("offset", "drift")),
+    ("rolling shutter", _with_row, ("line_time",)),
+)  # fmt: skip
+"""Causes, how much later an image point is by one unit of them, and the unknowns of a clock."""
+
+
 def _of_cameras(case: Case, linear: Linear) -> Iterator[Effect]:
-    cameras = [c.camera_id for c in case.survey.cameras]
+    cameras = {c.camera_id: () if c.clock is None else c.clock.parameters.free for c in case.survey.cameras}
     motion = _motion(linear.result.survey)
     blocks = linear.result.survey.image_blocks
     moving = [c for c in cameras if sum(blocks[i].camera_id == c for i in motion) >= _FEWEST - 2]
-    for name, weight, which in (
-        ("cameras not simultaneous", _always, moving[1:]), ("clock drift", _with_time, moving[1:]),
-        ("rolling shutter", _with_row, moving),
-    ):  # fmt: skip
+    for name, weight, components in _CAMERAS:
+        which = [c for c in (moving if "line_time" in components else moving[1:]) if components[-1] not in cameras[c]]
         if not which:
             continue
         first = of_shifts(linear, _late(linear.result.survey, which, weight))
         sigmas = np.sqrt(np.maximum(np.diag(first.cov), 1e-300) * linear.scale)
         clear = [c for c, t, s in zip(which, first.theta, sigmas, strict=True) if abs(t) > _CLEAR * s]
         if clear:
-            yield _camera_effect(case, linear, name, weight, clear)
+            yield _camera_effect(case, linear, name, weight, clear, {("camera_clock", c): components for c in clear})
 
 
 def _late(survey: Survey, cameras: Sequence[str], weight: Any) -> Shifts:
@@ -121,40 +127,28 @@ def _late(survey: Survey, cameras: Sequence[str], weight: Any) -> Shifts:
     return out
 
 
-def _in_time(survey: Survey, cameras: Sequence[str], weight: Any, theta: FloatArray) -> Survey:
-    """The image points as they are theta intervals earlier; images of which no speed is known go."""
-    heights = {c.camera_id: c.image_size[1] for c in survey.cameras}
-    motion, blocks = _motion(survey), []
-    for i, block in enumerate(survey.image_blocks):
-        if block.camera_id not in cameras:
-            blocks.append(block)
-        elif i in motion:
-            k, n, speed, bend = motion[i]
-            dt = theta[cameras.index(block.camera_id)] * weight(k, n, block, heights[block.camera_id])[:, None]
-            blocks.append(replace(block, uv=block.uv - dt * speed + 0.5 * dt**2 * bend))
-        else:
-            blocks.append(replace(block, used=np.zeros(len(block.uv), dtype=np.bool_)))
-    return replace(survey, image_blocks=tuple(blocks))
-
-
-def _camera_effect(case: Case, linear: Linear, name: str, weight: Any, cameras: list[str]) -> Effect:
+def _camera_effect(
+    case: Case, linear: Linear, name: str, weight: Any, cameras: list[str], freed: Freed
+) -> Effect:
     first = of_shifts(linear, _late(linear.result.survey, cameras, weight))
     worst = cameras[int(np.argmax(np.abs(first.theta)))]
 
-    def said(theta: FloatArray, sigmas: FloatArray) -> str:
-        each = [f"{c} {t:+.3f} +- {s:.3f}" for c, t, s in zip(cameras, theta, sigmas, strict=True)]
-        text = f"({', '.join(each)} intervals between epochs)"
-        if name == "rolling shutter":
-            return f"the rows of camera {worst} are read one after the other while things move {text}"
-        drift = name == "clock drift"
-        return (f"camera {worst} does not expose when the others do{', and less and less so' if drift else ''}: its "
-                f"clock {'drifts' if drift else 'is late'} {text}")  # fmt: skip
-
+    drift = name == "clock drift"
+    text = (
+        f"the rows of camera {worst} are read one after the other while things move" if name == "rolling shutter" else
+        f"camera {worst} does not expose when the others do{', and less and less so' if drift else ''}: its clock "
+        f"{'drifts' if drift else 'is late'}"
+    )  # fmt: skip
     remedy = ("hold still what moves, or take a camera with a global shutter" if name == "rolling shutter" else
               "trigger the cameras together, or hold the target still at every epoch, and measure again")  # fmt: skip
-    hypothesis = Hypothesis(name, "", remedy, Place("camera", (worst,)), case.survey, (), 1.0, 0)
-    return Effect(hypothesis, first, lambda at: of_shifts(at, _late(at.result.survey, cameras, weight)),
-                  lambda _, theta: _in_time(case.survey, cameras, weight, theta), said)  # fmt: skip
+    hypothesis = Hypothesis(name, "", remedy, Place("camera", (worst,), "clock"), case.survey, (), 1.0, 0)
+    return _modelled(case, hypothesis, freed, first, text)
+
+
+def _modelled(case: Case, hypothesis: Hypothesis, freed: Freed, first: Score, text: str) -> Effect:
+    """An effect whose size is an unknown of clocks; text: its cause."""
+    return Effect(hypothesis, first, lambda _: first, lambda *_: case.survey, lambda *_: text,
+                  model=lambda h: as_unknowns(case, h, freed))  # fmt: skip
 
 
 # -- tables and hands ------------------------------------------------------------------------------------------------
@@ -169,18 +163,26 @@ def _of_tables(case: Case, linear: Linear) -> Iterator[Effect]:
         speed = spline(angles)(np.arange(len(mine)), 1)
         ids = [(r.table_id, r.epoch_id) for r in mine]
         times = drift_times(len(mine))[:, None]
+        freed = () if table.clock is None else table.clock.parameters.free
         for name, D, text in (
-            ("clock offset", speed, "its readings are late by {:+.4f} +- {:.4f} intervals between epochs"),
-            ("clock drift", times * speed, "its clock drifts by {:+.4f} +- {:.4f} intervals over the session"),
-            *((f"gear ratio of axis {k + 1}", -np.eye(angles.shape[1])[k] * angles,
-               f"axis {k + 1} turns by {{0:+.6f}} +- {{1:.6f}} of its readings more than they say: its gear ratio, or "
-               "the lines of its encoder") for k in range(angles.shape[1])),
+            ("clock offset", speed, "its readings are late"), ("clock drift", times * speed, "its clock drifts"),
         ):  # fmt: skip
-            yield _table_effect(case, linear, table.table_id, name, dict(zip(ids, D, strict=True)), text)
+            components = ("offset",) if name == "clock offset" else ("offset", "drift")
+            if components[-1] not in freed:
+                shifts = {i: d[:, None] for i, d in zip(ids, D, strict=True)}
+                hypothesis = Hypothesis(
+                    name, "", "read the table while it stands still, and measure again",
+                    Place("table", (table.table_id,), "clock"), case.survey, (), 1.0, 0,
+                )  # fmt: skip
+                yield _modelled(case, hypothesis, {("table_clock", table.table_id): components},
+                                of_others(linear, "table", shifts), f"table {table.table_id}: {text}")  # fmt: skip
+        for k in range(angles.shape[1]):
+            D = -np.eye(angles.shape[1])[k] * angles
+            yield _gear_effect(case, linear, table.table_id, k, dict(zip(ids, D, strict=True)))
 
 
-def _table_effect(
-    case: Case, linear: Linear, table_id: str, name: str, D: dict[tuple[str, ...], FloatArray], text: str
+def _gear_effect(
+    case: Case, linear: Linear, table_id: str, axis: int, D: dict[tuple[str, ...], FloatArray]
 ) -> Effect:
     shifts = {i: d[:, None] for i, d in D.items()}
 
@@ -189,13 +191,11 @@ def _table_effect(
         return r if d is None else replace(r, angles=r.angles - theta * d)
 
     def said(theta: FloatArray, sigmas: FloatArray) -> str:
-        return f"table {table_id}: {text.format(theta[0], sigmas[0])}"
+        return (f"table {table_id}: axis {axis + 1} turns by {theta[0]:+.6f} +- {sigmas[0]:.6f} of its readings more "
+                "than they say: its gear ratio, or the lines of its encoder")  # fmt: skip
 
-    kind = "gear ratio" if name.startswith("gear ratio") else name
-    hypothesis = Hypothesis(
-        kind, "", "correct table_angles.csv" if kind == "gear ratio" else "read the table while it stands still, and "
-        "measure again", Place("table", (table_id,), "axis1_deg"), case.survey, (), 1.0, 0,
-    )  # fmt: skip
+    hypothesis = Hypothesis("gear ratio", "", "correct table_angles.csv", Place("table", (table_id,), "axis1_deg"),
+                            case.survey, (), 1.0, 0)  # fmt: skip
     return Effect(
         hypothesis, of_others(linear, "table", shifts), lambda at: of_others(at, "table", shifts),
         lambda _, theta: replace(case.survey, table_readings=tuple(
@@ -205,17 +205,34 @@ def _table_effect(
 
 
 def _of_hands(case: Case, linear: Linear) -> Iterator[Effect]:
+    clocks = {s.station_id: () if s.clock is None else s.clock.parameters.free for s in case.survey.stations}
     for station, poses in hand_poses(case.survey).items():
         rows = [i for i, _ in poses.values()]
-        if len(rows) < _FEWEST:
+        if len(rows) < _FEWEST or station not in clocks:
             continue
         path = [p for i in rows if isinstance(p := case.survey.pairs[i].b_from_a, Pose3)]
-        times = drift_times(len(rows))
-        for name, w, text in (
-            ("clock offset", np.ones(len(rows)), "are late by {:+.3f} +- {:.3f} intervals between epochs"),
-            ("clock drift", times, "drift by {:+.3f} +- {:.3f} intervals over the session against the images"),
+        for name, w, components, text in (
+            ("clock offset", np.ones(len(rows)), ("offset",), "are late"),
+            ("clock drift", drift_times(len(rows)), ("offset", "drift"), "are ever later against the images"),
         ):  # fmt: skip
-            yield _hand_effect(case, linear, station, name, (rows, path, w), text)
+            if components[-1] in clocks[station]:
+                continue
+            hypothesis = Hypothesis(
+                name, "", "stop the motion at every epoch, or read pose and image at the same time, and measure again",
+                Place("station", (station,), "clock"), case.survey, (), 1.0, 0,
+            )  # fmt: skip
+            yield _modelled(case, hypothesis, {("pose_clock", station): components},
+                            _of_path(case.survey, linear, rows, path, w), f"the poses of {station} {text}")  # fmt: skip
+
+
+def _of_path(survey: Survey, linear: Linear, rows: Sequence[int], path: Sequence[Pose3], w: FloatArray) -> Score:
+    """Of measured poses that are late, each by so much of the change."""
+    speed = [a.between(b) for a, b in zip(_at(path, -_STEP * w), _at(path, _STEP * w), strict=True)]
+    late = zip(rows, speed, strict=True)
+    shifts = {survey.pairs[i].pair_id: Pose3.Logmap(d)[:, None] / (2.0 * _STEP) for i, d in late}
+    ids = {o.ids: shifts[o.ids[0]] for o in linear.system.precision.graph.others
+           if o.kind == "pair" and o.ids[0] in shifts}  # fmt: skip
+    return of_others(linear, "pair", ids)
 
 
 def _at(path: Sequence[Pose3], dt: FloatArray) -> list[Pose3]:
@@ -230,29 +247,3 @@ def _at(path: Sequence[Pose3], dt: FloatArray) -> list[Pose3]:
 def spline(values: Any) -> CubicSpline:
     """Through values (n, ...) at 0, 1, 2 ..."""
     return CubicSpline(np.arange(len(values)), np.array(values))
-
-
-def _hand_effect(
-    case: Case, linear: Linear, station: str, name: str, course: tuple[list[int], list[Pose3], FloatArray], text: str
-) -> Effect:
-    """course: rows of the pairs, their poses, and by how much of the change each is late."""
-    pairs, (rows, path, w) = case.survey.pairs, course
-    speed = [(a.between(b)) for a, b in zip(_at(path, -_STEP * w), _at(path, _STEP * w), strict=True)]
-    shifts = {pairs[i].pair_id: Pose3.Logmap(d)[:, None] / (2.0 * _STEP) for i, d in zip(rows, speed, strict=True)}
-
-    def scored(at: Linear) -> Score:
-        ids = {o.ids: shifts[o.ids[0]] for o in at.system.precision.graph.others
-               if o.kind == "pair" and o.ids[0] in shifts}  # fmt: skip
-        return of_others(at, "pair", ids)
-
-    def mended(theta: FloatArray) -> Survey:
-        at = zip(rows, _at(path, -theta[0] * w), strict=True)  # of the ends a spline knows little: they go
-        return with_pairs(case.survey, {i: replace(pairs[i], b_from_a=m, used=i not in (rows[0], rows[-1]))
-                                        for i, m in at})  # fmt: skip
-
-    hypothesis = Hypothesis(
-        name, "", "stop the motion at every epoch, or read pose and image at the same time, and measure again",
-        Place("station", (station,)), case.survey, (), 1.0, 0,
-    )  # fmt: skip
-    return Effect(hypothesis, scored(linear), scored, lambda _, theta: mended(theta),
-                  lambda theta, sigmas: f"the poses of {station} {text.format(theta[0], sigmas[0])}")  # fmt: skip

@@ -28,6 +28,7 @@ class Effect:
     with the values of an adjustment. said: its cause in words, by theta and sigmas. added: theta and a further change.
     known: a size that explains itself near this one, and what that makes of the hypothesis; None where there is none.
     nearer: the same change at another epoch, that an adjustment with the change shows to be the right one, or None.
+    model: the hypothesis with a survey in which the size is an unknown, tried in place of ``mended``.
     """
 
     hypothesis: Hypothesis
@@ -38,6 +39,7 @@ class Effect:
     added: Callable[[FloatArray, FloatArray], FloatArray] = np.add
     known: Callable[[FloatArray, FloatArray], tuple[FloatArray, Mapping[str, Any]] | None] = lambda theta, sigmas: None
     nearer: Callable[[Adjustment, FloatArray], "Effect | None"] = lambda result, theta: None
+    model: Callable[[Hypothesis], Hypothesis] | None = None
 
     def value(self, scale: float, n: int) -> float:
         """By how much more it explains than its parameters cost (Schwarz 1978), over a variance factor."""
@@ -65,7 +67,7 @@ class Effect:
         hypothesis = replace(self.hypothesis, survey=made, cause=self.said(self.first.theta, sigmas),
                              parameters=self.hypothesis.parameters + self.first.seen, looked_at=looked_at,
                              evidence=ratio(linear, self.first.drop))  # fmt: skip
-        return replace(hypothesis, follow=told)
+        return replace(hypothesis, follow=told) if self.model is None else self.model(hypothesis)
 
     def made(self, result: Adjustment, theta: FloatArray) -> Survey:
         """The survey that was adjusted last, where it is that of theta."""

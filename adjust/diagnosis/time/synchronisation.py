@@ -12,6 +12,7 @@ from gtsam import Pose3
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
+from adjust.diagnosis.late import Freed, as_unknowns
 from adjust.diagnosis.sequences import Link, fitted, links
 from adjust.model.survey import Camera, PoseParameter, Station, Survey
 from adjust.testing.criteria import sidak
@@ -34,7 +35,7 @@ class Offset:
 
 
 def unsynchronised(case: Case) -> Iterator[Hypothesis]:
-    """One hypothesis: all cameras that see a moving target expose at their own times."""
+    """All cameras that see a moving target expose at their own times: as clocks, else with nothing in common."""
     rigs = [link for link in links(case) if link.kind == "rig"]
     offsets = [o for o in (time_offset(link) for link in rigs) if o is not None]
     bound = norm.isf(sidak(_ALPHA, len(rigs)))
@@ -44,22 +45,27 @@ def unsynchronised(case: Case) -> Iterator[Hypothesis]:
         return
     worst = max(clear, key=lambda o: abs(o.intervals) / o.sigma)
     cameras = tuple(sorted({o.camera_id for o in offsets} | {o.reference_id for o in offsets}))
-    alone, n_epochs = apart(case.survey, cameras[1:])
-    if alone is None:
-        return
-    alone = _with_own_lenses(alone, case, cameras)
     said = ", ".join(
         f"{o.camera_id} after {o.reference_id} by {o.intervals:+.2f} +- {o.sigma:.2f} intervals" for o in clear[:4]
     )
-    yield Hypothesis(
+    hypothesis = Hypothesis(
         "cameras not simultaneous",
         f"cameras {', '.join(cameras)} do not expose at the same time: each fits alone ({seen:.2f} px), but camera "
         f"{worst.camera_id} sees the moving target typically {1e3 * worst.misses:.1f} mm from where camera "
         f"{worst.reference_id} does, in proportion to its motion ({said})",
         "trigger the cameras together, or hold the target still at every epoch, and measure again",
-        Place("camera", (worst.camera_id,)), alone, (), abs(worst.intervals) / worst.sigma, 6 * n_epochs,
+        Place("camera", (worst.camera_id,)), case.survey, (), abs(worst.intervals) / worst.sigma, 1,
         max(1, len(rigs)),
     )  # fmt: skip
+    clocked = {c.camera_id for c in case.survey.cameras if c.clock is not None}
+    late: Freed = {("camera_clock", c): ("offset",) for c in cameras[1:] if c not in clocked}
+    explained: list[bool] = []
+    if late:
+        yield as_unknowns(case, hypothesis, late, noted=explained)
+    alone, n_epochs = apart(case.survey, cameras[1:])
+    if alone is not None:
+        own = _with_own_lenses(alone, case, cameras)
+        yield replace(hypothesis, survey=lambda: None if any(explained) else own, parameters=6 * n_epochs)
 
 
 def time_offset(link: Link) -> Offset | None:

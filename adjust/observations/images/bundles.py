@@ -183,13 +183,13 @@ class BundleBatch:
 
     def _place_derivatives(self) -> None:
         """Where the derivatives of the local unknowns by the keys stand; which hidden poses own one block alone."""
-        rows, columns, links, self._table_links = [], [], [], []
+        rows, columns, links, self._derived_links = [], [], [], []
         own: dict[int, list[tuple[int, int]]] = {key: [] for key in self.hidden_poses}
         for b in range(len(self.blocks)):
             for link in range(self.chains.ptr[b], self.chains.ptr[b + 1]):
                 slot = int(self.chains.slot[link])
-                if slot in self.unknowns.table_slots:
-                    self._table_links.append((self.first_pose + 6 * b, slot, link))
+                if self.unknowns.derived(slot) is not None:
+                    self._derived_links.append((self.first_pose + 6 * b, slot, link))
                     continue
                 for key in self.unknowns.link_keys(slot):
                     rows.append(self.first_pose + 6 * b)
@@ -213,7 +213,7 @@ class BundleBatch:
         per_block = np.bincount(np.array(rows, dtype=np.int64), minlength=self.n_local + 1)
         # every hidden pose is that of one block, and the only unknown behind that block's pose
         self.alone = (
-            bool(owners) and not self._table_links and all(len(own[key]) == 1 for key in self.hidden_poses)
+            bool(owners) and not self._derived_links and all(len(own[key]) == 1 for key in self.hidden_poses)
             and bool(np.all(per_block[self.first_pose + 6 * np.array(blocks_of)] == 1))
         )  # fmt: skip
         self.own_links = np.array([link for _, link in owners], dtype=np.int64)
@@ -223,7 +223,7 @@ class BundleBatch:
         """Derivative (n_local, n_keys) of the local unknowns by the keys: lens and points direct, poses by chains."""
         r, c = [self._G_rows], [self._G_columns]
         v = [self.chains.C[self._G_links].ravel(), self._G_direct]
-        for row, slot, link in self._table_links:
+        for row, slot, link in self._derived_links:
             for key, J in self.state.by_keys(slot, self.chains.C[link]):
                 r.append(np.repeat(row + np.arange(6), J.shape[1]))
                 c.append(np.tile(self.key_at[key] + np.arange(J.shape[1]), 6))

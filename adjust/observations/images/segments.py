@@ -65,13 +65,11 @@ def _sources(state: State) -> tuple[IntArray, IntArray, FloatArray]:
             rows.append((p.key, SEGMENT_LENS, -1, p.first, p.n, p.within))
         ptr.append(len(rows))
     for slot, key in enumerate(unknowns.slot_key):
-        table = unknowns.table_slots.get(slot)
-        if table is None:
+        derived, d = unknowns.derived(slot), int(state.derived_index[slot])
+        if derived is None:
             close((key, SEGMENT_POSE, -1, 0, 6))
         else:
-            d, k, geometry = int(state.table_index[slot]), len(table.axes), table.geometry
-            angles = (table.angles_key, SEGMENT_TABLE, d, 0, k)
-            close(angles, (geometry.key, SEGMENT_TABLE, d, k, len(geometry.free)))
+            close(*((part, SEGMENT_TABLE, d, start, n) for part, start, n in derived.parts))
     for warp in state.warp_maps:
         close((warp.key if warp is not None else None, SEGMENT_WARP, -1, 0, len(warp.free) if warp is not None else 0))
     every = np.array([factors.get(i, 1.0) for i in range(len(rows))])

@@ -21,6 +21,7 @@ WARP_UNITS = {
     "expansion": "ppm_per_K",
 }  # fmt: skip
 CROP_UNITS = {"scale": "1", "left": "px", "top": "px"}
+CLOCK_UNITS = {"offset": "ms", "drift": "ppm", "line_time": "us"}
 SURFACE_UNITS: dict[str, dict[str, str]] = {
     "plane": {"normal_1": "deg", "normal_2": "deg", "distance": "mm"},
     "line": {"direction_1": "deg", "direction_2": "deg", "offset_1": "mm", "offset_2": "mm"},
@@ -49,6 +50,19 @@ def _surface(kind: str, reference: Key | None) -> Declared:
         f"surface_{kind}", "surfaces.ID", f"A {kind}; what is not given is found from the positions on it.",
         (_SURFACE_KIND, *((reference,) if reference else ()), *keys), of=("kind", kind),
     )  # fmt: skip
+
+
+def _clock(name: str, path: str, what: str, names: tuple[str, ...]) -> Declared:
+    said = {
+        "offset": "how much later than the epochs' times", "drift": "how much more late with time, about the middle of "
+        "the session", "line_time": "from each row of the image to the next lower one",
+    }  # fmt: skip
+    jitter = "sigma of the time of every single epoch about that; 0: none"
+    return Declared(name, path, what, (
+        *vector_keys_declared({n: CLOCK_UNITS[n] for n in names}, said, ("offset",)),
+        Key("jitter_ms", "number", jitter, 0.0),
+        Key("jitter_intervals", "number", "the same where no times are known, in intervals between epochs", 0.0),
+    ))  # fmt: skip
 
 
 def _target(kind: str, what: str, *keys: Key) -> Declared:
@@ -94,6 +108,9 @@ DECLARATIONS: tuple[Declared, ...] = (
             Key("spots", "table", "beacons as bright spots, found without a name", table="spots"),
             Key("vertical", "table", "the plumb line", table="vertical"),
             Key("temperatures_degC", "table", "by epoch, for targets that expand", table="temperatures"),
+            Key("times_s", "table", "by epoch, for clocks; all epochs or none", table="times"),
+            Key("epoch_interval_s", "number", "instead: from each epoch to the next, in the order of their names",
+                positive=True),
             Key("bearings", "table", "how horizontal angles count", table="bearings"),
             Key("instruments", "table", "total stations, levels by id", table="instrument"),
             Key("setups", "table", "set-ups of instruments by id", table="setup"),
@@ -111,8 +128,13 @@ DECLARATIONS: tuple[Declared, ...] = (
             Key("image_size_px", "numbers", "width, height", REQUIRED, size=(2,)),
             Key("lens", "table", "its lens", REQUIRED, table="lens"),
             Key("station_from_camera", "table", "the camera in its station", table="pose"),
+            Key("clock", "table", "when it exposes; absent: at the epochs' times", table="camera_clock"),
         ),
     ),
+    _clock("camera_clock", "cameras.ID.clock", "When a camera exposes, while things move (remedies.md).",
+           tuple(CLOCK_UNITS)),
+    _clock("clock", "CLOCK", "When the axes of a turntable (tables.ID.clock), or the poses of a station in pairs.csv "
+           "(stations.ID.clock), were read.", ("offset", "drift")),
     Declared(
         "lens", "cameras.ID.lens", "Model and parameters. The parameters of each model: mathematics.md.",
         (
@@ -203,6 +225,7 @@ DECLARATIONS: tuple[Declared, ...] = (
             Key("mount_from_station", "table", "the station on the table's mount, where motion is table", table="pose"),
             Key("epochs", "table", "the station at single epochs, where motion is not fixed: epochs.EPOCH",
                 table="poses"),
+            Key("clock", "table", "when its poses in pairs.csv were measured, as by a robot", table="clock"),
         ),
     ),
     Declared(
@@ -236,6 +259,7 @@ DECLARATIONS: tuple[Declared, ...] = (
                 table="turntable_sigma"),
             Key("harmonics", "table", "errors of its axes as they turn, up to which order (remedies.md)",
                 table="harmonics"),
+            Key("clock", "table", "when its axes are read; absent: at the epochs' times", table="clock"),
         ),
     ),
     Declared(
@@ -455,6 +479,7 @@ DECLARATIONS: tuple[Declared, ...] = (
         "temperatures", "temperatures_degC", "Epoch = temperature, where something is to expand with it.",
         free_keys=Key("EPOCH", "number", "degC"),
     ),
+    Declared("times", "times_s", "Epoch = its time, s, from any beginning.", free_keys=Key("EPOCH", "number", "s")),
     Declared(
         "vector_sigma", "SIGMA", "Sigmas of priors, under the keys of the values.",
         free_keys=Key("KEY", "number", "sigma, in the unit of the key", positive=True),

@@ -15,7 +15,7 @@ REQUIRED = object()
 """The default of a key that must be there."""
 NOTHING = None
 """The default of a key that may be absent and then says nothing."""
-_UNITS = ("ppm_per_K", "mm2", "mm", "m", "arcsec", "mgon", "cc", "deg", "px", "ppm")
+_UNITS = ("ppm_per_K", "mm2", "mm", "m", "ms", "us", "s", "arcsec", "mgon", "cc", "deg", "px", "ppm")
 
 
 @dataclass(frozen=True)

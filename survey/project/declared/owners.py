@@ -17,6 +17,7 @@ from adjust.model.survey import (
 from adjust.model.tables import HARMONICS, HIGHEST, harmonic_names, in_order, unit_of
 from survey.folder.text import suggestion
 from survey.folder.units import to_si
+from survey.project.declared.clocks import read_clock
 from survey.project.declared.declarations import keys_of
 from survey.project.declared.lenses import read_lens, read_size
 from survey.project.declared.node import Node
@@ -25,7 +26,7 @@ from survey.project.declared.poses import read_pose
 _GEOMETRY_UNITS = {"non_orthogonality": "arcsec", "axis_offset": "mm", "zero_1": "deg", "zero_2": "deg"}
 
 
-def read_cameras(root: Node, station_ids: tuple[str, ...]) -> tuple[Camera, ...]:
+def read_cameras(root: Node, station_ids: tuple[str, ...], timed: bool) -> tuple[Camera, ...]:
     """The cameras under [cameras.*]."""
     cameras = []
     for camera_id, node in root.tables("cameras"):
@@ -39,11 +40,12 @@ def read_cameras(root: Node, station_ids: tuple[str, ...]) -> tuple[Camera, ...]
             others = [c for c, _ in root.tables("cameras") if c != camera_id]
             node.table("lens").table("shared").reference("camera", others, "camera")
         pose = read_pose(node.table("station_from_camera"))
-        cameras.append(Camera(camera_id, station_id, size, lens, pose))
+        clock = read_clock(node, "camera_clock", timed)
+        cameras.append(Camera(camera_id, station_id, size, lens, pose, clock))
     return tuple(cameras)
 
 
-def read_stations(root: Node, table_ids: tuple[str, ...]) -> tuple[Station, ...]:
+def read_stations(root: Node, table_ids: tuple[str, ...], timed: bool) -> tuple[Station, ...]:
     """The stations under [stations.*]."""
     stations = []
     for station_id, node in root.tables("stations"):
@@ -66,6 +68,7 @@ def read_stations(root: Node, table_ids: tuple[str, ...]) -> tuple[Station, ...]
                 read_epochs(node, motion == "fixed"),
                 table_id,
                 read_pose(node.table("mount_from_station")),
+                read_clock(node, "clock", timed),
             )
         )
     return tuple(stations)
@@ -78,7 +81,7 @@ def read_epochs(node: Node, is_fixed: bool) -> dict[str, PoseParameter]:
     return {epoch_id: read_pose(epoch) for epoch_id, epoch in node.tables("epochs")}
 
 
-def read_tables(root: Node) -> tuple[tuple[Table, ...], dict[str, FloatArray]]:
+def read_tables(root: Node, timed: bool) -> tuple[tuple[Table, ...], dict[str, FloatArray]]:
     """The tables under [tables.*] and the sigmas (axes,) rad of their readings, by table id."""
     tables, sigmas = [], {}
     for table_id, node in root.tables("tables"):
@@ -90,7 +93,8 @@ def read_tables(root: Node) -> tuple[tuple[Table, ...], dict[str, FloatArray]]:
         if sigma is not None:
             sigmas[table_id] = sigma
         pose = read_pose(node.table("world_from_table"))
-        tables.append(Table(table_id, axes, pose, _read_geometry(node, len(axes))))
+        geometry, clock = _read_geometry(node, len(axes)), read_clock(node, "clock", timed)
+        tables.append(Table(table_id, axes, pose, geometry, clock))
     return tuple(tables), sigmas
 
 

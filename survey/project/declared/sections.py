@@ -17,6 +17,7 @@ from adjust.model.survey import (
     Target,
 )
 from survey.folder.units import from_si
+from survey.project.declared.clocks import clock_to_toml
 from survey.project.declared.declarations import WARP_UNITS
 from survey.project.declared.instruments import body_sections, instrument_sections, vertical_sections
 from survey.project.declared.lenses import lens_to_toml
@@ -32,12 +33,13 @@ from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGri
 def survey_sections(survey: Survey, kinds: Mapping[str, TargetKind], sigmas: Sigmas) -> list[Section]:
     """The sections of what there is and of the datum."""
     sections: list[Section] = []
+    timed = bool(survey.times) or survey.epoch_interval is not None
     for camera in survey.cameras:
-        sections += _camera(camera)
+        sections += _camera(camera, timed)
     for station in survey.stations:
-        sections += _station(station)
+        sections += _station(station, timed)
     for table in survey.tables:
-        sections.append((("tables", table.table_id), _table(table, sigmas.tables.get(table.table_id))))
+        sections.append((("tables", table.table_id), _table(table, sigmas.tables.get(table.table_id), timed)))
     for target in survey.targets:
         sections += _target(target, kinds[target.target_id])
     if survey.points:
@@ -47,15 +49,18 @@ def survey_sections(survey: Survey, kinds: Mapping[str, TargetKind], sigmas: Sig
     sections += body_sections(survey.beams, survey.surfaces)
     if survey.temperatures:
         sections.append((("temperatures_degC",), dict(survey.temperatures)))
+    if survey.times:
+        sections.append((("times_s",), dict(survey.times)))
     datum: dict[str, Any] = {"kind": survey.datum.kind}
     datum |= {"points": survey.datum.points} if survey.datum.points else {}
     datum |= {"stations": survey.datum.stations} if survey.datum.stations else {}
     return [*sections, (("datum",), datum)]
 
 
-def head_section(title: str, tie_points: bool) -> Section:
+def head_section(title: str, tie_points: bool, survey: Survey) -> Section:
     """The keys before the first table."""
-    return (), {"format": FORMAT, "title": title, "tie_points": tie_points}
+    step = {} if survey.epoch_interval is None else {"epoch_interval_s": survey.epoch_interval}
+    return (), {"format": FORMAT, "title": title, "tie_points": tie_points, **step}
 
 
 def option_sections(options: AdjustmentOptions, request: SpotsRequest | None, sigmas: Sigmas) -> list[Section]:
@@ -127,24 +132,26 @@ def _epochs(path: tuple[str, ...], poses: Mapping[str, PoseParameter]) -> list[S
     return [((*path, "epochs"), {key: pose_to_toml(pose, f"{where}.{key}") for key, pose in poses.items()})]
 
 
-def _camera(camera: Camera) -> list[Section]:
+def _camera(camera: Camera, timed: bool) -> list[Section]:
     path = ("cameras", camera.camera_id)
     values = {"station": camera.station_id, "image_size_px": camera.image_size}
     poses = _poses({"station_from_camera": camera.station_from_camera}, ".".join(path))
-    return [(path, values | poses), ((*path, "lens"), lens_to_toml(camera.lens))]
+    values |= poses | clock_to_toml(camera.clock, timed, f"{'.'.join(path)}.clock")
+    return [(path, values), ((*path, "lens"), lens_to_toml(camera.lens))]
 
 
-def _station(station: Station) -> list[Section]:
+def _station(station: Station, timed: bool) -> list[Section]:
     path = ("stations", station.station_id)
     values: dict[str, Any] = {"motion": station.motion}
     poses = {"world_from_station": station.world_from_station}
     if station.motion == "table":
         values["table"] = station.table_id
         poses["mount_from_station"] = station.mount_from_station
-    return [(path, values | _poses(poses, ".".join(path))), *_epochs(path, station.epochs)]
+    values |= _poses(poses, ".".join(path)) | clock_to_toml(station.clock, timed, f"{'.'.join(path)}.clock")
+    return [(path, values), *_epochs(path, station.epochs)]
 
 
-def _table(table: Table, sigma: FloatArray | None) -> dict[str, Any]:
+def _table(table: Table, sigma: FloatArray | None, timed: bool) -> dict[str, Any]:
     values: dict[str, Any] = {"axes": table.axes}
     if sigma is not None:
         values["sigma_arcsec"] = from_si(sigma, "arcsec").tolist()
@@ -159,7 +166,7 @@ def _table(table: Table, sigma: FloatArray | None) -> dict[str, Any]:
     if geometry.prior is not None:
         sigmas = zip(geometry.prior.names, np.sqrt(np.diagonal(geometry.prior.cov)), strict=True)
         values["geometry_sigma"] = {geometry_key(n): float(from_si(s, geometry_unit(n))) for n, s in sigmas}
-    return values
+    return values | clock_to_toml(table.clock, timed, f"tables.{table.table_id}.clock")
 
 
 def _target(target: Target, kind: TargetKind) -> list[Section]:

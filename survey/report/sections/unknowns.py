@@ -177,6 +177,7 @@ def _camera(camera_id: str, entry: dict[str, Any], residuals: charts.CameraResid
     lens = entry.get("lens")
     shown = Markup() if lens is None else vector_table(lens, lens["value_over_sigma"]) + _remarks(lens)
     shown += joined(_changes(entry[key], part) for key, part in _OF_LENS.items() if key in entry)
+    shown += _clock(entry)
     makers = (charts.vector_field, charts.mean_field, charts.histogram)
     drawn = [make(residuals) for make in makers] if len(residuals.uv) else []
     rows = [row[:1] + row[2:] for row in map(_pose_row, _poses(camera_id, entry))]
@@ -200,6 +201,22 @@ def _change_head(key: str, name: str) -> Markup | str:
     if key == "crops":
         return t("Images cropped from epoch {name} on", name=name)
     return t("Change per kelvin") if name == "per_kelvin" else t("Change from epoch {name} on", name=name)
+
+
+_OWN_TIMES = ("<Epoch", "Value", "σ", "<Unit")
+
+
+def _clock(entry: dict[str, Any], owner: str = "") -> Markup:
+    """The clock of a camera, a table or a station's poses, where it has one; the times of single epochs folded in."""
+    clock = entry.get("clock")
+    if clock is None:
+        return Markup()
+    own = [(epoch, *found) for epoch, e in clock.get("epochs", {}).items() for found in _components(e)]
+    rows = [[e, _value_in(unit, v, s, s_unit), sigma_text(s), unit] for e, _, v, unit, s, s_unit, _ in own]
+    head = t("Clock of {name}", name=owner) if owner else t("Clock")
+    title = t("{n} epochs: times of their own", n=count(len(rows)))
+    shown = element("h3", head) + vector_table(clock)
+    return shown + (part("details", title, _limited(_OWN_TIMES, rows, list), False) if rows else Markup())
 
 
 def _remarks(lens: dict[str, Any]) -> Markup:
@@ -232,6 +249,7 @@ def stations(c: Context) -> Markup:
     if many:
         title = t("{n} poses by epoch", n=count(len(by_epoch)))
         body += part("details", title, _limited(_POSE_COLUMNS, by_epoch, _pose_row), False)
+    body += joined(_clock(e, k) for k, e in c.solution["stations"].items())
     return section("poses", "Poses of stations, tables and targets", body, t(_POSE_NOTE))
 
 
@@ -243,6 +261,7 @@ def tables(c: Context) -> Markup:
         body = element("h3", joined((table_id, t("axes {axes}", axes=axes)), ", "))
         if "geometry" in entry:
             body += vector_table(entry["geometry"])
+        body += _clock(entry, table_id)
         if entry["epochs"]:
             names = list(next(iter(entry["epochs"].values()))["status"])
             columns = ("<Epoch", *(x for n in names for x in (f"{n} [°]", "σ [″]")))

@@ -1,0 +1,66 @@
+"""Clocks of cameras, turntables and measured poses, and the times of epochs, in ``survey.toml``."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from adjust.model.errors import SurveyError
+from adjust.model.survey import Clock, VectorParameter
+from survey.folder.units import from_si, to_si
+from survey.project.declared.declarations import CLOCK_UNITS, keys_of
+from survey.project.declared.node import Node
+from survey.project.declared.vectors import key_of, read_vector, vector_to_toml
+
+
+def read_clock(node: Node, declared: str, timed: bool) -> Clock | None:
+    """The table ``clock`` of a node, by the declaration of that name; None where there is none.
+
+    timed: whether the times of the epochs are known.
+    """
+    if not node.has("clock"):
+        return None
+    clock = node.table("clock")
+    clock.allow(*keys_of(declared))
+    units = {name: unit for name, unit in CLOCK_UNITS.items() if key_of(name, CLOCK_UNITS) in keys_of(declared)}
+    known = [key for key in (*(key_of(name, units) for name in units), "sigma", "jitter_ms") if clock.has(key)]
+    if known and not timed:
+        raise clock.error("the times of the epochs are not known; give times_s or epoch_interval_s, or leave it out",
+                          known[0])  # fmt: skip
+    if clock.has("jitter_ms") and clock.has("jitter_intervals"):
+        raise clock.error("jitter_ms is given too; keep one of the two", "jitter_intervals")
+    if clock.has("jitter_intervals") and timed:
+        raise clock.error("the times of the epochs are known; give jitter_ms", "jitter_intervals")
+    jitter = float(to_si(clock.number("jitter_ms", 0.0), "ms")) if timed else clock.number("jitter_intervals", 0.0)
+    if not jitter >= 0.0:
+        raise clock.error(f"found {jitter:g}; a sigma is not negative", "jitter_ms" if timed else "jitter_intervals")
+    given = read_vector(clock, units, ("offset",))
+    needed = [n in given.free or value != 0.0 for n, value in zip(given.names, given.values, strict=True)]
+    names = tuple(n for n, keep in zip(given.names, needed, strict=True) if keep)
+    return Clock(VectorParameter(names, given.values[needed], given.free, given.prior), jitter)
+
+
+def clock_to_toml(clock: Clock | None, timed: bool, where: str) -> dict[str, Any]:
+    """The key that :func:`read_clock` reads; nothing where there is no clock."""
+    if clock is None:
+        return {}
+    units = {name: CLOCK_UNITS[name] for name in clock.parameters.names}
+    zero = {key_of(n, units) for n, x in zip(clock.parameters.names, clock.parameters.values, strict=True) if x == 0.0}
+    table = {key: value for key, value in vector_to_toml(clock.parameters, units, where).items() if key not in zero}
+    if not timed and table.keys() - {"free"}:
+        raise SurveyError(f"{where}: has values, but the times of the epochs are not known; give them")
+    if clock.jitter > 0.0:
+        table |= {"jitter_ms": float(from_si(clock.jitter, "ms"))} if timed else {"jitter_intervals": clock.jitter}
+    return {"clock": table}
+
+
+def read_times(root: Node) -> dict[str, Any]:
+    """The fields of a survey that say when its epochs are."""
+    node = root.table("times_s")
+    if root.has("epoch_interval_s") and node.values:
+        raise root.error("times_s is given too; keep one of the two", "epoch_interval_s")
+    step = root.number("epoch_interval_s", positive=True) if root.has("epoch_interval_s") else None
+    return {"times": {epoch_id: node.number(epoch_id) for epoch_id in node.values}, "epoch_interval": step}
+
+
+def are_timed(times: Mapping[str, Any]) -> bool:
+    """Whether what :func:`read_times` read says any time."""
+    return bool(times["times"]) or times["epoch_interval"] is not None

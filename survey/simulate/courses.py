@@ -1,0 +1,70 @@
+"""Where moving things truly are between the epochs: cubic splines of their places and turns, by SciPy."""
+
+from collections.abc import Mapping
+from functools import cached_property
+
+import numpy as np
+from gtsam import Pose3
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from adjust.model.clocks import EpochTimes, epoch_times
+from adjust.model.result import ParameterName
+from adjust.model.survey import Camera, Clock, FloatArray, Survey
+
+
+class Courses:
+    """The true courses of a survey, and the true times of its clocks."""
+
+    def __init__(self, survey: Survey, truth: Mapping[ParameterName, Pose3 | FloatArray]) -> None:
+        self.survey, self.truth = survey, truth
+        self._places: dict[ParameterName, CubicSpline] = {}
+        self._turns: dict[ParameterName, RotationSpline] = {}
+
+    @cached_property
+    def times(self) -> EpochTimes:
+        """Of all epochs."""
+        return epoch_times(self.survey)
+
+    def late(self, name: ParameterName, clock: Clock | None, epoch_id: str, row: float = 0.0) -> float:
+        """By how much later than an epoch something with this clock is observed; row: below the middle of the image."""
+        if clock is None:
+            return 0.0
+        values = dict(zip(clock.parameters.names, np.asarray(self.truth[name]).tolist(), strict=True))
+        own = self.truth.get((*name, epoch_id), np.zeros(1))
+        since = self.times.of[epoch_id] - self.times.middle
+        return float(
+            values.get("offset", 0.0) + values.get("drift", 0.0) * since + values.get("line_time", 0.0) * row
+            + (0.0 if isinstance(own, Pose3) else own[0])
+        )  # fmt: skip
+
+    def pose(self, name: ParameterName, dt: float) -> FloatArray:
+        """(4, 4) of a body, named with an epoch, a time after it."""
+        self._lay(name)
+        t, out = self.times.of[name[2]] + dt, np.eye(4)
+        out[:3, :3], out[:3, 3] = self._turns[name[:2]](t).as_matrix(), self._places[name[:2]](t)
+        return out
+
+    def angles(self, name: ParameterName, dt: float) -> FloatArray:
+        """(k,) rad of a table, named with an epoch, a time after it."""
+        self._lay(name)
+        return np.asarray(self._places[name[:2]](self.times.of[name[2]] + dt))
+
+    def _lay(self, name: ParameterName) -> None:
+        body = name[:2]
+        if body in self._places:
+            return
+        mine = sorted(
+            (self.times.of[n[2]], n) for n in self.truth if n[:2] == body and len(n) == 3 and n[2] in self.times.of
+        )
+        t, values = np.array([t for t, _ in mine]), [self.truth[n] for _, n in mine]
+        poses = [v for v in values if isinstance(v, Pose3)]
+        if poses:
+            self._turns[body] = RotationSpline(t, Rotation.from_matrix([p.rotation().matrix() for p in poses]))
+            values = [p.translation() for p in poses]
+        self._places[body] = CubicSpline(t, np.array(values))
+
+
+def rolls(camera: Camera) -> bool:
+    """Whether the rows of a camera are read one after the other."""
+    return camera.clock is not None and "line_time" in camera.clock.parameters.names
