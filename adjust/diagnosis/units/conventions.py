@@ -13,6 +13,7 @@ from adjust.model.survey import FloatArray, IntArray
 
 ANGLES: tuple[ReadingKind, ...] = ("direction", "angle", "azimuth", "zenith")
 TURNS: tuple[ReadingKind, ...] = ("direction", "angle", "azimuth")
+_SMALLER = 0.1
 LENGTHS: tuple[ReadingKind, ...] = ("slope_distance", "horizontal_distance", "height_difference")
 
 
@@ -41,6 +42,17 @@ class Misreading:
     def mend(self, values: FloatArray) -> FloatArray:
         """(n,) true values of values as they were read."""
         return np.asarray(self.factor * values + self.offset)
+
+    def may_be(self, widest: float) -> bool:
+        """Whether values of which the largest is that (rad or m) can have been read so: a circle has one turn.
+
+        Two of them are allowed for. A unit that is larger than a tenth of the one it was read as leaves readings
+        beyond a turn, save where all of them lie in a small sector.
+        """
+        if self.kinds[0] not in ANGLES or self.offset:
+            return True
+        turned = abs(self.factor) > _SMALLER or widest > 2.0 * np.pi
+        return turned and abs(self.factor) * widest <= 4.0 * np.pi
 
 
 def _scaled(name: str, kinds: tuple[ReadingKind, ...], ratios: dict[str, float]) -> list[Misreading]:
