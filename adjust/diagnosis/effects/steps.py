@@ -66,7 +66,6 @@ def _courses(linear: Linear, only: ParameterName | None = None) -> Iterator[_Cou
     ptr, row_of = linear.system.ptr, linear.system.row_of
     first_reading = len(ptr) - 1 - len(survey.readings)
     pairs = {i: k for k, i in enumerate(_other_rows(linear, "pair"))}
-    At = linear.A.tocsc()
 
     def course(name: ParameterName, kind: str, ids: Mapping[int, str], rows: IntArray) -> _Course:
         numbers = [i for i in np.unique(row_of[rows]).tolist() if i in ids]
@@ -76,7 +75,7 @@ def _courses(linear: Linear, only: ParameterName | None = None) -> Iterator[_Cou
     for name, at in columns.at.items() if only is None else [(n, columns.at[n]) for n in (only,) if n in columns.at]:
         if name[0] not in (*_MOVED, "lens") or not len(at) or len(name) > 2 or _is_the_world(survey, name):
             continue
-        rows = np.unique(At[:, at].indices)
+        rows = linear.rows_of(at)
         if (rows < ptr[linear.system.n_image]).any():
             yield from _of_images(linear, name, rows)
         elif name[0] == "world_from_station":
@@ -119,7 +118,6 @@ def _of_held(linear: Linear, only: ParameterName | None) -> Iterator[_Course]:
     turned = [s.station_id for s in survey.stations if s.motion == "table"]
     held = [("target_body", t) for t in still if ("carrier_from_target", t) not in free]
     held += [("station_body", s) for s in turned if ("mount_from_station", s) not in free]
-    prediction = Prediction(survey, adjusted_values(linear.result))
     on_table = {r.epoch_id for r in survey.table_readings}
     for name in held if only is None else [n for n in held if n == only]:
         by_epoch: dict[str, list[Part]] = {}
@@ -127,7 +125,7 @@ def _of_held(linear: Linear, only: ParameterName | None) -> Iterator[_Course]:
         mine = {i for i, b in enumerate(survey.image_blocks) if b.target_id == name[1] or
                 (name[0] == "station_body" and b.camera_id in cameras and b.epoch_id in on_table)}  # fmt: skip
         for i in sorted(mine):
-            D = prediction.by_motion(survey.image_blocks[i], name)
+            D = linear.prediction.by_motion(survey.image_blocks[i], name)
             if D is not None:
                 by_epoch.setdefault(survey.image_blocks[i].epoch_id, []).extend(linear.image_parts({i: D}))
         parts = tuple((np.concatenate([r for r, _ in p]), np.concatenate([B for _, B in p])) for p in by_epoch.values())

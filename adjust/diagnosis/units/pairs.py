@@ -208,11 +208,15 @@ class _Judge:
 
 
 def _by_hands(survey: Survey, hands: list[Link]) -> _Judge:
+    """The motions that join most poses stay what they are where fewer than half of these change: they are robust."""
+    joined = [fitted(link.kind, link.first, _second(survey, link, {})) for link in hands]
+
     def misses(new: Mapping[int, Motion]) -> FloatArray:
         parts = []
-        for link in hands:
+        for link, fit in zip(hands, joined, strict=True):
             second = _second(survey, link, new)
-            fit = fitted(link.kind, link.first, second)
+            if 2 * len(new.keys() & set(link.pairs)) >= len(link.pairs):
+                fit = fitted(link.kind, link.first, second)
             parts.append(np.full(len(link.epochs), np.inf) if fit is None else fit.misses(link.first, second))
         return np.concatenate(parts)
 
