@@ -17,7 +17,7 @@ _KEPT = 4.0  # adjustments for the second families
 
 FAMILIES: tuple[tuple[str, ...], ...] = (
     ("effects", "images", "names", "units", "time", "weights"),
-    ("bodies", "targets"),
+    ("targets", "bodies"),
 )
 """Rooms of this one, each with ``hypotheses(case) -> Iterable[Hypothesis]``: what cheap evidence makes worth a try.
 

@@ -53,6 +53,13 @@ def agreeing(network: PoseNetwork, family_alpha: float = 0.001, factor: float = 
             return fine
 
 
+def loop_tests(network: PoseNetwork) -> FloatArray:
+    """Misclosures (L,) of short loops of the pairs in use: chi-square over its degrees of freedom."""
+    loops = _short_loops(network, network.used, network.used)
+    test, freedom = _tests(network, loops) if len(loops) else (np.zeros(0), np.ones(0, dtype=np.int64))
+    return test / freedom
+
+
 def _in_closing(network: PoseNetwork, loops: Loops, limit: FloatArray) -> BoolArray:
     """Pairs (E,) of the loops whose test is not above its limit (7,), by degrees of freedom."""
     out = np.zeros(network.n_pairs, dtype=np.bool_)

@@ -55,6 +55,15 @@ class Misreading:
         return turned and abs(self.factor) * widest <= 4.0 * np.pi
 
 
+def shrinking(factor: float, n: int) -> float:
+    """What n numbers that become smaller by a factor add to minus twice the log likelihood of those that were read.
+
+    The density of ``y`` is that of ``factor * y`` times ``factor``: else a unit that makes all of them nearly zero, and
+    so less than their sigmas, would explain whatever contradicts in them. What makes them larger earns nothing by that.
+    """
+    return -2.0 * n * min(0.0, float(np.log(abs(factor))))
+
+
 def _scaled(name: str, kinds: tuple[ReadingKind, ...], ratios: dict[str, float]) -> list[Misreading]:
     return [Misreading(name, said, ratio, 0.0, kinds) for said, ratio in ratios.items()]
 

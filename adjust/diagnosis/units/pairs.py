@@ -14,10 +14,9 @@ from gtsam import Pose3, Rot3
 
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import ChangeColumns, Edit, ExchangeColumns, Hypothesis, Place
-from adjust.diagnosis.screen import Screen, screen
+from adjust.diagnosis.screen import Screen, at_best, screen
 from adjust.diagnosis.sequences import Link, fitted, links, typical, with_pairs
-from adjust.diagnosis.units.conventions import Scope
-from adjust.graph.assembly import values_of
+from adjust.diagnosis.units.conventions import Scope, shrinking
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.spatial.rotation_forms import euler_from_matrix, matrix_from_euler
@@ -33,7 +32,8 @@ _LARGE = 500
 class Convention:
     """name: of the kind of mistake. said: what is wrong. remedy: in pairs.csv. mend: the motion as it was meant.
 
-    columns: the numbers of pairs.csv that change, and by which matrix, where that mends it.
+    columns: the numbers of pairs.csv that change, and by which matrix, where that mends it. shifts: what the lengths of
+    shifts are multiplied by.
     """
 
     name: str
@@ -41,6 +41,7 @@ class Convention:
     remedy: str
     mend: Callable[[Motion], Motion | None]
     columns: tuple[tuple[str, ...], FloatArray] | None = None
+    shifts: float = 1.0
 
 
 def _inverted(m: Motion) -> Motion:
@@ -103,15 +104,17 @@ def _scaled(factor: float) -> Callable[[Motion], Motion | None]:
     return lambda m: Pose3(m.rotation(), factor * m.translation()) if isinstance(m, Pose3) else None
 
 
+def _of_shifts(said: str, factor: float) -> Convention:
+    return Convention("unit of shifts", f"have shifts in {said}", f"multiply tx, ty, tz by {factor:g}",
+                      _scaled(factor), (_SHIFT, factor * np.eye(3)), factor)  # fmt: skip
+
+
 _SHIFT, _QUATERNION = ("tx_mm", "ty_mm", "tz_mm"), ("qw", "qx", "qy", "qz")
 CONVENTIONS: tuple[Convention, ...] = (
     Convention("pairs inverted", "are a_from_b, read as b_from_a", "exchange a_id and b_id", _inverted),
-    Convention("unit of shifts", "have shifts in metres, read as millimetres", "multiply tx, ty, tz by 1000",
-               _scaled(1000.0), (_SHIFT, 1000.0 * np.eye(3))),
-    Convention("unit of shifts", "have shifts in millimetres, read as metres", "multiply tx, ty, tz by 0.001",
-               _scaled(0.001), (_SHIFT, 0.001 * np.eye(3))),
-    Convention("unit of shifts", "have shifts in inches, read as millimetres", "multiply tx, ty, tz by 25.4",
-               _scaled(25.4), (_SHIFT, 25.4 * np.eye(3))),
+    _of_shifts("metres, read as millimetres", 1000.0),
+    _of_shifts("millimetres, read as metres", 0.001),
+    _of_shifts("inches, read as millimetres", 25.4),
     Convention("order of quaternions", "have quaternions in the order x y z w, read as w x y z",
                "put the last of the four numbers first", _last_first, (_QUATERNION, np.roll(np.eye(4), 1, axis=0))),
     Convention("order of quaternions", "have quaternions in the order w x y z, read as x y z w",
@@ -152,7 +155,8 @@ def misread_pairs(case: Case) -> Iterator[Hypothesis]:
         if changed is not None:
             cause = f"{scope.text} {convention.said}{_lengths(changed, hands)}"
             yield Hypothesis(convention.name, cause, f"in pairs.csv {convention.remedy}", scope.place, changed,
-                             edits_of(survey, scope.rows, convention), evidence, 1, looked_at)  # fmt: skip
+                             edits_of(survey, scope.rows, convention), evidence, 1, looked_at,
+                             penalty=shrinking(convention.shifts, 3 * len(scope.rows)))  # fmt: skip
 
 
 def _lengths(survey: Survey, hands: list[Link]) -> str:
@@ -247,16 +251,18 @@ def _by_start(case: Case) -> _Judge | None:
     survey = case.survey
     if len(survey.pairs) > _LARGE:
         return None
-    before = None if case.result is None else screen(survey, values_of(case.result))
-    before = before or screen(survey)
+    before = at_best(case)
     if before is None:
         return None
-    squares = _of_pairs(before, survey)
+    squares, open_loops = _of_pairs(before, survey), _typical_loop(survey)
     worst = np.argsort(-squares, kind="stable")
 
     def evidence(new: Mapping[int, Motion]) -> float:
         whole, rows = len(new) > 0.5 * len(survey.pairs), np.array(list(new))
-        after = screen(_with(survey, new)) if whole else None
+        changed = _with(survey, new) if whole else survey
+        if whole and _typical_loop(changed) > 0.5 * open_loops:
+            return 0.0
+        after = screen(changed) if whole else None
         if after is not None:
             now, rows = _of_pairs(after, survey), np.arange(len(squares))
         else:
@@ -267,6 +273,17 @@ def _by_start(case: Case) -> _Judge | None:
         return float(old / (left + 0.1 * len(rows)))
 
     return _Judge(worst, evidence)
+
+
+def _typical_loop(survey: Survey) -> float:
+    """The misclosure of the typical short loop, over its sigma, squared; 0 where there is none that tells."""
+    if not survey.is_pose_network:
+        return 0.0
+    from adjust.pose_network.agreement import loop_tests  # here: a survey without pairs starts without it
+    from adjust.pose_network.from_survey import network_from_survey
+
+    tests = loop_tests(network_from_survey(survey, any_datum=True))
+    return float(np.median(tests)) if len(tests) else 0.0
 
 
 def _read_as(found: Screen, new: Mapping[int, Motion]) -> FloatArray:

@@ -12,7 +12,16 @@ import numpy as np
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import ChangeReadings, Hypothesis, Place
 from adjust.diagnosis.screen import Screen, at_best, improvement, screen
-from adjust.diagnosis.units.conventions import ANGLES, LENGTHS, MISREADINGS, SLIPS, TURNS, Misreading, Scope
+from adjust.diagnosis.units.conventions import (
+    ANGLES,
+    LENGTHS,
+    MISREADINGS,
+    SLIPS,
+    TURNS,
+    Misreading,
+    Scope,
+    shrinking,
+)
 from adjust.model.observations import Reading
 from adjust.model.survey import FloatArray, IntArray, Survey
 
@@ -147,7 +156,7 @@ def _hypothesis(survey: Survey, scope: Scope, misreading: Misreading, evidence: 
     return Hypothesis(
         misreading.name, _cause(scope, misreading), _remedy(misreading), scope.place,
         mended(survey, scope.rows, misreading), (ChangeReadings(ids, misreading.factor, misreading.offset),), evidence,
-        1, max(looked_at, 1),
+        1, max(looked_at, 1), penalty=shrinking(misreading.factor, len(scope.rows)),
     )  # fmt: skip
 
 
