@@ -59,6 +59,14 @@ class Case:
     result: Adjustment | None = None
     error: SurveyError | None = None
     budget: Budget = field(default_factory=Budget)
+    passed_over: list[str] = field(default_factory=list)
+    """Kinds of causes that are not looked for in a survey of this size; families add theirs."""
+
+    def few(self, name: str, number: int, most: int) -> bool:
+        """Whether a kind of cause is looked for, whose cost grows with a number faster than that of adjusting."""
+        if number > most and name not in self.passed_over:
+            self.passed_over.append(name)
+        return number <= most
 
     def run(self, survey: Survey) -> Adjustment:
         """A survey like this one, or a part of it, adjusted from its own start. SurveyError where that fails."""

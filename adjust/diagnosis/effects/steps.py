@@ -17,6 +17,7 @@ from adjust.diagnosis.sequences import with_pairs
 from adjust.model.observations import FrameRef, ImageBlock, Pair
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray, Survey
+from adjust.statistics.normal import DENSE
 
 FOCAL, CENTRE = ("fx", "fy", "c"), ("u0", "v0", "xp", "yp")
 _FEWEST = 4
@@ -50,7 +51,12 @@ def steps(case: Case) -> Iterator[Effect]:
     linear = case.linear
     if linear is None:
         return
+    n = len(linear.system.columns)
+    room = float(n) if n > DENSE else np.inf  # columns of the covariance matrix, as many as it has
     for course in _courses(linear):
+        room -= sum(B.shape[1] for _, B in course.parts)
+        if not case.few("what moved from some epoch on, of things that fit better than others", int(room < 0.0), 0):
+            return
         if len(course.parts) < _FEWEST:
             continue
         found = linear.steps(course.parts)
@@ -72,7 +78,9 @@ def _courses(linear: Linear, only: ParameterName | None = None) -> Iterator[_Cou
         of = [np.arange(ptr[i], ptr[i + 1]) for i in numbers]
         return _Course(name, (), kind, tuple(ids[i] for i in numbers), tuple(linear.parts(columns.at[name], of)))
 
-    for name, at in columns.at.items() if only is None else [(n, columns.at[n]) for n in (only,) if n in columns.at]:
+    yield from _of_held(linear, only)
+    for name in _worst_first(linear) if only is None else [only] if only in columns.at else []:
+        at = columns.at[name]
         if name[0] not in (*_MOVED, "lens") or not len(at) or len(name) > 2 or _is_the_world(survey, name):
             continue
         rows = linear.rows_of(at)
@@ -83,7 +91,16 @@ def _courses(linear: Linear, only: ParameterName | None = None) -> Iterator[_Cou
         elif name[0] == "orientation":
             ids = {first_reading + k: r.reading_id for k, r in enumerate(survey.readings)}
             yield course(name, "reading", ids, rows)
-    yield from _of_held(linear, only)
+
+
+def _worst_first(linear: Linear) -> list[ParameterName]:
+    """The unknowns; of many those first whose observations fit least."""
+    at = linear.system.columns.at
+    if len(linear.system.columns) <= DENSE:
+        return list(at)
+    some = [name for name in at if name[0] in _MOVED or name[0] == "lens"]
+    misfit = {name: float(np.mean(linear.e[linear.rows_of(at[name])] ** 2)) for name in some if len(at[name])}
+    return sorted(misfit, key=lambda name: -misfit[name])
 
 
 def _is_the_world(survey: Survey, name: ParameterName) -> bool:

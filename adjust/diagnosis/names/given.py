@@ -24,7 +24,7 @@ def wrong_given(case: Case) -> Iterator[Hypothesis]:
     """Changes of given coordinates after which the survey's own start fits its observations better."""
     survey = case.survey
     given = [p.point_id for p in survey.points if p.x_in_world.treatment != "free" and p.x_in_world.value is not None]
-    if not given or not survey.readings or len(survey.readings) > _LARGE:
+    if not given or not survey.readings or not case.few("wrong given coordinates", len(survey.readings), _LARGE):
         return
     before = screen(survey)
     tried = [h for h in (*_exchanges(survey, given), *_slips(survey, given), *_axes(survey, given))

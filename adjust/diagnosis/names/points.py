@@ -24,13 +24,15 @@ _LARGE = 2500
 def exchanged_points(case: Case) -> Iterator[Hypothesis]:
     """Pairs of points whose exchange makes their readings fit, the clearest first."""
     survey = case.survey
-    before = at_best(case) if 0 < len(survey.readings) <= _LARGE else None
+    if not survey.readings or not case.few("points exchanged", len(survey.readings), _LARGE):
+        return
+    before = at_best(case)
     if before is None:
         return
     setups = (None, *dict.fromkeys(r.setup_id for r in survey.readings if r.setup_id))
     pairs = [(s, a, b) for s in setups for a, b in combinations(_suspects(survey, before, s), 2)]
     sets = [_of_points(survey, s, (a, b)) for s, a, b in pairs]
-    after = before.alternatives(sets, **_exchanged_ends(before, sets, [(a, b) for _, a, b in pairs]))
+    after = before.alternatives(sets, **ends_exchanged(before, sets, [(a, b) for _, a, b in pairs]))
     found = [(before.drop(rows, squares), rows, *pair) for rows, squares, pair in zip(sets, after, pairs, strict=True)]
     for evidence, rows, setup_id, a, b in sorted(found, key=lambda f: -f[0])[:_MOST]:
         if evidence > _CLEARLY:
@@ -38,7 +40,7 @@ def exchanged_points(case: Case) -> Iterator[Hypothesis]:
             yield replace(_hypothesis(changed, setup_id, a, b, evidence), looked_at=len(pairs))
 
 
-def _exchanged_ends(before: Screen, sets: Sequence[IntArray], names: Sequence[tuple[str, str]]) -> dict[str, IntArray]:
+def ends_exchanged(before: Screen, sets: Sequence[IntArray], names: Sequence[tuple[str, str]]) -> dict[str, IntArray]:
     """The targets of each set of readings, with two points under each other's names, as numbers of their positions."""
     batch = before.graph.terrestrial
     if batch is None or not sets:

@@ -1,7 +1,8 @@
 """Rows of one set-up that were given to another: sights from where nobody stood."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,7 @@ def rows_of_another_setup(case: Case) -> Iterator[Hypothesis]:
     """Of every two set-ups: the sights of one that fit as sights of the other, all in one hypothesis."""
     survey = case.survey
     homes = {r.setup_id: r for r in reversed(survey.readings) if r.setup_id}
-    if len(homes) < 2 or len(survey.readings) > _LARGE:
+    if len(homes) < 2 or not case.few("rows of another set-up", len(survey.readings), _LARGE):
         return
     before = at_best(case)
     if before is None:
@@ -51,7 +52,8 @@ def _sights(survey: Survey, before: Screen, setup_id: str) -> list[IntArray]:
     return [np.array(rows) for rows in by_target.values() if before.missed[rows].any()]
 
 
-def _given(survey: Survey, rows: IntArray, home: Reading) -> Survey:
+def given_to(survey: Survey, rows: IntArray, home: Reading) -> Survey:
+    """The survey with these readings taken as the first one of another set-up is."""
     chosen = set(rows.tolist())
     readings = tuple(
         replace(r, setup_id=home.setup_id, at=home.at, instrument_height=home.instrument_height) if i in chosen else r
@@ -61,18 +63,22 @@ def _given(survey: Survey, rows: IntArray, home: Reading) -> Survey:
 
 
 def _drops(before: Screen, sets: list[IntArray], setup_id: str) -> list[float]:
-    """How much less everything misfits with each set of readings given to a set-up, as its first one is taken."""
+    """How much less everything misfits with each set of readings given to a set-up."""
+    after = before.alternatives(sets, **as_of_setup(before, sets, setup_id)) if sets else []
+    return [before.drop(rows, squares) for rows, squares in zip(sets, after, strict=True)]
+
+
+def as_of_setup(before: Screen, sets: Sequence[IntArray], setup_id: str) -> dict[str, Any]:
+    """The same as fields of the arrays of readings."""
     batch = before.graph.terrestrial
-    if batch is None or not sets:
-        return []
+    if batch is None:
+        return {}
     a, n = batch.layout.arrays, sum(len(rows) for rows in sets)
     home = next(i for i, r in enumerate(before.graph.survey.readings) if r.setup_id == setup_id)
-    fields = ("at", "orientation", "centring", "instrument", "body")
     heights = a.heights[np.concatenate(sets)]
     heights[:, 0] = a.heights[home, 0]
-    same = {name: np.full(n, getattr(a, name)[home]) for name in fields}
-    after = before.alternatives(sets, **same, heights=heights)
-    return [before.drop(rows, squares) for rows, squares in zip(sets, after, strict=True)]
+    fields = ("at", "orientation", "centring", "instrument", "body")
+    return {"heights": heights} | {name: np.full(n, getattr(a, name)[home]) for name in fields}
 
 
 def _hypothesis(survey: Survey, a: str, home: Reading, rows: IntArray, evidence: float, looked_at: int) -> Hypothesis:
@@ -80,6 +86,6 @@ def _hypothesis(survey: Survey, a: str, home: Reading, rows: IntArray, evidence:
     return Hypothesis(
         "rows of another set-up", f"the readings of set-up {a} to {', '.join(targets)} are those of set-up "
         f"{home.setup_id}", f"give these {len(rows)} rows of terrestrial.csv to set-up {home.setup_id}, with its point "
-        "and its instrument's height", Place("setup", (a, home.setup_id), "setup_id"), _given(survey, rows, home), (),
+        "and its instrument's height", Place("setup", (a, home.setup_id), "setup_id"), given_to(survey, rows, home), (),
         evidence, 1, looked_at,
     )  # fmt: skip

@@ -249,7 +249,7 @@ def _second(survey: Survey, link: Link, new: Mapping[int, Motion]) -> FloatArray
 def _by_start(case: Case) -> _Judge | None:
     """Poses that all pairs together say: those of most of them anew, where most are others."""
     survey = case.survey
-    if len(survey.pairs) > _LARGE:
+    if not case.few("pairs in another convention", len(survey.pairs), _LARGE):
         return None
     before = at_best(case)
     if before is None:

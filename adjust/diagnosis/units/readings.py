@@ -16,11 +16,11 @@ from adjust.diagnosis.units.conventions import (
     ANGLES,
     LENGTHS,
     MISREADINGS,
-    SLIPS,
     TURNS,
     Misreading,
     Scope,
     shrinking,
+    slips,
 )
 from adjust.model.observations import Reading
 from adjust.model.survey import FloatArray, IntArray, Survey
@@ -57,16 +57,15 @@ def _slips(survey: Survey, before: Screen | None, values: FloatArray) -> list[_F
     if before is None:
         return []
     worst = np.argsort(-before.readings)[:_SINGLE]
-    ways = [(i, factor) for i in worst.tolist() for factor in SLIPS]
-    after = before.alternatives([np.array([i]) for i, _ in ways], observed=np.array([f * values[i] for i, f in ways]))
+    ways = [(i, slip) for i in worst.tolist() for slip in slips(survey.readings[i].kind, values[i])]
+    after = before.alternatives([np.array([i]) for i, _ in ways], observed=np.array([w.factor * values[i]
+                                                                                      for i, w in ways]))  # fmt: skip
     out = []
-    for (i, factor), now in zip(ways, after, strict=True):
+    for (i, slip), now in zip(ways, after, strict=True):
         evidence = min(float(before.readings[i]) / before.scale, _FAR) / (float(now[0]) / before.scale + 5.0)
         if evidence > _CLEARLY:  # of it alone: among all others one bounded misfit is soon lost
-            r = survey.readings[i]
-            scope = Scope(np.array([i]), f"reading {r.reading_id}", Place("reading", (r.reading_id,), "value"))
-            said = f"has slipped: {r.value:.9g} for {factor * r.value:.9g} (SI)"
-            out.append((evidence, scope, Misreading("slipped decimal", said, factor, 0.0, (r.kind,))))
+            name = survey.readings[i].reading_id
+            out.append((evidence, Scope(np.array([i]), f"reading {name}", Place("reading", (name,), "value")), slip))
     return out
 
 
