@@ -54,10 +54,12 @@ def agreeing(network: PoseNetwork, family_alpha: float = 0.001, factor: float = 
 
 
 def loop_tests(network: PoseNetwork) -> FloatArray:
-    """Misclosures (L,) of short loops of the pairs in use: chi-square over its degrees of freedom."""
-    loops = _short_loops(network, network.used, network.used)
-    test, freedom = _tests(network, loops) if len(loops) else (np.zeros(0), np.ones(0, dtype=np.int64))
-    return test / freedom
+    """Of each pair (E,) in use the misclosure of a short loop through it, chi-square over its degrees of freedom."""
+    loops, out = _short_loops(network, network.used, network.used), np.full(network.n_pairs, np.nan)
+    if len(loops):
+        test, freedom = _tests(network, loops)
+        out[loops.pair_idx[loops.ptr[:-1]]] = test / freedom
+    return out
 
 
 def _in_closing(network: PoseNetwork, loops: Loops, limit: FloatArray) -> BoolArray:

@@ -27,8 +27,9 @@ def wrong_given(case: Case) -> Iterator[Hypothesis]:
     if not given or not survey.readings or not case.few("wrong given coordinates", len(survey.readings), _LARGE):
         return
     before = screen(survey)
-    tried = [h for h in (*_exchanges(survey, given), *_slips(survey, given), *_axes(survey, given))
-             if before is None or _misses(survey, before, h.place.ids)][:_TRIALS]  # fmt: skip
+    some = [h for h in (*_exchanges(survey, given), *_slips(survey, given))
+            if before is None or _misses(survey, before, h.place.ids)]  # fmt: skip
+    tried = [*_axes(survey, given), *some][:_TRIALS]  # the former concern all: where these are wrong all miss evenly
     changed = [h.survey for h in tried if isinstance(h.survey, Survey)]
     fits = map(screen, changed) if before is None else before.afresh(changed)
     found = [replace(h, evidence=e, looked_at=len(tried)) for h, fit in zip(tried, fits, strict=True)

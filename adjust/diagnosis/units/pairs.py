@@ -24,6 +24,8 @@ from adjust.spatial.rotation_forms import euler_from_matrix, matrix_from_euler
 Motion = Pose3 | Rot3
 _CLEARLY = 3.0
 _MOST, _SINGLE = 5, 8
+_MISSED = 25.0
+"""Mean square over sigmas at the start that the typical one of several pairs that are misread has at least."""
 _LARGE = 500
 """Pairs up to which start values are found anew for every convention."""
 
@@ -254,16 +256,22 @@ def _by_start(case: Case) -> _Judge | None:
     before = at_best(case)
     if before is None:
         return None
-    squares, open_loops = _of_pairs(before, survey), _typical_loop(survey)
+    squares, loops = _of_pairs(before, survey), _loops(survey)
     worst = np.argsort(-squares, kind="stable")
+    ends = np.array([[p.a.frame_id, p.b.frame_id] for p in survey.pairs])
+    ends = np.unique(ends, return_inverse=True)[1].reshape(-1, 2)
+    degree = np.bincount(ends.ravel())
 
     def evidence(new: Mapping[int, Motion]) -> float:
-        whole, rows = len(new) > 0.5 * len(survey.pairs), np.array(list(new))
-        changed = _with(survey, new) if whole else survey
-        if whole and _typical_loop(changed) > 0.5 * open_loops:
+        rows = np.array(list(new))
+        if len(rows) > 1 and np.median(squares[rows]) < _MISSED:
             return 0.0
-        after = screen(changed) if whole else None
-        if after is not None:
+        if (2 * np.bincount(ends[rows].ravel(), minlength=len(degree)) > degree).any():  # what told the pose of an end
+            changed = _with(survey, new)
+            open_still = np.median(_loops(changed)[rows]) > max(1.0, 0.5 * np.median(loops[rows]))
+            after = None if open_still else screen(changed)
+            if after is None:
+                return 0.0
             now, rows = _of_pairs(after, survey), np.arange(len(squares))
         else:
             now = squares.copy()
@@ -275,15 +283,14 @@ def _by_start(case: Case) -> _Judge | None:
     return _Judge(worst, evidence)
 
 
-def _typical_loop(survey: Survey) -> float:
-    """The misclosure of the typical short loop, over its sigma, squared; 0 where there is none that tells."""
+def _loops(survey: Survey) -> FloatArray:
+    """(p,) squares over sigmas by which a short loop through each pair stays open; 1 where there is none."""
     if not survey.is_pose_network:
-        return 0.0
+        return np.ones(len(survey.pairs))
     from adjust.pose_network.agreement import loop_tests  # here: a survey without pairs starts without it
     from adjust.pose_network.from_survey import network_from_survey
 
-    tests = loop_tests(network_from_survey(survey, any_datum=True))
-    return float(np.median(tests)) if len(tests) else 0.0
+    return np.nan_to_num(loop_tests(network_from_survey(survey, any_datum=True)), nan=1.0)
 
 
 def _read_as(found: Screen, new: Mapping[int, Motion]) -> FloatArray:
