@@ -1,7 +1,7 @@
 """Good simulated surveys, all diagnosed though nothing is wrong with them: how many are blamed?
 
-``python -m tests.acceptance.innocent_surveys 200 [FIRST_SEED]`` prints that; the adjustment asks for a diagnosis only where the
-global test fails, so that this is harder than what a user meets.
+``python -m tests.acceptance.innocent_surveys 200 [FIRST_SEED]`` prints that; the adjustment asks for a diagnosis only
+where the global test fails, so that this is harder than what a user meets.
 """
 
 import sys
