@@ -3,7 +3,7 @@
 ``python -m tests.acceptance.planted_mistakes RESULTS`` runs what RESULTS (a file of lines) does not have yet, and
 prints the outcomes: named first, among three, another one first, refused with the right reason, silent. ``--part 1/2``
 runs every second one, ``--again NAME`` (of a mistake, or an outcome) runs what is known once more, ``--seed N`` is that
-of the surveys' noise.
+of the surveys' noise, ``--table`` prints how many of each mistake were named first.
 """
 
 import argparse
@@ -110,13 +110,32 @@ def times(results: Mapping[str, Mapping[str, Any]]) -> str:
     return f"{'; '.join(some)}; at most ten in {int((ratio <= 10.0).sum())} of {len(known)}"
 
 
+def table(results: Mapping[str, Mapping[str, Any]]) -> str:
+    """The table of the documentation: what is planted, into which kinds of survey, and what became of it."""
+    cells: dict[str, dict[str, list[str]]] = {}
+    for mistake, kind, size in rows():
+        found = results.get(key(mistake, kind, size))
+        if found is not None:
+            name = f"{mistake.name}{': ' * bool(mistake.title)}{mistake.title}"
+            cells.setdefault(name, {}).setdefault(kind, []).append(found["outcome"])
+    lines = ["| mistake | named first, of so many sizes, by kind of survey |", "|---|---|"]
+    for name, kinds in sorted(cells.items()):
+        each = [f"{kind} {outcomes.count('first')}/{len(outcomes)}" for kind, outcomes in kinds.items()]
+        lines.append(f"| {name} | {', '.join(each)} |")
+    return "\n".join(lines)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("results", type=Path)
     parser.add_argument("--part", default="1/1")
     parser.add_argument("--again", action="append", default=[], help="name of a mistake, or an outcome")
     parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--table", action="store_true")
     said = parser.parse_args()
+    if said.table:
+        print(table(read(said.results)))
+        return
     first, of = (int(x) for x in said.part.split("/"))
     run(said.results, (first, of), said.again, said.seed)
     print(counts(read(said.results)))
