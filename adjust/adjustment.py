@@ -83,17 +83,17 @@ def _adjusted_network(
     What nothing measures is held meanwhile: the positions of a network of rotations.
     """
     from adjust.pose_network.agreement import agreeing_start  # here: as above
-    from adjust.pose_network.solve import minimize
+    from adjust.pose_network.solve import NetworkOptions, minimize
 
     names: list[ParameterName] = [("world_from_station", s) for s in network.station_ids]
     poses = [start.poses[n] for n in names if n in start.poses] if start is not None else []
-    begin = None
+    begin, how = None, NetworkOptions(settled=options.solve.settled)
     if len(poses) == len(names):
         begin = np.array([p.rotation().matrix() for p in poses]), np.array([p.translation() for p in poses])
     try:
-        found = minimize(network, begin, progress=progress)
+        found = minimize(network, begin, how, progress)
     except NotConvergedError:
-        found = minimize(network, agreeing_start(network), progress=progress)
+        found = minimize(network, agreeing_start(network), how, progress)
     return replace(assemble(found.graph, found.solved, options, given=given), survey=given)
 
 

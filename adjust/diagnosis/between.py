@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from gtsam import Pose3, Rot3
+from gtsam import Pose3
 
 from adjust.diagnosis.units.conventions import LENGTH_RATIOS
 from adjust.epochs.congruence import Common, CongruenceOptions, common, compare
@@ -18,7 +18,7 @@ from adjust.epochs.states import EpochState, aligned, moved, origin
 from adjust.model.errors import SurveyError, listed
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray
-from adjust.spatial.rigid import align
+from adjust.spatial.rigid import align, rotation_log, transform
 
 _WRONG, _FITS = 1e-4, 1e-3
 """p of the test of all below which something is looked for, and above which a change explains it."""
@@ -149,8 +149,8 @@ def _elsewhere(both: Common, found: Congruence) -> Iterator[_Trial]:
     if len(x) < 3:
         return
     move = align(x, y)
-    shift = float(np.linalg.norm((move[:3, :3] @ y.T).T + move[:3, 3] - y, axis=1).max())
-    turn = float(np.degrees(np.arccos(np.clip((np.trace(move[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))))
+    shift = float(np.linalg.norm(transform(move, y) - y, axis=1).max())
+    turn = float(np.degrees(np.linalg.norm(rotation_log(move[:3, :3]))))
     names = listed([n[1] for n in both.names], 4)
     yield _Trial("another datum", f"all of {found.epochs[1]} ({names}) moved as one, by up to {1e3 * shift:.4g} mm and "
                  f"{turn:.3g} deg: its datum is another, not its parts", "hold the same things at the same values in "
@@ -160,9 +160,7 @@ def _elsewhere(both: Common, found: Congruence) -> Iterator[_Trial]:
 
 def _moved_by(state: EpochState, move: FloatArray) -> EpochState:
     """By a rigid motion (4, 4)."""
-    pose = Pose3(np.ascontiguousarray(move))
-    turn = np.asarray(Rot3.Logmap(pose.rotation()))
-    return moved(state, np.concatenate([np.asarray(pose.translation()), turn, [0.0]]))
+    return moved(state, np.concatenate([move[:3, 3], rotation_log(move[:3, :3]), [0.0]]))
 
 
 def _with(directions: FloatArray, more: FloatArray) -> FloatArray:

@@ -33,9 +33,9 @@ MOST = 10.0
 _LEFT_OUT = 4
 _FAR = 25.0
 """Variance factor from which a solution may be another one than that of the observations without their mistake."""
-_WARM, _START, _LOST_ROUNDS = 0.3, 0.4, 3
+_WARM, _START, _LOST_ROUNDS = 0.4, 0.4, 3
 """What adjusting from near values costs, and what finding start values does, against a whole adjustment."""
-_SOLVE = SolveOptions(max_step=1e-3, max_iterations=40)
+_SOLVE = SolveOptions(max_step=1e-3, max_iterations=40, settled=1e-5)
 """A survey that is right converges soon, and is only compared with others."""
 
 
@@ -60,6 +60,14 @@ class Case:
     result: Adjustment | None = None
     error: SurveyError | None = None
     budget: Budget = field(default_factory=Budget)
+    passed_over: list[str] = field(default_factory=list)
+    """Kinds of causes that are not looked for in a survey of this size; families add theirs."""
+
+    def few(self, name: str, number: int, most: int) -> bool:
+        """Whether a kind of cause is looked for, whose cost grows with a number faster than that of adjusting."""
+        if number > most and name not in self.passed_over:
+            self.passed_over.append(name)
+        return number <= most
 
     def run(self, survey: Survey) -> Adjustment:
         """A survey like this one, or a part of it, adjusted from its own start. SurveyError where that fails."""
@@ -117,20 +125,21 @@ class Case:
         """The lens (n,) of each camera, from its own images alone; a camera without any is not there."""
         return own_lenses(self.survey)
 
-    @cached_property
-    def without_one(self) -> tuple[tuple[tuple[str, str], Altered], ...]:
-        """(("camera_id" or "target_id", id), start values of the survey without its images), where there are any.
+    def without_each(self, field_name: str) -> list[tuple[str, Altered]]:
+        """(id, start values of the survey without its images), where there are any; field_name: target_id, camera_id.
 
-        Of the few cameras and targets with the largest misfit, or with most images where nothing is adjusted.
+        Of the few targets or cameras with the largest misfit, or with most images where nothing is adjusted.
         """
-        out = []
-        for field_name in ("target_id", "camera_id"):
+        if field_name not in self._without:
             ids = [t for t in dict.fromkeys(getattr(b, field_name) for b in self.survey.image_blocks) if t is not None]
-            for owner in self._worst(field_name, ids)[:_LEFT_OUT] if len(ids) > 1 else ():
-                values = self.rough(without(self.survey, field_name, owner))
-                if values is not None:
-                    out.append(((field_name, owner), values))
-        return tuple(out)
+            worst = self._worst(field_name, ids)[:_LEFT_OUT] if len(ids) > 1 else ()
+            started = ((owner, self.rough(without(self.survey, field_name, owner))) for owner in worst)
+            self._without[field_name] = [(owner, values) for owner, values in started if values is not None]
+        return self._without[field_name]
+
+    @cached_property
+    def _without(self) -> dict[str, list[tuple[str, Altered]]]:
+        return {}
 
     def _worst(self, field_name: str, ids: list[str]) -> list[str]:
         share = dict.fromkeys(ids, 0.0)
@@ -195,12 +204,9 @@ def without(survey: Survey, field_name: str, owner: str) -> Survey:
 def without_points(survey: Survey, ids: Collection[str]) -> Survey:
     """The survey less the image points of some points of the world."""
     lost = [i for i, p in enumerate(survey.points) if p.point_id in ids]
-    blocks = []
-    for b in survey.image_blocks:
-        kept = np.full(len(b.uv), True) if b.target_id is not None else ~np.isin(b.point_idx, lost)
-        used = kept if b.used is None else b.used & kept
-        blocks.append(b if kept.all() else replace(b, used=used))
-    return replace(survey, image_blocks=tuple(b for b in blocks if b.used is None or b.used.any()))
+    kept = [b.mask & (True if b.target_id is not None else ~np.isin(b.point_idx, lost)) for b in survey.image_blocks]
+    blocks = (replace(b, used=k) for b, k in zip(survey.image_blocks, kept, strict=True))
+    return replace(survey, image_blocks=tuple(b for b in blocks if b.n_used))
 
 
 def block_squares(survey: Survey, result: Adjustment | None) -> list[FloatArray]:

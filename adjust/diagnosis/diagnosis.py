@@ -17,7 +17,7 @@ _KEPT = 4.0  # adjustments for the second families
 
 FAMILIES: tuple[tuple[str, ...], ...] = (
     ("effects", "images", "names", "units", "time", "weights"),
-    ("bodies", "targets"),
+    ("targets", "bodies"),
 )
 """Rooms of this one, each with ``hypotheses(case) -> Iterable[Hypothesis]``: what cheap evidence makes worth a try.
 
@@ -32,20 +32,28 @@ class Diagnosis:
     """What explains that a survey does not fit: candidates, the best first; empty where nothing that was tried does.
 
     tried: names of the kinds of causes that were tried, whether they explain anything or not. untried: of those that
-    evidence speaks for, but the time of a diagnosis did not suffice for.
+    evidence speaks for, but the time of a diagnosis did not suffice for. passed_over: of those that were not looked for
+    in a survey of this size.
     """
 
     candidates: tuple[Candidate, ...]
     tried: tuple[str, ...]
     misfit: Misfit
     untried: tuple[str, ...] = ()
+    passed_over: tuple[str, ...] = ()
+
+    @property
+    def note(self) -> str:
+        """For people: what was not tried, and what was not looked for; empty where all was."""
+        left = (("not tried, as the time of a diagnosis was spent", self.untried),
+                ("not looked for in a survey of this size", self.passed_over))  # fmt: skip
+        return "; ".join(f"{what}: {', '.join(names)}" for what, names in left if names)
 
     @property
     def lines(self) -> tuple[str, ...]:
         """For people: the first cause, what it changes, how sure it is, and the next one; what was not tried."""
-        *others, last = [_text(i, c) for i, c in enumerate(self.candidates[:_SHOWN], start=1)] or [""]
-        spent = f"; not tried, as the time of a diagnosis was spent: {', '.join(self.untried)}"
-        return (*others, last + spent * bool(self.untried)) if last else ()
+        shown = tuple(_text(i, c) for i, c in enumerate(self.candidates[:_SHOWN], start=1))
+        return (*shown[:-1], f"{shown[-1]}; {self.note}") if shown and self.note else shown
 
     def told(self) -> list[dict[str, Any]]:
         """The candidates for machines: name, cause, change, ids, epochs, how sure it is, and where to edit."""
@@ -90,7 +98,8 @@ def diagnose(case: Case, families: Sequence[Family] | None = None) -> Diagnosis:
         if _done(trials, 0.0):
             break
     untried = dict.fromkeys(h.name for h in queue if h.name not in names)
-    return Diagnosis(ranked(base, trials, looked_at), tuple(dict.fromkeys(names)), base, tuple(untried))
+    found = ranked(base, trials, looked_at)
+    return Diagnosis(found, tuple(dict.fromkeys(names)), base, tuple(untried), tuple(case.passed_over))
 
 
 def _done(trials: Sequence[Trial], following: float) -> bool:

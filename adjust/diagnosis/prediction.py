@@ -66,11 +66,22 @@ class Prediction:
         if pose is None or x is None:
             return None
         moved = np.array([self._moved_body(block, pose, {body: step}) for step in _STEPS])
-        every = np.einsum("kij,nj->kni", moved[:, :3, :3], x) + moved[:, None, :3, 3]
-        uv = self._project(block, every.reshape(-1, 3), {})
+        return self._differences(block, np.einsum("kij,nj->kni", moved[:, :3, :3], x) + moved[:, None, :3, 3])
+
+    def by_shape(self, block: ImageBlock, change: FloatArray) -> FloatArray | None:
+        """(n, 2, k) px by a change (P, 3, k) of all points of its target, in the target's axes; as above."""
+        pose, x = self.pose(block, {}), self._points(block, {})
+        if pose is None or x is None:
+            return None
+        by = np.moveaxis(change[block.point_idx], 2, 0)[:, None] * (_DELTA * np.array([1.0, -1.0])[:, None, None])
+        return self._differences(block, (x + by.reshape(-1, *x.shape)) @ pose[:3, :3].T + pose[:3, 3])
+
+    def _differences(self, block: ImageBlock, x_in_camera: FloatArray) -> FloatArray | None:
+        """(n, 2, k) px by k changes, of points (2 k, n, 3) after a step of each there and back."""
+        uv = self._project(block, x_in_camera.reshape(-1, 3), {})
         if uv is None:
             return None
-        both = uv.reshape(6, 2, -1, 2)
+        both = uv.reshape(len(x_in_camera) // 2, 2, -1, 2)
         return np.asarray(np.moveaxis((both[:, 0] - both[:, 1]) / (2.0 * _DELTA), 0, -1))
 
     def pose(self, block: ImageBlock, altered: Altered) -> FloatArray | None:

@@ -11,8 +11,10 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
+from adjust.diagnosis.prediction import Prediction, adjusted_values
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
+from adjust.statistics.normal import DENSE
 from adjust.statistics.system import LinearSystem, linear_system
 from adjust.statistics.weakness import times_covariance
 
@@ -76,15 +78,42 @@ class Linear:
         """Variance factor."""
         return max(1.0, self.result.omega / max(self.result.redundancy, 1))
 
+    def ratio(self, drop: float) -> float:
+        """How many times smaller the misfit beyond noise becomes by a drop of v'Pv."""
+        return ratio(self.result.omega, max(self.result.redundancy, 1), drop)
+
     def columns(self, name: ParameterName, components: Sequence[str] = ()) -> IntArray:
         """Of an unknown, or of some of its components; none where it is held."""
         at = self.system.columns.at.get(name, np.zeros(0, dtype=np.int64))
         return at if not components else at[[self.system.columns.components[i] in components for i in at]]
 
+    @cached_property
+    def prediction(self) -> Prediction:
+        """What the adjustment says that its images show."""
+        return Prediction(self.result.survey, adjusted_values(self.result))
+
+    @cached_property
+    def _by_column(self) -> sparse.csc_matrix:
+        return self.A.tocsc()
+
+    def rows_of(self, columns: IntArray) -> IntArray:
+        """Rows (r,) that these unknowns have a part in."""
+        ptr, rows = self._by_column.indptr, self._by_column.indices
+        return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(rows[ptr[c] : ptr[c + 1]] for c in columns)]))
+
     def parts(self, columns: IntArray, rows: Sequence[IntArray]) -> list[Part]:
         """Rows with their derivatives by unknowns."""
-        J = self.A[:, columns]
-        return [(r, J[r].toarray()) for r in rows]
+        if not rows:
+            return []
+        every, J = np.concatenate(rows), np.zeros((sum(map(len, rows)), len(columns)))
+        order = np.argsort(every, kind="stable")
+        for k, c in enumerate(columns.tolist()):
+            mine = slice(self._by_column.indptr[c], self._by_column.indptr[c + 1])
+            found = self._by_column.indices[mine]
+            at = np.minimum(np.searchsorted(every, found, sorter=order), len(every) - 1)
+            here = every[order[at]] == found
+            J[order[at[here]], k] = self._by_column.data[mine][here]
+        return list(zip(rows, np.split(J, np.cumsum([len(r) for r in rows])[:-1]), strict=True))
 
     def image_parts(self, shifts: Mapping[int, FloatArray]) -> list[Part]:
         """By image block a shift (n, 2, k) px of its points, in the order of the blocks."""
@@ -99,32 +128,58 @@ class Linear:
 
     def of_parts(self, parts: Sequence[Part]) -> Score:
         """Of a change of all of them."""
-        if not parts:
-            return Score(np.zeros(0), np.zeros((0, 0)), 0.0, 0)
-        rows, B = (np.concatenate(x) for x in zip(*parts, strict=True))
-        B = self._used[rows, None] * B
-        AB = np.asarray(self.A[rows].T @ B)
-        return score(B.T @ self.e[rows], B.T @ B, AB, times_covariance(self.system, AB))
+        return self._summed(parts, np.ones(len(parts)))
+
+    def drift(self, parts: Sequence[Part]) -> Score:
+        """A change in proportion to time, by ``theta`` from the first part to the last."""
+        return self._summed(parts, drift_times(len(parts)))
 
     def steps(self, parts: Sequence[Part]) -> dict[int, Score]:
         """A change from part t on: the scores of t, at most ``_CUTS`` of them. parts: in the order of time."""
         cuts = list(range(2, len(parts) - 1))[:: max(1, (len(parts) - 3) // _CUTS)]
-        g, BB, AB = self._by_part(parts)
-        QAB = times_covariance(self.system, np.concatenate(list(AB), axis=1)) if len(AB) else np.zeros((0, 0))
-        QAB = QAB.reshape(len(QAB), len(parts), -1).transpose(1, 0, 2)
-        return {t: score(g[t:].sum(0), BB[t:].sum(0), AB[t:].sum(0), QAB[t:].sum(0)) for t in cuts}
+        if not cuts:
+            return {}
+        g, BB, AB, QAB = (np.cumsum(x[::-1], axis=0)[::-1] for x in self._by_part(parts))
+        return {t: score(g[t], BB[t], AB[t], QAB[t]) for t in cuts}
 
-    def drift(self, parts: Sequence[Part]) -> Score:
-        """A change in proportion to time, by ``theta`` from the first part to the last."""
-        t = drift_times(len(parts))[:, None]
-        g, BB, AB = self._by_part(parts)
-        whole = (t[:, :, None] * AB).sum(0)
-        return score((t * g).sum(0), (t[:, :, None] ** 2 * BB).sum(0), whole, times_covariance(self.system, whole))
+    def _summed(self, parts: Sequence[Part], weights: FloatArray) -> Score:
+        """Of changes of all of them in these proportions."""
+        if not parts:
+            return Score(np.zeros(0), np.zeros((0, 0)), 0.0, 0)
+        rows, B = (np.concatenate(x) for x in zip(*parts, strict=True))
+        B = B * (self._used[rows] * np.repeat(weights, [len(r) for r, _ in parts]))[:, None]
+        A = self.A[rows]
+        near = np.unique(A.indices)
+        AB = np.asarray(A[:, near].T @ B)
+        return score(B.T @ self.e[rows], B.T @ B, AB, self._times_covariance(near, AB))
 
-    def _by_part(self, parts: Sequence[Part]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        g = np.array([B.T @ self.e[rows] for rows, B in parts])
-        AB = np.array([self.A[rows].T @ B for rows, B in parts])
-        return g, np.array([B.T @ B for _, B in parts]), AB
+    def _by_part(self, parts: Sequence[Part]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """B'e (p, k), B'B (p, k, k), and of the u unknowns that have a part in it A'B and Q A'B (p, u, k)."""
+        rows, B = (np.concatenate(x) for x in zip(*parts, strict=True))
+        first, (n, k) = np.cumsum([0, *(len(r) for r, _ in parts)]), B.shape
+        columns = k * np.repeat(np.arange(len(parts)), np.diff(first))[:, None] + np.arange(k)
+        apart = sparse.csr_matrix((B.ravel(), columns.ravel(), np.arange(0, n * k + 1, k)), (n, k * len(parts)))
+        A = self.A[rows]
+        near = np.unique(A.indices)
+        AB = (A[:, near].T @ apart).toarray()
+        QAB = self._times_covariance(near, AB)
+        g, BB = (np.add.reduceat(x, first[:-1]) for x in (B * self.e[rows, None], B[:, :, None] * B[:, None, :]))
+        of_part = len(near), len(parts), k
+        return g, BB, AB.reshape(of_part).transpose(1, 0, 2), QAB.reshape(of_part).transpose(1, 0, 2)
+
+    def _times_covariance(self, near: IntArray, right: FloatArray) -> FloatArray:
+        """Rows of the covariance matrix of all unknowns times what is zero elsewhere than in these rows, (u, c)."""
+        if len(self.system.columns) <= DENSE:
+            return np.asarray(self.system.covariance[np.ix_(near, near)] @ right)
+        whole = np.zeros((len(self.system.columns), right.shape[1]))
+        whole[near] = right
+        return times_covariance(self.system, whole)[near]
+
+
+def ratio(omega: float, n: float, drop: float) -> float:
+    """How many times smaller a square sum beyond its expectation n becomes by a drop; noise itself is some of it."""
+    noise, excess = float(np.sqrt(2.0 * n)), max(omega - n, drop)
+    return (excess + noise) / (excess - drop + noise)
 
 
 def drift_times(n: int) -> FloatArray:

@@ -3,47 +3,42 @@
 The closed forms of the start are robust: what one set-up or one pair says wrongly leaves the rest where it belongs.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import Any
 
+import gtsam
 import numpy as np
 
 from adjust.adjustment import start_values
 from adjust.diagnosis.case import CAP, Case
 from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues, values_of
 from adjust.model.errors import SurveyError
-from adjust.model.survey import FloatArray, Survey
+from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.observations.terrestrial import equations as k
+from adjust.observations.terrestrial.batch import TerrestrialBatch, circular_median, circular_medians
+from adjust.observations.terrestrial.building import reading_refs
+from adjust.observations.terrestrial.layout import ReadingArrays
+from adjust.precision.precision import adjusted_motion, residual_of
 from adjust.start import find_start
 
 _MEDIAN = 0.455  # of chi-square with one degree of freedom
+_MISSED = 25.0
+"""Square over its sigma, and over the variance factor of rough values, from which a reading does not fit."""
+_AT_ONCE = 200_000  # readings that are predicted in one go
 
 
 @dataclass(frozen=True, eq=False)
-class Screen:
-    """A graph at its start values. ``start``: these; orientations of set-ups are medians of their directions."""
+class Fit:
+    """How observations fit rough values.
 
-    graph: AdjustmentGraph
-    start: StartValues
+    readings: (N,) squares over sigmas of all readings. others: (k,) mean squares over sigmas of the components of what
+    is neither a reading nor an image point.
+    """
 
-    @cached_property
-    def readings(self) -> FloatArray:
-        """(N,) squares over sigmas of all readings."""
-        batch = self.graph.terrestrial
-        return np.zeros(0) if batch is None else _finite(batch.unweighted(self.graph.start) ** 2)
-
-    @cached_property
-    def predicted(self) -> FloatArray:
-        """(N,) rad or m, predicted values of all readings."""
-        if self.graph.terrestrial is None:
-            return np.zeros(0)
-        self.graph.terrestrial.evaluate(self.graph.start)
-        return np.array(self.graph.terrestrial.predicted)
-
-    @cached_property
-    def others(self) -> FloatArray:
-        """(k,) mean squares over sigmas of the components of what is neither a reading nor an image point."""
-        found = [(2.0 * o.factor.error(self.graph.start), max(1, len(o.components))) for o in self.graph.others]
-        return _finite(np.array([square / n for square, n in found]))
+    readings: FloatArray
+    others: FloatArray
 
     @cached_property
     def scale(self) -> float:
@@ -51,25 +46,168 @@ class Screen:
         every = np.concatenate([self.readings, self.others])
         return max(1.0, float(np.median(every)) / _MEDIAN) if len(every) else 1.0
 
+    @cached_property
+    def missed(self) -> BoolArray:
+        """Which readings (N,) do not fit."""
+        return np.asarray(self.readings > _MISSED * self.scale)
+
     def misfit(self, scale: float = 1.0) -> float:
         """Sum of squares, each bounded, over a variance factor."""
         return float(np.minimum(np.concatenate([self.readings, self.others]) / scale, CAP).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class Screen(Fit):
+    """A graph at its start values. ``start``: these; orientations of set-ups are medians of their directions."""
+
+    graph: AdjustmentGraph
+    start: StartValues
+
+    def alternatives(self, sets: Sequence[IntArray], **changed: Any) -> list[FloatArray]:
+        """Squares over sigmas of each set of readings (rows) if they were others, and all else stayed where it is.
+
+        changed: fields of the arrays of readings, of all sets one after the other. Directions of a set-up share a turn.
+        """
+        batch = self.graph.terrestrial
+        if batch is None or not sets:
+            return [np.zeros(len(rows)) for rows in sets]
+        every, a = np.concatenate(sets), batch.layout.arrays
+        observed = changed.pop("observed", a.observed[every])
+        read = replace(a.of(every), **changed)
+        predicted = k.predict(read, batch.geometry, batch.sign, batch.curve)[0] if changed else batch.predicted[every]
+        miss = k.wrapped(read.kind, predicted, observed)
+        ends = np.cumsum([0, *(len(rows) for rows in sets)])
+        for rows, i, j in zip(sets, ends[:-1].tolist(), ends[1:].tolist(), strict=True):
+            directions = i + np.flatnonzero(read.kind[i:j] == k.DIRECTION)
+            for setup in np.unique(read.orientation[directions]).tolist():
+                of = directions[read.orientation[directions] == setup]
+                rest = self._directions.get(setup, rows[:0])
+                both = np.concatenate([batch.residual[rest[~np.isin(rest, rows)]], miss[of]])
+                miss[of] = _turned(miss[of], circular_median(both[np.isfinite(both)]))
+        return np.split(_finite((miss / batch.sigma[every]) ** 2), ends[1:-1])
+
+    @cached_property
+    def _directions(self) -> dict[int, IntArray]:
+        """Rows of the directions of each set-up, by its number."""
+        return {} if self.graph.terrestrial is None else _directions(self.graph.terrestrial.layout.arrays)
+
+    @cached_property
+    def motions(self) -> dict[str, FloatArray]:
+        """By pair the logarithm (6,) or (3,) of its motion as everything else has it."""
+        pairs = [o for o in self.graph.others if o.kind == "pair"]
+        return {o.ids[0]: adjusted_motion(o.observed, residual_of(o, self.graph.start)) for o in pairs}
+
+    def drop(self, rows: IntArray, after: FloatArray) -> float:
+        """How much less everything misfits when these readings do as in ``after`` (n,), squares over sigmas."""
+        own, now = (np.minimum(s / self.scale, CAP).sum() for s in (self.readings[rows], after))
+        return improvement(self._of_readings, self._of_readings - float(own) + float(now), len(self.readings))
+
+    @cached_property
+    def _of_readings(self) -> float:
+        return float(np.minimum(self.readings / self.scale, CAP).sum())
+
+    def afresh(self, surveys: Sequence[Survey]) -> list[Fit | None]:
+        """The same readings with other values, or between points with other given coordinates, each at its own start.
+
+        None where there is no start. All are predicted together, as far as they are between points of the world.
+        """
+        batch, own = self.graph.terrestrial, self.graph.survey
+        refs = reading_refs(own)
+        others_move = bool(self.graph.others) and any(s.points is not own.points for s in surveys)
+        poses = any(u.kind == "pose" for u in self.graph.unknowns.by_key.values())
+        if batch is None or others_move or poses or own.image_blocks or any(r.frame is not None for r in refs):
+            return [screen(s) for s in surveys]
+        at_once = max(1, _AT_ONCE // len(own.readings))
+        out = list[Fit | None]()
+        for i in range(0, len(surveys), at_once):
+            some = surveys[i : i + at_once]
+            starts = [_start(s) for s in some]
+            known = [(s, start) for s, start in zip(some, starts, strict=True) if start is not None]
+            found = iter(self._between_points(batch, known, [str(r.point_id) for r in refs]) if known else [])
+            out += [None if start is None else next(found) for start in starts]
+        return out
+
+    def _between_points(
+        self, batch: TerrestrialBatch, known: Sequence[tuple[Survey, StartValues]], ids: Sequence[str]
+    ) -> list[Fit]:
+        """ids: of the points of the batch's positions."""
+        a, plumb, n = batch.layout.arrays, batch.parameters.vertical.at(self.graph.start), len(known)
+        held, points = self.graph.unknowns.held_points, list[dict[str, Any]]()
+        for survey, start in known:
+            given = {p.point_id: p.x_in_world.value for p in survey.points if p.point_id in held}
+            points.append({**start.points, **given})
+        X = np.array([[x[i] for i in ids] for x in points], dtype=float).reshape(-1, 3)
+        first = np.repeat(len(ids) * np.arange(n), len(a.kind))
+        every = a.of(np.tile(np.arange(len(a.kind)), n))
+        ends = {name: np.where((at := getattr(every, name)) >= 0, at + first, at) for name in ("at", "to", "second")}
+        every = replace(every, **ends)
+        geometry = replace(batch.geometry, X=X, horizon=plumb.horizon(X))
+        predicted = k.predict(every, geometry, batch.sign, batch.curve)[0]
+        observed = np.array([[r.value for r in survey.readings] for survey, _ in known])
+        miss = k.wrapped(every.kind, predicted, observed.ravel()).reshape(n, -1)
+        for rows in _directions(a).values():
+            miss[:, rows] = _turned(miss[:, rows], _medians(miss[:, rows])[:, None])
+        e = miss / batch.sigma
+        for chunk in batch.layout.chunks:
+            if chunk.whitener is not None:
+                e[:, chunk.rows] = miss[:, chunk.rows] @ chunk.whitener.T
+        return [Fit(_finite(row**2), self._others_at(start)) for row, (_, start) in zip(e, known, strict=True)]
+
+    def _others_at(self, start: StartValues) -> FloatArray:
+        values = self.graph.start
+        if self.graph.others:
+            values = gtsam.Values(values)
+            for name, unknown in self.graph.unknowns.by_name.items():
+                if name[0] == "point":
+                    values.update(unknown.key, np.asarray(start.points[name[1]], dtype=float))
+        return _others(self.graph, values)
+
+
+def _directions(a: ReadingArrays) -> dict[int, IntArray]:
+    rows = np.flatnonzero(a.kind == k.DIRECTION)
+    return {int(i): rows[a.orientation[rows] == i] for i in np.unique(a.orientation[rows])}
+
+
+def _turned(miss: FloatArray, by: Any) -> FloatArray:
+    """Misses of directions once their set-up is turned."""
+    return k.wrapped(np.full(miss.shape, k.DIRECTION), miss, by)
+
+
+def _medians(miss: FloatArray) -> FloatArray:
+    """(n,) circular medians of the finite ones of each row."""
+    if np.isfinite(miss).all():
+        return circular_medians(miss)
+    return np.array([circular_median(row[np.isfinite(row)]) for row in miss])
+
+
+def _others(graph: AdjustmentGraph, values: gtsam.Values) -> FloatArray:
+    found = [(2.0 * o.factor.error(values), max(1, len(o.components))) for o in graph.others]
+    return _finite(np.array([square / n for square, n in found]))
 
 
 def _finite(squares: FloatArray) -> FloatArray:
     return np.where(np.isfinite(squares), squares, np.inf)
 
 
-def screen(survey: Survey, start: StartValues | None = None) -> Screen | None:
-    """The survey at given or at its own start values; None where none can be found."""
+def _start(survey: Survey) -> StartValues | None:
     try:
-        if start is None:
-            start = start_values(find_start(survey))
-        vectors = {n: v for n, v in start.vectors.items() if n[0] != "orientation"}
-        graph = GraphBuilder(survey, start.lenses).build(replace(start, vectors=vectors))
-        return Screen(graph, start)
+        return start_values(find_start(survey))
     except (SurveyError, RuntimeError):  # GTSAM raises the latter where a convention that is not meant fits nothing
         return None
+
+
+def screen(survey: Survey, start: StartValues | None = None) -> Screen | None:
+    """The survey at given or at its own start values; None where none can be found."""
+    start = start or _start(survey)
+    if start is None:
+        return None
+    try:
+        vectors = {n: v for n, v in start.vectors.items() if n[0] != "orientation"}
+        graph = GraphBuilder(survey, start.lenses).build(replace(start, vectors=vectors))
+    except (SurveyError, RuntimeError):  # as of the start
+        return None
+    readings = np.zeros(0) if graph.terrestrial is None else graph.terrestrial.unweighted(graph.start)
+    return Screen(_finite(readings**2), _others(graph, graph.start), graph, start)
 
 
 @lru_cache(maxsize=2)

@@ -13,15 +13,16 @@ import numpy as np
 from adjust.diagnosis.case import CAP
 from adjust.diagnosis.hypothesis import ChangeColumns, Edit, Rename
 from adjust.diagnosis.images.maps import MIRRORED, TURNED, ImageMap
+from adjust.diagnosis.units.conventions import ANGLE_RATIOS
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
 from adjust.navigation import Beacons, EpochPose, Head, NavigateOptions, NavigationEpoch, Spots, Trajectory, navigate
+from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
 
 _TRIED, _MOST_BEACONS, _SHOWN = 4, 4, 3
 _ALPHA, _EXPLAINED, _BAD = 1e-4, 0.5, 3.0
 """Level shared by all that is tried; share of the misfit that a cause takes away; misfit over its count looked into."""
-_UNITS = {"gon, read as degrees": 0.9, "radians, read as degrees": 180.0 / np.pi}
 
 Change = Callable[[NavigationEpoch], NavigationEpoch]
 
@@ -67,7 +68,7 @@ def causes_of_trajectory(
     except SurveyError:
         return ()
     scale = max(1.0, min([*after, base]) / n)
-    critical = float(chi2.isf(_ALPHA / max(1, len(trials)), 1))
+    critical = float(chi2.isf(sidak(_ALPHA, len(trials)), 1))
     out = []
     for trial, left in zip(trials, after, strict=True):
         share = (base - left) / max(base - n, 1.0)
@@ -199,7 +200,8 @@ def _tables(some: Sequence[NavigationEpoch]) -> Iterator[_Trial]:
     ways = [(np.diag([-1.0 if i == axis else 1.0 for i in range(k)]), f"axis {axis + 1} counts the other way round")
             for axis in range(k)]  # fmt: skip
     ways += [(np.eye(2)[::-1], "the readings of its two axes are exchanged")] if k == 2 else []
-    ways += [(factor * np.eye(k), f"its readings are {said}") for said, factor in _UNITS.items()] if k else []
+    ways += [(factor * np.eye(k), f"its readings {said}") for said, factor in ANGLE_RATIOS.items()
+             if said.endswith("read as degrees")] if k else []  # fmt: skip
     for A, said in ways:
 
         def make(epoch: NavigationEpoch, A: FloatArray = A) -> NavigationEpoch:

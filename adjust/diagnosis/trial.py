@@ -61,7 +61,8 @@ class Trial:
 def tried(hypothesis: Hypothesis, case: Case, base: Misfit) -> Trial:
     """The survey of a hypothesis adjusted from the values of its case, and where that leads nowhere from its own start.
 
-    So it is, too, where these values may be spoilt by what the case does not explain. base: what that is.
+    So it is, too, where these values may be spoilt by what the case does not explain, unless what was found by small
+    steps from them makes it worse. base: what that is.
     """
     survey = hypothesis.changed()
     if survey is None:
@@ -77,7 +78,8 @@ def tried(hypothesis: Hypothesis, case: Case, base: Misfit) -> Trial:
         if best.result is None or misfit.omega < best.misfit.omega:
             best = Trial(hypothesis, misfit, result)
         led = case.is_near or misfit.is_noise()
-        if led and best.misfit.unused == 0 and misfit.omega < base.omega:
+        worse = misfit.omega > base.omega
+        if (worse and callable(hypothesis.survey)) or (led and not worse and best.misfit.unused == 0):
             break
     return best
 
@@ -96,8 +98,9 @@ def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:
     groups: dict[str, list[FloatArray]] = {}
     out = _left_out(survey)
     others = [o for o in result.other_residuals if o.used or not out & {o.ids, o.ids[:1]}]
+    joint = _joint_squares(result) if result.survey.reading_covariances else {}
     for o in others:
-        groups.setdefault(o.group, []).append(_squares(o.residual, o.sigma))
+        groups.setdefault(o.group, []).append(joint.get(o.ids[:1], _squares(o.residual, o.sigma)))
     n_adjusted = sum(len(s) for of in groups.values() for s in of)
     for block, squares in zip(survey.image_blocks, block_squares(survey, result), strict=True):
         groups.setdefault(block.group, []).append(np.repeat(0.5 * squares, 2))
@@ -108,6 +111,18 @@ def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:
     omega = float(sum(np.minimum(s, CAP).sum() for s in every)) + CAP * gone
     fitted = sum(_at_best_scale(s) for s in every) + CAP * gone
     return Misfit(omega, unused, points + max(n_adjusted, n_others), result.redundancy, fitted=fitted)
+
+
+def _joint_squares(result: Adjustment) -> dict[tuple[str, ...], FloatArray]:
+    """By id the whitened squares (1,) of readings that share a covariance: their sigmas alone say too little."""
+    if result.reading_residuals is None:
+        return {}
+    v = dict(zip([r.reading_id for r in result.survey.readings], result.reading_residuals.residual, strict=True))
+    out: dict[tuple[str, ...], FloatArray] = {}
+    for block in result.survey.reading_covariances:
+        white = np.linalg.solve(np.linalg.cholesky(block.cov), np.array([v[i] for i in block.reading_ids]))
+        out.update({(i,): np.array([w**2]) for i, w in zip(block.reading_ids, white.tolist(), strict=True)})
+    return out
 
 
 def _at_best_scale(squares: FloatArray) -> float:

@@ -48,7 +48,8 @@ class SolveOptions:
     patience: whole steps that may fail to lower chi-square, one after the other, before the search goes back to where
     it was least. On long corridors of pairs the first ones raise it before it falls (watchdog technique: Chamberlain,
     Lemarechal, Pedersen and Powell 1982; Nocedal and Wright 2006, section 15.6). determined: what the observations
-    determine was judged before; where GTSAM's Cholesky refuses, QR solves.
+    determine was judged before; where GTSAM's Cholesky refuses, QR solves. settled: share of chi-square that two steps
+    one after the other have to gain for the search to go on: of a survey that is only compared with others.
     """
 
     max_step: float = 1e-6
@@ -56,6 +57,7 @@ class SolveOptions:
     first_damping: float = 1e-4
     patience: int = 0
     determined: bool = False
+    settled: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +102,7 @@ class _Loop:
         self._linearize()
         self.best, self.waited = (self.at, self.omega), 0
         self.steps: list[float] = []
+        self.idle = 0
 
     def _evaluated(self, values: gtsam.Values) -> Evaluation:
         """Everything at ``values``, ready to be linearised there. A reduction without inverse is given up for good."""
@@ -211,15 +214,19 @@ class _Loop:
                 self.at, self.omega = self.best
                 self._damp(iteration)
                 continue
+            gained = abs(self.omega - found[1]) >= self.options.settled * found[1]
+            self.idle = 0 if gained else self.idle + 1
             self.at, self.omega, gain = found
             if self.omega < self.best[1] or not watched:
                 self.best, self.waited = (self.at, self.omega), 0
             if self.progress:
                 self.progress(iteration, self.omega)
-            if self._arrived():
+            if self._arrived() or (self.idle > 1 and self.damping == 0.0):
                 return self._finish(iteration)
+            if self.idle > 1:
+                break
             self._relax(gain)
-        raise self._stuck(self.options.max_iterations)
+        raise self._stuck(iteration)
 
     def _proposed(self) -> tuple[gtsam.VectorValues, float]:
         """The step of all unknowns from here, and by how much it lowers chi-square to first order, at least."""

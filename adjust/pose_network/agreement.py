@@ -53,6 +53,15 @@ def agreeing(network: PoseNetwork, family_alpha: float = 0.001, factor: float = 
             return fine
 
 
+def loop_tests(network: PoseNetwork) -> FloatArray:
+    """Of each pair (E,) in use the misclosure of a short loop through it, chi-square over its degrees of freedom."""
+    loops, out = _short_loops(network, network.used, network.used), np.full(network.n_pairs, np.nan)
+    if len(loops):
+        test, freedom = _tests(network, loops)
+        out[loops.pair_idx[loops.ptr[:-1]]] = test / freedom
+    return out
+
+
 def _in_closing(network: PoseNetwork, loops: Loops, limit: FloatArray) -> BoolArray:
     """Pairs (E,) of the loops whose test is not above its limit (7,), by degrees of freedom."""
     out = np.zeros(network.n_pairs, dtype=np.bool_)

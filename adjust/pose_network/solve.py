@@ -24,12 +24,13 @@ class NetworkOptions:
     """How a network is solved.
 
     max_step: convergence, what is left to go in sigmas. patience: steps that may fail to lower the weighted square sum
-    before damping begins.
+    before damping begins. settled: as of every survey.
     """
 
     max_step: float = 1e-6
     max_iterations: int = 100
     patience: int = 8
+    settled: float = 0.0
 
 
 DEFAULTS = NetworkOptions()
@@ -81,9 +82,8 @@ def minimize(
     at = np.zeros_like(t) if network.rotation_only else t
     graph = builder.build(StartValues({}, {n: Pose3(Rot3(a), b) for n, a, b in zip(names, R, at, strict=True)}, {}))
     try:
-        solved = solve(
-            graph, SolveOptions(options.max_step, options.max_iterations, 1e-5, options.patience, True), progress
-        )
+        how = SolveOptions(options.max_step, options.max_iterations, 1e-5, options.patience, True, options.settled)
+        solved = solve(graph, how, progress)
     except NotConvergedError as error:
         raise NotConvergedError(
             f"{str(error).splitlines()[0].split(';')[0].replace('adjustment', 'network')}; look for wrong pairs, or "

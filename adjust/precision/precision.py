@@ -294,6 +294,11 @@ def noise_of(item: ObservationFactor) -> gtsam.noiseModel.Gaussian:
     return noise
 
 
+def residual_of(item: ObservationFactor, values: gtsam.Values) -> FloatArray:
+    """The factor's residual (k,), predicted minus observed, at these values; as above."""
+    return np.asarray(item.factor.unwhitenedError(values))  # type: ignore[attr-defined]  # see above
+
+
 def image_residuals(precision: Precision) -> ImageResiduals:
     """Residuals and their statistics of all image points, in the order of ``Survey.image_blocks``."""
     points = precision.image_points

@@ -11,6 +11,7 @@ from survey.project.observed import name_of_residual
 from survey.report.sections.published import head_rows, worst_pairs
 from survey.solution.anchors import anchor, anchors_in
 from survey.solution.dictionary import RunInfo, solution_dict
+from survey.solution.records import having
 
 _WIDTH = 100
 _WORDS = {"passed": "PASSED", "check": "NEEDS A LOOK", "failed": "FAILED"}
@@ -153,7 +154,7 @@ def _terms(solution: dict[str, Any]) -> Iterator[str]:
     owners += [(f"camera {k}", e[key]) for k, e in solution["cameras"].items()
                for key in ("lens_drift", "lens_crop", "lens_shared") if key in e]  # fmt: skip
     owners += [(f"{kind[:-1]} {k}", e["clock"]) for kind in ("cameras", "tables", "stations")
-               for k, e in solution[kind].items() if "clock" in e]  # fmt: skip
+               for k, e in having(solution[kind], "clock").items()]  # fmt: skip
     rows = [(k, term, test) for k, e in owners for term, test in e.get("significance", {}).items()]
     if rows:
         yield ""

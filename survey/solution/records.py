@@ -59,6 +59,12 @@ class Records(Mapping[str, dict[str, Any]]):
                 out[form.rows] = column
         return dict(zip(self._names, out.tolist(), strict=True))
 
+    def having(self, key: str) -> dict[str, dict[str, Any]]:
+        """The records that have a key of theirs, by name, without making the others."""
+        found = {row for form in self._forms if key in form.tree for row in form.rows.tolist()}
+        return {name: self[name] for row, name in enumerate(self._names)
+                if row in found or key in self._apart.get(name, ())}  # fmt: skip
+
     def lines(self, depth: int) -> str:
         """As JSON, one line per entry of a mapping, the whole beginning in a line indented by so many spaces."""
         if not self._names:
@@ -185,3 +191,8 @@ def _one(value: Any) -> str:
 
 
 _key = lru_cache(encode_basestring)
+
+
+def having(entries: Mapping[str, dict[str, Any]], key: str) -> Mapping[str, dict[str, Any]]:
+    """Of entries by name those that have a key."""
+    return entries.having(key) if isinstance(entries, Records) else {k: e for k, e in entries.items() if key in e}

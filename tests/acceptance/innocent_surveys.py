@@ -1,7 +1,7 @@
 """Good simulated surveys, all diagnosed though nothing is wrong with them: how many are blamed?
 
-``python -m tests.acceptance.innocent_surveys 200`` prints that; the adjustment asks for a diagnosis only where the
-global test fails, so that this is harder than what a user meets.
+``python -m tests.acceptance.innocent_surveys 200 [FIRST_SEED]`` prints that; the adjustment asks for a diagnosis only
+where the global test fails, so that this is harder than what a user meets.
 """
 
 import sys
@@ -13,9 +13,9 @@ FAST = ("stereo", "rig", "tripods", "held lens", "relay", "hand", "base", "hall"
 
 
 def main() -> None:
-    number, blamed = int(sys.argv[1]), 0
+    number, first, blamed = int(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 1000, 0
     for i in range(number):
-        kind, seed = FAST[i % len(FAST)], 1000 + i
+        kind, seed = FAST[i % len(FAST)], first + i
         found = diagnosed(survey_of(kind, seed)[0]).candidates
         blamed += bool(found)
         if found:

@@ -457,7 +457,7 @@ IMAGE_MISTAKES = (
     Mistake("station moved", of("post"), ("tripods",), (1.0, 5.0, 20.0),
             bumped(("world_from_station", "post"), 0.5, of_post), ("camera moved", "right"), "a tripod"),
     Mistake("motion forgotten", of("board"), ("stereo", "rig"), (12.0, 8.0, 5.0), still("target"), title="of a target"),
-    Mistake("motion forgotten", of("relay"), ("relay",), (12.0, 8.0, 6.0), still("station"), title="of a station"),
+    Mistake("motion forgotten", of("relay"), ("relay",), (12.0, 11.0, 10.0), still("station"), title="of a station"),
     Mistake("epochs shifted", anything, ("stereo", "rig"), (1.0, 2.0, -1.0), shifted_epochs),
     Mistake("epochs exchanged", anything, ("stereo", "rig"), (1.0, 3.0, 6.0), epochs_exchanged),
     Mistake("cameras not simultaneous", camera_of, ("rig",), (0.03, 0.1, 0.3), late),

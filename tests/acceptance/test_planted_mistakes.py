@@ -38,7 +38,8 @@ NAMED = {  # one size of each, in one kind of survey; the whole table is python 
 SEARCHED = (  # names that closed forms find, and small mistakes among much noise
     ("points exchanged", "beacons", 0.2), ("rows of another set-up", "plane", 2.0), ("slipped decimal", "plane", 0.1),
     ("target height", "hall", 0.1), ("gear ratio", "head", 1e-3), ("clock offset", "hand", 0.05),
-    ("left-handed frames", "hand", 0.0), ("images turned", "head", 0.2),
+    ("left-handed frames", "hand", 0.0), ("images turned", "head", 0.2), ("pairs inverted", "poses", 7.0),
+    ("order of quaternions", "poses", 12.0), ("the same twice", "poses", 100.0), ("sigmas of a group", "hall", 0.1),
 )  # fmt: skip
 
 

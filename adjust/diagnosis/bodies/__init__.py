@@ -30,7 +30,7 @@ def _steps(case: Case) -> Iterator[Step]:
         every = series_of(case, adjusted_values(case.result))
         found = [step for series in every if (step := step_of(series)) is not None]
     if not found:
-        for (_, owner), values in case.without_one:
+        for owner, values in (*case.without_each("target_id"), *case.without_each("camera_id")):
             steps = [step_of(s) for s in series_of(case, values) if s.name[1] == owner]
             found += [s for s in steps if s is not None]
     yield from found

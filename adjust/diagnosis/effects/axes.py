@@ -14,6 +14,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey, Table
 from adjust.model.tables import harmonic, harmonic_names
+from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
 from adjust.testing.significance import significances
 
@@ -39,8 +40,8 @@ def unsteady_axes(case: Case) -> Iterator[Hypothesis]:
                 if found is None or survey is None:
                     continue
                 drop = _promised(survey, linear.result)
-                if drop > linear.scale * float(chi2.isf(_ALPHA / found.looked_at, found.parameters)):
-                    yield replace(found, evidence=drop)
+                if drop > linear.scale * float(chi2.isf(sidak(_ALPHA, found.looked_at), found.parameters)):
+                    yield replace(found, evidence=linear.ratio(drop))
 
 
 def _promised(survey: Survey, result: Adjustment) -> float:

@@ -7,12 +7,10 @@ neighbouring epochs. What is tried are clocks as unknowns (:mod:`adjust.diagnosi
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gtsam import Pose3, Rot3
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect, Shifts, of_others, of_shifts
@@ -22,6 +20,9 @@ from adjust.diagnosis.score import Linear, Score, drift_times
 from adjust.diagnosis.sequences import hand_poses
 from adjust.model.observations import ImageBlock, TableReading
 from adjust.model.survey import FloatArray, Survey
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
 
 _FEWEST = 6
 _STEP = 1e-3  # intervals
@@ -237,6 +238,8 @@ def _of_path(survey: Survey, linear: Linear, rows: Sequence[int], path: Sequence
 
 def _at(path: Sequence[Pose3], dt: FloatArray) -> list[Pose3]:
     """Poses of a path at dt (n,) intervals after each of them: cubic splines of their places and of their turns."""
+    from scipy.spatial.transform import Rotation, RotationSpline  # here: what stands still needs none
+
     R = np.array([p.rotation().matrix() for p in path])
     times = np.arange(len(path)) + dt
     turns = RotationSpline(np.arange(len(path)), Rotation.from_matrix(R))
@@ -244,6 +247,8 @@ def _at(path: Sequence[Pose3], dt: FloatArray) -> list[Pose3]:
     return [Pose3(Rot3(M), t) for M, t in zip(turns(times).as_matrix(), places(times), strict=True)]
 
 
-def spline(values: Any) -> CubicSpline:
+def spline(values: Any) -> "CubicSpline":
     """Through values (n, ...) at 0, 1, 2 ..."""
+    from scipy.interpolate import CubicSpline  # here: it takes longer to load than a small survey to diagnose
+
     return CubicSpline(np.arange(len(values)), np.array(values))

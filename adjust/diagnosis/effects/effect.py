@@ -66,7 +66,7 @@ class Effect:
         sigmas = np.sqrt(np.maximum(np.diag(self.first.cov), 0.0))
         hypothesis = replace(self.hypothesis, survey=made, cause=self.said(self.first.theta, sigmas),
                              parameters=self.hypothesis.parameters + self.first.seen, looked_at=looked_at,
-                             evidence=ratio(linear, self.first.drop))  # fmt: skip
+                             evidence=linear.ratio(self.first.drop))  # fmt: skip
         return replace(hypothesis, follow=told) if self.model is None else self.model(hypothesis)
 
     def made(self, result: Adjustment, theta: FloatArray) -> Survey:
@@ -100,13 +100,6 @@ class Effect:
         return theta, now.result, np.sqrt(np.maximum(np.diag(cov), 0.0) * now.scale)
 
 
-def ratio(linear: Linear, drop: float) -> float:
-    """How many times smaller the misfit beyond noise becomes by a drop of v'Pv; noise itself is some of it."""
-    redundancy = max(linear.result.redundancy, 1)
-    noise, excess = float(np.sqrt(2.0 * redundancy)), linear.result.omega - redundancy
-    return (max(excess, drop) + noise) / (max(excess - drop, 0.0) + noise)
-
-
 Shifts = Mapping[int, FloatArray]
 """By the position of an image block: (n, 2, k) px that a change of size one has shifted its points by."""
 
@@ -114,6 +107,13 @@ Shifts = Mapping[int, FloatArray]
 def of_shifts(linear: Linear, shifts: Shifts) -> Score:
     """The score of shifts of the image points of ``linear.result.survey``."""
     return linear.of_parts(linear.image_parts(shifts))
+
+
+def of_shape(linear: Linear, target_id: str, change: FloatArray) -> Score:
+    """The score of a change (P, 3, k) of the points of a target."""
+    found = {i: linear.prediction.by_shape(b, change) for i, b in enumerate(linear.result.survey.image_blocks)
+             if b.target_id == target_id}  # fmt: skip
+    return of_shifts(linear, {i: D for i, D in found.items() if D is not None})
 
 
 def of_others(linear: Linear, kind: str, shifts: Mapping[tuple[str, ...], FloatArray]) -> Score:

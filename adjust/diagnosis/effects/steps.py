@@ -18,6 +18,7 @@ from adjust.diagnosis.sequences import with_pairs
 from adjust.model.observations import FrameRef, ImageBlock, Pair
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray, Survey
+from adjust.statistics.normal import DENSE
 
 FOCAL, CENTRE = ("fx", "fy", "c"), ("u0", "v0", "xp", "yp")
 _FEWEST = 4
@@ -51,7 +52,12 @@ def steps(case: Case) -> Iterator[Effect]:
     linear = case.linear
     if linear is None:
         return
+    n = len(linear.system.columns)
+    room = float(n) if n > DENSE else np.inf  # columns of the covariance matrix, as many as it has
     for course in _courses(linear):
+        room -= sum(B.shape[1] for _, B in course.parts)
+        if not case.few("what moved from some epoch on, of things that fit better than others", int(room < 0.0), 0):
+            return
         if len(course.parts) < _FEWEST:
             continue
         found = linear.steps(course.parts)
@@ -67,17 +73,18 @@ def _courses(linear: Linear, only: ParameterName | None = None) -> Iterator[_Cou
     ptr, row_of = linear.system.ptr, linear.system.row_of
     first_reading = len(ptr) - 1 - len(survey.readings)
     pairs = {i: k for k, i in enumerate(_other_rows(linear, "pair"))}
-    At = linear.A.tocsc()
 
     def course(name: ParameterName, kind: str, ids: Mapping[int, str], rows: IntArray) -> _Course:
         numbers = [i for i in np.unique(row_of[rows]).tolist() if i in ids]
         of = [np.arange(ptr[i], ptr[i + 1]) for i in numbers]
         return _Course(name, (), kind, tuple(ids[i] for i in numbers), tuple(linear.parts(columns.at[name], of)))
 
-    for name, at in columns.at.items() if only is None else [(n, columns.at[n]) for n in (only,) if n in columns.at]:
+    yield from _of_held(linear, only)
+    for name in _worst_first(linear) if only is None else [only] if only in columns.at else []:
+        at = columns.at[name]
         if name[0] not in (*_MOVED, "lens") or not len(at) or len(name) > 2 or _is_the_world(survey, name):
             continue
-        rows = np.unique(At[:, at].indices)
+        rows = linear.rows_of(at)
         if (rows < ptr[linear.system.n_image]).any():
             yield from _of_images(linear, name, rows)
         elif name[0] == "world_from_station":
@@ -85,7 +92,16 @@ def _courses(linear: Linear, only: ParameterName | None = None) -> Iterator[_Cou
         elif name[0] == "orientation":
             ids = {first_reading + k: r.reading_id for k, r in enumerate(survey.readings)}
             yield course(name, "reading", ids, rows)
-    yield from _of_held(linear, only)
+
+
+def _worst_first(linear: Linear) -> list[ParameterName]:
+    """The unknowns; of many those first whose observations fit least."""
+    at = linear.system.columns.at
+    if len(linear.system.columns) <= DENSE:
+        return list(at)
+    some = [name for name in at if name[0] in _MOVED or name[0] == "lens"]
+    misfit = {name: float(np.mean(linear.e[linear.rows_of(at[name])] ** 2)) for name in some if len(at[name])}
+    return sorted(misfit, key=lambda name: -misfit[name])
 
 
 def _is_the_world(survey: Survey, name: ParameterName) -> bool:
@@ -120,7 +136,6 @@ def _of_held(linear: Linear, only: ParameterName | None) -> Iterator[_Course]:
     turned = [s.station_id for s in survey.stations if s.motion == "table"]
     held = [("target_body", t) for t in still if ("carrier_from_target", t) not in free]
     held += [("station_body", s) for s in turned if ("mount_from_station", s) not in free]
-    prediction = Prediction(survey, adjusted_values(linear.result))
     on_table = {r.epoch_id for r in survey.table_readings}
     for name in held if only is None else [n for n in held if n == only]:
         by_epoch: dict[str, list[Part]] = {}
@@ -128,7 +143,7 @@ def _of_held(linear: Linear, only: ParameterName | None) -> Iterator[_Course]:
         mine = {i for i, b in enumerate(survey.image_blocks) if b.target_id == name[1] or
                 (name[0] == "station_body" and b.camera_id in cameras and b.epoch_id in on_table)}  # fmt: skip
         for i in sorted(mine):
-            D = prediction.by_motion(survey.image_blocks[i], name)
+            D = linear.prediction.by_motion(survey.image_blocks[i], name)
             if D is not None:
                 by_epoch.setdefault(survey.image_blocks[i].epoch_id, []).extend(linear.image_parts({i: D}))
         parts = tuple((np.concatenate([r for r, _ in p]), np.concatenate([B for _, B in p])) for p in by_epoch.values())

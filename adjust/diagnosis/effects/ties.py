@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from adjust.diagnosis.case import Case
-from adjust.diagnosis.effects.effect import ratio
 from adjust.diagnosis.hypothesis import Hypothesis, Place, SetKey
 from adjust.diagnosis.score import Linear, Score
 from adjust.frames.lens_states import lenders
@@ -92,7 +91,7 @@ def untied(case: Case) -> Iterator[Hypothesis]:
                 f"give it parameters of its own: parameters = [] in cameras.{camera}.lens.shared",
                 Place("camera", (camera,), "shared"), _freed(case.survey, camera),
                 (SetKey(("cameras", camera, "lens", "shared", "parameters"), ()),),
-                evidence=ratio(linear, score.drop), parameters=score.seen, looked_at=len(shared),
+                evidence=linear.ratio(score.drop), parameters=score.seen, looked_at=len(shared),
             )  # fmt: skip
             yield replace(hypothesis, follow=_told(hypothesis, linear.result, camera))
 

@@ -9,6 +9,7 @@ from adjust.diagnosis.case import Case, single_views
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.images.maps import TURNED, mapped, turned
 from adjust.model.survey import FloatArray, Survey
+from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
 
 _ALPHA = 1e-6
@@ -27,7 +28,7 @@ def turned_alone(case: Case) -> Iterator[Hypothesis]:
         back = _squares(mapped(alone, camera, set(epochs), TURNED[_HALF]), lenses)
         gain = _squares(alone, lenses) - back
         since = np.array([gain[[b.epoch_id in set(epochs[k:]) for b in mine]].sum() for k in range(1, len(epochs))])
-        if len(since) and since.max() > float(chi2.isf(_ALPHA / len(since), 1)):
+        if len(since) and since.max() > float(chi2.isf(sidak(_ALPHA, len(since)), 1)):
             later = tuple(epochs[int(np.argmax(since)) + 1 :])
             ratio = 1.0 + float(since.max() / max(back[-len(later) :].sum(), 1.0))
             yield turned(case.survey, camera, later, TURNED[_HALF], ratio, len(since))

@@ -5,17 +5,16 @@ Held values and priors of points, which the readings of a network contradict.
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, compress
 
 import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Edit, Hypothesis, Place, SetKey
-from adjust.diagnosis.screen import Screen, improvement, screen
+from adjust.diagnosis.screen import Fit, Screen, improvement, screen
 from adjust.model.survey import FloatArray, Point, Survey
 
 _CLEARLY = 2.0
-_MISSING = 25.0
 _MOST, _TRIALS = 4, 80
 _SLIPS = (10.0, 0.1, 100.0, 0.01, 1000.0, 0.001)
 _LARGE = 2500
@@ -25,27 +24,25 @@ def wrong_given(case: Case) -> Iterator[Hypothesis]:
     """Changes of given coordinates after which the survey's own start fits its observations better."""
     survey = case.survey
     given = [p.point_id for p in survey.points if p.x_in_world.treatment != "free" and p.x_in_world.value is not None]
-    if not given or not survey.readings or len(survey.readings) > _LARGE:
+    if not given or not survey.readings or not case.few("wrong given coordinates", len(survey.readings), _LARGE):
         return
     before = screen(survey)
-    tried = [h for h in (*_exchanges(survey, given), *_slips(survey, given), *_axes(survey, given))
-             if before is None or _misses(survey, before, h.place.ids)][:_TRIALS]  # fmt: skip
-    found = []
-    for h in tried:
-        changed = h.changed()
-        evidence = 0.0 if changed is None else _evidence(before, screen(changed))
-        if evidence > _CLEARLY:
-            found.append(replace(h, evidence=evidence, looked_at=len(tried)))
+    some = [h for h in (*_exchanges(survey, given), *_slips(survey, given))
+            if before is None or _misses(survey, before, h.place.ids)]  # fmt: skip
+    tried = [*_axes(survey, given), *some][:_TRIALS]  # the former concern all: where these are wrong all miss evenly
+    changed = [h.survey for h in tried if isinstance(h.survey, Survey)]
+    fits = map(screen, changed) if before is None else before.afresh(changed)
+    found = [replace(h, evidence=e, looked_at=len(tried)) for h, fit in zip(tried, fits, strict=True)
+             if (e := _evidence(before, fit)) > _CLEARLY]  # fmt: skip
     yield from sorted(found, key=lambda h: -h.evidence)[:_MOST]
 
 
 def _misses(survey: Survey, before: Screen, ids: tuple[str, ...]) -> bool:
     """Whether readings from or to one of these points do."""
-    bad = before.readings > _MISSING * before.scale
-    return any(b and {r.at.point_id, r.to.point_id} & {*ids} for b, r in zip(bad, survey.readings, strict=True))
+    return any({r.at.point_id, r.to.point_id} & {*ids} for r in compress(survey.readings, before.missed))
 
 
-def _evidence(before: Screen | None, after: Screen | None) -> float:
+def _evidence(before: Screen | None, after: Fit | None) -> float:
     if after is None or not len(after.readings):
         return 0.0
     n = len(after.readings)

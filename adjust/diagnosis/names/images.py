@@ -12,6 +12,7 @@ import numpy as np
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, LeaveOut, Place, Rename
 from adjust.diagnosis.prediction import Prediction
+from adjust.diagnosis.score import ratio
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import FloatArray, Survey
 
@@ -30,9 +31,7 @@ class Now:
 
     def ratio(self, gain: float) -> float:
         """How many times smaller the misfit beyond noise becomes."""
-        n = 2.0 * sum(len(s) for s in self.squares)
-        excess = max(float(sum(s.sum() for s in self.squares)) - n, gain)
-        return float((excess + np.sqrt(2.0 * n)) / (excess - gain + np.sqrt(2.0 * n)))
+        return ratio(float(sum(s.sum() for s in self.squares)), 2.0 * sum(len(s) for s in self.squares), gain)
 
 
 def misnamed_images(case: Case) -> Iterator[Hypothesis]:

@@ -3,7 +3,7 @@
 Evidence: the readings concerned against what the rest predicts at its robust start, with the names exchanged.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -11,10 +11,10 @@ import numpy as np
 
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, Rename
-from adjust.diagnosis.screen import Screen, at_best, screen
-from adjust.diagnosis.units.readings import drop
+from adjust.diagnosis.screen import Screen, at_best
 from adjust.model.observations import PositionRef, Reading
 from adjust.model.survey import IntArray, Survey
+from adjust.observations.terrestrial.building import reading_refs
 
 _CLEARLY = 3.0
 _SUSPECTS, _MOST = 6, 4
@@ -24,20 +24,34 @@ _LARGE = 2500
 def exchanged_points(case: Case) -> Iterator[Hypothesis]:
     """Pairs of points whose exchange makes their readings fit, the clearest first."""
     survey = case.survey
-    before = at_best(case) if 0 < len(survey.readings) <= _LARGE else None
+    if not survey.readings or not case.few("points exchanged", len(survey.readings), _LARGE):
+        return
+    before = at_best(case)
     if before is None:
         return
-    found, looked_at = list[tuple[float, Hypothesis]](), 0
-    for setup_id in (None, *dict.fromkeys(r.setup_id for r in survey.readings if r.setup_id)):
-        for a, b in combinations(_suspects(survey, before, setup_id), 2):
-            looked_at += 1
-            rows = _of_points(survey, setup_id, (a, b))
+    setups = (None, *dict.fromkeys(r.setup_id for r in survey.readings if r.setup_id))
+    pairs = [(s, a, b) for s in setups for a, b in combinations(_suspects(survey, before, s), 2)]
+    sets = [_of_points(survey, s, (a, b)) for s, a, b in pairs]
+    after = before.alternatives(sets, **ends_exchanged(before, sets, [(a, b) for _, a, b in pairs]))
+    found = [(before.drop(rows, squares), rows, *pair) for rows, squares, pair in zip(sets, after, pairs, strict=True)]
+    for evidence, rows, setup_id, a, b in sorted(found, key=lambda f: -f[0])[:_MOST]:
+        if evidence > _CLEARLY:
             changed = exchanged(survey, rows, a, b)
-            evidence = _evidence(before, changed, rows)
-            if evidence > _CLEARLY:
-                found.append((evidence, _hypothesis(changed, setup_id, a, b, evidence)))
-    found.sort(key=lambda f: -f[0])
-    yield from (replace(h, looked_at=max(1, looked_at)) for _, h in found[:_MOST])
+            yield replace(_hypothesis(changed, setup_id, a, b, evidence), looked_at=len(pairs))
+
+
+def ends_exchanged(before: Screen, sets: Sequence[IntArray], names: Sequence[tuple[str, str]]) -> dict[str, IntArray]:
+    """The targets of each set of readings, with two points under each other's names, as numbers of their positions."""
+    batch = before.graph.terrestrial
+    if batch is None or not sets:
+        return {}
+    number = {r.point_id: i for i, r in enumerate(reading_refs(before.graph.survey)) if r.frame is None}
+    a, b = (np.repeat([number.get(n[k], -2) for n in names], [len(rows) for rows in sets]) for k in (0, 1))
+    rows, arrays = np.concatenate(sets), batch.layout.arrays
+    old = np.stack([arrays.to[rows], arrays.second[rows]])
+    new = np.where(old == a, b, np.where(old == b, a, old))
+    new = np.where((new == arrays.at[rows]).any(axis=0), old, new)  # nobody sights the point he stands on
+    return {"to": new[0], "second": new[1]}
 
 
 def _suspects(survey: Survey, before: Screen, setup_id: str | None) -> list[str]:
@@ -71,11 +85,6 @@ def exchanged(survey: Survey, rows: IntArray, a: str, b: str) -> Survey:
 
     readings = tuple(renamed(r) if i in chosen else r for i, r in enumerate(survey.readings))
     return replace(survey, readings=tuple(r if r.at != r.to else survey.readings[i] for i, r in enumerate(readings)))
-
-
-def _evidence(before: Screen, changed: Survey, rows: IntArray) -> float:
-    after = screen(changed, before.start)
-    return 0.0 if after is None else drop(before, rows, after.readings[rows])
 
 
 def _hypothesis(changed: Survey, setup_id: str | None, a: str, b: str, evidence: float) -> Hypothesis:

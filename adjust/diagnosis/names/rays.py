@@ -6,7 +6,7 @@ divided anew between the two places where most of them meet.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, islice
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.names.images import exchange
 from adjust.diagnosis.prediction import Prediction
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.start.closed_forms.triangulation import intersect
 from adjust.start.views import focal_px, rays_by_block
 
 _NEAR_PX = 15.0
@@ -43,16 +44,15 @@ class Rays:
 
     def meeting(self, rows: IntArray) -> IntArray:
         """Those of the rays (k,) that meet in one place: as many of them as possible."""
+        pairs = np.array(list(islice(combinations(rows.tolist(), 2), _PAIRS)), dtype=np.int64).reshape(-1, 2)
         best: IntArray = rows[:0]
-        for i, j in list(combinations(rows.tolist(), 2))[:_PAIRS]:
-            c = float(self.d[i] @ self.d[j])
-            if 1.0 - c * c < _PARALLAX**2:
-                continue
-            between = self.o[j] - self.o[i]
-            s, t = np.linalg.solve([[1.0, -c], [c, -1.0]], [between @ self.d[i], between @ self.d[j]])
-            x = 0.5 * (self.o[i] + s * self.d[i] + self.o[j] + t * self.d[j])
+        if not len(pairs):
+            return best
+        of, both = np.repeat(np.arange(len(pairs)), 2), pairs.ravel()
+        met = intersect(self.o[both], self.d[both], of, len(pairs), iterations=0)
+        for pair, x in zip(pairs[met.parallax > _PARALLAX], met.x[met.parallax > _PARALLAX], strict=True):
             found = rows[self.near(rows, x)]
-            if i in found and j in found and len(found) > len(best):
+            if len(found) > len(best) and np.isin(pair, found).all():
                 best = found
         return best
 

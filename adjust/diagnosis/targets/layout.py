@@ -25,11 +25,13 @@ def other_layouts(case: Case) -> Iterator[Hypothesis]:
         square = float(np.linalg.norm(x[1] - x[0]))
         if not np.allclose(x, lattice(n, _columns(x, square), square), atol=1e-6):
             continue
-        misses = {c: max(_miss(lattice(n, c, 1.0)[b.point_idx], b.uv) for b in some) for c in range(2, _WIDEST)}
-        now = max(_miss(x[b.point_idx] / square, b.uv) for b in some)
-        best = min(misses, key=lambda c: misses[c])
-        if now > _CLEARLY * misses[best]:
-            yield _hypothesis(case.survey, target.target_id, best, square, now / misses[best])
+        widths = list(range(2, _WIDEST))
+        every = np.array([lattice(n, c, square) for c in widths] + [x])
+        *misses, now = np.max([_misses(every[:, b.point_idx, :2], b.uv) for b in some], axis=0).tolist()
+        best = min(misses)
+        if now > _CLEARLY * best:
+            columns = widths[misses.index(best)]
+            yield _hypothesis(case.survey, target.target_id, columns, square, now / best)
 
 
 def lattice(n: int, columns: int, square: float) -> FloatArray:
@@ -42,22 +44,23 @@ def _columns(x: FloatArray, square: float) -> int:
     return round(float(np.ptp(x[:, 0])) / square) + 1
 
 
-def _miss(x: FloatArray, uv: FloatArray) -> float:
-    """px, rms of the best homography of points (n, 3) of a plane to uv (n, 2), by the direct linear transformation."""
-    a, _ = _normalized(x[:, :2])
-    b, scale = _normalized(uv)
-    one, zero = np.column_stack([a, np.ones(len(a))]), np.zeros((len(a), 3))
-    A = np.concatenate([np.hstack([one, zero, -b[:, :1] * one]), np.hstack([zero, one, -b[:, 1:] * one])])
-    H = np.linalg.svd(A, full_matrices=False)[2][-1].reshape(3, 3)
-    q = one @ H.T
+def _misses(x: FloatArray, uv: FloatArray) -> FloatArray:
+    """(m,) px, rms of the best homographies of points (m, n, 2) to uv (n, 2), by the direct linear transformation."""
+    (a, _), (b, scale) = _normalized(x), _normalized(uv[None])
+    one, zero = np.concatenate([a, np.ones((*a.shape[:2], 1))], axis=2), np.zeros((*a.shape[:2], 3))
+    rows = [np.concatenate(r, axis=2) for r in ((one, zero, -b[..., :1] * one), (zero, one, -b[..., 1:] * one))]
+    A = np.concatenate(rows, axis=1)
+    H = np.linalg.eigh(np.swapaxes(A, 1, 2) @ A)[1][:, :, 0].reshape(-1, 3, 3)
+    q = one @ np.swapaxes(H, 1, 2)
     with np.errstate(divide="ignore", invalid="ignore"):
-        miss = (q[:, :2] / q[:, 2:] - b) / scale
-    return float(np.sqrt(np.minimum(np.nan_to_num(miss, nan=1e6) ** 2, 1e12).mean()))
+        miss = (q[..., :2] / q[..., 2:] - b) / scale
+    return np.asarray(np.sqrt(np.minimum(np.nan_to_num(miss, nan=1e6) ** 2, 1e12).mean(axis=(1, 2))))
 
 
-def _normalized(x: FloatArray) -> tuple[FloatArray, float]:
-    centred = x - x.mean(axis=0)
-    scale = 1.0 / max(float(np.abs(centred).max()), 1e-12)
+def _normalized(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Sets (m, n, 2) about their middle, within 1, and what each was multiplied by (m, 1, 1)."""
+    centred = x - x.mean(axis=1, keepdims=True)
+    scale = 1.0 / np.maximum(np.abs(centred).max(axis=(1, 2), keepdims=True), 1e-12)
     return scale * centred, scale
 
 

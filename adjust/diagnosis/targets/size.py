@@ -38,9 +38,7 @@ def wrong_sizes(case: Case) -> Iterator[Hypothesis]:
     """For each target that the rest contradicts: its size as the rest says it, and the nearest known cause."""
     if len({b.target_id for b in case.survey.image_blocks}) < 2:
         return
-    for (field, owner), values in case.without_one:
-        if field != "target_id":
-            continue
+    for owner, values in case.without_each("target_id"):
         found = _ratio(case, values, owner)
         if found is not None and abs(found[0] - 1.0) > _CLEAR * found[1] and found[0] > 0.0:
             yield from _hypotheses(case.survey, owner, *found)

@@ -16,7 +16,8 @@ from adjust.spatial.averaging import mean_pose
 from adjust.spatial.rigid import inverse
 
 _CLEARLY = 10.0
-_FEWEST = 3
+_FEWEST = 2
+"""Images beyond the first of each camera and target, all together, that have to show it moved."""
 
 
 def forgotten_motion(case: Case) -> Iterator[Hypothesis]:
@@ -26,18 +27,19 @@ def forgotten_motion(case: Case) -> Iterator[Hypothesis]:
     still = {t.target_id for t in survey.targets if t.motion == "fixed" and (t.station_id or "") in fixed | {""}}
     station_of = {c.camera_id: c.station_id for c in survey.cameras}
     carriers = {t.target_id: t.station_id for t in survey.targets}
-    moves: dict[tuple[str, str], float] = {}
+    moves: dict[tuple[str, str], tuple[float, int]] = {}
     for (camera_id, target_id), (poses, error_px, focal) in _poses(case).items():
         joined = carriers[target_id] == station_of[camera_id]
-        if target_id in still and station_of[camera_id] in fixed and len(poses) >= _FEWEST and not joined:
-            key = (station_of[camera_id], target_id)
-            moves[key] = max(moves.get(key, 0.0), _scatter(poses, error_px / focal))
-    moved = {k: r for k, r in moves.items() if r > _CLEARLY}
-    for target_id in dict.fromkeys(t for _, t in moved):
-        yield _target(survey, target_id, max(r for (_, t), r in moved.items() if t == target_id))
-    for station_id in dict.fromkeys(s for s, _ in moved):
-        mine = [(t, r) for (s, t), r in moved.items() if s == station_id]
-        yield _station(survey, station_id, max(r for _, r in mine))
+        if target_id in still and station_of[camera_id] in fixed and not joined and len(poses) > 1:
+            key, ratio = (station_of[camera_id], target_id), _scatter(poses, error_px / focal)
+            if ratio > _CLEARLY:
+                most, n = moves.get(key, (0.0, 0))
+                moves[key] = max(most, ratio), n + len(poses) - 1
+    for which, made in ((1, _target), (0, _station)):
+        for owner in dict.fromkeys(key[which] for key in moves):
+            ratios, numbers = zip(*(found for key, found in moves.items() if key[which] == owner), strict=True)
+            if sum(numbers) >= _FEWEST:
+                yield made(survey, owner, max(ratios))
 
 
 def _poses(case: Case) -> dict[tuple[str, str], tuple[FloatArray, float, float]]:

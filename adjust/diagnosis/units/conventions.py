@@ -13,6 +13,7 @@ from adjust.model.survey import FloatArray, IntArray
 
 ANGLES: tuple[ReadingKind, ...] = ("direction", "angle", "azimuth", "zenith")
 TURNS: tuple[ReadingKind, ...] = ("direction", "angle", "azimuth")
+_SMALLER = 0.1
 LENGTHS: tuple[ReadingKind, ...] = ("slope_distance", "horizontal_distance", "height_difference")
 
 
@@ -41,6 +42,26 @@ class Misreading:
     def mend(self, values: FloatArray) -> FloatArray:
         """(n,) true values of values as they were read."""
         return np.asarray(self.factor * values + self.offset)
+
+    def may_be(self, widest: float) -> bool:
+        """Whether values of which the largest is that (rad or m) can have been read so: a circle has one turn.
+
+        Two of them are allowed for. A unit that is larger than a tenth of the one it was read as leaves readings
+        beyond a turn, save where all of them lie in a small sector.
+        """
+        if self.kinds[0] not in ANGLES or self.offset:
+            return True
+        turned = abs(self.factor) > _SMALLER or widest > 2.0 * np.pi
+        return turned and abs(self.factor) * widest <= 4.0 * np.pi
+
+
+def shrinking(factor: float, n: int) -> float:
+    """What n numbers that become smaller by a factor add to minus twice the log likelihood of those that were read.
+
+    The density of ``y`` is that of ``factor * y`` times ``factor``: else a unit that makes all of them nearly zero, and
+    so less than their sigmas, would explain whatever contradicts in them. What makes them larger earns nothing by that.
+    """
+    return -2.0 * n * min(0.0, float(np.log(abs(factor))))
 
 
 def _scaled(name: str, kinds: tuple[ReadingKind, ...], ratios: dict[str, float]) -> list[Misreading]:
@@ -77,5 +98,10 @@ MISREADINGS: tuple[Misreading, ...] = (
     Misreading("angles from another zero", "are zenith angles of the second face", -1.0, 2.0 * np.pi, ("zenith",)),
     Misreading("sign of height differences", "have the other sign", -1.0, 0.0, ("height_difference",)),
 )
-SLIPS: tuple[float, ...] = (10.0, 0.1, 100.0, 0.01)
-"""Slips of the decimal point, tried on single values alone."""
+_SLIPS = (10.0, 0.1, 100.0, 0.01)
+
+
+def slips(kind: ReadingKind, value: float) -> list[Misreading]:
+    """Of the decimal point, tried on single values alone."""
+    return [Misreading("slipped decimal", f"has slipped: {value:.9g} for {f * value:.9g} (SI)", f, 0.0, (kind,))
+            for f in _SLIPS]  # fmt: skip

@@ -5,7 +5,7 @@ and shifts of both sides must be those of one rigid body. Inverting both sides o
 (eye-in-hand taken for eye-to-hand): only the lengths of the result tell.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,18 +14,18 @@ from gtsam import Pose3, Rot3
 
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import ChangeColumns, Edit, ExchangeColumns, Hypothesis, Place
-from adjust.diagnosis.screen import Screen, screen
+from adjust.diagnosis.screen import Screen, at_best, screen
 from adjust.diagnosis.sequences import Link, fitted, links, typical, with_pairs
-from adjust.diagnosis.units.conventions import Scope
-from adjust.graph.assembly import values_of
+from adjust.diagnosis.units.conventions import Scope, shrinking
 from adjust.model.errors import SurveyError
-from adjust.model.observations import Pair
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.spatial.rotation_forms import euler_from_matrix, matrix_from_euler
 
 Motion = Pose3 | Rot3
 _CLEARLY = 3.0
 _MOST, _SINGLE = 5, 8
+_MISSED = 25.0
+"""Mean square over sigmas at the start that the typical one of several pairs that are misread has at least."""
 _LARGE = 500
 """Pairs up to which start values are found anew for every convention."""
 
@@ -34,7 +34,8 @@ _LARGE = 500
 class Convention:
     """name: of the kind of mistake. said: what is wrong. remedy: in pairs.csv. mend: the motion as it was meant.
 
-    columns: the numbers of pairs.csv that change, and by which matrix, where that mends it.
+    columns: the numbers of pairs.csv that change, and by which matrix, where that mends it. shifts: what the lengths of
+    shifts are multiplied by.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Convention:
     remedy: str
     mend: Callable[[Motion], Motion | None]
     columns: tuple[tuple[str, ...], FloatArray] | None = None
+    shifts: float = 1.0
 
 
 def _inverted(m: Motion) -> Motion:
@@ -104,15 +106,17 @@ def _scaled(factor: float) -> Callable[[Motion], Motion | None]:
     return lambda m: Pose3(m.rotation(), factor * m.translation()) if isinstance(m, Pose3) else None
 
 
+def _of_shifts(said: str, factor: float) -> Convention:
+    return Convention("unit of shifts", f"have shifts in {said}", f"multiply tx, ty, tz by {factor:g}",
+                      _scaled(factor), (_SHIFT, factor * np.eye(3)), factor)  # fmt: skip
+
+
 _SHIFT, _QUATERNION = ("tx_mm", "ty_mm", "tz_mm"), ("qw", "qx", "qy", "qz")
 CONVENTIONS: tuple[Convention, ...] = (
     Convention("pairs inverted", "are a_from_b, read as b_from_a", "exchange a_id and b_id", _inverted),
-    Convention("unit of shifts", "have shifts in metres, read as millimetres", "multiply tx, ty, tz by 1000",
-               _scaled(1000.0), (_SHIFT, 1000.0 * np.eye(3))),
-    Convention("unit of shifts", "have shifts in millimetres, read as metres", "multiply tx, ty, tz by 0.001",
-               _scaled(0.001), (_SHIFT, 0.001 * np.eye(3))),
-    Convention("unit of shifts", "have shifts in inches, read as millimetres", "multiply tx, ty, tz by 25.4",
-               _scaled(25.4), (_SHIFT, 25.4 * np.eye(3))),
+    _of_shifts("metres, read as millimetres", 1000.0),
+    _of_shifts("millimetres, read as metres", 0.001),
+    _of_shifts("inches, read as millimetres", 25.4),
     Convention("order of quaternions", "have quaternions in the order x y z w, read as w x y z",
                "put the last of the four numbers first", _last_first, (_QUATERNION, np.roll(np.eye(4), 1, axis=0))),
     Convention("order of quaternions", "have quaternions in the order w x y z, read as x y z w",
@@ -139,27 +143,29 @@ def misread_pairs(case: Case) -> Iterator[Hypothesis]:
     judge = _by_hands(survey, hands) if hands else _by_start(case)
     if judge is None:
         return
-    found, looked_at = list[tuple[float, Scope, Convention, Survey]](), 0
+    found, looked_at = list[tuple[float, Scope, Convention]](), 0
+    meant = [(c, {i: m for i, p in enumerate(survey.pairs) if (m := c.mend(p.b_from_a)) is not None})
+             for c in CONVENTIONS]  # fmt: skip
     for scope in _scopes(survey, judge.worst):
-        for convention in CONVENTIONS:
-            changed = mended(survey, scope.rows, convention)
-            if changed is None:
-                continue
-            looked_at += 1
-            found.append((judge.evidence(changed, scope.rows), scope, convention, changed))
+        for convention, motions in meant:
+            if all(i in motions for i in scope.rows.tolist()):
+                looked_at += 1
+                found.append((judge.evidence({i: motions[i] for i in scope.rows.tolist()}), scope, convention))
     found.sort(key=lambda f: (-f[0], -len(f[1].rows)))
-    for evidence, scope, convention, changed in found[:_MOST]:
-        if evidence > _CLEARLY:
+    for evidence, scope, convention in found[:_MOST]:
+        changed = mended(survey, scope.rows, convention) if evidence > _CLEARLY else None
+        if changed is not None:
             cause = f"{scope.text} {convention.said}{_lengths(changed, hands)}"
             yield Hypothesis(convention.name, cause, f"in pairs.csv {convention.remedy}", scope.place, changed,
-                             edits_of(survey, scope.rows, convention), evidence, 1, looked_at)  # fmt: skip
+                             edits_of(survey, scope.rows, convention), evidence, 1, looked_at,
+                             penalty=shrinking(convention.shifts, 3 * len(scope.rows)))  # fmt: skip
 
 
 def _lengths(survey: Survey, hands: list[Link]) -> str:
     """How far camera and target are from hand and base: what no residual shows, a person sees."""
     out = []
     for link in hands[:1]:
-        fit = fitted(link.kind, link.first, _second(survey, link))
+        fit = fitted(link.kind, link.first, _second(survey, link, {}))
         if fit is not None:
             left, right = (float(np.linalg.norm(x[:3, 3])) for x in (fit.left, fit.right))
             out.append(f" (then the camera is {left:.3f} m from the hand and the target {right:.3f} m from the base; "
@@ -173,13 +179,13 @@ def mended(survey: Survey, rows: IntArray, convention: Convention) -> Survey | N
 
     The covariance is in the tangent of the motion as it is written; rotation and shift keep their sigmas.
     """
-    new: dict[int, Pair] = {}
-    for i in rows.tolist():
-        motion = convention.mend(survey.pairs[i].b_from_a)
-        if motion is None:
-            return None
-        new[i] = replace(survey.pairs[i], b_from_a=motion)
-    return with_pairs(survey, new)
+    new = {i: convention.mend(survey.pairs[i].b_from_a) for i in rows.tolist()}
+    known = {i: motion for i, motion in new.items() if motion is not None}
+    return _with(survey, known) if len(known) == len(new) else None
+
+
+def _with(survey: Survey, new: Mapping[int, Motion]) -> Survey:
+    return with_pairs(survey, {i: replace(survey.pairs[i], b_from_a=motion) for i, motion in new.items()})
 
 
 def _scopes(survey: Survey, worst: IntArray) -> Iterator[Scope]:
@@ -201,66 +207,107 @@ def _scopes(survey: Survey, worst: IntArray) -> Iterator[Scope]:
 
 @dataclass(frozen=True, eq=False)
 class _Judge:
-    """worst: pairs that fit least, first. evidence: of a changed survey, how many times less its pairs miss."""
+    """worst: pairs that fit least, first. evidence: of other motions of some pairs, how many times less these miss."""
 
     worst: IntArray
-    evidence: Callable[[Survey, IntArray], float]
+    evidence: Callable[[Mapping[int, Motion]], float]
 
 
 def _by_hands(survey: Survey, hands: list[Link]) -> _Judge:
-    def misses(changed: Survey) -> FloatArray:
+    """The motions that join most poses stay what they are where fewer than half of these change: they are robust."""
+    joined = [fitted(link.kind, link.first, _second(survey, link, {})) for link in hands]
+
+    def misses(new: Mapping[int, Motion]) -> FloatArray:
         parts = []
-        for link in hands:
-            second = _second(changed, link)
-            fit = fitted(link.kind, link.first, second)
+        for link, fit in zip(hands, joined, strict=True):
+            second = _second(survey, link, new)
+            if 2 * len(new.keys() & set(link.pairs)) >= len(link.pairs):
+                fit = fitted(link.kind, link.first, second)
             parts.append(np.full(len(link.epochs), np.inf) if fit is None else fit.misses(link.first, second))
         return np.concatenate(parts)
 
-    base = misses(survey)
+    base = misses({})
     rows = np.concatenate([np.array(link.pairs, dtype=np.int64) for link in hands])
 
-    def evidence(changed: Survey, of: IntArray) -> float:
-        some = np.isin(rows, of)
-        if not some.any():
-            return 0.0
-        return typical(base[some]) / typical(misses(changed)[some])
+    def evidence(new: Mapping[int, Motion]) -> float:
+        some = np.isin(rows, list(new))
+        return typical(base[some]) / typical(misses(new)[some]) if some.any() else 0.0
 
     return _Judge(rows[np.argsort(-base, kind="stable")], evidence)
 
 
-def _second(survey: Survey, link: Link) -> FloatArray:
-    """The poses of the hand, in the direction that the link has them, from the pairs of a survey."""
+def _second(survey: Survey, link: Link, new: Mapping[int, Motion]) -> FloatArray:
+    """The poses of the hand, in the direction that the link has them, from the pairs of a survey; new: other ones."""
     out = []
     on_hand = any(c.camera_id == link.names[0] and c.station_id == link.names[1] for c in survey.cameras)
     for i in link.pairs:
-        pair = survey.pairs[i]
-        pose = pair.b_from_a.matrix() if isinstance(pair.b_from_a, Pose3) else np.eye(4)
+        pair, motion = survey.pairs[i], new.get(i, survey.pairs[i].b_from_a)
+        pose = motion.matrix() if isinstance(motion, Pose3) else np.eye(4)
         forwards = pair.b.frame_id == link.names[1] and bool(pair.b.epoch_id)
         out.append(pose if forwards == on_hand else np.linalg.inv(pose))
     return np.array(out)
 
 
 def _by_start(case: Case) -> _Judge | None:
-    if len(case.survey.pairs) > _LARGE:
+    """Poses that all pairs together say: those of most of them anew, where most are others."""
+    survey = case.survey
+    if not case.few("pairs in another convention", len(survey.pairs), _LARGE):
         return None
-    before = None if case.result is None else screen(case.survey, values_of(case.result))
-    before = before or screen(case.survey)
+    before = at_best(case)
     if before is None:
         return None
-    squares = _of_pairs(before, case.survey)
+    squares, loops = _of_pairs(before, survey), _loops(survey)
     worst = np.argsort(-squares, kind="stable")
+    ends = np.array([[p.a.frame_id, p.b.frame_id] for p in survey.pairs])
+    ends = np.unique(ends, return_inverse=True)[1].reshape(-1, 2)
+    degree = np.bincount(ends.ravel())
 
-    def evidence(changed: Survey, of: IntArray) -> float:
-        whole = len(of) > 0.5 * len(changed.pairs)
-        after = screen(changed, None if whole else before.start) or before
-        now = _of_pairs(after, changed)
-        rows = np.arange(len(now)) if whole else of
-        typical_now = float(np.median(now)) / 2.0
-        scale = max(1.0, min(typical_now, float(np.median(squares)) / 2.0))
-        old, new = (np.minimum(s[rows] / scale, CAP).sum() for s in (squares, now))
-        return float(old / (new + 0.1 * len(rows)))
+    def evidence(new: Mapping[int, Motion]) -> float:
+        rows = np.array(list(new))
+        if len(rows) > 1 and np.median(squares[rows]) < _MISSED:
+            return 0.0
+        if (2 * np.bincount(ends[rows].ravel(), minlength=len(degree)) > degree).any():  # what told the pose of an end
+            changed = _with(survey, new)
+            open_still = np.median(_loops(changed)[rows]) > max(1.0, 0.5 * np.median(loops[rows]))
+            after = None if open_still else screen(changed)
+            if after is None:
+                return 0.0
+            now, rows = _of_pairs(after, survey), np.arange(len(squares))
+        else:
+            now = squares.copy()
+            now[rows] = _read_as(before, new)
+        scale = max(1.0, min(float(np.median(now)), float(np.median(squares))) / 2.0)
+        old, left = (np.minimum(s[rows] / scale, CAP).sum() for s in (squares, now))
+        return float(old / (left + 0.1 * len(rows)))
 
     return _Judge(worst, evidence)
+
+
+def _loops(survey: Survey) -> FloatArray:
+    """(p,) squares over sigmas by which a short loop through each pair stays open; 1 where there is none."""
+    if not survey.is_pose_network:
+        return np.ones(len(survey.pairs))
+    from adjust.pose_network.agreement import loop_tests  # here: a survey without pairs starts without it
+    from adjust.pose_network.from_survey import network_from_survey
+
+    return np.nan_to_num(loop_tests(network_from_survey(survey, any_datum=True)), nan=1.0)
+
+
+def _read_as(found: Screen, new: Mapping[int, Motion]) -> FloatArray:
+    """(n,) mean squares over sigmas of pairs with other motions, where everything else is."""
+    out = []
+    for i, motion in new.items():
+        pair = found.graph.survey.pairs[i]
+        v = miss(motion, found.motions[pair.pair_id])
+        out.append(float(v @ np.linalg.solve(pair.cov, v)) / len(v))
+    return np.array(out)
+
+
+def miss(motion: Motion, other: FloatArray) -> FloatArray:
+    """(k,) rad and m: logarithm from a motion to the one with this logarithm (6,), of rotations alone (3,)."""
+    if isinstance(motion, Pose3):
+        return np.asarray(Pose3.Logmap(motion.between(Pose3.Expmap(other))))
+    return np.asarray(Rot3.Logmap(motion.between(Rot3.Expmap(other))))
 
 
 def _of_pairs(found: Screen, survey: Survey) -> FloatArray:

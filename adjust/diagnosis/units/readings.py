@@ -12,20 +12,29 @@ import numpy as np
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import ChangeReadings, Hypothesis, Place
 from adjust.diagnosis.screen import Screen, at_best, improvement, screen
-from adjust.diagnosis.units.conventions import ANGLES, LENGTHS, MISREADINGS, SLIPS, TURNS, Misreading, Scope
+from adjust.diagnosis.units.conventions import (
+    ANGLES,
+    LENGTHS,
+    MISREADINGS,
+    TURNS,
+    Misreading,
+    Scope,
+    shrinking,
+    slips,
+)
 from adjust.model.observations import Reading
 from adjust.model.survey import FloatArray, IntArray, Survey
-from adjust.observations.terrestrial.batch import circular_median
-from adjust.observations.terrestrial.equations import DIRECTION, wrapped
 
 _CLEARLY = 3.0
 """By how much the misfit of the readings concerned has to fall."""
 _MOST, _SINGLE = 6, 8
 _FAR = 1000.0
 """Square over sigma of a single reading from which it is no matter how much larger it is."""
-_BAD, _FEW, _ROUGH = 25.0, 0.1, 4.0
+_FEW, _ROUGH = 0.1, 4.0
 _LARGE_START = 2500
 """Readings up to which start values are found anew for every hypothesis that concerns all of a kind."""
+_Way = tuple[Scope, Misreading]
+_Found = tuple[float, Scope, Misreading]
 
 
 def misread_readings(case: Case) -> Iterator[Hypothesis]:
@@ -33,34 +42,30 @@ def misread_readings(case: Case) -> Iterator[Hypothesis]:
     survey = case.survey
     if not survey.readings:
         return
-    before = at_best(case)
-    looked_at, found = 0, list[tuple[float, Scope, Misreading]]()
-    for scope in scopes(survey):
-        for misreading in _possible(survey, scope):
-            looked_at += 1
-            found.append((_evidence(survey, before, scope, misreading), scope, misreading))
+    before, values = at_best(case), np.array([r.value for r in survey.readings])
+    ways = [(scope, m) for scope in scopes(survey) for m in _possible(survey, scope, values)]
+    looked_at = len(ways)
+    found = [(e, *way) for e, way in zip(_evidence(survey, before, values, ways), ways, strict=True)]
     # what explains many first: that of single readings is of each alone, which many misread ones have as well
-    for some in ([f for f in found if f[0] > _CLEARLY], _slips(survey, before)):
+    for some in ([f for f in found if f[0] > _CLEARLY], _slips(survey, before, values)):
         for evidence, scope, misreading in sorted(some, key=lambda f: (-f[0], -len(f[1].rows)))[:_MOST]:
             yield _hypothesis(survey, scope, misreading, evidence, looked_at)
 
 
-def _slips(survey: Survey, before: Screen | None) -> list[tuple[float, Scope, Misreading]]:
+def _slips(survey: Survey, before: Screen | None, values: FloatArray) -> list[_Found]:
     """Single readings that fit with their decimal point one or two places on: of those that miss most."""
     if before is None:
         return []
+    worst = np.argsort(-before.readings)[:_SINGLE]
+    ways = [(i, slip) for i in worst.tolist() for slip in slips(survey.readings[i].kind, values[i])]
+    after = before.alternatives([np.array([i]) for i, _ in ways], observed=np.array([w.factor * values[i]
+                                                                                      for i, w in ways]))  # fmt: skip
     out = []
-    for i in np.argsort(-before.readings)[:_SINGLE].tolist():
-        r = survey.readings[i]
-        scope = Scope(np.array([i]), f"reading {r.reading_id}", Place("reading", (r.reading_id,), "value"))
-        for factor in SLIPS:
-            slip = Misreading("slipped decimal", f"has slipped: {r.value:.9g} for {factor * r.value:.9g} (SI)", factor,
-                              0.0, (r.kind,))  # fmt: skip
-            was, now = (float(x[0]) / before.scale for x in (before.readings[[i]], _mended_squares(
-                before, scope.rows, slip)))  # fmt: skip
-            evidence = min(was, _FAR) / (now + 5.0)  # of it alone: among all others one bounded misfit is soon lost
-            if evidence > _CLEARLY:
-                out.append((evidence, scope, slip))
+    for (i, slip), now in zip(ways, after, strict=True):
+        evidence = min(float(before.readings[i]) / before.scale, _FAR) / (float(now[0]) / before.scale + 5.0)
+        if evidence > _CLEARLY:  # of it alone: among all others one bounded misfit is soon lost
+            name = survey.readings[i].reading_id
+            out.append((evidence, Scope(np.array([i]), f"reading {name}", Place("reading", (name,), "value")), slip))
     return out
 
 
@@ -95,10 +100,11 @@ def _rows(readings: Sequence[Reading], kinds: Sequence[str]) -> IntArray:
     return np.array([i for i, r in enumerate(readings) if r.kind in kinds], dtype=np.int64)
 
 
-def _possible(survey: Survey, scope: Scope) -> Iterator[Misreading]:
+def _possible(survey: Survey, scope: Scope, values: FloatArray) -> Iterator[Misreading]:
     """A scope of several kinds is misread as a whole, in a way that all of them can be."""
     kinds = {survey.readings[i].kind for i in scope.rows}
-    yield from (m for m in MISREADINGS if kinds <= set(m.kinds))
+    widest = float(np.abs(values[scope.rows]).max())
+    yield from (m for m in MISREADINGS if kinds <= set(m.kinds) and m.may_be(widest))
 
 
 def mended(survey: Survey, rows: IntArray, misreading: Misreading) -> Survey:
@@ -109,50 +115,34 @@ def mended(survey: Survey, rows: IntArray, misreading: Misreading) -> Survey:
     return replace(survey, readings=readings)
 
 
-def _evidence(survey: Survey, before: Screen | None, scope: Scope, misreading: Misreading) -> float:
-    """How many times smaller the bounded misfit becomes."""
-    n, whole = len(survey.readings), _concerns_all(survey, scope)
-    if whole and before is not None and _fits_as_it_is(before, scope.rows):
-        return 0.0
-    if before is not None and not (whole and n <= _LARGE_START):
-        return drop(before, scope.rows, _mended_squares(before, scope.rows, misreading))
-    after = screen(mended(survey, scope.rows, misreading))
-    if after is None:
-        return 0.0
-    if before is None:
-        return improvement(CAP * n, after.misfit(after.scale), n)
-    scale = min(before.scale, after.scale)
-    return improvement(before.misfit(scale), after.misfit(scale), n)
+def _evidence(survey: Survey, before: Screen | None, values: FloatArray, ways: Sequence[_Way]) -> list[float]:
+    """How many times smaller the bounded misfit becomes by each way to read."""
+    n, out = len(survey.readings), [0.0] * len(ways)
+    whole = [_concerns_all(survey, scope) for scope, _ in ways]
+    anew = [i for i, (scope, _) in enumerate(ways) if before is None or (
+        whole[i] and n <= _LARGE_START and not _fits_as_it_is(before, scope.rows))]  # fmt: skip
+    surveys = [mended(survey, ways[i][0].rows, ways[i][1]) for i in anew]
+    for i, after in zip(anew, before.afresh(surveys) if before else map(screen, surveys), strict=True):
+        if after is not None and before is None:
+            out[i] = improvement(CAP * n, after.misfit(after.scale), n)
+        elif after is not None and before is not None:
+            scale = min(before.scale, after.scale)
+            out[i] = improvement(before.misfit(scale), after.misfit(scale), n)
+    if before is not None:
+        there = [i for i, (scope, _) in enumerate(ways) if not whole[i] or (
+            n > _LARGE_START and not _fits_as_it_is(before, scope.rows))]  # fmt: skip
+        sets = [ways[i][0].rows for i in there]
+        read = [ways[i][1].mend(values[ways[i][0].rows]) for i in there]
+        after_each = before.alternatives(sets, observed=np.concatenate([np.zeros(0), *read]))
+        for i, rows, squares in zip(there, sets, after_each, strict=True):
+            out[i] = before.drop(rows, squares)
+    return out
 
 
 def _fits_as_it_is(before: Screen, rows: IntArray) -> bool:
     """Whether so few readings miss, of these and of all, that these cannot be misread throughout."""
-    bad = before.readings > _BAD * before.scale
+    bad = before.missed
     return bool(before.scale < _ROUGH and bad.mean() < _FEW and bad[rows].mean() < 0.5)
-
-
-def drop(before: Screen, rows: IntArray, after: FloatArray) -> float:
-    """How much less everything misfits when these readings do as in ``after`` (n,), squares over sigmas."""
-    every, now = (np.minimum(s / before.scale, CAP) for s in (before.readings, after))
-    total = float(every.sum())
-    return improvement(total, total - float(every[rows].sum()) + float(now.sum()), len(every))
-
-
-def _mended_squares(before: Screen, rows: IntArray, misreading: Misreading) -> FloatArray:
-    """(n,) squares over sigmas of mended readings where everything else is; directions of a set-up share a turn."""
-    batch = before.graph.terrestrial
-    if batch is None:
-        return np.zeros(len(rows))
-    a = batch.layout.arrays
-    observed = np.array(a.observed)
-    observed[rows] = misreading.mend(observed[rows])
-    miss = wrapped(a.kind, before.predicted, observed)
-    for orientation in np.unique(a.orientation[rows][a.kind[rows] == DIRECTION]):
-        of = (a.kind == DIRECTION) & (a.orientation == orientation)
-        turn = circular_median(miss[of & np.isfinite(miss)])
-        miss[of] = wrapped(a.kind[of], miss[of], np.full(int(of.sum()), turn))
-    squares = (miss[rows] / batch.sigma[rows]) ** 2
-    return np.where(np.isfinite(squares), squares, np.inf)
 
 
 def _concerns_all(survey: Survey, scope: Scope) -> bool:
@@ -165,7 +155,7 @@ def _hypothesis(survey: Survey, scope: Scope, misreading: Misreading, evidence: 
     return Hypothesis(
         misreading.name, _cause(scope, misreading), _remedy(misreading), scope.place,
         mended(survey, scope.rows, misreading), (ChangeReadings(ids, misreading.factor, misreading.offset),), evidence,
-        1, max(looked_at, 1),
+        1, max(looked_at, 1), penalty=shrinking(misreading.factor, len(scope.rows)),
     )  # fmt: skip
 
 

@@ -286,12 +286,15 @@ def sigmas(a: ReadingArrays, axes: FloatArray, A: FloatArray) -> FloatArray:
 
 def circular_median(angles: FloatArray) -> float:
     """The angle nearest to all others (least sum of absolute differences), of those given; zero of none."""
-    if len(angles) == 0:
-        return 0.0
-    some = angles[:: max(1, len(angles) // 64)]
-    turns = (angles[None, :] - some[:, None] + np.pi) % (2.0 * np.pi) - np.pi
-    best = int(np.argmin(np.abs(turns).sum(axis=1)))
-    return float(some[best] + np.median(turns[best]))
+    return float(circular_medians(angles[None])[0]) if len(angles) else 0.0
+
+
+def circular_medians(angles: FloatArray) -> FloatArray:
+    """The same (m,) of each row of angles (m, n), n > 0."""
+    some = angles[:, :: max(1, angles.shape[1] // 64)]
+    turns = (angles[:, None, :] - some[:, :, None] + np.pi) % (2.0 * np.pi) - np.pi
+    rows, best = np.arange(len(angles)), np.abs(turns).sum(axis=2).argmin(axis=1)
+    return np.asarray(some[rows, best] + np.median(turns[rows, best], axis=1))
 
 
 def _blocks(chunk: Chunk, J: FloatArray) -> list[FloatArray]:

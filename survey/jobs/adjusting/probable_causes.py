@@ -16,21 +16,19 @@ if TYPE_CHECKING:
 
 _LARGE = 1.15
 """sigma0 from which a mistake is looked for by trial; below, sigmas that are a little small explain as much."""
-_MOST_UNKNOWNS = 1500
-"""Of networks without images: their steps are scored one by one, which takes minutes where there are more."""
 
 
 def explained(survey: Survey, error: SurveyError, project: Project) -> SurveyError:
     """What an adjustment of the ``survey`` of a project raised, with the probable causes in front, if any."""
     apart, contradictions = separate_epochs(survey), _probable_causes(survey)
-    diagnosis = _located(_diagnosis(survey, None, error, contradictions), project)
+    diagnosis, note = _named(_diagnosis(survey, None, error, contradictions), project)
     if diagnosis is not None and project.origins:  # of a project that has not grown there is nothing to try
         done = (replace(c, hypothesis=replace(c.hypothesis, edits=())) for c in diagnosis.candidates)
         diagnosis = replace(diagnosis, candidates=tuple(done))
     tried = diagnosis.lines if diagnosis is not None else ()
     if not apart and not contradictions and not tried:
         return error
-    lines = "\n  - ".join(["probable cause:", *apart, *tried, *contradictions])
+    lines = "\n  - ".join(["probable cause:", *apart, *tried, *contradictions, *note])
     said = _consequence(error) if contradictions or tried else f"without that: {error}"
     message = f"{lines}\n{said}"
     return SurveyError(message) if diagnosis is None else DiagnosedError(message, diagnosis)
@@ -39,7 +37,7 @@ def explained(survey: Survey, error: SurveyError, project: Project) -> SurveyErr
 def with_probable_causes(survey: Survey, result: Adjustment, project: Project) -> Adjustment:
     """The adjustment of the ``survey`` of a project; its first warnings are the probable causes of what contradicts."""
     warnings: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    note: tuple[str, ...] = ()
     diagnosis: Diagnosis | None = None
     if survey.tables:
         from adjust.diagnosis.table import sign_warnings  # here: a survey without a table starts without it
@@ -48,24 +46,21 @@ def with_probable_causes(survey: Survey, result: Adjustment, project: Project) -
     if _contradicted(survey, result):
         # what does not fit may have spoilt the lenses too: then those that the images alone give
         causes = _probable_causes(survey, result) or _probable_causes(survey)
-        if not survey.image_blocks and result.n_unknowns > _MOST_UNKNOWNS:
-            notes = (f"causes of what contradicts were not looked for: a network without images of {result.n_unknowns} "
-                     f"unknowns, more than {_MOST_UNKNOWNS}",)  # fmt: skip
-        elif not warnings:
-            diagnosis = _located(_diagnosis(survey, result, None, causes), project)
+        if not warnings:
+            diagnosis, note = _named(_diagnosis(survey, result, None, causes), project)
             warnings = diagnosis.lines if diagnosis is not None else ()
         warnings += tuple(c for c in causes if c not in warnings)
-    if diagnosis is None and not warnings and not notes:
-        diagnosis = _located(_misread(survey, result), project)
+    if diagnosis is None and not warnings:
+        diagnosis, _ = _named(_misread(survey, result), project)
         warnings = diagnosis.lines if diagnosis is not None else ()
     lines = tuple(f"probable cause: {c}" for c in warnings)
-    return replace(result, warnings=lines + result.warnings + notes, diagnosis=diagnosis)
+    return replace(result, warnings=(*lines, *result.warnings, *note), diagnosis=diagnosis)
 
 
 def _diagnosis(
     survey: Survey, result: Adjustment | None, error: SurveyError | None, causes: Sequence[str]
 ) -> "Diagnosis | None":
-    """What explains the misfit by trial, where closed forms have not named it; None where nothing does."""
+    """What explains the misfit by trial, where closed forms have not named it; None where none of that is asked."""
     from adjust.diagnosis.table import only_symptoms  # here: a survey that fits starts without them
 
     refused = error is not None and not isinstance(error, IndeterminateError | NotConvergedError)
@@ -75,8 +70,7 @@ def _diagnosis(
     from adjust.diagnosis.case import Case
     from adjust.diagnosis.diagnosis import diagnose
 
-    found = diagnose(Case(survey, result, error))
-    return found if found.candidates else None
+    return diagnose(Case(survey, result, error))
 
 
 def _misread(survey: Survey, result: Adjustment) -> "Diagnosis | None":
@@ -93,12 +87,13 @@ def _misread(survey: Survey, result: Adjustment) -> "Diagnosis | None":
     return Diagnosis(found, names, misfit_of(result, survey)) if found else None
 
 
-def _located(found: "Diagnosis | None", project: Project) -> "Diagnosis | None":
-    if found is None:
-        return None
+def _named(found: "Diagnosis | None", project: Project) -> "tuple[Diagnosis | None, tuple[str, ...]]":
+    """The diagnosis with the lines of its project, where it names anything; else what it was not able to look for."""
+    if found is None or not found.candidates:
+        return None, (f"causes of what contradicts: {found.note}",) if found is not None and found.note else ()
     from survey.jobs.adjusting.places import located  # here: as above
 
-    return located(found, project)
+    return located(found, project), ()
 
 
 def _consequence(error: SurveyError) -> str:

@@ -10,6 +10,7 @@ from survey.report import charts
 from survey.report.context import Context
 from survey.report.language import known, t
 from survey.report.markup import (
+from survey.solution.records import having
     code,
     count,
     element,
@@ -249,7 +250,7 @@ def stations(c: Context) -> Markup:
     if many:
         title = t("{n} poses by epoch", n=count(len(by_epoch)))
         body += part("details", title, _limited(_POSE_COLUMNS, by_epoch, _pose_row), False)
-    body += joined(_clock(e, k) for k, e in c.solution["stations"].items())
+    body += joined(_clock(e, k) for k, e in having(c.solution["stations"], "clock").items())
     return section("poses", "Poses of stations, tables and targets", body, t(_POSE_NOTE))
 
 
