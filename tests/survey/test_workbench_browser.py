@@ -15,9 +15,11 @@ import pytest
 
 import capture.web
 from survey.examples import write_example
+from survey.project import write_project
 from survey.report.language import catalogue
 from survey.report.modules import WEB as SHARED
 from survey.report.terminal import summary_text
+from survey.simulate import stereo
 from survey.workbench.guard import new_token
 from survey.workbench.live import Listening
 from survey.workbench.rows import columns
@@ -314,6 +316,24 @@ def test_a_million_points_are_sorted_and_filtered_without_a_pause(page: Page) ->
     assert order
     assert 0.3e6 < rows < 0.5e6
     assert chosen < 4000.0
+
+
+def test_of_a_solution_that_has_gone_the_page_keeps_nothing(browser: Any, tmp_path: Path) -> None:
+    """Bytes that the page holds of each image point once one was left out and taken back: its columns have 49."""
+    write_project(tmp_path / "lab", stereo(3, n_pairs=300)[0])
+    token = new_token()
+    with Listening(Server(Workbench(tmp_path / "lab"), token), "127.0.0.1", 0) as listening:
+        page = Page(browser, f"{listening.address}#token={token}", 1280, "document.body.dataset.results !== undefined")
+        p = page.page
+        p.locator("#tables .row.head button").nth(4).click()
+        p.locator("#tables .rows .row").nth(2).click()
+        for keys in (("x", "w", "h", "y", "Enter"), ("u",)):
+            page.done(lambda keys=keys: [p.keyboard.press(key) for key in keys])
+        session = page.context.new_cdp_session(p)
+        session.send("HeapProfiler.collectGarbage")
+        held = session.send("Runtime.getHeapUsage")["backingStorageSize"] / (p.evaluate(ROWS) - 1)
+        page.context.close()
+    assert 20.0 < held < 65.0
 
 
 def test_columns_as_the_page_reads_them(page: Page, folder: Path) -> None:
