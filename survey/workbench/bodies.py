@@ -2,12 +2,13 @@
 
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from starlette.requests import Request
 
 from adjust.model.errors import SurveyError
-from survey.workbench.jobs import Told
+from survey.workbench.pages.beginning import Told
 from survey.workbench.session import Workbench
 
 if TYPE_CHECKING:
@@ -99,14 +100,24 @@ def _plan(bench: Workbench, body: Body, _: Any) -> Told:
                                   place=int(body.number("place", 0.0))))  # fmt: skip
 
 
-JOBS: Mapping[str, Callable[[Workbench, Body, "Callable[[ImageReport], None]"], Told]] = {
-    "init": lambda bench, body, _: bench.start(body.text("images"), body.text("folder")),
-    "show": lambda bench, body, _: bench.show(body.text("folder")),
-    "detect": lambda bench, body, found: bench.detect(everything=body.flag("all", False), told=found),
-    "plan": _plan,
-    "navigate": lambda bench, body, _: bench.navigate(body.text("station"), body.number("interval_s", 0.0) or None),
-    "add": lambda bench, body, _: bench.add(body.text("folder")),
-    "compare": lambda bench, body, _: bench.compare_with(body.text("folder")),
-    "batch": lambda bench, body, _: bench.batch(body.names("folders")),
-}
+@dataclass(frozen=True)
+class Job:
+    """A job of a page. call: what of ``survey.Workbench`` it is; changes: whether files may change."""
+
+    call: str
+    run: Callable[[Any, Body, "Callable[[ImageReport], None]"], Told]
+    changes: bool = True
+
+
+JOBS: Mapping[str, Job] = {
+    "init": Job("start", lambda bench, body, _: bench.start(body.text("images"), body.text("folder"))),
+    "show": Job("show", lambda bench, body, _: bench.show(body.text("folder")), changes=False),
+    "detect": Job("detect", lambda bench, body, found: bench.detect(everything=body.flag("all", False), told=found)),
+    "plan": Job("plan", _plan),
+    "navigate": Job("navigate", lambda bench, body, _: bench.navigate(body.text("station"),
+                                                                      body.number("interval_s", 0.0) or None)),
+    "add": Job("add", lambda bench, body, _: bench.add(body.text("folder"))),
+    "compare": Job("compare_with", lambda bench, body, _: bench.compare_with(body.text("folder")), changes=False),
+    "batch": Job("batch", lambda bench, body, _: bench.batch(body.names("folders"))),
+}  # fmt: skip
 """The jobs of a page by their names, with what it asks of them."""

@@ -15,12 +15,12 @@ from survey.folder.text import suggestion
 from survey.solution.dictionary import plain
 from survey.solution.earlier.changes import Snapshot
 from survey.solution.earlier.runs import load_run
-from survey.workbench.session import Workbench
+from survey.workbench.jobs import Jobs
 
 _CELLS = 24
 
 
-def camera_of(bench: Workbench, camera_id: str) -> Camera:
+def camera_of(bench: Jobs, camera_id: str) -> Camera:
     """A camera by its name. Raises SurveyError."""
     cameras = {c.camera_id: c for c in bench.adjustment.survey.cameras}
     if camera_id not in cameras:
@@ -46,7 +46,7 @@ def invertible(camera: Camera, lens: Optics, uv: FloatArray) -> BoolArray:
     return np.asarray(np.linalg.norm(uv - centre, axis=1) < 0.999 * radius)
 
 
-def camera_view(bench: Workbench, camera_id: str, distance: float = np.inf) -> dict[str, Any]:
+def camera_view(bench: Jobs, camera_id: str, distance: float = np.inf) -> dict[str, Any]:
     """Residual field, coverage, distortion and uncertainty of a camera; distance: m, of the point that is seen.
 
     cells: over the image, in rows: number of points in use, mean residual (px), rms (px). distortion: pixels without
@@ -79,7 +79,7 @@ def camera_view(bench: Workbench, camera_id: str, distance: float = np.inf) -> d
     }))  # fmt: skip
 
 
-def _in_use(bench: Workbench, camera_id: str) -> tuple[FloatArray, FloatArray]:
+def _in_use(bench: Jobs, camera_id: str) -> tuple[FloatArray, FloatArray]:
     rows = bench.rows
     blocks = [(i, b) for i, b in enumerate(rows.survey.image_blocks) if b.camera_id == camera_id]
     parts = [(b.uv[u], rows.residuals[rows.ptr[i] : rows.ptr[i + 1]][u]) for i, b in blocks
@@ -113,7 +113,7 @@ def _covered(uv: FloatArray, points: FloatArray, reach: float) -> BoolArray:
     return np.asarray(cKDTree(points).query(uv)[0] <= reach)
 
 
-def _uncertainty(bench: Workbench, camera: Camera, lens: Optics, uv: FloatArray, distance: float) -> dict[str, Any]:
+def _uncertainty(bench: Jobs, camera: Camera, lens: Optics, uv: FloatArray, distance: float) -> dict[str, Any]:
     names: list[ParameterName] = [("lens", camera.camera_id), ("station_from_camera", camera.camera_id)]
     estimates, factor = bench.adjustment.estimates, bench.scale.factor
     free = np.array([s in ("free", "prior") for s in estimates[names[0]].status])
@@ -130,7 +130,7 @@ def _uncertainty(bench: Workbench, camera: Camera, lens: Optics, uv: FloatArray,
 
 
 def lens_change(
-    bench: Workbench, camera_id: str, before: int | None = None, other: str = "", distance: float = np.inf
+    bench: Jobs, camera_id: str, before: int | None = None, other: str = "", distance: float = np.inf
 ) -> dict[str, Any]:
     """The lens of a camera against that of a run (``before``), or of another camera of the same image size.
 

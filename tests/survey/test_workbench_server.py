@@ -1,5 +1,6 @@
 """The local server of the workbench: what it refuses, what it answers, and the loop of a mistake found and mended."""
 
+import inspect
 import json
 import re
 import shutil
@@ -19,7 +20,7 @@ from websockets.sync.client import connect
 from survey.cli import main
 from survey.report.language import message, speaking
 from survey.workbench.live import Listening
-from survey.workbench.server import Server
+from survey.workbench.server import WEB, Server
 from survey.workbench.session import Workbench
 from tests.survey.test_workbench import exclusions, wrong_point
 
@@ -120,12 +121,42 @@ def test_bodies_that_are_too_long_or_no_sense(mine):
         assert not exclusions(mine)
 
 
-def test_read_only_is_get_only(mine):
+def ways(folder):
+    return Server(Workbench(folder), TOKEN).ways()
+
+
+def test_reading_only_allows_what_changes_no_file_and_nothing_else(mine, tmp_path):
+    """Every address is asked; those that say that they change nothing with what makes them work."""
+    other = shutil.copytree(mine, tmp_path / "other")
+    bodies = {"/api/preview": {"changes": [{"name": f"image:{image_of(mine)}", "excluded": True}]},
+              "/api/jobs/compare": {"folder": "other"}, "/api/jobs/show": {"folder": "other"},
+              "/api/adjust": {"mode": "cold"}}  # fmt: skip
+    files = {p: p.read_bytes() for at in (mine, other) for p in at.rglob("*") if p.is_file()}
     with page(mine, read_only=True) as client:
-        assert client.get("/api/findings", headers=HERE).status_code == 200
-        for path in ("exclusions", "adjust", "undo", "save", "runs/1/restore"):
-            assert post(client, f"/api/{path}", {}).status_code == 403
-    assert not exclusions(mine)
+        for way in ways(mine):
+            path = way.path.replace("{number:int}", "1").replace("{camera}/{epoch}", image_of(mine))
+            path = path.replace("{camera}", "left").replace("{part}", "weak").replace("{name}", "none")
+            if way.method == "GET":
+                assert client.get(path, headers=HERE).status_code in (200, 404, 409), path
+                continue
+            status = post(client, path, bodies.get(path, {})).status_code
+            assert (status == 403) == way.changes, path
+            assert way.changes or status == 200 or not way.calls, path
+    now = {p: p.read_bytes() for at in (mine, other) for p in at.rglob("*") if p.is_file()}
+    assert now == files
+
+
+def test_every_address_is_a_function_of_the_python_interface(mine):
+    """And what the scripts of the page ask for is an address."""
+    found = ways(mine)
+    for way in found:
+        for name in way.calls:
+            assert name in vars(Workbench(mine)) or inspect.getdoc(getattr(Workbench, name)), name
+    assert {"state", "exclude", "undo", "save", "plan", "detect"} <= {name for way in found for name in way.calls}
+    known = {re.sub(r"\{.*", "", way.path.removeprefix("/api/")).split("/")[0] for way in found}
+    asked = {name for p in WEB.glob("*.js") for name in re.findall(r'\b(?:get|post)\([`"]([a-z_]+)', p.read_text())}
+    assert len(asked) > 10
+    assert asked <= known
 
 
 def test_the_socket_needs_origin_and_token(mine):

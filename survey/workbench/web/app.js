@@ -239,7 +239,7 @@ function drawDoing() {
   }
   by("undo").disabled = !state.undo.length || state.read_only;
   by("redo").disabled = !state.redo.length || state.read_only;
-  by("save").disabled = by("adjust").disabled = state.read_only;
+  by("save").disabled = state.read_only;
   by("undo").title = state.undo[0] ?? "";
   by("redo").title = state.redo[0] ?? "";
 }
