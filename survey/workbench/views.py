@@ -155,8 +155,8 @@ def remedies(bench: Jobs) -> list[dict[str, Any]]:
     for number, candidate in enumerate(bench.remedies, start=1):
         h = candidate.hypothesis
         out.append({
-            "number": number, "name": h.name, "cause": h.cause, "change": h.change, "possible": bool(h.edits),
-            "where": candidate.where,
+            "number": number, "name": h.name, "cause": message(h.cause), "change": message(h.change),
+            "possible": bool(h.edits), "where": candidate.where,
             "anchor": _anchor_of(h.place), "explained": candidate.explained, "statistic": candidate.statistic,
             "critical": candidate.critical, "probability": candidate.probability, "sigma0": candidate.sigma0,
         })  # fmt: skip

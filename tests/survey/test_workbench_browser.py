@@ -272,7 +272,7 @@ def said_by_the_page() -> set[str]:
     views = re.search(r"const VIEWS = \{.*?\n\};", app, re.DOTALL)
     assert views is not None
     found |= set(re.findall(r': \["([^"]+)"', views[0]))
-    for line in re.findall(r"const (?:REGIONS|TABLES) = .*", app + sources["tables.js"]):
+    for line in re.findall(r"const (?:REGIONS|TABLES) = .*", sources["frame.js"] + sources["tables.js"]):
         found |= set(re.findall(r'(?:", |: )"([^"]+)"', line))
     found |= {"not started", "running", "paused", "finished", "stopped", "broken off", "live"}  # states of a session
     jobs = re.search(r"const JOBS = \[.*?\n\];", sources["jobs.js"], re.DOTALL)

@@ -164,6 +164,9 @@ export class ImageView {
   /** All of the image in sight again. */
   whole() { this.fit = true; this.surface.redraw(); }
 
+  /** Marks and vectors on or off. */
+  toggle() { this.overlay = !this.overlay; this.surface.redraw(); }
+
   enlarge(by) {
     const at = SCALES.findIndex((scale) => scale >= this.enlarged);
     this.enlarged = SCALES[Math.max(0, Math.min(SCALES.length - 1, at + by))];

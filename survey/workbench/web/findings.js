@@ -1,9 +1,10 @@
 // What is wrong, worst first: verdict, warnings, suspects with their probable cause and what may be done about them.
 
-import { button, by, fill, link, make, plainTable } from "./dom.js";
+import { button, fill, link, make, plainTable } from "./dom.js";
 import { count, known, number, significant, t, time } from "./words.js";
 import { anchor, current, select } from "./store.js";
 import { rowOf, rowsOfImage } from "./columns.js";
+import { verdictText } from "./header.js";
 import { placeOf } from "./tree.js";
 
 /** The places that a message names. */
@@ -86,19 +87,3 @@ export class FindingsView {
     if (next) select(next.place[0], next.place[1], true);
   }
 }
-
-/** @param {string} verdict passed, check or failed */
-export const verdictText = (verdict) => ({ passed: `✓ ${t("verdict passed")}`, check: `! ${t("verdict check")}`, failed: `✕ ${t("verdict failed")}` })[verdict] ?? known(verdict);
-
-/** The header: what the solution is worth. @param {any} state */
-export function drawHeader(state) {
-  by("title").textContent = state.title;
-  document.title = `${state.title} · labsurvey`;
-  const none = state.waiting && !state.known;
-  by("verdict").className = none ? "" : state.verdict;
-  by("verdict").textContent = none ? "" : verdictText(state.verdict);
-  const fact = (name, value) => make("span", {}, make("span", { class: "quiet" }, `${name} `), value);
-  fill(by("facts"), ...(state.known ? [fact("sigma0", number(state.sigma0, 4)), fact(t("redundancy"), count(state.redundancy))] : []),
-    fact(t("excluded"), count(state.exclusions.length)), state.n_not_used ? fact(t("not used"), count(state.n_not_used)) : null, state.unsaved ? fact(t("unsaved"), count(state.unsaved)) : null, state.read_only ? make("span", { class: "pill" }, t("for reading only")) : null);
-}
-

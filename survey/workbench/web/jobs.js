@@ -2,7 +2,7 @@
 
 import { button, fill, make, plainTable } from "./dom.js";
 import { count, number, t } from "./words.js";
-import { verdictText } from "./findings.js";
+import { verdictText } from "./header.js";
 import { go, select } from "./store.js";
 import { picture, post } from "./source.js";
 
