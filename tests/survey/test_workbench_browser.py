@@ -22,6 +22,7 @@ from survey.report.terminal import summary_text
 from survey.simulate import stereo
 from survey.workbench.guard import new_token
 from survey.workbench.live import Listening
+from survey.workbench.pages.beginning import Beginning
 from survey.workbench.rows import columns
 from survey.workbench.server import WEB, Server
 from survey.workbench.session import Workbench
@@ -357,6 +358,27 @@ def test_what_others_write_is_told_and_loaded(page: Page, folder: Path) -> None:
     page.wait("document.querySelector('#message').textContent.includes('survey.toml')")
     page.done(lambda: p.locator("#message button").click())
     assert p.inner_text("#title").startswith("again ")
+
+
+def test_a_folder_of_images_becomes_a_project_on_the_page(browser: Any, tmp_path: Path) -> None:
+    """Its survey.toml is gone; the images lie where those of a project do, and stay."""
+    write_example("one-camera", tmp_path / "lab")
+    for name in sorted((tmp_path / "lab/images").glob("*/*"))[3:]:
+        name.unlink()
+    (tmp_path / "lab/survey.toml").unlink()
+    images = {path: path.read_bytes() for path in (tmp_path / "lab/images").glob("*/*")}
+    token = new_token()
+    with Listening(Server(Beginning(tmp_path / "lab"), token), "127.0.0.1", 0) as listening:
+        page = Page(browser, f"{listening.address}#token={token}", 390)
+        p = page.page
+        assert "holds images and no survey.toml" in p.inner_text("#left")
+        assert p.evaluate("document.documentElement.scrollWidth") <= 390
+        page.done(lambda: p.locator("#begin").click())
+        page.wait("document.querySelector('#left .verdict')?.textContent.includes('nothing to adjust')")
+        page.context.close()
+    assert (tmp_path / "lab/survey.toml").read_text().startswith("# Begun by labsurvey init")
+    assert {path: path.read_bytes() for path in (tmp_path / "lab/images").glob("*/*")} == images
+    assert [text for text in page.complaints if "409" not in text] == []
 
 
 def test_images_are_detected_and_shown_as_they_come(browser: Any, tmp_path: Path) -> None:

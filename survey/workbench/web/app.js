@@ -22,6 +22,7 @@ import { CameraView, CorrelationsView, LoopsView, TableAnglesView } from "./rela
 import { NetworkView } from "./network.js";
 import { JobsView } from "./jobs.js";
 import { SettingsView } from "./settings.js";
+import { drawBeginning } from "./beginning.js";
 
 const actions = actionsOf(renew);
 const tables = new Tables(bench, { show: frame.show });
@@ -58,6 +59,7 @@ const KEYS = keysOf(page);
 /** New values, then every view with them: observations and what is wrong first. @param {any} answer see `load` */
 async function renew(answer) {
   const fresh = await load(answer);
+  if (bench.beginning) { drawBeginning(bench.beginning, actions); return; }
   drawAll(fresh);
   if (bench.state.changed_files?.length) changedOutside(bench.state.changed_files);
   if (!fresh || !bench.state.solved || !(await loadResults())) return;
@@ -140,7 +142,7 @@ async function begin() {
   try {
     await renew(null);
     live(told); // its cookie comes with the first answer
-    if (!bench.state.solved && !bench.state.failure) working(t("adjusting …")); // a message tells when it is done
+    if (bench.state && !bench.state.solved && !bench.state.failure) working(t("adjusting …")); // a message tells when it is done
   } catch (error) { tell(error.message, "bad"); }
 }
 

@@ -6,6 +6,7 @@ import { findingsOf, leftOut, parametersOf, readingsOf, sceneOf, shiftsOf, sizes
 export const bench = {
   state: null, points: null, limit: 1, readings: [], findings: {}, sizes: {}, leftOut: new Map(), // of the observations
   parameters: [], scene: null, shifts: new Map(), // of the solution
+  beginning: null, // instead of them: the state of a folder that is no project yet
   told: {}, toldAt: 0, arrived: [], drawn: null, planned: null, // of the other jobs
 };
 
@@ -14,7 +15,10 @@ export const bench = {
  * @param {any} answer a state, what a decision answered, or null to ask for the state
  */
 export async function load(answer) {
-  const raw = answer?.state ?? (answer?.version !== undefined && answer.exclusions ? answer : await get("state")), state = stateOf(raw), old = bench.state;
+  const raw = answer?.state ?? (answer?.version !== undefined && answer.exclusions ? answer : await get("state"));
+  bench.beginning = raw.beginning ? raw : null;
+  if (raw.beginning) return false;
+  const state = stateOf(raw), old = bench.state;
   const fresh = !old || old.version !== state.version || old.folder !== state.folder || (state.failure ?? "") !== (old.failure ?? "");
   if (!fresh) { bench.state = { ...state, changes: old.changes }; return false; }
   const [columns, readings, findings] = await Promise.all([points(old?.folder === state.folder ? bench.points : null), get("readings"), get("findings")]);
