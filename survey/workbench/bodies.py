@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from survey.detection import ImageReport
 
 
+_LARGEST = 1e12  # what any number of a request may be
+
+
 def distance_of(request: Request) -> float:
     """What a request says of how far a point is, m; at infinity where it says nothing. Raises SurveyError."""
     text = request.query_params.get("distance_m", "inf")
@@ -25,6 +28,12 @@ def distance_of(request: Request) -> float:
     if not value > 0.0:
         raise SurveyError(f"distance_m: found {text!r}; expected metres, or inf")
     return value
+
+
+def whole_of(request: Request, key: str) -> int | None:
+    """What a request says of a whole number from 0 on, in its path or behind it; None where it says none."""
+    text = str(request.path_params.get(key, request.query_params.get(key, "")))
+    return int(text) if text.isdecimal() and len(text) < 10 else None
 
 
 class BodyError(Exception):
@@ -59,8 +68,11 @@ class Body:
         return str(self._value(key, "", (str,), "a text"))
 
     def number(self, key: str, default: float | None = None) -> float:
-        """A number."""
-        return float(self._value(key, default, (int, float), "a number"))
+        """A finite number."""
+        value = self._value(key, default, (int, float), "a number")
+        if not abs(value) <= _LARGEST:  # nor nan
+            raise BodyError(f"{key}: expected a number")
+        return float(value)
 
     def names(self, key: str) -> list[str]:
         """Texts, none where there are none."""

@@ -25,7 +25,7 @@ from survey.folder.text import suggestion
 from survey.report.language import LANGUAGES, message, speaking
 from survey.report.modules import WEB as SHARED
 from survey.workbench import pictures
-from survey.workbench.bodies import JOBS, Body, BodyError, distance_of, json_of
+from survey.workbench.bodies import JOBS, Body, BodyError, distance_of, json_of, whole_of
 from survey.workbench.guard import LONGEST_BODY, Guard, TooLongError
 from survey.workbench.live import Live
 from survey.workbench.pages.beginning import Beginning
@@ -96,8 +96,8 @@ class Server:
             Way("POST", "/api/undo", ("undo",), self._act("undo"), True),
             Way("POST", "/api/redo", ("redo",), self._act("redo"), True),
             Way("POST", "/api/save", ("save",), self._save, True),
-            Way("POST", "/api/runs/{number:int}/restore", ("restore",), self._restore, True),
-            Way("POST", "/api/runs/{number:int}/pin", ("pin",), self._pin, True),
+            Way("POST", "/api/runs/{number}/restore", ("restore",), self._restore, True),
+            Way("POST", "/api/runs/{number}/pin", ("pin",), self._pin, True),
             *(Way("POST", f"/api/jobs/{name}", (job.call,), self._job(name), job.changes)
               for name, job in JOBS.items()),
             Way("POST", "/api/jobs/{name}", (), self._no_job),
@@ -229,9 +229,7 @@ class Server:
     async def _points(self, request: Request) -> Response:
         q = request.query_params
         camera, _, epoch = q.get("image", "").partition("/")
-        worst = int(q["worst"]) if q.get("worst", "").isdecimal() else 0
-        known = int(q["layout"]) if q.get("layout", "").isdecimal() else None
-        most = min(worst, _MOST_ROWS)
+        known, most = whole_of(request, "layout"), min(whole_of(request, "worst") or 0, _MOST_ROWS)
         data = await self._run("view", lambda: self.bench.points(camera, epoch, most, known))
         return Response(data, media_type="application/octet-stream")
 
@@ -240,26 +238,24 @@ class Server:
         return JSONResponse(await self._run("statistics", lambda: self.bench.statistics_part(part)))
 
     async def _compare(self, request: Request) -> Response:
-        a, b = (int(q) if (q := request.query_params.get(k, "")).isdecimal() else None for k in "ab")
-        most = request.query_params.get("most", "")
+        a, b = (whole_of(request, k) for k in "ab")
         found = await self._run("compare", lambda: self.bench.compare(a, b))
-        return JSONResponse(found.as_dict(int(most) if most.isdecimal() else None))
+        return JSONResponse(found.as_dict(whole_of(request, "most")))
 
     async def _camera(self, request: Request) -> Response:
         camera, distance = request.path_params["camera"], distance_of(request)
         return JSONResponse(await self._run("view", lambda: self.bench.camera_view(camera, distance)))
 
     async def _difference(self, request: Request) -> Response:
-        camera, distance, q = request.path_params["camera"], distance_of(request), request.query_params
-        run = int(q["run"]) if q.get("run", "").isdecimal() else None
-        other = q.get("other", "")
+        camera, distance = request.path_params["camera"], distance_of(request)
+        run, other = whole_of(request, "run"), request.query_params.get("other", "")
         return JSONResponse(await self._run("view", lambda: self.bench.lens_change(camera, run, other, distance)))
 
     async def _image(self, request: Request) -> Response:
         key = request.path_params["camera"], request.path_params["epoch"]
         project = self.bench.situation.everything
-        asked = request.query_params.get("size", "1600")
-        size = None if asked == "full" else int(asked) if asked.isdecimal() and 0 < int(asked) <= 4096 else 1600
+        asked = whole_of(request, "size") or 1600
+        size = None if request.query_params.get("size") == "full" else asked if asked <= 4096 else 1600
         if key not in project.images:
             return JSONResponse({"error": "no such image"}, 404)
         tag = pictures.etag(project.detected.get(key), project.images[key], size)
@@ -317,11 +313,11 @@ class Server:
         return answering
 
     async def _restore(self, request: Request) -> Response:
-        number, base = request.path_params["number"], Body(await json_of(request)).base()
+        number, base = _run_of(request), Body(await json_of(request)).base()
         return await self._decided(lambda: self.bench.restore(number, base))
 
     async def _pin(self, request: Request) -> Response:
-        number, pinned = request.path_params["number"], Body(await json_of(request)).flag("pinned")
+        number, pinned = _run_of(request), Body(await json_of(request)).flag("pinned")
         run = await self._run("pin", lambda: self.bench.pin(number, pinned))
         return JSONResponse(run.as_dict())
 
@@ -369,3 +365,10 @@ class Server:
     def _changed(self) -> dict[str, Any]:
         found = self.bench.changes
         return {"version": self.bench.version, "changes": None if found is None else found.as_dict(500)}
+
+
+def _run_of(request: Request) -> int:
+    number = whole_of(request, "number")
+    if number is None:
+        raise SurveyError("a run has a number; 'labsurvey runs FOLDER' lists them")
+    return number
