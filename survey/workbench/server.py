@@ -23,6 +23,7 @@ from survey.folder.locking import BusyError
 from survey.folder.text import suggestion
 from survey.report.language import LANGUAGES, message, speaking
 from survey.report.modules import WEB as SHARED
+from survey.solution.dictionary import plain
 from survey.solution.earlier.runs import pin_run
 from survey.workbench import cameras, pictures, views
 from survey.workbench.bodies import JOBS, Body, BodyError, distance_of, json_of
@@ -61,7 +62,7 @@ class Server:
             "/api/network": self._view(views.network),
             "/api/table_residuals": self._view(views.table_residuals), "/api/camera/{camera}": self._camera,
             "/api/camera/{camera}/difference": self._difference, "/api/runs": self._view(views.runs),
-            "/api/compare": self._compare,
+            "/api/compare": self._compare, "/api/halves": self._halves,
             "/api/statistics/{part}": self._statistics,
         }  # fmt: skip
         post: dict[str, _Handler] = {
@@ -216,6 +217,12 @@ class Server:
         run = int(q["run"]) if q.get("run", "").isdecimal() else None
         other, bench = q.get("other", ""), self.bench
         return JSONResponse(await self._run("view", lambda: cameras.lens_change(bench, camera, run, other, distance)))
+
+    async def _halves(self, request: Request) -> Response:
+        distance = distance_of(request)
+        found = await self._run("compare", lambda: self.bench.cross_validate(distance))
+        cameras = [c.summary() | c.pixels() for c in found.cameras]
+        return JSONResponse(plain(found.summary() | {"version": self.bench.version, "cameras": cameras}))
 
     async def _image(self, request: Request) -> Response:
         key = request.path_params["camera"], request.path_params["epoch"]

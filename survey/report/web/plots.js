@@ -30,11 +30,11 @@ function legend(context, box, low, high, unit) {
 /**
  * Values on a regular grid over an image (rows from the top), with arrows where there are any.
  * @param {string} label
- * @param {{size: number[], columns: number, rows: number, values: (number|null)[], unit: string, low?: number, said?: string, arrows?: number[][], counts?: boolean}} grid
+ * @param {{size: number[], columns: number, rows: number, values: (number|null)[], unit: string, low?: number, high?: number, said?: string, arrows?: number[][], counts?: boolean}} grid
  *   arrows: u, v, du, dv (px)
  */
 export function heat(label, grid) {
-  const known = grid.values.filter((x) => x !== null && Number.isFinite(x)), high = Math.max(...known, 1e-300), low = grid.low ?? Math.min(...known, high);
+  const known = grid.values.filter((x) => x !== null && Number.isFinite(x)), high = grid.high ?? Math.max(...known, 1e-300), low = grid.low ?? Math.min(...known, high);
   const longest = Math.max(...(grid.arrows ?? []).map((a) => Math.hypot(a[2], a[3])), 1e-300);
   const { canvas } = surface(label, (context, width, height) => {
     const box = frame(grid.size, width, height, high > low ? 70 : 0), dx = box.w / grid.columns, dy = box.h / grid.rows;

@@ -77,11 +77,11 @@ export class HistoryView {
     const { state } = this.bench, chosen = current();
     const pick = (name, run) => make("input", { type: "radio", name, "aria-label": `${t(name)} ${run}`, checked: String(chosen[name === "before" ? "against" : "run"]) === String(run), onchange: () => go(name === "before" ? { against: String(run) } : { run: String(run) }, true) });
     const acts = (run) => (state.read_only ? null : make("span", { class: "actions" }, button(run.pinned ? "★" : "☆", () => this.act("pin", run), "", { "aria-label": `${run.pinned ? t("not kept for ever") : t("keep for ever")}: ${run.number}` }), " ", button(t("restore"), () => this.act("restore", run), "", { "aria-label": `${t("restore")}: ${run.number}` })));
-    const rows = runs.map((run) => [pick("before", run.number), pick("after", run.number), link(`#run=${run.number}`, String(run.number)), t(`verdict ${run.summary.verdict}`), number(run.summary.sigma0, 4), count(run.summary.redundancy),
-      make("span", {}, time(run.time), " ", make("span", { class: "quiet" }, [run.author, run.command].filter(Boolean).join(" · "))), acts(run)]);
+    const rows = runs.map((run) => [pick("before", run.number), pick("after", run.number), link(`#run=${run.number}`, String(run.number)), t(`verdict ${run.summary.verdict}`), number(run.summary.sigma0, 4),
+      make("div", { class: "wide" }, time(run.time), " ", make("span", { class: "quiet" }, [`${t("redundancy")} ${count(run.summary.redundancy)}`, run.author, run.command].filter(Boolean).join(" · ")), acts(run))]);
     const steps = (title, labels) => labels?.length ? make("div", {}, make("h3", {}, title), make("ol", {}, ...labels.map((label) => make("li", {}, label)))) : null;
     fill(this.element, make("h2", {}, t("History")), steps(t("Can be undone"), state.undo), steps(t("Can be done again"), state.redo), make("h3", {}, t("Runs")),
-      rows.length ? plainTable(t("Runs"), [t("before"), t("after"), t("run"), t("verdict"), "sigma0", t("redundancy"), t("time, who, command"), ""], rows, [4, 5]) : make("p", { class: "quiet" }, t("No runs are kept yet; Save writes one.")),
+      rows.length ? plainTable(t("Runs"), [t("before"), t("after"), t("run"), t("verdict"), "sigma0", t("time, who, command")], rows, [4]) : make("p", { class: "quiet" }, t("No runs are kept yet; Save writes one.")),
       rows.length > 1 ? button(t("Compare"), () => this.compare(), "d", { class: "primary" }) : null);
   }
 
