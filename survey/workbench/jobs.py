@@ -27,6 +27,7 @@ from survey.workbench.places import Places
 
 if TYPE_CHECKING:  # detection brings in OpenCV, planning much else
     from survey.detection import ImageReport
+    from survey.jobs.cross_validation import CrossValidation
     from survey.planning.job import PlanRequest
     from survey.planning.summary import PlanningOutcome
 
@@ -113,6 +114,12 @@ class Jobs(Deciding):
         before, after = (_positions(a) for a in outcome.adjustments)
         lines = [(name, [before[name], x]) for name, x in after.items() if name in before]
         return Told(outcome.text(), outcome.summary(), Drawn(lines=lines))
+
+    def cross_validate(self, distance: float = float("inf")) -> "CrossValidation":
+        """The lenses of two halves of the epochs compared, for points at ``distance`` (m); nothing is written."""
+        from survey.jobs.cross_validation import cross_validate
+
+        return cross_validate(self.situation.project, distance)
 
     def batch(self, folders: Sequence[str | Path] = ()) -> Told:
         """Adjust several projects (none: all beside this one), side by side; each has its results afterwards.

@@ -24,6 +24,7 @@ from survey.folder.locking import BusyError
 from survey.folder.text import suggestion
 from survey.report.language import LANGUAGES, message, speaking
 from survey.report.modules import WEB as SHARED
+from survey.solution.dictionary import plain
 from survey.workbench import pictures
 from survey.workbench.bodies import JOBS, Body, BodyError, distance_of, json_of, whole_of
 from survey.workbench.guard import LONGEST_BODY, Guard, TooLongError
@@ -85,6 +86,7 @@ class Server:
             Way("GET", "/api/camera/{camera}", ("camera_view",), self._camera),
             Way("GET", "/api/camera/{camera}/difference", ("lens_change",), self._difference),
             Way("GET", "/api/compare", ("compare",), self._compare),
+            Way("GET", "/api/halves", ("cross_validate",), self._halves),
             Way("GET", "/api/statistics/{part}", ("statistics_part",), self._statistics),
             Way("POST", "/api/preview", ("preview",), self._preview),
             Way("POST", "/api/adjust", ("adjust",), self._adjust),
@@ -250,6 +252,12 @@ class Server:
         camera, distance = request.path_params["camera"], distance_of(request)
         run, other = whole_of(request, "run"), request.query_params.get("other", "")
         return JSONResponse(await self._run("view", lambda: self.bench.lens_change(camera, run, other, distance)))
+
+    async def _halves(self, request: Request) -> Response:
+        distance = distance_of(request)
+        found = await self._run("compare", lambda: self.bench.cross_validate(distance))
+        cameras = [c.summary() | c.pixels() for c in found.cameras]
+        return JSONResponse(plain(found.summary() | {"version": self.bench.version, "cameras": cameras}))
 
     async def _image(self, request: Request) -> Response:
         key = request.path_params["camera"], request.path_params["epoch"]

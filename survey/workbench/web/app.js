@@ -18,7 +18,7 @@ import { FindingsView } from "./findings.js";
 import { ImageView } from "./image.js";
 import { SceneView } from "./scene.js";
 import { CompareView, HistoryView } from "./compare.js";
-import { CameraView, CorrelationsView, LoopsView, TableAnglesView } from "./relations.js";
+import { CameraView, CorrelationsView, HalvesView, LoopsView, TableAnglesView } from "./relations.js";
 import { NetworkView } from "./network.js";
 import { JobsView } from "./jobs.js";
 import { SettingsView } from "./settings.js";
@@ -34,6 +34,7 @@ const VIEWS = {
   south: ["South view", () => new SceneView(bench, "south")],
   east: ["East view", () => new SceneView(bench, "east")],
   camera: ["Camera", () => new CameraView(bench)],
+  halves: ["Cross-validation", () => new HalvesView(bench)],
   compare: ["Compare", () => new CompareView(bench)],
   history: ["History", () => new HistoryView(bench, actions)],
   angles: ["Angles", () => new TableAnglesView(bench)],

@@ -1,7 +1,7 @@
 // The tables below the views: image points, readings, parameters, what people excluded.
 
 import { by, make } from "./dom.js";
-import { known, significant, t } from "./words.js";
+import { known, measure, significant, t } from "./words.js";
 import { current, names, select } from "./store.js";
 import { pointId, rowOf } from "./columns.js";
 import { Table, named, numbers } from "./table.js";
@@ -88,7 +88,7 @@ export class Tables {
     const rows = this.bench.readings;
     return { n: rows.length, id: (i) => rows[i].id, state: (i) => (rows[i].used ? (rows[i].share > 1 ? "suspect" : "") : "out"), kind: "reading", sort: "w",
       columns: [named("table", t("sort of reading"), rows.map((r) => known(r.table.replaceAll("_", " ")))), named("name", t("reading"), rows.map((r) => r.name)), named("component", t("component"), rows.map((r) => r.component)),
-        number4("observed", t("observed"), rows), number4("residual", t("residual"), rows, true), named("unit", t("unit"), rows.map((r) => r.sigma_unit ?? "")), numbers("w", "w", rows.map((r) => r.w), { digits: 2, size: true }), numbers("r", "r", rows.map((r) => r.redundancy), { digits: 3 }), numbers("used", t("used"), rows.map((r) => Number(r.used)), { text: (i) => (rows[i].used ? "✓" : "✕") })] };
+        { ...number4("observed", t("observed"), rows), wide: 7, text: (i) => measure(rows[i].observed, rows[i].unit, 7) }, number4("residual", t("residual"), rows, true), named("unit", t("unit"), rows.map((r) => r.sigma_unit ?? "")), numbers("w", "w", rows.map((r) => r.w), { digits: 2, size: true }), numbers("r", "r", rows.map((r) => r.redundancy), { digits: 3 }), numbers("used", t("used"), rows.map((r) => Number(r.used)), { text: (i) => (rows[i].used ? "✓" : "✕") })] };
   }
 
   parameters() {
