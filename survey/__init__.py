@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from survey.notebook.covariance import Covariance
     from survey.notebook.plots import Plot
     from survey.notebook.solution import Solution
-    from survey.notebook.steps import Problem, adjust, detect, exclude, include, problem, read, solve
+    from survey.notebook.steps import Problem, adjust, cross_validate, detect, exclude, include, problem, read, solve
     from survey.project import Project, write_project
     from survey.workbench.session import Workbench
 
@@ -40,6 +40,7 @@ _PLACES = {
     "Workbench": "survey.workbench.session",
     "adjust": "survey.notebook.steps",
     "adjust_many": "survey.notebook.batch",
+    "cross_validate": "survey.notebook.steps",
     "detect": "survey.notebook.steps",
     "exclude": "survey.notebook.steps",
     "include": "survey.notebook.steps",
@@ -64,6 +65,7 @@ __all__ = [
     "Workbench",
     "adjust",
     "adjust_many",
+    "cross_validate",
     "detect",
     "exclude",
     "include",

@@ -12,7 +12,7 @@ from typing import NoReturn
 
 from survey.commands.adjusting import declare_adjust
 from survey.commands.common import DONE, FAILED, INTERRUPTED, TEST_FAILED, USAGE, run_as_program, run_command
-from survey.commands.comparing import declare_compare
+from survey.commands.comparing import declare_compare, declare_cross_validate
 from survey.commands.completion import declare_completion
 from survey.commands.converting import declare_convert
 from survey.commands.examples import declare_example, declare_schema
@@ -58,6 +58,7 @@ _COMMANDS = (
     declare_navigate,
     declare_align,
     declare_compare,
+    declare_cross_validate,
     declare_example,
     declare_schema,
 )

@@ -6,14 +6,26 @@ its documentation "differencing", Kogan 2017), and uncertainties are either thos
 which carries the camera, or, for a camera by itself, those of the difference so fitted, to first order.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.lenses.models import LensModel, lens_derivatives, project, unit_rays
+from adjust.lenses.models import (
+    LensModel,
+    camera_constants,
+    lens_derivatives,
+    lens_model,
+    monotone_radius_px,
+    principal_point_px,
+    project,
+    unit_rays,
+)
 from adjust.model.arrays import BoolArray, FloatArray
 from adjust.model.errors import SurveyError
+from adjust.model.result import Estimate, ParameterName
+from adjust.model.survey import Camera
 
 _STEPS = 30
 _SMALL = 1e-12
@@ -45,6 +57,33 @@ class Difference:
     shift: FloatArray
     second_from_first: Pose3
     fitted: BoolArray
+
+
+def optics_of(camera: Camera, estimates: Mapping[ParameterName, Estimate]) -> Optics:
+    """A camera with its adjusted lens. Raises SurveyError where there is none."""
+    estimate = estimates.get(("lens", camera.camera_id))
+    if estimate is None or isinstance(estimate.value, Pose3):
+        raise SurveyError(f"camera {camera.camera_id}: this solution has no lens of it")
+    model = lens_model(camera.lens.model)
+    if len(estimate.value) != model.n:
+        raise SurveyError(f"camera {camera.camera_id}: this solution has a lens of another model than {model.name}")
+    return Optics(model, np.asarray(estimate.value, dtype=float), camera_constants(camera))
+
+
+def invertible(lens: Optics, uv: FloatArray) -> BoolArray:
+    """Pixels (n,) inside the radius up to which the distortion is one to one."""
+    centre = principal_point_px(lens.model, lens.values, lens.constants)
+    radius = monotone_radius_px(lens.model, lens.values, lens.constants)
+    return np.asarray(np.linalg.norm(uv - centre, axis=1) < 0.999 * radius)
+
+
+def covered(uv: FloatArray, points: FloatArray, reach: float) -> BoolArray:
+    """Pixels (n,) with an observed point within ``reach`` px."""
+    if not len(points):
+        return np.zeros(len(uv), dtype=np.bool_)
+    from scipy.spatial import cKDTree  # here: it takes long to load
+
+    return np.asarray(cKDTree(points).query(uv)[0] <= reach)
 
 
 def pixel_grid(image_size: tuple[int, int], columns: int = 24) -> FloatArray:

@@ -1,4 +1,4 @@
-"""The command ``compare``."""
+"""The commands ``compare`` and ``cross-validate``."""
 
 import argparse
 from typing import Any
@@ -30,4 +30,31 @@ def _compare(arguments: argparse.Namespace) -> int:
 
     outcome = compare_job(arguments.first, arguments.second, progress=not is_set(arguments, "quiet"))
     show(arguments, outcome)
+    return DONE
+
+
+def declare_cross_validate(commands: Any, shaped: dict[str, Any]) -> None:
+    """Add ``cross-validate`` to the commands."""
+    parser = commands.add_parser(
+        "cross-validate",
+        help="compare the lenses of two halves of the epochs",
+        usage="labsurvey cross-validate lab   (labsurvey cross-validate FOLDER [--distance METRES])",
+        description="Adjusts the epochs in two halves, each by itself, and compares what the lenses see, with the\n"
+        "motion of the camera taken out, with what their covariances expect. Writes nothing.",
+        epilog="Next: labsurvey open FOLDER --at '#view=halves'",
+        **shaped,
+    )
+    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder")
+    parser.add_argument("--distance", type=float, default=float("inf"), metavar="METRES",
+                        help="how far the points are that are looked at (infinitely)")  # fmt: skip
+    parser.set_defaults(run=_cross_validate)
+
+
+def _cross_validate(arguments: argparse.Namespace) -> int:
+    require_project(arguments.folder)
+    from survey.jobs.cross_validation import cross_validate
+    from survey.project import read
+
+    progress = not is_set(arguments, "quiet")
+    show(arguments, cross_validate(read(arguments.folder), arguments.distance, progress=progress))
     return DONE

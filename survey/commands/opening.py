@@ -2,10 +2,12 @@
 
 import argparse
 import os
+from pathlib import Path
 from typing import Any
 
 from survey.commands.common import DONE, is_set, not_negative, positive, print_json, require_project, say
 from survey.commands.parser import project_folder
+from survey.folder.kept import undo_killed
 
 
 def declare_open(commands: Any, shaped: dict[str, Any]) -> None:
@@ -49,12 +51,14 @@ def declare_runs(commands: Any, shaped: dict[str, Any]) -> None:
 
 
 def _open(arguments: argparse.Namespace) -> int:
-    require_project(arguments.folder)
+    if not _holds_images(arguments.folder):
+        require_project(arguments.folder)
     import signal
     import webbrowser
 
     from survey.workbench.guard import loopback_address, new_token
     from survey.workbench.live import Listening
+    from survey.workbench.pages.beginning import Beginning
     from survey.workbench.server import Server
     from survey.workbench.session import Workbench
 
@@ -64,7 +68,8 @@ def _open(arguments: argparse.Namespace) -> int:
     if read_only and not arguments.read_only:
         say(arguments, f"{folder}: cannot be written; it is open for reading only")
     token = new_token()
-    server = Server(Workbench(folder, read_only=read_only), token, f"labsurvey_{port}")
+    shown = (Workbench if (folder / "survey.toml").is_file() else Beginning)(folder, read_only=read_only)
+    server = Server(shown, token, f"labsurvey_{port}")
     endings = {signal.SIGINT, signal.SIGTERM}
     before = signal.pthread_sigmask(signal.SIG_BLOCK, endings)  # in all threads from here on: this one waits for them
     try:
@@ -78,6 +83,16 @@ def _open(arguments: argparse.Namespace) -> int:
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
     return DONE
+
+
+def _holds_images(folder: Path) -> bool:
+    """Whether a folder is no project, but may become one by the images in it."""
+    undo_killed(folder)
+    if (folder / "survey.toml").is_file() or not folder.is_dir():
+        return False
+    from survey.project.images import IMAGE_ENDINGS
+
+    return any(p.suffix.lower() in IMAGE_ENDINGS for at in ("*", "*/*", "images/*/*") for p in folder.glob(at))
 
 
 def _runs(arguments: argparse.Namespace) -> int:

@@ -67,11 +67,14 @@ def start_project(images: Path, folder: Path) -> StartOutcome:
 
     images: a folder of one camera's images, or of one folder for each camera; an image's name is its epoch, and images
     of the same name were taken at the same moment. Raises SurveyError for what cannot be a camera, an epoch or an
-    image, and where ``folder`` holds a project.
+    image, and where ``folder`` holds a project. Images that lie in ``folder/images`` already stay as they are.
     """
     from survey.detection.gray import read_image
 
-    cameras = _cameras(Path(images))
+    cameras = cameras_in(Path(images))
+    in_place = Path(images).resolve() == (Path(folder) / IMAGES_FOLDER).resolve()
+    if in_place and any(path.parent == Path(images) for paths in cameras.values() for path in paths):
+        raise SurveyError(f"{images}: images of a project lie in a folder of their camera; move them into one")
     sizes: dict[str, tuple[int, int]] = {}
     seen: Counter[tuple[int, int]] = Counter()
     looked_at = with_markers = 0
@@ -91,7 +94,7 @@ def start_project(images: Path, folder: Path) -> StartOutcome:
                     with_markers += markers
                     seen.update([board] if board is not None else [])
         board, n = seen.most_common(1)[0] if seen else (None, 0)
-        for camera, paths in cameras.items():
+        for camera, paths in () if in_place else cameras.items():
             (place / IMAGES_FOLDER / camera).mkdir(parents=True)
             for path in paths:
                 (place / IMAGES_FOLDER / camera / path.name).write_bytes(path.read_bytes())
@@ -100,8 +103,8 @@ def start_project(images: Path, folder: Path) -> StartOutcome:
                         with_markers)  # fmt: skip
 
 
-def _cameras(images: Path) -> dict[str, list[Path]]:
-    """Images by camera, in natural order."""
+def cameras_in(images: Path) -> dict[str, list[Path]]:
+    """Images by camera, in natural order. Raises SurveyError as :func:`start_project`."""
     if not images.is_dir():
         raise SurveyError(f"{images}: there is no such folder")
     entries = sorted((p for p in images.iterdir() if not p.name.startswith(".")), key=lambda p: natural_key(p.name))

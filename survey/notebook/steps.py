@@ -9,6 +9,8 @@ from adjust.model.survey import Survey
 from survey.folder.text import suggestion
 from survey.jobs.adjusting.job import run_info
 from survey.jobs.adjusting.steps import adjust_project
+from survey.jobs.cross_validation import CrossValidation
+from survey.jobs.cross_validation import cross_validate as cross_validate_project
 from survey.jobs.detecting import DetectOutcome, detect_job
 from survey.jobs.excluding import ExcludeOutcome, exclude_job, include_job
 from survey.notebook.html import heading, html_table
@@ -114,3 +116,13 @@ def solve(problem: Problem, *, progress: bool = False) -> Solution:
 def adjust(project: Project | Problem | str | Path, *, progress: bool = False) -> Solution:
     """Problem and solution in one step, of a project or its folder; nothing is written. Raises SurveyError."""
     return solve(project if isinstance(project, Problem) else problem(project), progress=progress)
+
+
+def cross_validate(
+    project: Project | str | Path, distance: float = float("inf"), *, progress: bool = False
+) -> CrossValidation:  # fmt: skip
+    """The epochs in two halves, each adjusted by itself, and the lenses compared for points at ``distance`` (m).
+
+    Nothing is written. Raises SurveyError where there are no two halves.
+    """
+    return cross_validate_project(project if isinstance(project, Project) else read(project), distance, progress)

@@ -29,6 +29,9 @@ TURNING = {ord(sign): f"\\u{ord(sign):04x}" for sign in "\u061c\u200e\u200f\u202
            "\u2066\u2067\u2068\u2069"}  # fmt: skip
 """Signs that let what follows them be shown in another order, with what stands for them on a page."""
 _SIGNS = tuple(map(chr, TURNING))
+_NUMBER = r"[-+\d.e]+"
+_PLACE = re.compile(r"\{[nw]?\}")
+_PARTS = {"{}": "(.+?)", "{w}": r"(\S+)", "{n}": f"({_NUMBER})"}
 _current: ContextVar[str] = ContextVar("language", default="en")
 
 
@@ -38,10 +41,15 @@ class MissingTranslationError(KeyError):
 
 @dataclass(frozen=True)
 class Catalogue:
-    """A language: its decimal sign, ``texts`` by their English form, ``messages`` as patterns with what they become."""
+    """A language: its decimal sign, ``texts`` by their English form, ``messages`` as patterns with what they become.
+
+    sentences: messages as the catalogue has them, by their English form: ``{}`` for a part, ``{w}`` for a part of one
+    word, ``{n}`` for a number; those with most words of their own first.
+    """
 
     decimal: str
     texts: Mapping[str, str]
+    sentences: Mapping[str, str]
     messages: tuple[tuple[str, str], ...]
 
 
@@ -49,9 +57,19 @@ class Catalogue:
 def catalogue(language: str) -> Catalogue:
     """The catalogue of a language; English needs no texts."""
     if language == "en":
-        return Catalogue(".", {}, ())
+        return Catalogue(".", {}, {}, ())
     found = tomllib.loads((_CATALOGUES / f"{language}.toml").read_text(encoding="utf-8"))
-    return Catalogue(found["decimal"], found["texts"], tuple((m["pattern"], m["text"]) for m in found["messages"]))
+    sentences = dict(sorted(found["sentences"].items(), key=lambda item: -len(_PLACE.sub("", item[0]))))
+    messages = ((m["pattern"], m["text"]) for m in found["messages"])
+    said = ((pattern_of(sentence), _PLACE.sub("{}", text)) for sentence, text in sentences.items())
+    return Catalogue(found["decimal"], found["texts"], sentences, (*said, *messages))
+
+
+def pattern_of(sentence: str) -> str:
+    """The pattern of a sentence."""
+    words = [re.escape(words) for words in _PLACE.split(sentence)]
+    places = [_PARTS[place] for place in _PLACE.findall(sentence)]
+    return "".join(x for pair in zip(words, [*places, ""], strict=True) for x in pair)
 
 
 @contextmanager
@@ -107,7 +125,7 @@ def group_name(name: str) -> str:
 def message(text: str) -> str:
     """A message that the adjustment has made, translated where its pattern is known, else as it is.
 
-    A part that a pattern has as ``(.+)`` is a message itself.
+    A part that a pattern has as ``(.+)`` or ``(.+?)`` is a message itself.
     """
     for pattern, said in catalogue(_current.get()).messages:
         found = re.fullmatch(pattern, text, re.DOTALL)
@@ -120,7 +138,7 @@ def message(text: str) -> str:
 
 def _part(text: str, kind: str) -> str:
     """A part of a message by its pattern: numbers and messages are said in the language, the rest is data."""
-    return localised(text) if kind == r"[\d.]+" else message(text) if kind == ".+" else text
+    return localised(text) if kind in (r"[\d.]+", _NUMBER) else message(text) if kind in (".+", ".+?") else text
 
 
 def localised(number: str) -> str:

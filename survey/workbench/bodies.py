@@ -2,16 +2,20 @@
 
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from starlette.requests import Request
 
 from adjust.model.errors import SurveyError
-from survey.workbench.jobs import Told
+from survey.workbench.pages.beginning import Told
 from survey.workbench.session import Workbench
 
 if TYPE_CHECKING:
     from survey.detection import ImageReport
+
+
+_LARGEST = 1e12  # what any number of a request may be
 
 
 def distance_of(request: Request) -> float:
@@ -24,6 +28,12 @@ def distance_of(request: Request) -> float:
     if not value > 0.0:
         raise SurveyError(f"distance_m: found {text!r}; expected metres, or inf")
     return value
+
+
+def whole_of(request: Request, key: str) -> int | None:
+    """What a request says of a whole number from 0 on, in its path or behind it; None where it says none."""
+    text = str(request.path_params.get(key, request.query_params.get(key, "")))
+    return int(text) if text.isdecimal() and len(text) < 10 else None
 
 
 class BodyError(Exception):
@@ -58,8 +68,11 @@ class Body:
         return str(self._value(key, "", (str,), "a text"))
 
     def number(self, key: str, default: float | None = None) -> float:
-        """A number."""
-        return float(self._value(key, default, (int, float), "a number"))
+        """A finite number."""
+        value = self._value(key, default, (int, float), "a number")
+        if not abs(value) <= _LARGEST:  # nor nan
+            raise BodyError(f"{key}: expected a number")
+        return float(value)
 
     def names(self, key: str) -> list[str]:
         """Texts, none where there are none."""
@@ -99,14 +112,24 @@ def _plan(bench: Workbench, body: Body, _: Any) -> Told:
                                   place=int(body.number("place", 0.0))))  # fmt: skip
 
 
-JOBS: Mapping[str, Callable[[Workbench, Body, "Callable[[ImageReport], None]"], Told]] = {
-    "init": lambda bench, body, _: bench.start(body.text("images"), body.text("folder")),
-    "show": lambda bench, body, _: bench.show(body.text("folder")),
-    "detect": lambda bench, body, found: bench.detect(everything=body.flag("all", False), told=found),
-    "plan": _plan,
-    "navigate": lambda bench, body, _: bench.navigate(body.text("station"), body.number("interval_s", 0.0) or None),
-    "add": lambda bench, body, _: bench.add(body.text("folder")),
-    "compare": lambda bench, body, _: bench.compare_with(body.text("folder")),
-    "batch": lambda bench, body, _: bench.batch(body.names("folders")),
-}
+@dataclass(frozen=True)
+class Job:
+    """A job of a page. call: what of ``survey.Workbench`` it is; changes: whether files may change."""
+
+    call: str
+    run: Callable[[Any, Body, "Callable[[ImageReport], None]"], Told]
+    changes: bool = True
+
+
+JOBS: Mapping[str, Job] = {
+    "init": Job("start", lambda bench, body, _: bench.start(body.text("images"), body.text("folder"))),
+    "show": Job("show", lambda bench, body, _: bench.show(body.text("folder")), changes=False),
+    "detect": Job("detect", lambda bench, body, found: bench.detect(everything=body.flag("all", False), told=found)),
+    "plan": Job("plan", _plan),
+    "navigate": Job("navigate", lambda bench, body, _: bench.navigate(body.text("station"),
+                                                                      body.number("interval_s", 0.0) or None)),
+    "add": Job("add", lambda bench, body, _: bench.add(body.text("folder"))),
+    "compare": Job("compare_with", lambda bench, body, _: bench.compare_with(body.text("folder")), changes=False),
+    "batch": Job("batch", lambda bench, body, _: bench.batch(body.names("folders"))),
+}  # fmt: skip
 """The jobs of a page by their names, with what it asks of them."""

@@ -3,24 +3,33 @@
 from typing import Any
 
 import numpy as np
-from gtsam import Pose3, Rot3
+from gtsam import Rot3
 
-from adjust.lenses.compared import Optics, lens_difference, pixel_grid, projection_covariance, worst_sigma
-from adjust.lenses.models import camera_constants, lens_model, monotone_radius_px, principal_point_px
-from adjust.model.arrays import BoolArray, FloatArray
+from adjust.lenses.compared import (
+    Optics,
+    covered,
+    invertible,
+    lens_difference,
+    optics_of,
+    pixel_grid,
+    projection_covariance,
+    worst_sigma,
+)
+from adjust.lenses.models import principal_point_px
+from adjust.model.arrays import FloatArray
 from adjust.model.errors import SurveyError
-from adjust.model.result import Estimate, ParameterName
+from adjust.model.result import ParameterName
 from adjust.model.survey import Camera
 from survey.folder.text import suggestion
 from survey.solution.dictionary import plain
 from survey.solution.earlier.changes import Snapshot
 from survey.solution.earlier.runs import load_run
-from survey.workbench.session import Workbench
+from survey.workbench.jobs import Jobs
 
 _CELLS = 24
 
 
-def camera_of(bench: Workbench, camera_id: str) -> Camera:
+def camera_of(bench: Jobs, camera_id: str) -> Camera:
     """A camera by its name. Raises SurveyError."""
     cameras = {c.camera_id: c for c in bench.adjustment.survey.cameras}
     if camera_id not in cameras:
@@ -28,25 +37,7 @@ def camera_of(bench: Workbench, camera_id: str) -> Camera:
     return cameras[camera_id]
 
 
-def optics(camera: Camera, estimates: Any) -> Optics:
-    """A camera with its adjusted lens. Raises SurveyError where there is none."""
-    estimate: Estimate | None = estimates.get(("lens", camera.camera_id))
-    if estimate is None or isinstance(estimate.value, Pose3):
-        raise SurveyError(f"camera {camera.camera_id}: this solution has no lens of it")
-    model = lens_model(camera.lens.model)
-    if len(estimate.value) != model.n:
-        raise SurveyError(f"camera {camera.camera_id}: this solution has a lens of another model than {model.name}")
-    return Optics(model, np.asarray(estimate.value, dtype=float), camera_constants(camera))
-
-
-def invertible(camera: Camera, lens: Optics, uv: FloatArray) -> BoolArray:
-    """Pixels (n,) inside the radius up to which the distortion is one to one."""
-    centre = principal_point_px(lens.model, lens.values, lens.constants)
-    radius = monotone_radius_px(lens.model, lens.values, lens.constants)
-    return np.asarray(np.linalg.norm(uv - centre, axis=1) < 0.999 * radius)
-
-
-def camera_view(bench: Workbench, camera_id: str, distance: float = np.inf) -> dict[str, Any]:
+def camera_view(bench: Jobs, camera_id: str, distance: float = np.inf) -> dict[str, Any]:
     """Residual field, coverage, distortion and uncertainty of a camera; distance: m, of the point that is seen.
 
     cells: over the image, in rows: number of points in use, mean residual (px), rms (px). distortion: pixels without
@@ -56,7 +47,7 @@ def camera_view(bench: Workbench, camera_id: str, distance: float = np.inf) -> d
     allows. covered: whether a cell beside has points. Raises SurveyError.
     """
     camera = camera_of(bench, camera_id)
-    lens, (width, height) = optics(camera, bench.adjustment.estimates), camera.image_size
+    lens, (width, height) = optics_of(camera, bench.adjustment.estimates), camera.image_size
     uv = pixel_grid(camera.image_size)
     rows = max(2, round(_CELLS * height / width))
     points, residuals = _in_use(bench, camera_id)
@@ -67,7 +58,7 @@ def camera_view(bench: Workbench, camera_id: str, distance: float = np.inf) -> d
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.stack([np.bincount(cell, residuals[:, k], rows * _CELLS) / n for k in range(2)], axis=1)
         rms = np.sqrt(np.bincount(cell, (residuals**2).sum(axis=1), rows * _CELLS) / (2 * n))
-    good = invertible(camera, lens, uv)
+    good = invertible(lens, uv)
     return dict(plain({
         "version": bench.version, "camera": camera_id, "size": camera.image_size, "model": lens.model.name,
         "distance_m": None if np.isinf(distance) else distance,
@@ -75,11 +66,11 @@ def camera_view(bench: Workbench, camera_id: str, distance: float = np.inf) -> d
         "cells": {"columns": _CELLS, "rows": rows, "n": n, "mean": mean, "rms": rms},
         "distortion": {"uv": uv[good], "without": _undistorted(lens, uv[good])},
         "uncertainty": {"uv": uv[good], **_uncertainty(bench, camera, lens, uv[good], distance),
-                        "covered": _covered(uv[good], points, width / _CELLS)},
+                        "covered": covered(uv[good], points, width / _CELLS)},
     }))  # fmt: skip
 
 
-def _in_use(bench: Workbench, camera_id: str) -> tuple[FloatArray, FloatArray]:
+def _in_use(bench: Jobs, camera_id: str) -> tuple[FloatArray, FloatArray]:
     rows = bench.rows
     blocks = [(i, b) for i, b in enumerate(rows.survey.image_blocks) if b.camera_id == camera_id]
     parts = [(b.uv[u], rows.residuals[rows.ptr[i] : rows.ptr[i + 1]][u]) for i, b in blocks
@@ -104,16 +95,7 @@ def _undistorted(lens: Optics, uv: FloatArray) -> FloatArray:
     return np.asarray(centre + focal * away[:, :2] / away[:, 2:])
 
 
-def _covered(uv: FloatArray, points: FloatArray, reach: float) -> BoolArray:
-    """Pixels (n,) with an observed point within ``reach`` px."""
-    if not len(points):
-        return np.zeros(len(uv), dtype=np.bool_)
-    from scipy.spatial import cKDTree  # here: it takes long to load
-
-    return np.asarray(cKDTree(points).query(uv)[0] <= reach)
-
-
-def _uncertainty(bench: Workbench, camera: Camera, lens: Optics, uv: FloatArray, distance: float) -> dict[str, Any]:
+def _uncertainty(bench: Jobs, camera: Camera, lens: Optics, uv: FloatArray, distance: float) -> dict[str, Any]:
     names: list[ParameterName] = [("lens", camera.camera_id), ("station_from_camera", camera.camera_id)]
     estimates, factor = bench.adjustment.estimates, bench.scale.factor
     free = np.array([s in ("free", "prior") for s in estimates[names[0]].status])
@@ -130,7 +112,7 @@ def _uncertainty(bench: Workbench, camera: Camera, lens: Optics, uv: FloatArray,
 
 
 def lens_change(
-    bench: Workbench, camera_id: str, before: int | None = None, other: str = "", distance: float = np.inf
+    bench: Jobs, camera_id: str, before: int | None = None, other: str = "", distance: float = np.inf
 ) -> dict[str, Any]:
     """The lens of a camera against that of a run (``before``), or of another camera of the same image size.
 
@@ -138,22 +120,22 @@ def lens_change(
     points were observed; the angle (deg) and length (mm) of that motion beside it. Raises SurveyError.
     """
     camera = camera_of(bench, camera_id)
-    now = optics(camera, bench.adjustment.estimates)
+    now = optics_of(camera, bench.adjustment.estimates)
     if other:
         against = camera_of(bench, other)
         if against.image_size != camera.image_size:
             raise SurveyError(f"cameras {camera_id} and {other} have images of different sizes")
-        then = optics(against, bench.adjustment.estimates)
+        then = optics_of(against, bench.adjustment.estimates)
     elif before is not None:
         kept: Snapshot = load_run(bench.folder, before)
-        then = optics(camera, kept.estimates)
+        then = optics_of(camera, kept.estimates)
     else:
         raise SurveyError("name the run or the other camera that the lens is to be compared with")
     uv = pixel_grid(camera.image_size)
-    uv = uv[invertible(camera, now, uv) & invertible(camera, then, uv)]
+    uv = uv[invertible(now, uv) & invertible(then, uv)]
     points, _ = _in_use(bench, camera_id)
-    covered = _covered(uv, points, camera.image_size[0] / _CELLS)
-    found = lens_difference(then, now, uv, distance, covered if covered.sum() >= 6 else None)
+    near = covered(uv, points, camera.image_size[0] / _CELLS)
+    found = lens_difference(then, now, uv, distance, near if near.sum() >= 6 else None)
     rotation = float(np.linalg.norm(Rot3.Logmap(found.second_from_first.rotation())))
     return dict(plain({
         "version": bench.version, "camera": camera_id, "uv": uv, "shift": found.shift, "covered": found.fitted,

@@ -184,8 +184,7 @@ class Deciding(Resident):
             return changes
 
     def _check(self, base: int | None) -> None:
-        if self.read_only:
-            raise SurveyError(f"{self.folder}: is open for reading only; open it without --read-only to change it")
+        self._require_writable()
         if base is not None and base != self.version:
             raise ChangedError(f"the solution has changed since (now {self.version}, not {base}); look at it again")
         self._require_unchanged()

@@ -83,8 +83,8 @@ class Guard:
     which no script can read and no other site sends.
     """
 
-    def __init__(self, app: ASGIApp, token: str, cookie: str, read_only: bool) -> None:
-        self.app, self.token, self.cookie, self.read_only = app, token, cookie, read_only
+    def __init__(self, app: ASGIApp, token: str, cookie: str) -> None:
+        self.app, self.token, self.cookie = app, token, cookie
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """One request."""
@@ -111,8 +111,6 @@ class Guard:
         by_cookie = is_socket or (method in ("GET", "HEAD") and path.startswith("/api/image/"))
         if not is_token(headers.get("x-token", ""), self.token) and not (by_cookie and self._in_cookie(headers)):
             return 403, WRONG_TOKEN
-        if method == "POST" and self.read_only:
-            return 403, "the project is open for reading only"
         if method == "POST" and headers.get("content-type", "").partition(";")[0].strip() != "application/json":
             return 415, "the body has to be application/json"
         return None

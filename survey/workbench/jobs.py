@@ -1,9 +1,9 @@
 """The other jobs of a project, from the page and from Python: what each says, and what of it is drawn in space."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from gtsam import Pose3
@@ -14,60 +14,24 @@ from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, PoseParameter
 from survey.folder.replacing import changing, replace_parts
-from survey.jobs.adjusting.job import AdjustOutcome, Clock, command_line, kept_run, made
+from survey.jobs.adjusting.job import AdjustOutcome, Clock, command_line, kept_run, made, run_info
 from survey.project.project import DEFINITION_FILE, RESULTS
 from survey.report.scene import scene_values
-from survey.solution.dictionary import plain
+from survey.solution.dictionary import RunInfo
 from survey.solution.earlier.runs import remove_empty
 from survey.solution.frames import AdjustedFrames
 from survey.solution.quantities import scale_of
 from survey.workbench.deciding import Deciding
+from survey.workbench.pages.beginning import Drawn, Told
 from survey.workbench.places import Places
 
 if TYPE_CHECKING:  # detection brings in OpenCV, planning much else
     from survey.detection import ImageReport
+    from survey.jobs.cross_validation import CrossValidation
     from survey.planning.job import PlanRequest
     from survey.planning.summary import PlanningOutcome
 
 _MOST_LINES = 300
-
-
-@dataclass(frozen=True, eq=False)
-class Drawn:
-    """What a job adds to the scene, in the world (m).
-
-    cameras: ``world_from_camera`` by image. points: with covariances (3, 3) m^2. lines: ends by name. path: positions
-    in order, each with its covariance and status. scene: everything, where there is no solution that shows it.
-    """
-
-    cameras: Mapping[str, Pose3] = field(default_factory=dict)
-    points: Sequence[tuple[str, FloatArray, FloatArray]] = ()
-    lines: Sequence[tuple[str, Sequence[FloatArray]]] = ()
-    path: Sequence[tuple[str, FloatArray, FloatArray, str]] = ()
-    scene: Mapping[str, Any] | None = None
-
-    def as_dict(self) -> dict[str, Any]:
-        """As plain values."""
-        return dict(plain({
-            "cameras": {name: pose.matrix()[:3].ravel() for name, pose in self.cameras.items()},
-            "points": [{"id": name, "x": x, "cov": cov.ravel()} for name, x, cov in self.points],
-            "scene": self.scene,
-            "lines": [{"id": name, "x": x} for name, x in self.lines],
-            "path": [{"id": name, "x": x, "cov": cov.ravel(), "status": s} for name, x, cov, s in self.path],
-        }))  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class Told:
-    """What a job said: for people, as plain values, and in the scene."""
-
-    text: str
-    summary: Mapping[str, Any]
-    drawn: Drawn = Drawn()
-
-    def as_dict(self) -> dict[str, Any]:
-        """As plain values."""
-        return {"text": self.text, "summary": self.summary, "drawn": self.drawn.as_dict()}
 
 
 class Jobs(Deciding):
@@ -87,6 +51,10 @@ class Jobs(Deciding):
             remove_empty(self.folder, gone)
             self.n_unsaved = 0
             return outcome.at(self.folder)
+
+    def run(self) -> RunInfo:
+        """What was run, for reports."""
+        return run_info(self.situation.project, {})
 
     def detect(self, *, everything: bool = False, told: "Callable[[ImageReport], None] | None" = None) -> Told:
         """Find targets and spots in images that are new or have changed (everything: in all), and adjust again.
@@ -147,25 +115,11 @@ class Jobs(Deciding):
         lines = [(name, [before[name], x]) for name, x in after.items() if name in before]
         return Told(outcome.text(), outcome.summary(), Drawn(lines=lines))
 
-    def start(self, images: str | Path, folder: str | Path) -> Told:
-        """Begin another project with images that lie beside this one, or anywhere, as ``labsurvey init`` does.
+    def cross_validate(self, distance: float = float("inf")) -> "CrossValidation":
+        """The lenses of two halves of the epochs compared, for points at ``distance`` (m); nothing is written."""
+        from survey.jobs.cross_validation import cross_validate
 
-        folder: the new one, beside this one; ``summary["folder"]`` names it. This project stays as it is.
-        """
-        from survey.jobs.starting import start_project
-
-        self._check(None)
-        if not str(folder).strip():
-            raise SurveyError("name the folder of the new project; it is made beside this one")
-        outcome = start_project(self._other(images), self.folder.resolve().parent / Path(folder).expanduser())
-        return Told(outcome.text(), outcome.summary())
-
-    def show(self, folder: str | Path) -> Told:
-        """Another project folder, for a page that is to show it instead of this one: ``summary["folder"]``."""
-        path = self._other(folder)
-        if not (path / DEFINITION_FILE).is_file():
-            raise SurveyError(f"{path}: holds no {DEFINITION_FILE}; begin a project with its images")
-        return Told(str(path), {"folder": str(path)})
+        return cross_validate(self.situation.project, distance)
 
     def batch(self, folders: Sequence[str | Path] = ()) -> Told:
         """Adjust several projects (none: all beside this one), side by side; each has its results afterwards.
@@ -183,13 +137,6 @@ class Jobs(Deciding):
                  **{k: r.summary.get(k) for k in ("verdict", "sigma0", "redundancy")}} for r in found]  # fmt: skip
         return Told(summary_table(found), {"folders": [row["folder"] for row in rows],
                                            "states": [row["state"] for row in rows], "rows": rows})  # fmt: skip
-
-    def _other(self, folder: str | Path) -> Path:
-        """Another project folder; a relative one lies beside this one. Raises SurveyError."""
-        path = self.folder.resolve().parent / Path(folder).expanduser()
-        if not str(folder).strip() or not path.is_dir():
-            raise SurveyError(f"{folder or 'FOLDER'}: there is no such folder; name it as it lies beside {self.folder}")
-        return path
 
 
 def _positions(adjustment: Adjustment) -> dict[str, FloatArray]:

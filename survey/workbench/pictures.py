@@ -31,7 +31,7 @@ def picture(images: Mapping[tuple[str, str], Path], key: tuple[str, str], size: 
     from survey.detection.gray import gray_values, read_image
 
     path = images[key]
-    if not stat.S_ISREG(os.lstat(path).st_mode):
+    if not stat.S_ISREG(os.lstat(path).st_mode) or path.parent.is_symlink():
         raise SurveyError(f"{path}: is a link or no file; put the image itself into the project")
     stored = read_image(path)
     image: Any = stored if stored.dtype == np.uint8 else _in_8_bit(gray_values(stored))

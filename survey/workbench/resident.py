@@ -24,6 +24,7 @@ from survey.solution.earlier.changes import Changes, snapshot, solution_changes
 from survey.solution.quantities import Scale, scale_of
 from survey.solution.statistics import Statistics, statistics_of
 from survey.workbench.kept import Kept, kept_results, with_kept
+from survey.workbench.pages.beginning import Folder
 from survey.workbench.rows import PointRows, point_rows
 from survey.workbench.situation import (
     CancelledError,
@@ -41,15 +42,15 @@ _UNREAD = object()
 _MOST_KEPT = 300_000  # image points: of more only the verdict is taken from the results, to be there at once
 
 
-class Resident:
+class Resident(Folder):
     """A project folder, kept in memory. Every method may be called from any thread.
 
     read_only: nothing is ever written. watch: called with (iteration, v'Pv) while something is adjusted.
     """
 
     def __init__(self, folder: str | Path, *, read_only: bool = False, watch: Watch | None = None) -> None:
-        self.folder, self.read_only, self.watch = Path(folder), read_only, watch
-        self.version = 0
+        super().__init__(folder, read_only)
+        self.watch, self.version = watch, 0
         self.layout = 0  # counts changes of which image points there are, and in which order
         self.changes: Changes | None = None
         self.failure: SurveyError | None = None

@@ -148,13 +148,20 @@ def columns(
         said, seen = _seen(rows)
         header, arrays = header | said, seen | arrays
     typed = {k: a[every].astype("<f4" if a.dtype.kind == "f" else a.dtype, copy=False) for k, a in arrays.items()}
+    typed = dict(sorted(typed.items(), key=lambda item: -item[1].itemsize))  # each begins at a multiple of its size
     header |= {
         "n": len(typed["w"]), "rows": None if chosen is None else chosen.tolist(),
         "columns": [{"name": k, "type": a.dtype.str.lstrip("<|")} for k, a in typed.items()],
     }  # fmt: skip
     text = json.dumps(header, ensure_ascii=False, allow_nan=False).encode()
-    text += b" " * (-len(text) % 4)  # the columns of 4 bytes begin at a multiple of 4
+    text += b" " * (-len(text) % 4)
     return b"".join([len(text).to_bytes(4, "little"), text, *(a.tobytes() for a in typed.values())])
+
+
+def _small(values: IntArray) -> npt.NDArray[np.unsignedinteger[Any]]:
+    """Numbers from 0 on in as few bytes as they need, at most 4."""
+    most = int(values.max(initial=0))
+    return values.astype("u1" if most < 1 << 8 else "<u2" if most < 1 << 16 else "<u4")
 
 
 def _seen(rows: PointRows) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
@@ -162,8 +169,8 @@ def _seen(rows: PointRows) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]
     blocks, sizes = rows.survey.image_blocks, np.diff(rows.ptr)
     uv = np.concatenate([*(b.uv for b in blocks), np.zeros((0, 2))])
     arrays: dict[str, npt.NDArray[Any]] = {
-        "block": np.repeat(np.arange(len(blocks), dtype=np.uint32), sizes),
-        "point": np.concatenate([*(b.point_idx for b in blocks), np.zeros(0, dtype=np.int64)]).astype("<u4"),
+        "block": _small(np.repeat(np.arange(len(blocks)), sizes)),
+        "point": _small(np.concatenate([*(b.point_idx for b in blocks), np.zeros(0, dtype=np.int64)])),
         "u": uv[:, 0], "v": uv[:, 1],
     }  # fmt: skip
     if len(uv) <= _MOST_SIGMAS:

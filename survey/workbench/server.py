@@ -1,7 +1,7 @@
 """The local server of ``labsurvey open``: one project, one browser on this machine, a token.
 
-Everything that it answers is a method of :class:`survey.workbench.session.Workbench` or a function of
-``survey.workbench.views``; here stand the addresses, the guard and the messages while something runs.
+Everything that it answers is a method of :class:`survey.workbench.session.Workbench`; here stand the addresses, the
+guard and the messages while something runs.
 """
 
 import asyncio
@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
 from contextvars import copy_context
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,12 @@ from survey.folder.locking import BusyError
 from survey.folder.text import suggestion
 from survey.report.language import LANGUAGES, message, speaking
 from survey.report.modules import WEB as SHARED
-from survey.solution.earlier.runs import pin_run
-from survey.workbench import cameras, pictures, views
-from survey.workbench.bodies import JOBS, Body, BodyError, distance_of, json_of
+from survey.solution.dictionary import plain
+from survey.workbench import pictures
+from survey.workbench.bodies import JOBS, Body, BodyError, distance_of, json_of, whole_of
 from survey.workbench.guard import LONGEST_BODY, Guard, TooLongError
 from survey.workbench.live import Live
+from survey.workbench.pages.beginning import Beginning
 from survey.workbench.session import Workbench
 from survey.workbench.situation import CancelledError, ChangedError
 
@@ -39,58 +41,92 @@ _MOST_ROWS = 200_000  # of image points at once, where not all are asked for
 _Handler = Callable[[Request], Awaitable[Response]]
 
 
+@dataclass(frozen=True)
+class Way:
+    """An address of the interface. calls: what of ``survey.Workbench`` it is; changes: whether files may change."""
+
+    method: str
+    path: str
+    calls: tuple[str, ...]
+    handler: _Handler
+    changes: bool = False
+
+
 class Server:
     """What is served, and the one thread in which everything about the project runs."""
 
-    def __init__(self, bench: Workbench, token: str, cookie: str = "labsurvey") -> None:
-        self.bench, self.token, self.cookie = bench, token, cookie
+    def __init__(self, shown: Workbench | Beginning, token: str, cookie: str = "labsurvey") -> None:
+        self.shown, self.token, self.cookie = shown, token, cookie
         self.live, self._worker = Live(), ThreadPoolExecutor(1, "workbench")
         self._running, self._asked = "", asyncio.Event()
         self.patience_s = _PATIENCE_S
         self._files = {f"/{p.relative_to(at).as_posix()}": p for at in (SHARED, WEB) for p in at.rglob("*")
                        if p.suffix in _KINDS}  # fmt: skip
-        bench.watch = self._progress
+        if isinstance(shown, Workbench):
+            shown.watch = self._progress
+
+    @property
+    def bench(self) -> Workbench:
+        """The project; raises SurveyError where it is only to begin."""
+        if isinstance(self.shown, Beginning):
+            raise SurveyError(f"{self.shown.folder}: there is no survey.toml yet; begin a project with its images")
+        return self.shown
+
+    def ways(self) -> tuple[Way, ...]:
+        """All addresses of the interface."""
+        def view(name: str) -> Way:
+            return Way("GET", f"/api/{name}", (name,), self._view(name))
+
+        return (
+            Way("GET", "/api/state", ("state",), self._state),
+            Way("GET", "/api/points", ("points",), self._points),
+            Way("GET", "/api/image/{camera}/{epoch}", ("picture",), self._image),
+            *map(view, ("readings", "parameters", "scene", "findings", "loops", "network", "table_residuals", "runs")),
+            Way("GET", "/api/changes", ("changes",), self._changes),
+            Way("GET", "/api/camera/{camera}", ("camera_view",), self._camera),
+            Way("GET", "/api/camera/{camera}/difference", ("lens_change",), self._difference),
+            Way("GET", "/api/compare", ("compare",), self._compare),
+            Way("GET", "/api/halves", ("cross_validate",), self._halves),
+            Way("GET", "/api/statistics/{part}", ("statistics_part",), self._statistics),
+            Way("POST", "/api/preview", ("preview",), self._preview),
+            Way("POST", "/api/adjust", ("adjust",), self._adjust),
+            Way("POST", "/api/reload", ("reload",), self._reload),
+            Way("POST", "/api/cancel", ("cancel",), self._cancel),
+            Way("POST", "/api/exclusions", ("exclude", "include", "decide"), self._exclusions, True),
+            Way("POST", "/api/definition", ("set_sigma_scale", "set_treatment", "set_datum"), self._definition, True),
+            Way("POST", "/api/remedy", ("apply_remedy",), self._remedy, True),
+            Way("POST", "/api/undo", ("undo",), self._act("undo"), True),
+            Way("POST", "/api/redo", ("redo",), self._act("redo"), True),
+            Way("POST", "/api/save", ("save",), self._save, True),
+            Way("POST", "/api/runs/{number}/restore", ("restore",), self._restore, True),
+            Way("POST", "/api/runs/{number}/pin", ("pin",), self._pin, True),
+            *(Way("POST", f"/api/jobs/{name}", (job.call,), self._job(name), job.changes)
+              for name, job in JOBS.items()),
+            Way("POST", "/api/jobs/{name}", (), self._no_job),
+        )
 
     def app(self) -> ASGIApp:
         """The application, guarded."""
-        get: dict[str, _Handler] = {
-            "/api/state": self._state, "/api/points": self._points, "/api/image/{camera}/{epoch}": self._image,
-            "/api/readings": self._view(views.readings), "/api/parameters": self._view(views.parameters),
-            "/api/scene": self._view(views.scene), "/api/findings": self._view(views.findings),
-            "/api/changes": self._view(_changes), "/api/loops": self._view(views.loops),
-            "/api/network": self._view(views.network),
-            "/api/table_residuals": self._view(views.table_residuals), "/api/camera/{camera}": self._camera,
-            "/api/camera/{camera}/difference": self._difference, "/api/runs": self._view(views.runs),
-            "/api/compare": self._compare,
-            "/api/statistics/{part}": self._statistics,
-        }  # fmt: skip
-        post: dict[str, _Handler] = {
-            "/api/preview": self._preview, "/api/exclusions": self._exclusions, "/api/adjust": self._adjust,
-            "/api/definition": self._definition, "/api/remedy": self._remedy,
-            "/api/undo": self._act("undo"), "/api/redo": self._act("redo"), "/api/save": self._save,
-            "/api/runs/{number:int}/restore": self._restore, "/api/runs/{number:int}/pin": self._pin,
-            "/api/jobs/{name}": self._job, "/api/reload": self._reload, "/api/cancel": self._cancel,
-        }  # fmt: skip
-        routes = [Route(path, self._said(f), methods=["GET"]) for path, f in get.items()]
-        routes += [Route(path, self._said(f), methods=["POST"]) for path, f in post.items()]
+        routes = [Route(way.path, self._said(way), methods=[way.method]) for way in self.ways()]
         routes.append(Route("/{path:path}", self._file, methods=["GET"]))
         app = Starlette(routes=[*routes, WebSocketRoute("/live", self.live.serve)], lifespan=self._lifespan)
-        return Guard(app, self.token, self.cookie, self.bench.read_only)
+        return Guard(app, self.token, self.cookie)
 
     def end(self) -> None:
         """Give up what runs."""
-        self.bench.cancel()
+        if isinstance(self.shown, Workbench):
+            self.shown.cancel()
 
     @asynccontextmanager
     async def _lifespan(self, _app: Starlette) -> AsyncIterator[None]:
         self.live.begin()
         tasks = [asyncio.create_task(self._watch_folder())]
-        if self.bench.version == 0:
+        if isinstance(self.shown, Workbench) and self.shown.version == 0:
             tasks.append(asyncio.create_task(self._first()))
         yield
         for task in tasks:
             task.cancel()
-        self.bench.cancel()
+        self.end()
         self.live.post(None)
         self._worker.shutdown(wait=False, cancel_futures=True)
 
@@ -108,6 +144,8 @@ class Server:
         told: tuple[str, ...] = ()
         while True:
             await asyncio.sleep(_LOOK_S)
+            if isinstance(self.shown, Beginning):
+                continue
             changed = await asyncio.to_thread(self.bench.changed_files)
             if changed != told and not self._running:  # else it may be what is being written here
                 told = changed
@@ -118,7 +156,7 @@ class Server:
 
     async def _run(self, what: str, work: Callable[[], Any]) -> Any:
         """In the one thread, in turn; pages hear of the new state where there is one."""
-        version = self.bench.version
+        version = self.shown.version
         if version == 0 and what == "view":  # what there is, while the first solution is waited for
             return await asyncio.to_thread(work)
 
@@ -133,10 +171,10 @@ class Server:
             spoken = copy_context()  # the language of who asks
             return await asyncio.get_running_loop().run_in_executor(self._worker, spoken.run, working)
         finally:
-            if self.bench.version != version or what == "save":
+            if isinstance(self.shown, Workbench) and (self.shown.version != version or what == "save"):
                 self.live.post({"type": "state", "version": self.bench.version, "unsaved": self.bench.n_unsaved})
 
-    def _said(self, handler: _Handler) -> _Handler:
+    def _said(self, way: Way) -> _Handler:
         """What its owner can mend is an answer of one line."""
 
         async def answering(request: Request) -> Response:
@@ -145,12 +183,14 @@ class Server:
                 return await said(request)
 
         async def said(request: Request) -> Response:
+            if way.changes and self.shown.read_only:
+                return JSONResponse({"error": "the project is open for reading only"}, 403)
             try:
-                return await handler(request)
+                return await way.handler(request)
             except SurveyError as error:
                 kind = {"cancelled": True} if isinstance(error, CancelledError) else {}
                 kind |= {"retry": True} if isinstance(error, ChangedError | BusyError) else {}
-                return JSONResponse({"error": message(str(error)), "version": self.bench.version, **kind}, 409)
+                return JSONResponse({"error": message(str(error)), "version": self.shown.version, **kind}, 409)
             except OSError as error:
                 return JSONResponse({"error": f"{error.filename}: {error.strerror}"}, 409)
             except (BodyError, ClientDisconnect) as error:
@@ -177,58 +217,60 @@ class Server:
 
     async def _state(self, _request: Request) -> Response:
         self._asked.set()
-        found = await asyncio.to_thread(views.state, self.bench)
+        found = await asyncio.to_thread(self.shown.state)
         response = JSONResponse(found | {"running": self._running})
         response.set_cookie(self.cookie, self.token, httponly=True, samesite="strict")
         return response
 
-    def _view(self, view: Callable[[Workbench], dict[str, Any]]) -> _Handler:
+    def _view(self, name: str) -> _Handler:
         async def answering(_request: Request) -> Response:
-            return JSONResponse(await self._run("view", lambda: view(self.bench)))
+            return JSONResponse(await self._run("view", getattr(self.bench, name)))
 
         return answering
 
     async def _points(self, request: Request) -> Response:
         q = request.query_params
         camera, _, epoch = q.get("image", "").partition("/")
-        worst = int(q["worst"]) if q.get("worst", "").isdecimal() else 0
-        known = int(q["layout"]) if q.get("layout", "").isdecimal() else None
-        most = min(worst, _MOST_ROWS)
-        data = await self._run("view", lambda: views.points(self.bench, camera, epoch, most, known))
+        known, most = whole_of(request, "layout"), min(whole_of(request, "worst") or 0, _MOST_ROWS)
+        data = await self._run("view", lambda: self.bench.points(camera, epoch, most, known))
         return Response(data, media_type="application/octet-stream")
 
     async def _statistics(self, request: Request) -> Response:
         part = request.path_params["part"]
-        return JSONResponse(await self._run("statistics", lambda: views.statistics_part(self.bench, part)))
+        return JSONResponse(await self._run("statistics", lambda: self.bench.statistics_part(part)))
 
     async def _compare(self, request: Request) -> Response:
-        a, b = (int(q) if (q := request.query_params.get(k, "")).isdecimal() else None for k in "ab")
-        most = request.query_params.get("most", "")
+        a, b = (whole_of(request, k) for k in "ab")
         found = await self._run("compare", lambda: self.bench.compare(a, b))
-        return JSONResponse(found.as_dict(int(most) if most.isdecimal() else None))
+        return JSONResponse(found.as_dict(whole_of(request, "most")))
 
     async def _camera(self, request: Request) -> Response:
         camera, distance = request.path_params["camera"], distance_of(request)
-        return JSONResponse(await self._run("view", lambda: cameras.camera_view(self.bench, camera, distance)))
+        return JSONResponse(await self._run("view", lambda: self.bench.camera_view(camera, distance)))
 
     async def _difference(self, request: Request) -> Response:
-        camera, distance, q = request.path_params["camera"], distance_of(request), request.query_params
-        run = int(q["run"]) if q.get("run", "").isdecimal() else None
-        other, bench = q.get("other", ""), self.bench
-        return JSONResponse(await self._run("view", lambda: cameras.lens_change(bench, camera, run, other, distance)))
+        camera, distance = request.path_params["camera"], distance_of(request)
+        run, other = whole_of(request, "run"), request.query_params.get("other", "")
+        return JSONResponse(await self._run("view", lambda: self.bench.lens_change(camera, run, other, distance)))
+
+    async def _halves(self, request: Request) -> Response:
+        distance = distance_of(request)
+        found = await self._run("compare", lambda: self.bench.cross_validate(distance))
+        cameras = [c.summary() | c.pixels() for c in found.cameras]
+        return JSONResponse(plain(found.summary() | {"version": self.bench.version, "cameras": cameras}))
 
     async def _image(self, request: Request) -> Response:
         key = request.path_params["camera"], request.path_params["epoch"]
         project = self.bench.situation.everything
-        asked = request.query_params.get("size", "1600")
-        size = None if asked == "full" else int(asked) if asked.isdecimal() and 0 < int(asked) <= 4096 else 1600
+        asked = whole_of(request, "size") or 1600
+        size = None if request.query_params.get("size") == "full" else asked if asked <= 4096 else 1600
         if key not in project.images:
             return JSONResponse({"error": "no such image"}, 404)
         tag = pictures.etag(project.detected.get(key), project.images[key], size)
         kept = {"ETag": tag, "Cache-Control": "private, no-cache"}
         if request.headers.get("if-none-match") == tag:
             return Response(status_code=304, headers=kept)
-        data, kind = await asyncio.to_thread(pictures.picture, project.images, key, size)
+        data, kind = await asyncio.to_thread(self.bench.picture, *key, size)
         return Response(data, media_type=kind, headers=kept)
 
     # acting
@@ -260,7 +302,7 @@ class Server:
 
     async def _decided(self, work: Callable[[], Any]) -> Response:
         await self._run("adjust", work)
-        return JSONResponse(await asyncio.to_thread(views.state, self.bench) | _changes(self.bench))
+        return JSONResponse(await asyncio.to_thread(self.bench.state) | self._changed())
 
     async def _remedy(self, request: Request) -> Response:
         body = Body(await json_of(request))
@@ -279,12 +321,12 @@ class Server:
         return answering
 
     async def _restore(self, request: Request) -> Response:
-        number, base = request.path_params["number"], Body(await json_of(request)).base()
+        number, base = _run_of(request), Body(await json_of(request)).base()
         return await self._decided(lambda: self.bench.restore(number, base))
 
     async def _pin(self, request: Request) -> Response:
-        number, pinned = request.path_params["number"], Body(await json_of(request)).flag("pinned")
-        run = await self._run("pin", lambda: pin_run(self.bench.folder, number, pinned))
+        number, pinned = _run_of(request), Body(await json_of(request)).flag("pinned")
+        run = await self._run("pin", lambda: self.bench.pin(number, pinned))
         return JSONResponse(run.as_dict())
 
     async def _reload(self, _request: Request) -> Response:
@@ -294,32 +336,47 @@ class Server:
         outcome = await self._run("save", self.bench.save)
         return JSONResponse(outcome.summary())
 
-    async def _job(self, request: Request) -> Response:
-        """One of ``JOBS``; what it said, and the state after it."""
-        name, body = request.path_params["name"], Body(await json_of(request))
-        if name not in JOBS:
-            raise SurveyError(f"there is no job {name!r}; {suggestion(name, JOBS)}")
+    def _job(self, name: str) -> _Handler:
+        """A job: what it said, and the state after it."""
+        async def answering(request: Request) -> Response:
+            body = Body(await json_of(request))
+            bench = self.shown if name in ("init", "show") else self.bench
 
-        def found(report: Any) -> None:
-            self.live.post({"type": "detected"} | pictures.found_in(report))
+            def found(report: Any) -> None:
+                self.live.post({"type": "detected"} | pictures.found_in(report))
 
-        told = await self._run(name, lambda: JOBS[name](self.bench, body, found))
-        if name in ("init", "show"):
-            await self._run("adjust", lambda: self._show(Path(told.summary["folder"])))
-        return JSONResponse(told.as_dict() | {"state": await asyncio.to_thread(views.state, self.bench)})
+            told = await self._run(name, lambda: JOBS[name].run(bench, body, found))
+            if name in ("init", "show"):
+                await self._run("adjust", lambda: self._show(Path(told.summary["folder"])))
+            return JSONResponse(told.as_dict() | {"state": await asyncio.to_thread(self.bench.state)})
+
+        return answering
+
+    async def _no_job(self, request: Request) -> Response:
+        name = request.path_params["name"]
+        raise SurveyError(f"there is no job {name!r}; {suggestion(name, JOBS)}")
 
     def _show(self, folder: Path) -> None:
         """Another project from now on; one of which nothing is found yet says what is missing."""
-        bench = Workbench(folder, read_only=self.bench.read_only, watch=self._progress)
+        bench = Workbench(folder, read_only=self.shown.read_only, watch=self._progress)
         with suppress(SurveyError):
             bench.adjust()
-        self.bench = bench
+        self.shown = bench
 
     async def _cancel(self, _request: Request) -> Response:
         self.bench.cancel()
         return JSONResponse({})
 
+    async def _changes(self, _request: Request) -> Response:
+        return JSONResponse(await self._run("view", self._changed))
 
-def _changes(bench: Workbench) -> dict[str, Any]:
-    found = bench.changes
-    return {"version": bench.version, "changes": None if found is None else found.as_dict(500)}
+    def _changed(self) -> dict[str, Any]:
+        found = self.bench.changes
+        return {"version": self.bench.version, "changes": None if found is None else found.as_dict(500)}
+
+
+def _run_of(request: Request) -> int:
+    number = whole_of(request, "number")
+    if number is None:
+        raise SurveyError("a run has a number; 'labsurvey runs FOLDER' lists them")
+    return number

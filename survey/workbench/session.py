@@ -11,16 +11,16 @@ itself. Only the third is found anew by every adjustment, which begins at the va
 """
 
 from dataclasses import replace
-from typing import Any
 
-from survey.jobs.adjusting.job import run_info
 from survey.jobs.detecting import author_name
 from survey.jobs.excluding import FILE
 from survey.project.exclusions import Row
 from survey.project.project import DEFINITION_FILE
 from survey.solution.earlier.changes import Changes, Snapshot, snapshot, solution_changes
-from survey.solution.earlier.runs import definition_of, find_run, load_run
+from survey.solution.earlier.runs import Run, definition_of, find_run, load_run, pin_run
+from survey.workbench import cameras, views
 from survey.workbench.jobs import Jobs
+from survey.workbench.pictures import picture
 
 
 class Workbench(Jobs):
@@ -28,6 +28,20 @@ class Workbench(Jobs):
 
     read_only: nothing is ever written. watch: called with (iteration, v'Pv) while something is adjusted.
     """
+
+    state = views.state
+    points = views.points
+    readings = views.readings
+    parameters = views.parameters
+    findings = views.findings
+    scene = views.scene
+    loops = views.loops
+    network = views.network
+    table_residuals = views.table_residuals
+    statistics_part = views.statistics_part
+    runs = views.runs
+    camera_view = cameras.camera_view
+    lens_change = cameras.lens_change
 
     def restore(self, number: int, base: int | None = None) -> tuple[str, ...]:
         """survey.toml and exclusions as they were at a run, as one decision; what else has changed since, for people.
@@ -58,6 +72,11 @@ class Workbench(Jobs):
     def _snapshot(self, number: int | None) -> Snapshot:
         return snapshot(self.adjustment) if number is None else load_run(self.folder, number)
 
-    def run(self) -> Any:
-        """What was run, for reports."""
-        return run_info(self.situation.project, {})
+    def pin(self, number: int, pinned: bool = True) -> Run:
+        """Keep a run for ever, or no more. Raises SurveyError."""
+        self._require_writable()
+        return pin_run(self.folder, number, pinned)
+
+    def picture(self, camera_id: str, epoch_id: str, size: int | None = None) -> tuple[bytes, str]:
+        """An image as bytes and their media type, as :func:`survey.workbench.pictures.picture`."""
+        return picture(self.situation.everything.images, (camera_id, epoch_id), size)

@@ -21,23 +21,23 @@ from survey.solution.earlier.runs import list_runs
 from survey.solution.frames import AdjustedFrames
 from survey.solution.quantities import ARCSEC_PER_RAD, sigma_unit_for_people, sigmas_of, status_of, unit_for_people
 from survey.solution.verdict import suspects
+from survey.workbench.jobs import Jobs
 from survey.workbench.places import Places, refs_of
 from survey.workbench.rows import BY_THIS_RUN, IN_USE, columns, reading_rows
-from survey.workbench.session import Workbench
 
 _MOST_FINDINGS = 100
 _MOST_FITTING = 20
 _CAUSE = "probable cause: "
 
 
-def limits(bench: Workbench) -> tuple[float, float]:
+def limits(bench: Jobs) -> tuple[float, float]:
     """Of |w| of image points (square root of the chi-square test's) and of other observations."""
     adjustment = bench.situation.adjustment
     found = bench.kept if adjustment is None else suspects(adjustment)
     return (1.0, 1.0) if found is None else (float(np.sqrt(found.image_limit)), found.w_limit)
 
 
-def state(bench: Workbench) -> dict[str, Any]:
+def state(bench: Jobs) -> dict[str, Any]:
     """What there is, how it stands, and what can be done; the tree of names among it."""
     now = bench.situation
     solved = now.adjustment
@@ -69,13 +69,13 @@ def _in_words(summary: Mapping[str, Any]) -> dict[str, Any]:
     return {**summary, "reason": message(str(summary["reason"]))}
 
 
-def _warnings(bench: Workbench) -> Sequence[str]:
+def _warnings(bench: Jobs) -> Sequence[str]:
     """Of the solution, or of the results until there is one."""
     found = bench.situation.adjustment or bench.kept
     return () if found is None else found.warnings
 
 
-def _tree(bench: Workbench) -> dict[str, Any]:
+def _tree(bench: Jobs) -> dict[str, Any]:
     survey, project = bench.situation.survey, bench.situation.project
     images: dict[str, list[str]] = {c.camera_id: [] for c in survey.cameras}
     seen = dict.fromkeys([*project.images, *((b.camera_id, b.epoch_id) for b in survey.image_blocks)])
@@ -92,7 +92,7 @@ def _tree(bench: Workbench) -> dict[str, Any]:
 
 
 def points(
-    bench: Workbench, camera: str = "", epoch: str = "", worst: int = 0, known: int | None = None
+    bench: Jobs, camera: str = "", epoch: str = "", worst: int = 0, known: int | None = None
 ) -> bytes:
     """Image points as :func:`survey.workbench.rows.columns`: all, those of one image, or the ``worst`` by |w|.
 
@@ -107,7 +107,7 @@ def points(
     return columns(rows, limits(bench)[0], bench.version, chosen, bench.layout, whole)
 
 
-def readings(bench: Workbench) -> dict[str, Any]:
+def readings(bench: Jobs) -> dict[str, Any]:
     """All observations that are no image points."""
     now = bench.situation
     limit = limits(bench)[1]
@@ -115,7 +115,7 @@ def readings(bench: Workbench) -> dict[str, Any]:
     return {"version": bench.version, "limit": limit, "rows": rows}
 
 
-def parameters(bench: Workbench) -> dict[str, Any]:
+def parameters(bench: Jobs) -> dict[str, Any]:
     """Every component of every parameter: value, sigma and status in the units shown, as columns."""
     out: dict[str, list[Any]] = {k: [] for k in ("name", "component", "value", "unit", "sigma", "sigma_unit", "status")}
     for name, e in bench.adjustment.estimates.items():
@@ -134,7 +134,7 @@ def parameters(bench: Workbench) -> dict[str, Any]:
     return {"version": bench.version, "sigmas": bench.scale.sigmas, "columns": plain(out)}
 
 
-def findings(bench: Workbench) -> dict[str, Any]:
+def findings(bench: Jobs) -> dict[str, Any]:
     """The verdict, warnings, and what is suspect or was left out by this run, worst first, each with its remedies.
 
     remedies: what the diagnosis says would mend it; also of a survey that cannot be adjusted, of which nothing else is
@@ -149,14 +149,14 @@ def findings(bench: Workbench) -> dict[str, Any]:
     return dict(plain({"version": bench.version, **known, "remedies": remedies(bench)}))
 
 
-def remedies(bench: Workbench) -> list[dict[str, Any]]:
+def remedies(bench: Jobs) -> list[dict[str, Any]]:
     """The candidates of the diagnosis, the best first: cause, change, evidence, and whether a program can do it."""
     out = []
     for number, candidate in enumerate(bench.remedies, start=1):
         h = candidate.hypothesis
         out.append({
-            "number": number, "name": h.name, "cause": h.cause, "change": h.change, "possible": bool(h.edits),
-            "where": candidate.where,
+            "number": number, "name": h.name, "cause": message(h.cause), "change": message(h.change),
+            "possible": bool(h.edits), "where": candidate.where,
             "anchor": _anchor_of(h.place), "explained": candidate.explained, "statistic": candidate.statistic,
             "critical": candidate.critical, "probability": candidate.probability, "sigma0": candidate.sigma0,
         })  # fmt: skip
@@ -168,7 +168,7 @@ def _anchor_of(place: Place) -> str | None:
     return anchor(place.kind, "/".join(place.ids)) if place.kind in ANCHORED and place.ids else None
 
 
-def _of_solution(bench: Workbench, summary: Mapping[str, Any]) -> dict[str, Any]:
+def _of_solution(bench: Jobs, summary: Mapping[str, Any]) -> dict[str, Any]:
     (image_limit, limit), warnings = limits(bench), _warnings(bench)
     found = [*_of_points(bench, image_limit), *_of_readings(bench, limit)]
     worst = sorted(found, key=lambda f: -(f["share"] or 0.0))
@@ -189,7 +189,7 @@ def _said(text: str) -> dict[str, Any]:
     return {"text": message(text), "anchors": anchors_in(text)}
 
 
-def _of_points(bench: Workbench, limit: float) -> Iterable[dict[str, Any]]:
+def _of_points(bench: Jobs, limit: float) -> Iterable[dict[str, Any]]:
     rows = bench.rows
     test = np.where((rows.why == IN_USE) | (rows.why == BY_THIS_RUN), np.nan_to_num(rows.test, nan=-1.0), -1.0)
     most = min(_MOST_FINDINGS + _MOST_FITTING, len(test))
@@ -205,13 +205,13 @@ def _of_points(bench: Workbench, limit: float) -> Iterable[dict[str, Any]]:
             }  # fmt: skip
 
 
-def _exclude(bench: Workbench, name: str, row: int | None = None) -> dict[str, Any]:
+def _exclude(bench: Jobs, name: str, row: int | None = None) -> dict[str, Any]:
     if row is not None and row >= sum(len(b.uv) for b in bench.situation.everything.survey.image_blocks):
         name = bench.spot_name(row)
     return {"label": f"exclude {name}", "changes": [{"name": name, "excluded": True}]}
 
 
-def _of_readings(bench: Workbench, limit: float) -> Iterable[dict[str, Any]]:
+def _of_readings(bench: Jobs, limit: float) -> Iterable[dict[str, Any]]:
     for row in readings(bench)["rows"]:
         if row["w"] is not None and row["why"] in (IN_USE, BY_THIS_RUN):
             yield {
@@ -222,7 +222,7 @@ def _of_readings(bench: Workbench, limit: float) -> Iterable[dict[str, Any]]:
             }  # fmt: skip
 
 
-def _of_images(bench: Workbench, failing: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _of_images(bench: Jobs, failing: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Images of which a fifth of the points or more do not fit: the image is wrong rather than each of them."""
     counts: dict[str, int] = {}
     for f in failing:
@@ -238,23 +238,23 @@ def _of_images(bench: Workbench, failing: list[dict[str, Any]]) -> list[dict[str
     return out
 
 
-def runs(bench: Workbench) -> dict[str, Any]:
+def runs(bench: Jobs) -> dict[str, Any]:
     """The runs that were kept, the last first."""
     return {"version": bench.version, "runs": [r.as_dict() for r in reversed(list_runs(bench.folder))]}
 
 
-def scene(bench: Workbench) -> dict[str, Any]:
+def scene(bench: Jobs) -> dict[str, Any]:
     """Cameras, targets, tables, points and stations in the world (m), covariances (m^2) as sigmas are given."""
     return {"version": bench.version, **scene_values(bench.adjustment, bench.scale)}
 
 
-def loops(bench: Workbench) -> dict[str, Any]:
+def loops(bench: Jobs) -> dict[str, Any]:
     """Loops of measured pairs and how they close, the worst first; None where there are none."""
     solution = solution_dict(bench.adjustment, bench.run(), None)
     return {"version": bench.version, "loops": solution.get("loops"), "network": solution.get("network")}
 
 
-def table_residuals(bench: Workbench) -> dict[str, Any]:
+def table_residuals(bench: Jobs) -> dict[str, Any]:
     """Residuals of turntables (arcsec) over the adjusted angles (deg) of all their axes, by table, in use or not."""
     out: dict[str, list[dict[str, Any]]] = {}
     for o in bench.adjustment.other_residuals:
@@ -275,7 +275,7 @@ PARTS = {
 """What statistics there are, by the key of ``solution.json`` that has them; ``solution``: all of it."""
 
 
-def statistics_part(bench: Workbench, part: str) -> dict[str, Any]:
+def statistics_part(bench: Jobs, part: str) -> dict[str, Any]:
     """A part of what ``solution.json`` says, one of ``PARTS``; computed when first asked for. Raises SurveyError."""
     if part not in PARTS:
         raise SurveyError(f"there are no statistics {part!r}; {suggestion(part, PARTS)}")
@@ -283,7 +283,7 @@ def statistics_part(bench: Workbench, part: str) -> dict[str, Any]:
     return {"version": bench.version, part: solution if key is None else solution[key]}
 
 
-def network(bench: Workbench) -> dict[str, Any]:
+def network(bench: Jobs) -> dict[str, Any]:
     """Every reading that joins places, and the set-ups of instruments.
 
     lines: ``id``, ``table``, ``kind``, ends in the world ``x`` (m), largest ``w`` of its components and ``share`` of

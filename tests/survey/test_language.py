@@ -4,6 +4,7 @@ import ast
 import re
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -28,6 +29,17 @@ from survey.report.language import (
 SURVEY, ADJUST = (Path(str(package.__file__)).parent for package in (survey, adjust))
 PAGES = (*SURVEY.glob("report/**/*.py"), *SURVEY.glob("batch/*.py"))  # what is said in the reader's language
 TEMPLATES = SURVEY / "report" / "templates"
+TERMINAL = ("beforehand.py", "between.py", "trajectory.py")
+"""What speaks on a terminal alone, of the diagnosis; its room ``table`` makes warnings, not causes."""
+NAMES = """angles from another zero|axes or unit of given coordinates|axis of a table runs out|cameras exchanged
+cameras not simultaneous|clock drift|clock offset|correlated observations|encoder of a table|epochs exchanged
+epochs shifted|focus touched|gear ratio|gear ratio of axis 7|given points exchanged|images copied|images mirrored
+images of another camera|images resized|images shifted|images turned|instrument height|left-handed frames|lens drifts
+motion forgotten|odd sigma|order of Euler angles|order of quaternions|pairs inverted|pixel origin|point moved
+points exchanged|prism constant|rolling shutter|rotations inverted|rows and columns|rows of another set-up
+sense of rotation|set-up turned|shift in other axes|sigmas of a group|sign of height differences|slipped decimal
+station moved|table moved|targets exchanged|the same twice|unit of angles|unit of lengths|unit of shifts"""
+"""Kinds of causes: names by which programs tell them apart, shown to nobody."""
 OTHERS = [language for language in LANGUAGES if language != "en"]
 
 
@@ -79,7 +91,11 @@ def test_nothing_stale_remains(language: str) -> None:
     used = near | {x.removeprefix("<") for x in near} | said_by_templates() | {x.replace("_", " ") for x in far}
     assert set(catalogue(language).texts) - used == set()
     everything = "\n".join(far)
-    for pattern, _ in catalogue(language).messages:
+    sentences = catalogue(language).sentences
+    for sentence in sentences:
+        words = max(re.split(r"\{[nw]?\}|[^A-Za-z' ]", sentence), key=len).split()
+        assert all(word in everything for word in words), sentence
+    for pattern, _ in catalogue(language).messages[len(sentences) :]:
         words = re.findall(r"[a-z][a-z' ]+[a-z']", re.sub(r"\((?:\?:)?[^()]*(?<!\\)\)|\\S", "|", pattern))
         assert " ".join(max(words, key=len).split()[-4:]) in everything, pattern
 
@@ -91,6 +107,48 @@ def test_translations_take_what_the_texts_give(language: str) -> None:
         assert re.findall(r"<[^>]*>", english) == re.findall(r"<[^>]*>", said), english
     for pattern, said in catalogue(language).messages:
         assert re.compile(pattern).groups == said.count("{}"), pattern
+
+
+def ways(node: ast.AST | None) -> list[str]:
+    """What a text may be: every choice within it, and 7 for a value."""
+    if isinstance(node, ast.JoinedStr):
+        return ["".join(parts) for parts in product(*map(ways, node.values))]
+    if isinstance(node, ast.FormattedValue):
+        return ways(node.value)
+    if isinstance(node, ast.IfExp):
+        return ways(node.body) + ways(node.orelse)
+    if isinstance(node, ast.BinOp) and isinstance(node.left, ast.Constant) and isinstance(node.left.value, str):
+        return ["", node.left.value]  # as often as a condition holds
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return [re.sub(r"\{[^{}]+\}|\{\}", "7", node.value)]
+    return ["7"]
+
+
+def said_by_diagnosis() -> set[str]:
+    """Sentences of causes and remedies, and what they are put together from."""
+    out = set()
+    for path in ADJUST.glob("diagnosis/**/*.py"):
+        if path.name not in TERMINAL and path.parent.name != "table":
+            out |= set(_said(ast.parse(path.read_text(encoding="utf-8"))))
+    out = {re.sub("(?<=[a-z])7", ": 7", re.sub("7(?=[a-z])", "7 ", x)) for x in out}  # values with signs of their own
+    return {x for x in out if re.search("[A-Za-z]{2,} [a-z]{2,}", x)} - set(re.split(r"[|\n]", NAMES))
+
+
+def _said(node: ast.AST) -> Iterator[str]:
+    if isinstance(node, ast.JoinedStr | ast.Constant):
+        yield from (text.strip(" ;:,") for text in ways(node))
+    elif not isinstance(node, ast.Raise) and not (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)):
+        for child in ast.iter_child_nodes(node):
+            yield from _said(child)
+
+
+@pytest.mark.parametrize("language", OTHERS)
+def test_causes_and_remedies_have_their_translation(language: str) -> None:
+    said = said_by_diagnosis()
+    assert len(said) > 150
+    with speaking(language):
+        assert {x for x in said if message(x) == x} == set()
+        assert {x for x in map(message, said) if re.search(r"\b(the|is|are|its|of|and|or|to|from|them)\b", x)} == set()
 
 
 def test_a_text_that_is_missing_is_a_bug() -> None:

@@ -42,6 +42,18 @@ def test_cameras_sizes_and_board_are_read_out_of_the_images(images, tmp_path, ca
     assert (tmp_path / "new/survey.toml").read_text() == text
 
 
+def test_images_that_lie_in_the_project_already_stay(images, tmp_path):
+    shutil.copytree(images, tmp_path / "lab/images")
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "lab/images").glob("*/*")}
+    assert start_project(tmp_path / "lab/images", tmp_path / "lab").board == (9, 6)
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "lab/images").glob("*/*")} == before
+    assert read(tmp_path / "lab").images.keys() == read(images.parent).images.keys()
+    shutil.copytree(images / "left", tmp_path / "flat/images")
+    with pytest.raises(SurveyError, match="in a folder of their camera"):
+        start_project(tmp_path / "flat/images", tmp_path / "flat")
+    assert not (tmp_path / "flat/survey.toml").exists()
+
+
 def test_one_folder_is_one_camera_and_a_name_may_be_anything(images, tmp_path):
     place = tmp_path / 'my "camera" 1'
     shutil.copytree(images / "left", place, ignore=shutil.ignore_patterns("e03*", "e04*"))

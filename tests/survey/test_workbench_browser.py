@@ -13,11 +13,14 @@ import pytest
 
 import capture.web
 from survey.examples import write_example
+from survey.project import write_project
 from survey.report.language import catalogue
 from survey.report.modules import WEB as SHARED
 from survey.report.terminal import summary_text
+from survey.simulate import stereo
 from survey.workbench.guard import new_token
 from survey.workbench.live import Listening
+from survey.workbench.pages.beginning import Beginning
 from survey.workbench.rows import columns
 from survey.workbench.server import WEB, Server
 from survey.workbench.session import Workbench
@@ -217,7 +220,7 @@ def said_by_the_page() -> set[str]:
     views = re.search(r"const VIEWS = \{.*?\n\};", app, re.DOTALL)
     assert views is not None
     found |= set(re.findall(r': \["([^"]+)"', views[0]))
-    for line in re.findall(r"const (?:REGIONS|TABLES) = .*", app + sources["tables.js"]):
+    for line in re.findall(r"const (?:REGIONS|TABLES) = .*", sources["frame.js"] + sources["tables.js"]):
         found |= set(re.findall(r'(?:", |: )"([^"]+)"', line))
     found |= {"not started", "running", "paused", "finished", "stopped", "broken off", "live"}  # states of a session
     jobs = re.search(r"const JOBS = \[.*?\n\];", sources["jobs.js"], re.DOTALL)
@@ -263,6 +266,24 @@ def test_a_million_points_are_sorted_and_filtered_without_a_pause(page: Page) ->
     assert chosen < 4000.0
 
 
+def test_of_a_solution_that_has_gone_the_page_keeps_nothing(browser: Any, tmp_path: Path) -> None:
+    """Bytes that the page holds of each image point once one was left out and taken back: its columns have 49."""
+    write_project(tmp_path / "lab", stereo(3, n_pairs=300)[0])
+    token = new_token()
+    with Listening(Server(Workbench(tmp_path / "lab"), token), "127.0.0.1", 0) as listening:
+        page = Page(browser, f"{listening.address}#token={token}", 1280, "document.body.dataset.results !== undefined")
+        p = page.page
+        p.locator("#tables .row.head button").nth(4).click()
+        p.locator("#tables .rows .row").nth(2).click()
+        for keys in (("x", "w", "h", "y", "Enter"), ("u",)):
+            page.done(lambda keys=keys: [p.keyboard.press(key) for key in keys])
+        session = page.context.new_cdp_session(p)
+        session.send("HeapProfiler.collectGarbage")
+        held = session.send("Runtime.getHeapUsage")["backingStorageSize"] / (p.evaluate(ROWS) - 1)
+        page.context.close()
+    assert 20.0 < held < 65.0
+
+
 def test_columns_as_the_page_reads_them(page: Page, folder: Path) -> None:
     bench = Workbench(folder, read_only=True)
     bench.adjust()
@@ -284,6 +305,27 @@ def test_what_others_write_is_told_and_loaded(page: Page, folder: Path) -> None:
     page.wait("document.querySelector('#message').textContent.includes('survey.toml')")
     page.done(lambda: p.locator("#message button").click())
     assert p.inner_text("#title").startswith("again ")
+
+
+def test_a_folder_of_images_becomes_a_project_on_the_page(browser: Any, tmp_path: Path) -> None:
+    """Its survey.toml is gone; the images lie where those of a project do, and stay."""
+    write_example("one-camera", tmp_path / "lab")
+    for name in sorted((tmp_path / "lab/images").glob("*/*"))[3:]:
+        name.unlink()
+    (tmp_path / "lab/survey.toml").unlink()
+    images = {path: path.read_bytes() for path in (tmp_path / "lab/images").glob("*/*")}
+    token = new_token()
+    with Listening(Server(Beginning(tmp_path / "lab"), token), "127.0.0.1", 0) as listening:
+        page = Page(browser, f"{listening.address}#token={token}", 390)
+        p = page.page
+        assert "holds images and no survey.toml" in p.inner_text("#left")
+        assert p.evaluate("document.documentElement.scrollWidth") <= 390
+        page.done(lambda: p.locator("#begin").click())
+        page.wait("document.querySelector('#left .verdict')?.textContent.includes('nothing to adjust')")
+        page.context.close()
+    assert (tmp_path / "lab/survey.toml").read_text().startswith("# Begun by labsurvey init")
+    assert {path: path.read_bytes() for path in (tmp_path / "lab/images").glob("*/*")} == images
+    assert [text for text in page.complaints if "409" not in text] == []
 
 
 def test_images_are_detected_and_shown_as_they_come(browser: Any, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """The local server of the workbench: what it refuses, what it answers, and the loop of a mistake found and mended."""
 
+import inspect
 import json
 import re
 import shutil
@@ -19,12 +20,14 @@ from websockets.sync.client import connect
 from survey.cli import main
 from survey.report.language import message, speaking
 from survey.workbench.live import Listening
-from survey.workbench.server import Server
+from survey.workbench.pages.beginning import Beginning
+from survey.workbench.server import WEB, Server
 from survey.workbench.session import Workbench
 from tests.survey.test_workbench import exclusions, wrong_point
 
 TOKEN = "secret-token-of-this-test"
 HERE = {"X-Token": TOKEN}
+BASE = "http://127.0.0.1:8790"
 LIVE = "ws://127.0.0.1:8790/live"
 
 
@@ -37,7 +40,7 @@ def mine(lab, tmp_path):
 def page(folder, read_only=False):
     bench = Workbench(folder, read_only=read_only)
     bench.adjust()
-    with TestClient(Server(bench, TOKEN).app(), base_url="http://127.0.0.1:8790") as client:
+    with TestClient(Server(bench, TOKEN).app(), base_url=BASE) as client:
         yield client
 
 
@@ -120,12 +123,42 @@ def test_bodies_that_are_too_long_or_no_sense(mine):
         assert not exclusions(mine)
 
 
-def test_read_only_is_get_only(mine):
+def ways(folder):
+    return Server(Workbench(folder), TOKEN).ways()
+
+
+def test_reading_only_allows_what_changes_no_file_and_nothing_else(mine, tmp_path):
+    """Every address is asked; those that say that they change nothing with what makes them work."""
+    other = shutil.copytree(mine, tmp_path / "other")
+    bodies = {"/api/preview": {"changes": [{"name": f"image:{image_of(mine)}", "excluded": True}]},
+              "/api/jobs/compare": {"folder": "other"}, "/api/jobs/show": {"folder": "other"},
+              "/api/adjust": {"mode": "cold"}}  # fmt: skip
+    files = {p: p.read_bytes() for at in (mine, other) for p in at.rglob("*") if p.is_file()}
     with page(mine, read_only=True) as client:
-        assert client.get("/api/findings", headers=HERE).status_code == 200
-        for path in ("exclusions", "adjust", "undo", "save", "runs/1/restore"):
-            assert post(client, f"/api/{path}", {}).status_code == 403
-    assert not exclusions(mine)
+        for way in ways(mine):
+            path = way.path.replace("{number:int}", "1").replace("{camera}/{epoch}", image_of(mine))
+            path = path.replace("{camera}", "left").replace("{part}", "weak").replace("{name}", "none")
+            if way.method == "GET":
+                assert client.get(path, headers=HERE).status_code in (200, 404, 409), path
+                continue
+            status = post(client, path, bodies.get(path, {})).status_code
+            assert (status == 403) == way.changes, path
+            assert way.changes or status == 200 or not way.calls, path
+    now = {p: p.read_bytes() for at in (mine, other) for p in at.rglob("*") if p.is_file()}
+    assert now == files
+
+
+def test_every_address_is_a_function_of_the_python_interface(mine):
+    """And what the scripts of the page ask for is an address."""
+    found = ways(mine)
+    for way in found:
+        for name in way.calls:
+            assert name in vars(Workbench(mine)) or inspect.getdoc(getattr(Workbench, name)), name
+    assert {"state", "exclude", "undo", "save", "plan", "detect"} <= {name for way in found for name in way.calls}
+    known = {re.sub(r"\{.*", "", way.path.removeprefix("/api/")).split("/")[0] for way in found}
+    asked = {name for p in WEB.glob("*.js") for name in re.findall(r'\b(?:get|post)\([`"]([a-z_]+)', p.read_text())}
+    assert len(asked) > 10
+    assert asked <= known
 
 
 def test_the_socket_needs_origin_and_token(mine):
@@ -252,7 +285,7 @@ def test_what_there_is_is_shown_while_the_first_solution_is_waited_for(mine, kep
     server = Server(bench, TOKEN)
     server.patience_s = 0.0  # no page joins here
     bench.watch = lambda _step, _omega: seen.wait(20.0)
-    with TestClient(server.app(), base_url="http://127.0.0.1:8790") as client:
+    with TestClient(server.app(), base_url=BASE) as client:
         state = client.get("/api/state", headers=HERE).json()
         assert state["solution"] is None
         assert (state["kept"] is not None) == kept
@@ -299,6 +332,44 @@ def test_a_page_that_knows_the_rows_gets_what_the_solution_says_of_them(mine):
         assert changed["used"].sum() < seen["used"].sum()
         assert post(client, "/api/reload", {}).status_code == 200
         assert points(client, f"?layout={first['layout']}")[0]["whole"], "they may be others now"
+
+
+def images_alone(place, *names):
+    for name in names:
+        (place / name).parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(place / name), np.full((60, 80), 90, np.uint8))
+    return place
+
+
+def test_a_folder_of_images_is_offered_to_begin_a_project_with(tmp_path):
+    folder = images_alone(tmp_path / "lab", "X/e1.png", "X/e2.png", "Y/e1.png")
+    for read_only in (True, False):
+        with TestClient(Server(Beginning(folder, read_only=read_only), TOKEN).app(), base_url=BASE) as client:
+            found = client.get("/api/state", headers=HERE).json()["beginning"]
+            assert found["cameras"] == {"X": 2, "Y": 1}
+            assert found["folder"].endswith("lab-project")
+            refused = client.get("/api/findings", headers=HERE)
+            assert (refused.status_code, "begin a project" in refused.json()["error"]) == (409, True)
+            assert client.get("/api/image/X/e1", headers=HERE).status_code == 409
+            answer = post(client, "/api/jobs/init", {k: found[k] for k in ("images", "folder")})
+            assert answer.status_code == (403 if read_only else 200)
+    assert answer.json()["state"]["tree"]["cameras"][0]["images"] == ["e1", "e2"]
+    assert sorted(p.name for p in folder.rglob("*") if p.is_file()) == ["e1.png", "e1.png", "e2.png"]
+
+
+@pytest.mark.parametrize(("make", "says"), [
+    (lambda at: None, "no such folder"), (lambda at: at.mkdir(), "there is no survey.toml in it"),
+    (lambda at: at.write_text(""), "is a file"), (lambda at: images_alone(at, 'a"b/e1.png'), "that of the camera"),
+    (lambda at: images_alone(at, "X/e1.png", "X/e1.jpg"), "two images are named e1"),
+    (lambda at: (at.mkdir(), (at / "survey.toml").write_bytes(b"\xff\x00")), "survey.toml"),
+])  # fmt: skip
+def test_what_cannot_be_opened_is_said(tmp_path, capsys, make, says):
+    make(tmp_path / "lab")
+    assert main(["open", str(tmp_path / "lab"), "--no-browser", "--port", "0"]) == 1
+    said = capsys.readouterr().err
+    assert says in said
+    assert "lab" in said
+    assert "Traceback" not in said
 
 
 def test_messages_are_in_the_language_that_is_asked_for(mine):

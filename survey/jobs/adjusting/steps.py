@@ -144,10 +144,10 @@ def adjust_project(
     """
     others = (v for k, v in project.survey.others.items() if k != "table_readings")
     if not any((project.survey.image_blocks, project.spots, *others)):
-        raise SurveyError(
-            f"{project.folder}: there is nothing to adjust; put images at images/<camera_id>/<epoch_id>.png or tables "
-            "into observations/"
-        )
+        remedy = (f"no target is known in its {len(project.images)} images: labsurvey detect {project.folder}"
+                  if project.images else
+                  "put images at images/<camera_id>/<epoch_id>.png or tables into observations/")  # fmt: skip
+        raise SurveyError(f"{project.folder}: there is nothing to adjust; {remedy}")
     with tqdm(desc="adjusting", unit=" steps", disable=not progress, file=sys.stderr, leave=False) as bar:
 
         def told_bar(iteration: int, omega: float) -> None:

@@ -10,7 +10,6 @@ from survey.report import charts
 from survey.report.context import Context
 from survey.report.language import known, t
 from survey.report.markup import (
-from survey.solution.records import having
     code,
     count,
     element,
@@ -26,6 +25,7 @@ from survey.solution.records import having
     value_text,
     with_sigma,
 )
+from survey.solution.records import having
 
 _MOST_ROWS, _MOST_CAMERAS, _MOST_BLOCKS = 250, 40, 100
 _MANY_EPOCHS = 12

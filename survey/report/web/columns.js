@@ -4,7 +4,7 @@ const ARRAYS = { u1: Uint8Array, u2: Uint16Array, u4: Uint32Array, i4: Int32Arra
 
 /**
  * @typedef {{n: number, version: number, limit: number, blocks: {camera: string, epoch: string, target: string|null}[],
- *   points: Object<string, string[]>, block: Uint32Array, point: Uint32Array, u: Float32Array, v: Float32Array,
+ *   points: Object<string, string[]>, block: ArrayLike<number>, point: ArrayLike<number>, u: Float32Array, v: Float32Array,
  *   du: Float32Array, dv: Float32Array, w: Float32Array, used: Uint8Array, why: Uint8Array, images: string[],
  *   imageIdx: Map<string, number>, imageOf: Uint32Array, first: Uint32Array, rows: Uint32Array}} Points
  */

@@ -71,6 +71,32 @@ export function surface(label, draw) {
   return { canvas, redraw };
 }
 
+/** The largest 1, 2 or 5 times a power of ten that is not larger. @param {number} x */
+export function roundBelow(x) {
+  const power = 10 ** Math.floor(Math.log10(x || 1));
+  return power * ([5, 2, 1].find((k) => k * power <= x) ?? 1);
+}
+
+/**
+ * A length to compare with, at the lower left of a drawing.
+ * @param {CanvasRenderingContext2D} context @param {number} length px @param {number} y px from the top @param {string} text
+ */
+export function ruler(context, length, y, text) {
+  context.font = "11px system-ui, sans-serif";
+  context.setLineDash([]);
+  context.lineJoin = "round";
+  for (const [name, wide] of [["paper", 4], ["ink", 1.8]]) { // to be read on any picture
+    context.strokeStyle = colour(name);
+    context.lineWidth = wide;
+    context.beginPath();
+    context.moveTo(12, y - 4); context.lineTo(12, y); context.lineTo(12 + length, y); context.lineTo(12 + length, y - 4);
+    context.stroke();
+    if (name === "paper") context.strokeText(text, 18 + length, y + 2);
+  }
+  context.fillStyle = colour("ink");
+  context.fillText(text, 18 + length, y + 2);
+}
+
 const colours = new Map();
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => colours.clear());
 

@@ -1,7 +1,7 @@
 // One image: the picture, detected (o) and predicted (+) points, residual vectors enlarged, what is left out dashed.
 
-import { button, colour, make, surface } from "./dom.js";
-import { count, number, t } from "./words.js";
+import { button, colour, make, roundBelow, ruler, surface } from "./dom.js";
+import { count, number, significant, t } from "./words.js";
 import { current, names, select } from "./store.js";
 import { pointId, rowOf, rowsOfImage, rowsOfPoint, rowsWhere } from "./columns.js";
 
@@ -80,14 +80,17 @@ export class ImageView {
       const at = this.worstOf(kind === "point" ? rowsOfPoint(data, null, ids[0]) : rowsWhere(data, (b) => b.target === ids[0]));
       if (at >= 0) { const block = data.blocks[data.block[at]]; image = `${block.camera}/${block.epoch}`; if (kind === "point") this.row = at; }
     }
-    if (!image && data.images.length) {
+    if (!image && this.all.length) {
       const at = this.worstOf(data.rows), block = data.blocks[data.block[at]];
-      if (block) image = `${block.camera}/${block.epoch}`;
+      image = block ? `${block.camera}/${block.epoch}` : this.all[0];
     }
     if (image !== this.image) this.open(image);
     else if (this.row >= 0) this.keepInSight();
     this.surface.redraw();
   }
+
+  /** All images: those with points, or those of the project in which nothing was found yet. */
+  get all() { const { images } = this.bench.points; return images.length ? images : this.bench.images ?? []; }
 
   /** @param {ArrayLike<number>} rows */
   worstOf(rows) {
@@ -121,9 +124,9 @@ export class ImageView {
 
   /** Pictures of the same camera, or those of the same moment; only what is in sight is fetched. */
   film() {
-    const [camera, epoch] = this.image.split("/"), data = this.bench.points;
+    const [camera, epoch] = this.image.split("/");
     if (!this.picture || this.steady) return;
-    const all = data.images.filter((name) => name.startsWith(`${camera}/`)), at = all.indexOf(this.image);
+    const all = this.all.filter((name) => name.startsWith(`${camera}/`)), at = all.indexOf(this.image);
     const k = this.filmed?.indexOf(this.image) ?? -1, cut = (k < 6 && this.filmed?.[0] !== all[0]) || (k > FILM - 6 && this.filmed?.at(-1) !== all.at(-1));
     if (k < 0 || cut || this.filmedOf !== all.length) {
       const from = Math.max(0, Math.min(at - FILM / 2, all.length - FILM)), near = all.slice(from, from + FILM);
@@ -146,16 +149,20 @@ export class ImageView {
 
   async thumbnail(place) {
     this.seen.unobserve(place);
+    const { image } = place.dataset, context = place.querySelector("canvas").getContext("2d"), fit = (width, height) => { const scale = Math.min(96 / width, 72 / height); return [scale, (96 - scale * width) / 2, (72 - scale * height) / 2]; };
     try {
-      const bitmap = await this.picture(place.dataset.image, 240), canvas = place.querySelector("canvas");
-      const scale = Math.min(96 / bitmap.width, 72 / bitmap.height);
-      canvas.getContext("2d").drawImage(bitmap, (96 - scale * bitmap.width) / 2, (72 - scale * bitmap.height) / 2, scale * bitmap.width, scale * bitmap.height);
-    } catch { /* an image without a file keeps its name only */ }
+      const bitmap = await this.picture(image, 240), [scale, x, y] = fit(bitmap.width, bitmap.height);
+      context.drawImage(bitmap, x, y, scale * bitmap.width, scale * bitmap.height);
+    } catch { // of an image without a file its points are known
+      const data = this.bench.points, [scale, x, y] = fit(...this.size ?? [1280, 1024]);
+      context.fillStyle = colour("point-good");
+      for (const i of rowsOfImage(data, image)) context.fillRect(x + scale * data.u[i] - 1, y + scale * data.v[i] - 1, 2, 2);
+    }
   }
 
   /** The image before or after in the strip (`[`, `]`), or of the next epoch. @param {number} by */
   next(by, sameEpoch = false) {
-    const all = this.bench.points.images, [camera, epoch] = this.image.split("/");
+    const { all } = this, [camera, epoch] = this.image.split("/");
     const among = all.filter((name) => (sameEpoch ? name.endsWith(`/${epoch}`) : name.startsWith(`${camera}/`)));
     const to = among[(among.indexOf(this.image) + by + among.length) % among.length];
     if (to) select("image", to, true);
@@ -163,6 +170,9 @@ export class ImageView {
 
   /** All of the image in sight again. */
   whole() { this.fit = true; this.surface.redraw(); }
+
+  /** Marks and vectors on or off. */
+  toggle() { this.overlay = !this.overlay; this.surface.redraw(); }
 
   enlarge(by) {
     const at = SCALES.findIndex((scale) => scale >= this.enlarged);
@@ -243,9 +253,13 @@ export class ImageView {
     this.scale.textContent = !this.overlay ? t("overlay off (o)") : this.steady ? t("{n} points", { n: count(rows.length) }) : `v × ${count(this.enlarged)}`;
     this.scale.title = this.steady ? "" : t("residual vectors enlarged");
     if (this.overlay) this.marks(context, rows);
+    if (this.overlay && rows.length && !this.steady) { const step = roundBelow(110 / this.stretch); ruler(context, step * this.stretch, height - 12, t("{size} px of residuals", { size: significant(step, 1) })); }
     const out = rows.reduce((sum, i) => sum + (data.used[i] ? 0 : 1), 0);
     this.surface.canvas.setAttribute("aria-label", t("Image {image}: {n} points, {out} left out, residual vectors enlarged {k} times", { image: this.image, n: rows.length, out, k: this.enlarged }));
   }
+
+  /** Pixels of the screen for each pixel of a residual: less than the enlarged picture's where it is seen pixel by pixel. */
+  get stretch() { return this.enlarged * this.s / Math.max(1, this.s / 4); }
 
   sharper() {
     const image = this.image;
@@ -270,7 +284,7 @@ export class ImageView {
       if (here) { context.moveTo(x + size + 6, y); context.arc(x, y, size + 6, 0, 7); }
       const px = x + data.du[i] * this.s, py = y + data.dv[i] * this.s;
       if (this.s > 3) { context.moveTo(px - 4, py); context.lineTo(px + 4, py); context.moveTo(px, py - 4); context.lineTo(px, py + 4); }
-      const length = Number.isFinite(data.du[i]) ? this.enlarged * this.s / Math.max(1, this.s / 4) : 0;
+      const length = Number.isFinite(data.du[i]) ? this.stretch : 0;
       if (length) { context.moveTo(x, y); context.lineTo(x + length * data.du[i], y + length * data.dv[i]); }
       context.stroke();
       if (!wide && here && data.sigma_u) this.ellipse(context, i, x, y, length);

@@ -34,10 +34,14 @@ export function ranks(names) {
 }
 
 /**
- * @typedef {{key: string, title: string, names?: string[], codes?: ArrayLike<number>, values?: ArrayLike<number>,
- *   digits?: number, size?: boolean, text?: (i: number) => string, wide?: number}} Column
- * names with codes, or values; `size`: large ones are of interest whatever their sign
+ * @typedef {{key: string, title: string, names?: string[], codes?: ArrayLike<number>, code?: (i: number) => number,
+ *   values?: ArrayLike<number>, digits?: number, size?: boolean, text?: (i: number) => string, wide?: number}} Column
+ * names with codes (or what tells the code of a row: a million need no array of them), or values; `size`: large ones are
+ * of interest whatever their sign
  */
+
+/** What tells the place of a row's name among the names of its column. @param {Column} column @returns {(i: number) => number} */
+export const codeOf = ({ code, codes }) => code ?? ((i) => /** @type {ArrayLike<number>} */ (codes)[i]);
 
 /** Conditions like `w>3`, `used=0` and words; all must hold. @param {string} text @param {Column[]} columns */
 export function conditions(text, columns) {
@@ -51,8 +55,8 @@ export function conditions(text, columns) {
       tests.push({ "<": (i) => at(i) < limit, ">": (i) => at(i) > limit, "<=": (i) => at(i) <= limit, ">=": (i) => at(i) >= limit, "=": (i) => at(i) === limit }[found[2]]);
     } else {
       const wanted = word.toLowerCase();
-      const flags = columns.filter((c) => c.names).map((c) => /** @type {[ArrayLike<number>, Uint8Array]} */ ([c.codes, Uint8Array.from(/** @type {string[]} */ (c.names), (name) => Number(name.toLowerCase().includes(wanted)))]));
-      tests.push((i) => flags.some(([codes, hit]) => hit[codes[i]]));
+      const flags = columns.filter((c) => c.names).map((c) => /** @type {[(i: number) => number, Uint8Array]} */ ([codeOf(c), Uint8Array.from(/** @type {string[]} */ (c.names), (name) => Number(name.toLowerCase().includes(wanted)))]));
+      tests.push((i) => flags.some(([code, hit]) => hit[code(i)]));
     }
   }
   return tests;

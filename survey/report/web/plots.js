@@ -30,11 +30,11 @@ function legend(context, box, low, high, unit) {
 /**
  * Values on a regular grid over an image (rows from the top), with arrows where there are any.
  * @param {string} label
- * @param {{size: number[], columns: number, rows: number, values: (number|null)[], unit: string, low?: number, said?: string, arrows?: number[][], counts?: boolean}} grid
+ * @param {{size: number[], columns: number, rows: number, values: (number|null)[], unit: string, low?: number, high?: number, said?: string, arrows?: number[][], counts?: boolean}} grid
  *   arrows: u, v, du, dv (px)
  */
 export function heat(label, grid) {
-  const known = grid.values.filter((x) => x !== null && Number.isFinite(x)), high = Math.max(...known, 1e-300), low = grid.low ?? Math.min(...known, high);
+  const known = grid.values.filter((x) => x !== null && Number.isFinite(x)), high = grid.high ?? Math.max(...known, 1e-300), low = grid.low ?? Math.min(...known, high);
   const longest = Math.max(...(grid.arrows ?? []).map((a) => Math.hypot(a[2], a[3])), 1e-300);
   const { canvas } = surface(label, (context, width, height) => {
     const box = frame(grid.size, width, height, high > low ? 70 : 0), dx = box.w / grid.columns, dy = box.h / grid.rows;
@@ -51,7 +51,8 @@ export function heat(label, grid) {
     context.strokeRect(box.x, box.y, box.w, box.h);
     if (high > low) legend(context, box, low, high, grid.unit);
   });
-  const said = grid.said ?? (known.length ? t("from {a} to {b} {unit}", { a: significant(low, 3), b: significant(high, 3), unit: grid.unit }) : t("no values"));
+  const size = grid.counts ? count : (x) => significant(x, 3), arrows = grid.arrows?.length ? `; ${t("longest arrow {size} px", { size: significant(longest, 2) })}` : "";
+  const said = grid.said ?? (known.length ? t("from {a} to {b} {unit}", { a: size(low), b: size(high), unit: grid.unit }) + arrows : t("no values"));
   return figure(label, said, canvas);
 }
 
@@ -107,7 +108,7 @@ export function residualField(points, camera, size) {
   const arrows = [...n.keys()].filter((k) => n[k] >= 3).map((k) => [...centre(k), sums[0][k] / n[k], sums[1][k] / n[k]]);
   return {
     field: { size, columns, rows, unit: "px", low: 0, values: [...n].map((m, k) => (m ? Math.sqrt(sums[2][k] / (2 * m)) : null)), arrows },
-    coverage: { size, columns, rows, unit: t("points"), low: 0, values: [...n].map((m) => m || null), arrows: undefined },
+    coverage: { size, columns, rows, unit: t("points"), low: 0, counts: true, values: [...n].map((m) => m || null), arrows: undefined },
   };
 }
 

@@ -1,6 +1,6 @@
 // The survey in space: cameras, targets, points with their ellipsoids; in perspective, as a plan and as elevations.
 
-import { button, colour, make, surface } from "./dom.js";
+import { button, colour, make, roundBelow, ruler, surface } from "./dom.js";
 import { number, significant, t } from "./words.js";
 import { current, names, select } from "./store.js";
 import { rowsOfPoint } from "./columns.js";
@@ -153,7 +153,7 @@ export class SceneView {
     for (const spot of scene.spots) this.spot(context, line, to, spot, chosen.points.has(spot.id));
     if (this.bench.drawn) this.told_(context, line, to);
     this.labels(context, to);
-    this.ruler(context, width, height);
+    this.rulers(context, height);
     const k = significant(this.factor, 2);
     this.told.textContent = this.region === 1 ? t("ellipsoids × {k}", { k }) : t("95 % ellipsoids × {k}", { k });
     this.surface.canvas.setAttribute("aria-label", t("{view}: {c} camera places, {n} points and stations; the same in the tables below", { view: t(NAMES[this.mode] ?? "The survey in space"), c: scene.shots.length, n: scene.spots.length }));
@@ -161,7 +161,7 @@ export class SceneView {
 
   ground(context, line) {
     const { low, high, mode } = this, [a, b] = FLAT[mode] ?? [0, 1], rest = 3 - a - b;
-    const span = Math.max(high[a] - low[a], high[b] - low[b]) / 5, power = 10 ** Math.floor(Math.log10(span || 1)), step = power * ([5, 2, 1].find((k) => k * power <= span) ?? 1);
+    const span = Math.max(high[a] - low[a], high[b] - low[b]) / 5, step = roundBelow(span);
     this.step = step;
     context.strokeStyle = colour("rule");
     context.lineWidth = 1;
@@ -293,16 +293,14 @@ export class SceneView {
     }
   }
 
-  /** A length to compare with: exact in the flat views. */
-  ruler(context, width, height) {
-    if (this.mode === "scene") return;
-    const length = this.step * this.scale, metres = this.step >= 1 ? `${significant(this.step, 2)} m` : `${significant(1000 * this.step, 2)} mm`;
-    context.strokeStyle = context.fillStyle = colour("ink");
-    context.lineWidth = 2;
-    context.beginPath();
-    context.moveTo(12, height - 26); context.lineTo(12, height - 22); context.lineTo(12 + length, height - 22); context.lineTo(12 + length, height - 26);
-    context.stroke();
-    context.fillText(`${metres}   ${"xyz"[FLAT[this.mode][0]]} →  ${"xyz"[FLAT[this.mode][1]]} ↑`, 16 + length, height - 20);
+  /** Lengths to compare with, of the survey and of its ellipsoids: exact in the flat views, in the middle of the scene. */
+  rulers(context, height) {
+    const flat = FLAT[this.mode], scale = flat ? this.scale : this.unit * this.zoom, step = flat ? this.step : roundBelow(90 / scale);
+    const axes = flat ? `   ${"xyz"[flat[0]]} →  ${"xyz"[flat[1]]} ↑` : "";
+    ruler(context, step * scale, height - 18, `${lengthText(step)}${axes}`);
+    if (!this.scene.spots.length) return;
+    const size = roundBelow(90 / (scale * this.factor));
+    ruler(context, size * scale * this.factor, height - 36, t("{length} of ellipsoids and shifts", { length: lengthText(size) }));
   }
 
   nearest(x, y) {
@@ -323,6 +321,8 @@ export class SceneView {
 
   click(event) { const found = this.nearest(event.offsetX, event.offsetY); if (found) select(found.kind, found.id); }
 }
+
+const lengthText = (metres) => { const [size, unit] = metres >= 1 ? [metres, "m"] : metres >= 1e-3 ? [1e3 * metres, "mm"] : [1e6 * metres, "µm"]; return `${significant(size, 1)} ${unit}`; };
 
 /** Principal axes (one sigma, m) of a covariance (3, 3): Jacobi's rotations. @param {number[][]} cov @returns {number[][]} */
 export function axesOf(cov) {

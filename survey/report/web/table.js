@@ -2,7 +2,7 @@
 
 import { make } from "./dom.js";
 import { count, number, t } from "./words.js";
-import { chosen, conditions, orderOf, ranks } from "./order.js";
+import { chosen, codeOf, conditions, orderOf, ranks } from "./order.js";
 
 const ROW = 24;
 const MOST = 30e6; // px: taller than this no browser draws
@@ -57,7 +57,7 @@ export class Table {
     this.scroll.style.setProperty("--columns", widths.map((rem) => `minmax(0, ${rem}fr)`).join(" "));
     this.scroll.style.setProperty("--width", `${widths.reduce((sum, rem) => sum + rem + 0.6, 1)}rem`);
     this.head.replaceChildren(...this.data.columns.map((column, k) => {
-      const head = make("button", { type: "button", tabindex: -1, class: column.values ? "r" : "l", onclick: () => this.sort(k, this.sorted?.column === k ? !this.sorted.up : !column.size) }, column.title);
+      const head = make("button", { type: "button", tabindex: -1, class: column.values ? "r" : "l", onclick: () => this.sort(k, this.sorted?.column === k ? !this.sorted.up : !this.data.columns[k].size) }, column.title);
       return make("span", { role: "columnheader", "aria-colindex": k + 1 }, head);
     }));
   }
@@ -68,8 +68,9 @@ export class Table {
     this.sorted = { column: k, up };
     if (column.values) this.order = orderOf(column.values, up, column.size);
     else {
-      const rank = ranks(column.names ?? []);
-      this.order = orderOf(Float32Array.from(/** @type {ArrayLike<number>} */ (column.codes), (code) => rank[code]), up);
+      const rank = ranks(column.names ?? []), code = codeOf(column), places = new Float32Array(this.data.n);
+      for (let i = 0; i < places.length; i++) places[i] = rank[code(i)];
+      this.order = orderOf(places, up);
     }
     [...this.head.children].forEach((head, j) => (j === k ? head.setAttribute("aria-sort", up ? "ascending" : "descending") : head.removeAttribute("aria-sort")));
     this.filter();
@@ -111,7 +112,7 @@ export class Table {
 
   text(column, i) {
     if (column.text) return column.text(i);
-    return column.values ? number(column.values[i], column.digits ?? 3) : column.names[column.codes[i]];
+    return column.values ? number(column.values[i], column.digits ?? 3) : column.names[codeOf(column)(i)];
   }
 
   /** Shows what is chosen elsewhere; scrolls to the first. @param {string[]} ids @param {number} [row] */
@@ -173,7 +174,7 @@ export class Table {
       return /[",\n]/.test(safe) ? `"${safe.replaceAll('"', '""')}"` : safe;
     };
     const rows = [...this.shown].filter((i) => !this.selected.size || this.selected.has(this.data.id(i))).slice(0, 100000);
-    const cell = (column, i) => (column.values ? (Number.isFinite(column.values[i]) ? String(column.values[i]) : "") : column.text ? column.text(i) : column.names[column.codes[i]]);
+    const cell = (column, i) => (column.values ? (Number.isFinite(column.values[i]) ? String(column.values[i]) : "") : column.text ? column.text(i) : column.names[codeOf(column)(i)]);
     return [this.data.columns.map((c) => quote(c.title)).join(","), ...rows.map((i) => this.data.columns.map((c) => quote(cell(c, i))).join(","))].join("\n") + "\n";
   }
 }

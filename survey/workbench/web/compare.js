@@ -39,20 +39,24 @@ export class CompareView {
   }
 
   async follow() {
-    const { run, against } = current();
-    const key = `${run}/${against}/${this.bench.state.version}`;
+    const { run, against } = current(), { state } = this.bench;
+    const key = `${run}/${against}/${state.version}`;
     if (key === this.key) return;
     this.key = key;
-    if (run && against) {
-      try {
-        const changes = await get(`compare?a=${encodeURIComponent(against)}&b=${encodeURIComponent(run)}`);
-        this.show(t("Run {a} → run {b}", { a: against, b: run }), changes);
-      } catch (error) { fill(this.element, make("p", { class: "warn" }, error.message)); }
-    } else if (this.bench.state.changes) this.show(t("Before and after the last change"), this.bench.state.changes);
-    else fill(this.element, make("p", { class: "quiet" }, t("Nothing has been changed yet. Leave something out (x), or choose two runs under History.")));
+    try {
+      const { runs } = await get("runs"), asked = new URLSearchParams(Object.entries({ a: against, b: run }).filter(([, number]) => number));
+      const changes = against ? await get(`compare?${asked}`) : state.changes;
+      const title = !against ? t("Before and after the last change") : run ? t("Run {a} → run {b}", { a: against, b: run }) : t("Run {a} → now", { a: against });
+      const nothing = make("p", { class: "quiet" }, t("Nothing has been changed yet. Leave something out (x), or choose a run."));
+      if (this.key === key) fill(this.element, runs.length ? this.chooser(runs, run, against) : null, changes ? [make("h2", {}, title), changesText(changes)] : nothing);
+    } catch (error) { fill(this.element, make("p", { class: "warn" }, error.message)); }
   }
 
-  show(title, changes) { fill(this.element, make("h2", {}, title), changesText(changes)); }
+  /** Which run is before, and which after: none is what the page shows now. */
+  chooser(runs, run, against) {
+    const field = (name, chosen, none, to) => { const select = make("select", { "aria-label": name, onchange: () => go(to(select.value), true) }, make("option", { value: "" }, none), ...runs.map((r) => make("option", { value: r.number, selected: String(r.number) === String(chosen) }, `${r.number}  ${time(r.time)}`))); return make("label", {}, name, " ", select); };
+    return make("div", { class: "actions" }, field(t("before"), against, t("the last change"), (against) => ({ against })), field(t("after"), run, t("now"), (run) => ({ run })));
+  }
 }
 
 export class HistoryView {
@@ -72,11 +76,12 @@ export class HistoryView {
     try { runs = (await get("runs")).runs; } catch (error) { fill(this.element, make("p", { class: "warn" }, error.message)); return; }
     const { state } = this.bench, chosen = current();
     const pick = (name, run) => make("input", { type: "radio", name, "aria-label": `${t(name)} ${run}`, checked: String(chosen[name === "before" ? "against" : "run"]) === String(run), onchange: () => go(name === "before" ? { against: String(run) } : { run: String(run) }, true) });
-    const acts = (run) => (state.read_only ? null : make("span", {}, button(run.pinned ? "★" : "☆", () => this.act("pin", run), "", { "aria-label": `${run.pinned ? t("not kept for ever") : t("keep for ever")}: ${run.number}` }), " ", button(t("restore"), () => this.act("restore", run), "", { "aria-label": `${t("restore")}: ${run.number}` })));
-    const rows = runs.map((run) => [pick("before", run.number), pick("after", run.number), link(`#run=${run.number}`, String(run.number)), t(`verdict ${run.summary.verdict}`), number(run.summary.sigma0, 4), count(run.summary.redundancy), acts(run), time(run.time), run.author ?? "", run.command ?? ""]);
+    const acts = (run) => (state.read_only ? null : make("span", { class: "actions" }, button(run.pinned ? "★" : "☆", () => this.act("pin", run), "", { "aria-label": `${run.pinned ? t("not kept for ever") : t("keep for ever")}: ${run.number}` }), " ", button(t("restore"), () => this.act("restore", run), "", { "aria-label": `${t("restore")}: ${run.number}` })));
+    const rows = runs.map((run) => [pick("before", run.number), pick("after", run.number), link(`#run=${run.number}`, String(run.number)), t(`verdict ${run.summary.verdict}`), number(run.summary.sigma0, 4),
+      make("div", { class: "wide" }, time(run.time), " ", make("span", { class: "quiet" }, [`${t("redundancy")} ${count(run.summary.redundancy)}`, run.author, run.command].filter(Boolean).join(" · ")), acts(run))]);
     const steps = (title, labels) => labels?.length ? make("div", {}, make("h3", {}, title), make("ol", {}, ...labels.map((label) => make("li", {}, label)))) : null;
     fill(this.element, make("h2", {}, t("History")), steps(t("Can be undone"), state.undo), steps(t("Can be done again"), state.redo), make("h3", {}, t("Runs")),
-      rows.length ? plainTable(t("Runs"), [t("before"), t("after"), t("run"), t("verdict"), "sigma0", t("redundancy"), "", t("time"), t("who"), t("Command")], rows, [4, 5]) : make("p", { class: "quiet" }, t("No runs are kept yet; Save writes one.")),
+      rows.length ? plainTable(t("Runs"), [t("before"), t("after"), t("run"), t("verdict"), "sigma0", t("time, who, command")], rows, [4]) : make("p", { class: "quiet" }, t("No runs are kept yet; Save writes one.")),
       rows.length > 1 ? button(t("Compare"), () => this.compare(), "d", { class: "primary" }) : null);
   }
 

@@ -1,9 +1,11 @@
 // What is wrong, worst first: verdict, warnings, suspects with their probable cause and what may be done about them.
 
-import { button, by, fill, link, make, plainTable } from "./dom.js";
+import { button, fill, link, make, plainTable } from "./dom.js";
 import { count, known, number, significant, t, time } from "./words.js";
 import { anchor, current, select } from "./store.js";
 import { rowOf, rowsOfImage } from "./columns.js";
+import { post } from "./source.js";
+import { verdictText } from "./header.js";
 import { placeOf } from "./tree.js";
 
 /** The places that a message names. */
@@ -31,6 +33,7 @@ export class FindingsView {
     fill(this.element, 
       state.waiting && !state.known ? make("p", { class: "verdict" }, t("adjusting …")) : make("p", { class: `verdict ${state.verdict}` }, make("b", {}, verdictText(state.verdict)), " ", make("span", {}, state.reason ?? "")),
       state.waiting && state.known ? make("p", { class: "quiet" }, t("As saved {time}; it is being adjusted again.", { time: time(state.date) })) : null,
+      this.undetected() ? make("p", {}, t("{n} images, and nothing was looked for in them yet.", { n: count(this.bench.images.length) }), " ", state.read_only ? null : button(t("Detect"), () => this.detect(), "", { class: "primary" })) : null,
       ...causes.map((cause) => this.cause(cause)),
       findings.remedies?.length ? make("h2", {}, t("What would mend it")) : null,
       ...(findings.remedies ?? []).map((remedy) => this.remedy(remedy)),
@@ -44,19 +47,28 @@ export class FindingsView {
       findings.largest?.length ? this.suspects(t("Largest within the limit"), findings.largest) : null);
   }
 
+  /** Whether there is nothing but images. */
+  undetected() { return !this.bench.points.n && !this.bench.readings.length && this.bench.images.length > 0; }
+
+  /** The pictures come in under Jobs. */
+  detect() {
+    this.actions.show("jobs", "left");
+    this.actions.job("detect", () => post("jobs/detect", { all: false }));
+  }
+
   cause(cause) { return make("p", { class: "cause" }, make("b", {}, t("Probable cause")), " ", cause.text, ...places(cause)); }
 
   /** A cause that was tried: what it explains, and one click that carries it out. */
   remedy(r) {
     const evidence = t("explains {share} % of the misfit; sigma0 becomes {sigma0}; test {test}, limit {limit}; probability {sure} %", { share: number(100 * r.explained, 0), sigma0: number(r.sigma0, 3), test: significant(r.statistic, 3), limit: significant(r.critical, 3), sure: number(100 * r.probability, 0) });
-    return make("div", { class: "cause remedy" }, make("p", {}, make("b", {}, `${r.number}. ${r.cause}`), "; ", r.change, r.anchor ? [" ", link(r.anchor, t("show"))] : null), make("p", { class: "quiet" }, evidence),
+    return make("div", { class: "cause remedy" }, make("p", {}, make("b", {}, `${r.number}. ${r.cause}`), "; ", r.change, r.where ? [" ", make("code", {}, r.where)] : null, r.anchor ? [" ", link(r.anchor, t("show"))] : null), make("p", { class: "quiet" }, evidence),
       this.bench.state.read_only ? null : r.possible ? button(t("Apply"), () => this.actions.remedy(r.number), r.number === 1 ? "m" : "", { "aria-label": `${t("Apply")}: ${r.cause}` }) : make("p", { class: "quiet" }, t("Only you can do that.")));
   }
 
   suspects(title, rows) {
-    return plainTable(title, [t("observation"), "w", t("share of limit"), "r", t("residual"), ""],
-      rows.map((s) => [make("a", { href: s.anchor, data: { id: s.place[1] } }, `${t(`kind ${s.kind}`)} ${s.text}`), s.w === null ? t("{k} of {n} points", { k: s.n_points, n: s.n_in_image }) : number(s.w, 2), s.share === null ? "–" : `${number(100 * s.share, 0)} %`,
-        number(s.redundancy, 2), s.residual === undefined ? "–" : `${[s.residual].flat().map((x) => significant(x, 3)).join(", ")} ${s.unit}`, s.why === 0 ? "" : t("left out")]), [1, 2, 3, 4]);
+    return plainTable(title, [t("observation"), "w", t("limit"), t("residual"), "r"],
+      rows.map((s) => [make("span", {}, make("a", { href: s.anchor, data: { id: s.place[1] } }, s.kind === "image_point" ? s.text : `${t(`kind ${s.kind}`)} ${s.text}`), s.why === 0 ? "" : make("span", { class: "pill" }, t("left out"))),
+        s.w === null ? t("{k} of {n} points", { k: s.n_points, n: s.n_in_image }) : number(s.w, 2), s.share === null ? "–" : `${number(100 * s.share, 0)} %`, s.residual === undefined ? "–" : `${[s.residual].flat().map((x) => significant(x, 2)).join(", ")} ${s.unit}`, number(s.redundancy, 2)]), [1, 2, 3, 4]);
   }
 
   groups(rows) {
@@ -86,19 +98,3 @@ export class FindingsView {
     if (next) select(next.place[0], next.place[1], true);
   }
 }
-
-/** @param {string} verdict passed, check or failed */
-export const verdictText = (verdict) => ({ passed: `✓ ${t("verdict passed")}`, check: `! ${t("verdict check")}`, failed: `✕ ${t("verdict failed")}` })[verdict] ?? known(verdict);
-
-/** The header: what the solution is worth. @param {any} state */
-export function drawHeader(state) {
-  by("title").textContent = state.title;
-  document.title = `${state.title} · labsurvey`;
-  const none = state.waiting && !state.known;
-  by("verdict").className = none ? "" : state.verdict;
-  by("verdict").textContent = none ? "" : verdictText(state.verdict);
-  const fact = (name, value) => make("span", {}, make("span", { class: "quiet" }, `${name} `), value);
-  fill(by("facts"), ...(state.known ? [fact("sigma0", number(state.sigma0, 4)), fact(t("redundancy"), count(state.redundancy))] : []),
-    fact(t("excluded"), count(state.exclusions.length)), state.n_not_used ? fact(t("not used"), count(state.n_not_used)) : null, state.unsaved ? fact(t("unsaved"), count(state.unsaved)) : null, state.read_only ? make("span", { class: "pill" }, t("for reading only")) : null);
-}
-

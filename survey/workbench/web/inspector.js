@@ -18,10 +18,21 @@ export function chosenNames() {
 /** @param {any} bench @param {any} actions */
 export function drawInspector(bench, actions) {
   const { kind, ids } = current(), id = ids[0];
-  if (!kind || id === undefined) { fill(by("inspector"), make("p", { class: "quiet" }, t("Choose something: a suspect, a row, a point in an image or in space."))); return; }
+  if (!kind || id === undefined) { fill(by("inspector"), ...survey(bench)); return; }
   const parts = (ABOUT[kind] ?? (() => []))(bench, id, actions) ?? [];
   fill(by("inspector"), make("h2", {}, `${t(`kind ${kind}`)} ${id.replace(/^\w+:/, "")}`, ids.length > 1 ? make("span", { class: "pill" }, `+ ${ids.length - 1}`) : null), ...doing(bench, actions), ...parts,
     make("p", { class: "quiet anchor" }, anchor(kind, id)));
+}
+
+/** The survey as a whole, while nothing is chosen, and how something is. */
+function survey({ state }) {
+  const { tree, solution, datum } = state, images = tree.cameras.reduce((sum, c) => sum + c.images.length, 0);
+  const key = (name, does) => [make("dt", {}, make("kbd", {}, name)), make("dd", {}, t(`key ${does}`))];
+  return [make("h2", {}, t("Survey")), facts([[t("observations"), state.known ? count(state.n_observations) : undefined], [t("unknowns"), state.known ? count(state.n_unknowns) : undefined], [t("redundancy"), state.known ? count(state.redundancy) : undefined],
+    ["sigma0", state.known ? number(state.sigma0, 4) : undefined], [t("sigmas"), solution ? known(solution.sigmas.replaceAll("_", " ")) : undefined], [t("Datum"), t(`datum ${datum.kind}`)], [t("adjusted in"), solution ? `${number(solution.seconds, 2)} s` : undefined],
+    [t("Cameras"), tree.cameras.length || undefined], [t("Images"), images ? count(images) : undefined], [t("Stations"), tree.stations.length || undefined], [t("Targets"), tree.targets.length || undefined], [t("Points"), tree.points.length || undefined]]),
+    make("p", { class: "quiet" }, t("Choose something: a suspect, a row, a point in an image or in space.")),
+    make("dl", { class: "keys" }, ...key("j", "next suspect"), ...key("x", "leave out what is chosen (or take it back)"), ...key("d", "before and after"), ...key("u", "undo (also Ctrl-Z)"), ...key("?", "these keys"))];
 }
 
 function doing(bench, actions) {

@@ -2,7 +2,7 @@
 
 import { button, fill, make, plainTable } from "./dom.js";
 import { count, number, t } from "./words.js";
-import { verdictText } from "./findings.js";
+import { verdictText } from "./header.js";
 import { go, select } from "./store.js";
 import { picture, post } from "./source.js";
 
@@ -12,7 +12,7 @@ const MOST = 60; // pictures shown at once
 const JOBS = [
   ["init", "New project", "Begin a project with a folder of images; cameras, sizes and boards are read out of them, and it is shown here.", [["images", "folder of images", "text", ""], ["folder", "folder", "text", ""]]],
   ["detect", "Detect", "Find targets in images that are new or have changed, and adjust.", [["all", "all images anew", "flag", false]]],
-  ["plan", "Plan", "What to measure next, of what plan.toml lists; drawn in the scene.", [["wanted", "to become precise", "text", ""], ["add", "candidates to choose", "number", 5], ["navigation", "poses from beacons", "flag", false]]],
+  ["plan", "Planning", "What to measure next, of what plan.toml lists; drawn in the scene.", [["wanted", "to become precise", "text", ""], ["add", "candidates to choose", "number", 5], ["navigation", "poses from beacons", "flag", false]]],
   ["navigate", "Navigate", "A pose for every epoch that shows beacons and no target; drawn in the scene.", [["station", "station", "text", ""], ["interval_s", "seconds between epochs", "number", 0]]],
   ["add", "Add", "Let the network grow by another folder, and adjust.", [["folder", "folder", "text", ""]]],
   ["compare", "Compare epochs", "What moved since another folder of the same laboratory; drawn in the scene.", [["folder", "folder", "text", ""]]],

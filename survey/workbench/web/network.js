@@ -19,6 +19,8 @@ export class NetworkView extends SceneView {
     this.mode_ = make("select", { "aria-label": t("projection"), onchange: () => { this.mode = this.mode_.value; this.surface.redraw(); } },
       ...["plan", "south", "east", "scene"].map((mode) => make("option", { value: mode }, t(NAMES[mode] ?? "Scene"))));
     this.element.querySelector(".bar").prepend(this.mode_);
+    this.legend = make("p", { class: "legend quiet" });
+    this.element.querySelector(".stage").append(this.legend);
     this.load();
   }
 
@@ -58,8 +60,8 @@ export class NetworkView extends SceneView {
       context.fill();
       context.fillText(setup.id, u + 8, v + 14);
     }
-    this.told.textContent = t("{n} readings, {k} beyond the limit, {m} of no place", { n: count(lines.length + marks.length), k: count([...lines, ...marks].filter((r) => (r.share ?? 0) > 1).length), m: count(n_nowhere) });
-    this.surface.canvas.setAttribute("aria-label", `${t("Network of readings")}: ${this.told.textContent}; ${setups.map((s) => `${s.id} (${s.instrument ?? ""}, ${s.n})`).join(", ")}`);
+    this.legend.textContent = t("{n} readings, {k} beyond the limit, {m} of no place", { n: count(lines.length + marks.length), k: count([...lines, ...marks].filter((r) => (r.share ?? 0) > 1).length), m: count(n_nowhere) });
+    this.surface.canvas.setAttribute("aria-label", `${t("Network of readings")}: ${this.legend.textContent}; ${setups.map((s) => `${s.id} (${s.instrument ?? ""}, ${s.n})`).join(", ")}`);
   }
 
   /** The reading whose line is nearest; points and stations go before lines. */

@@ -33,21 +33,29 @@ class Asked {
   }
 }
 
+/** The camera that the selection means, one of those that there are. @param {string[]} cameras @returns {string|undefined} */
+function chosenCamera(cameras) {
+  const { kind, ids } = current();
+  const said = kind === "camera" ? ids[0] : kind === "image" ? ids[0].split("/")[0] : kind === "obs" ? names(ids[0]).ids[0] : kind === "param" && ids[0].startsWith("lens/") ? ids[0].split("/")[1] : "";
+  return cameras.includes(said) ? said : undefined;
+}
+
+const metresField = (value, change) => make("input", { type: "number", min: "0.01", step: "any", value: value ?? "", placeholder: "∞", "aria-label": t("distance, m"), onchange: (event) => change(event.target.value) });
+
 export class CameraView extends Asked {
   question() { return `${this.camera()}/${JSON.stringify(this.against)}/${this.distance ?? ""}`; }
 
   camera() {
-    const { kind, ids } = current(), cameras = Object.keys(this.bench.sizes);
-    const said = kind === "camera" ? ids[0] : kind === "image" ? ids[0].split("/")[0] : kind === "obs" ? names(ids[0]).ids[0] : kind === "param" && ids[0].startsWith("lens/") ? ids[0].split("/")[1] : "";
-    if (cameras.includes(said)) this.last = said;
-    return this.last ?? cameras[0];
+    const cameras = Object.keys(this.bench.sizes);
+    this.last = chosenCamera(cameras) ?? this.last ?? cameras[0];
+    return this.last;
   }
 
   async parts() {
     const camera = this.camera(), size = this.bench.sizes[camera], { field, coverage } = residualField(this.bench.points, camera, size);
     const plots = make("div", { class: "figures" }, heat(t("Residual field: mean vectors over the root mean square"), field), heat(t("Coverage: image points"), coverage));
     const choose = make("select", { "aria-label": t("Camera"), onchange: (event) => select("camera", event.target.value) }, ...Object.keys(this.bench.sizes).map((id) => make("option", { value: id, selected: id === camera }, id)));
-    const distance = make("input", { type: "number", min: "0.01", step: "any", value: this.distance ?? "", placeholder: "∞", "aria-label": t("distance, m"), onchange: () => { this.distance = distance.value; this.follow(); } });
+    const distance = metresField(this.distance, (value) => { this.distance = value; this.follow(); });
     const runs = (await get("runs")).runs, choices = [...runs.map((run) => [{ run: run.number }, `${t("run")} ${run.number}`]), ...Object.keys(this.bench.sizes).filter((id) => id !== camera && this.bench.sizes[id].join() === size.join()).map((id) => [{ other: id }, `${t("camera")} ${id}`])];
     const others = make("select", { "aria-label": t("difference to"), onchange: () => { this.against = choices[others.selectedIndex - 1]?.[0]; this.follow(); } },
       make("option", {}, "–"), ...choices.map(([what, text]) => make("option", { selected: JSON.stringify(what) === JSON.stringify(this.against) }, text)));
@@ -65,6 +73,34 @@ export class CameraView extends Asked {
       plots.append(heat(`${t("Difference of two lens results, implied rotation fitted")}: ${significant(found.rotation_deg, 2)}°, ${significant(found.translation_mm, 2)} mm`, gridOf(size, found.uv, found.shift.map((x) => Math.hypot(...x)), found.shift)));
     }).catch(refused);
     return [make("div", { class: "bar" }, choose, make("label", {}, t("distance, m"), " ", distance), make("label", {}, t("difference to"), " ", others)), plots, said];
+  }
+}
+
+/** The epochs in two halves, each adjusted by itself: lenses that differ by more than expected contradict their sigmas. */
+export class HalvesView extends Asked {
+  question() { return this.distance ?? ""; }
+
+  async follow() { await super.follow(); this.plot(); }
+
+  async parts() {
+    this.found = await get(`halves?${this.distance ? `distance_m=${encodeURIComponent(this.distance)}` : ""}`);
+    const { cameras, epochs, sigma0, notes } = this.found;
+    this.plots = make("div", { class: "figures" });
+    this.plotted = "";
+    const rows = cameras.map((c) => [link(anchor("camera", c.camera), c.camera), number(c.rms_px, 4), number(c.expected_px, 4), number(c.ratio, 2), make("span", { class: c.p_value < 0.01 ? "bad" : "" }, `${c.p_value < 0.01 ? "■ " : ""}${significant(c.p_value, 2)}`), `${c.largest} ${number(c.largest_in_sigmas, 1)} σ`]);
+    return [make("div", { class: "bar" }, make("label", {}, t("distance, m"), " ", metresField(this.distance, (value) => { this.distance = value; this.follow(); }))),
+      make("p", { class: "quiet" }, t("Halves of {a} and {b} epochs, each adjusted by itself: sigma0 {s} and {u}. The difference of the lenses, with the motion of the camera taken out, beside what their covariances expect.", { a: epochs[0].length, b: epochs[1].length, s: number(sigma0[0], 4), u: number(sigma0[1], 4) })),
+      plainTable(t("Cross-validation"), [t("camera"), t("differ, px"), t("expected, px"), t("ratio"), "p", t("largest change")], rows, [1, 2, 3, 4]), this.plots, ...notes.map((note) => make("p", { class: "quiet" }, note))];
+  }
+
+  /** Difference and expectation of the chosen camera, in the same colours. */
+  plot() {
+    const cameras = this.found?.cameras ?? [], id = chosenCamera(cameras.map((c) => c.camera)) ?? (this.plotted || cameras[0]?.camera), c = cameras.find((one) => one.camera === id);
+    if (!c || id === this.plotted) return;
+    this.plotted = id;
+    const size = this.bench.sizes[id], far = c.shift.map((x) => Math.hypot(...x)), sigma = c.sigma.map((x, k) => (c.covered[k] ? x : null)), high = Math.max(...far.filter((_, k) => c.covered[k]), ...sigma);
+    this.plots.replaceChildren(heat(`${id} (${c.n_images.join(" + ")}): ${t("difference of the halves, implied motion taken out")}: ${significant(c.rotation_deg, 2)}°, ${significant(c.translation_mm, 2)} mm`, { ...gridOf(size, c.uv, far.map((x, k) => (c.covered[k] ? x : null)), c.shift.map((x, k) => (c.covered[k] ? x : [NaN, NaN]))), high }),
+      heat(`${id}: ${t("expected difference, one sigma")}`, { ...gridOf(size, c.uv, sigma), high }));
   }
 }
 

@@ -44,7 +44,7 @@ export const post = async (path, body = {}) =>
 export async function points(known) {
   const data = columns(await (await ask(`/api/points${known ? `?layout=${known.layout}` : ""}`)).arrayBuffer());
   if (!data.whole) return { ...known, ...data, rows: known.rows };
-  for (const name of ["block", "point", "u", "v", "sigma_u", "sigma_v"]) data[name] = data[name]?.slice(); // else they would keep the answer of every solution
+  for (const { name } of data.columns) data[name] = data[name].slice(); // else what stays would keep the answer with what goes
   return withImages(data);
 }
 

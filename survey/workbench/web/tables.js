@@ -1,7 +1,7 @@
 // The tables below the views: image points, readings, parameters, what people excluded.
 
 import { by, make } from "./dom.js";
-import { known, significant, t } from "./words.js";
+import { known, measure, significant, t } from "./words.js";
 import { current, names, select } from "./store.js";
 import { pointId, rowOf } from "./columns.js";
 import { Table, named, numbers } from "./table.js";
@@ -17,9 +17,6 @@ function each(Kind, n, value) {
   for (let i = 0; i < n; i++) out[i] = value(i);
   return out;
 }
-
-/** Of codes: half the memory where they fit. */
-const kindFor = (n) => (n < 65536 ? Uint16Array : Uint32Array);
 
 const number4 = (key, title, rows, size = false) => numbers(key, title, rows.map((r) => r[key]), { size, text: (i) => significant(rows[i][key], 6) });
 
@@ -55,8 +52,8 @@ export class Tables {
   renew(name) { if (name === this.name) this.table?.renew(this.data()); }
 
   begin() {
-    const data = this.data();
-    this.table = new Table(t(TABLES[this.name]), data, { sort: data.sort, onselect: (rows, quiet) => this.select(data.kind, rows, quiet), onenter: (row) => { this.select(data.kind, [row], false); this.actions.show("image", "right"); } });
+    const data = this.data(), { kind, sort } = data; // no listener may hold the rows of a solution that has gone
+    this.table = new Table(t(TABLES[this.name]), data, { sort, onselect: (rows, quiet) => this.select(kind, rows, quiet), onenter: (row) => { this.select(kind, [row], false); this.actions.show("image", "right"); } });
     const tab = (name, title) => make("button", { type: "button", role: "tab", "aria-selected": name === this.name, onclick: () => { this.asked = true; this.name = name; this.table = null; this.draw(false); } }, t(title));
     by("tables").replaceChildren(make("div", { role: "tablist", "aria-label": t("Tables"), class: "tabs" }, ...Object.entries(TABLES).map(([name, title]) => tab(name, title))), this.table.element);
   }
@@ -71,16 +68,16 @@ export class Tables {
 
   points() {
     const data = this.bench.points, coded = (key) => {
-      const found = [...new Set(data.blocks.map((b) => b[key] ?? ""))], idx = new Map(found.map((x, k) => [x, k])), of = data.blocks.map((b) => idx.get(b[key] ?? ""));
-      return { names: found, codes: each(kindFor(found.length), data.n, (i) => of[data.block[i]]), wide: 5 };
+      const found = [...new Set(data.blocks.map((b) => b[key] ?? ""))], idx = new Map(found.map((x, k) => [x, k])), of = Uint32Array.from(data.blocks, (b) => idx.get(b[key] ?? ""));
+      return { names: found, code: (i) => of[data.block[i]], wide: 5 };
     };
     const all = [...new Set(Object.values(data.points).flat())], place = new Map(all.map((x, k) => [x, k]));
-    const lists = data.blocks.map((b) => data.points[b.target ?? ""].map((x) => place.get(x)));
+    const lists = Object.fromEntries(Object.entries(data.points).map(([target, ids]) => [target, ids.map((x) => place.get(x))])), of = data.blocks.map((b) => lists[b.target ?? ""]);
     const residual = each(Float32Array, data.n, (i) => Math.hypot(data.du[i], data.dv[i]));
     return {
       n: data.n, id: (i) => `image_point:${pointId(data, i)}`, state: (i) => (data.used[i] ? (data.w[i] > data.limit ? "suspect" : "") : "out"),
       columns: [{ key: "camera", title: t("camera"), ...coded("camera") }, { key: "epoch", title: t("kind epoch"), ...coded("epoch") }, { key: "target", title: t("target"), ...coded("target") },
-        { key: "point", title: t("point"), names: all, codes: each(kindFor(all.length), data.n, (i) => lists[data.block[i]][data.point[i]]), wide: 5 },
+        { key: "point", title: t("point"), names: all, code: (i) => of[data.block[i]][data.point[i]], wide: 5 },
         { key: "residual", title: t("residual, px"), values: residual, digits: 3, size: true }, { key: "w", title: "w", values: data.w, digits: 2, size: true },
         ...(data.redundancy ? [{ key: "r", title: "r", values: data.redundancy, digits: 3 }] : []), { key: "used", title: t("used"), values: data.used, digits: 0, text: (i) => (data.used[i] ? "✓" : "✕") }],
       kind: "obs", sort: "w",
@@ -91,7 +88,7 @@ export class Tables {
     const rows = this.bench.readings;
     return { n: rows.length, id: (i) => rows[i].id, state: (i) => (rows[i].used ? (rows[i].share > 1 ? "suspect" : "") : "out"), kind: "reading", sort: "w",
       columns: [named("table", t("sort of reading"), rows.map((r) => known(r.table.replaceAll("_", " ")))), named("name", t("reading"), rows.map((r) => r.name)), named("component", t("component"), rows.map((r) => r.component)),
-        number4("observed", t("observed"), rows), number4("residual", t("residual"), rows, true), named("unit", t("unit"), rows.map((r) => r.sigma_unit ?? "")), numbers("w", "w", rows.map((r) => r.w), { digits: 2, size: true }), numbers("r", "r", rows.map((r) => r.redundancy), { digits: 3 }), numbers("used", t("used"), rows.map((r) => Number(r.used)), { text: (i) => (rows[i].used ? "✓" : "✕") })] };
+        { ...number4("observed", t("observed"), rows), wide: 7, text: (i) => measure(rows[i].observed, rows[i].unit, 7) }, number4("residual", t("residual"), rows, true), named("unit", t("unit"), rows.map((r) => r.sigma_unit ?? "")), numbers("w", "w", rows.map((r) => r.w), { digits: 2, size: true }), numbers("r", "r", rows.map((r) => r.redundancy), { digits: 3 }), numbers("used", t("used"), rows.map((r) => Number(r.used)), { text: (i) => (rows[i].used ? "✓" : "✕") })] };
   }
 
   parameters() {
