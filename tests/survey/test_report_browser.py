@@ -132,7 +132,7 @@ def test_all_observations_can_be_sorted_and_searched(german: str, tmp_path: Path
     assert len(cells(found, COMPONENT)) == 6
 
 
-@pytest.mark.parametrize("kind", ["obs", "reading", "image", "point"])
+@pytest.mark.parametrize("kind", ["obs", "reading", "image", "point", "camera", "target", "table", "group"])
 def test_places_of_the_workbench_lead_to_rows_of_the_report(english: str, tmp_path: Path, kind: str) -> None:
     adjustment = lab_adjustment(Lab(n_epochs=6, n_beacons=6, blunders=2))
     block = adjustment.survey.image_blocks[0]
@@ -141,13 +141,14 @@ def test_places_of_the_workbench_lead_to_rows_of_the_report(english: str, tmp_pa
     name = {
         "obs": f"image_point:{image}/{block.target_id}/{target.point_ids[int(block.point_idx[3])]}", "image": image,
         "reading": name_of_residual(next(o for o in adjustment.other_residuals if o.kind == "table")),
-        "point": adjustment.survey.points[0].point_id,
+        "point": adjustment.survey.points[0].point_id, "camera": block.camera_id, "target": block.target_id,
+        "table": "turntable", "group": "image",
     }[kind]  # fmt: skip
     shown = f"(() => {{ location.hash = {json.dumps(anchor(kind, name))}; }})()"
     page = english.replace("</body>", f"<script>{shown}</script></body>")
-    if kind == "point":
-        measure = "[...document.querySelectorAll('tr.here')].map((r) => r.cells[0].textContent)"
-        assert seen(page, measure, tmp_path) == [name]
+    if kind in ("point", "camera", "target", "table", "group"):
+        measure = "[...document.querySelectorAll('main .here')].map((e) => (e.cells?.[0] ?? e).textContent.split(', ')[0])"
+        assert seen(page, measure, tmp_path) == [{"group": "image points"}.get(name, name)]
         return
     rows = "'#all .rows .row'" if kind == "image" else "'#all .row[aria-selected=true]'"
     texts = "(r) => [...r.children].map((c) => c.textContent)"
