@@ -314,7 +314,7 @@ def test_numbers_of_readme_stand_in_the_pages_it_links() -> None:
 @pytest.mark.parametrize("name", COMMANDS)
 def test_readme_names_every_command(name: str) -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    rows = set(re.findall(rf"^\| `{name} (\w+)", readme, re.M))
+    rows = set(re.findall(rf"^\| `{name} ([\w-]+)", readme, re.M))
     assert rows == set(_commands_of(COMMANDS[name][1]()))
 
 

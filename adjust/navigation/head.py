@@ -15,6 +15,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import Camera, FloatArray, ImageCrop, PoseParameter, Survey
 from adjust.navigation.model import Beacons, Head, HeadCamera, HeadTable
+from adjust.precision.precision import precision_of
 
 
 def head_of(survey: Survey) -> str | None:
@@ -133,7 +134,8 @@ def _spreads(
     adjustment: Adjustment, names: Sequence[ParameterName], epochs: Mapping[str, str]
 ) -> list[dict[int, FloatArray]]:
     """How every parameter follows from the unknowns, of a lens at its epoch or as it was left."""
-    graph, values = adjustment.precision.graph, adjustment.precision.solved.values
+    precision = precision_of(adjustment)
+    graph, values = precision.graph, precision.solved.values
     unknowns, lenses, out = graph.unknowns, graph.state.lens_states, []
     for name in names:
         if name[0] != "lens":

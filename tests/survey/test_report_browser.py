@@ -63,7 +63,7 @@ def test_all_observations_can_be_sorted_and_searched(browser: Any, german: str, 
     assert len(cells(found, COMPONENT)) == 6
 
 
-@pytest.mark.parametrize("kind", ["obs", "reading", "image", "point"])
+@pytest.mark.parametrize("kind", ["obs", "reading", "image", "point", "camera", "target", "table", "group"])
 def test_places_of_the_workbench_lead_to_rows_of_the_report(
     browser: Any, english: str, tmp_path: Path, kind: str
 ) -> None:
@@ -74,12 +74,15 @@ def test_places_of_the_workbench_lead_to_rows_of_the_report(
     name = {
         "obs": f"image_point:{image}/{block.target_id}/{target.point_ids[int(block.point_idx[3])]}", "image": image,
         "reading": name_of_residual(next(o for o in adjustment.other_residuals if o.kind == "table")),
-        "point": adjustment.survey.points[0].point_id,
+        "point": adjustment.survey.points[0].point_id, "camera": block.camera_id, "target": block.target_id,
+        "table": "turntable", "group": "image",
     }[kind]  # fmt: skip
     place = "#" + quote(anchor(kind, name).removeprefix("#"), safe="=:/")
-    if kind == "point":
-        measure = "[...document.querySelectorAll('tr.here')].map((r) => r.cells[0].textContent)"
-        assert asked(browser, english, tmp_path, measure, place=place) == [[name]]
+    if kind in ("point", "camera", "target", "table", "group"):
+        measure = (
+            "[...document.querySelectorAll('main .here')].map((e) => (e.cells?.[0] ?? e).textContent.split(', ')[0])"
+        )
+        assert asked(browser, english, tmp_path, measure, place=place) == [[{"group": "image points"}.get(name, name)]]
         return
     rows = "'#all .rows .row'" if kind == "image" else "'#all .row[aria-selected=true]'"
     texts = "(r) => [...r.children].map((c) => c.textContent)"

@@ -161,6 +161,31 @@ def test_places_that_the_terminal_names_are_places_of_the_page(page: Page, folde
         assert "There is no such" not in page.page.inner_text("#inspector")
 
 
+@pytest.mark.parametrize(("place", "shown"), [
+    ("image=X/tX05", "image X/tX05"), ("obs=image_point:X/tX05/board/c41", "observation X/tX05/board/c41"),
+    ("reading=table_angles:turntable/tX05", "reading turntable/tX05"), ("param=lens/X/fx", "parameter lens/X/fx"),
+    ("camera=Y", "camera Y"), ("epoch=tX05", "epoch tX05"), ("target=board", "target board"), ("group=image", "group image"),
+    ("station=head", "station head"), ("table=turntable", "turntable"), ("run=1", ""),
+])  # fmt: skip
+def test_every_kind_of_place_opens_what_it_names(browser: Any, address: str, folder: Path, place: str, shown: str) -> None:
+    """As a link from a terminal or a mail: behind the token, in a page that was not open before."""
+    page = Page(browser, f"{address}&{place}", 1280)
+    p = page.page
+    page.wait("document.body.dataset.results !== undefined")
+    if place.startswith("run="):
+        assert p.inner_text("#right h2") == "History"
+    else:
+        assert p.inner_text("#inspector h2").endswith(shown)
+        assert p.locator("#inspector dl.facts, #inspector table").count() > 0
+        assert "There is no such" not in p.inner_text("#inspector")
+    if place.startswith(("image=", "obs=", "epoch=")):
+        assert "tX05" in p.inner_text("#right .bar b")
+    if place.startswith(("obs=", "reading=", "param=")):
+        page.wait("document.querySelectorAll('#tables .row[aria-selected=true]').length > 0")
+    page.context.close()
+    assert page.complaints == []
+
+
 def test_the_address_of_a_run_shows_the_history(page: Page) -> None:
     page.page.evaluate("location.hash = '#run=12'")
     page.wait("document.querySelector('#right h2')?.textContent === 'History'")

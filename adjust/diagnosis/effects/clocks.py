@@ -162,7 +162,7 @@ def _of_tables(case: Case, linear: Linear) -> Iterator[Effect]:
             continue
         angles = np.array([r.angles for r in mine])
         speed = spline(angles)(np.arange(len(mine)), 1)
-        ids = [(r.table_id, r.epoch_id) for r in mine]
+        ids: list[tuple[str, ...]] = [(r.table_id, r.epoch_id) for r in mine]
         times = drift_times(len(mine))[:, None]
         freed = () if table.clock is None else table.clock.parameters.free
         for name, D, text in (

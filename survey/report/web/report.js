@@ -85,8 +85,8 @@ function space(found) {
   return view;
 }
 
-/** The row of a thing in one of the tables that are always there. @param {string} id */
-const rowOf = (id) => [...document.querySelectorAll("main tbody tr")].find((row) => row.cells[0]?.textContent.trim() === id);
+/** The row of a thing in one of the tables that are always there, or the heading of what is said of it. @param {string} id */
+const rowOf = (id) => [...document.querySelectorAll("main tbody tr")].find((row) => row.cells[0]?.textContent.trim() === id) ?? [...document.querySelectorAll("main h3")].find((head) => head.textContent.split(", ")[0] === id);
 
 function begin() {
   use(words.language, words.texts);
@@ -96,7 +96,7 @@ function begin() {
   const all = observations && everyObservation(observations), view = drawn && space(drawn);
   const follow = (scrolling) => {
     const { kind, ids } = current();
-    for (const old of document.querySelectorAll("tr.here")) old.classList.remove("here");
+    for (const old of document.querySelectorAll("main .here")) old.classList.remove("here");
     view?.follow();
     if (!kind) return;
     const listed = all?.show(kind, ids), row = listed ? null : rowOf(ids[0]) ?? rowOf(ids[0].split("/").pop());

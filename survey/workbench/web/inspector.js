@@ -90,8 +90,9 @@ const ABOUT = {
   },
   camera: (bench, id) => [sums(bench.points, rowsWhere(bench.points, (b) => b.camera === id)), ...parameters(bench, `lens/${id}`, `station_from_camera/${id}`)],
   epoch: (bench, id) => [sums(bench.points, rowsWhere(bench.points, (b) => b.epoch === id)), ...imagesOf(bench, (b) => b.epoch === id), ...parametersOfEpoch(bench, id)],
-  target: (bench, id) => [sums(bench.points, rowsWhere(bench.points, (b) => b.target === id)), ...parameters(bench, `world_from_target/${id}`, `target/${id}`)],
+  target: (bench, id) => [sums(bench.points, rowsWhere(bench.points, (b) => b.target === id)), ...parameters(bench, `carrier_from_target/${id}`, `warp/${id}`, `target_points/${id}`)],
   point: (bench, id) => [...parameters(bench, `point/${id}`), ...seenBy(bench.points, rowsOfPoint(bench.points, null, id))],
+  table: (bench, id) => parameters(bench, `world_from_table/${id}`, `table_geometry/${id}`),
   station: (bench, id) => parameters(bench, `world_from_station/${id}`, `mount_from_station/${id}`),
   reading(bench, id) {
     const rows = bench.readings.filter((row) => row.id === id);

@@ -36,9 +36,8 @@ export class Tables {
 
   draw(fresh) {
     const { kind, ids } = current(), wanted = TABLE_OF[kind];
-    if (wanted && this.followed !== ids[0]) this.open(wanted);
+    if (wanted) { if (this.followed !== ids[0]) this.open(wanted); } else if (!this.asked && fresh) this.open(this.bench.points.n ? "points" : "readings");
     this.followed = ids[0];
-    if (!this.asked && fresh) this.open(this.bench.points.n ? "points" : "readings");
     if (!this.table) this.begin();
     else if (fresh) this.table.renew(this.data());
     const rows = { points: () => (kind === "obs" ? (ids[0]?.startsWith("image_point:") ? rowOf(this.bench.points, names(ids[0]).ids) : -1) : null),
@@ -49,7 +48,7 @@ export class Tables {
   }
 
   /** New values of one of the tables. */
-  renew(name) { if (name === this.name) this.table?.renew(this.data()); }
+  renew(name) { if (name === this.name) { this.table?.renew(this.data()); this.draw(false); } }
 
   begin() {
     const data = this.data(), { kind, sort } = data; // no listener may hold the rows of a solution that has gone

@@ -33,6 +33,7 @@ export function drawTree(bench) {
     branch("targets", t("Targets"), targets.length, () => targets.map((target) => leaf("target", target))),
     branch("points", t("Points"), tree.points.length, () => tree.points.map((id) => leaf("point", id))),
     branch("stations", t("Stations"), tree.stations.length, () => tree.stations.map((id) => leaf("station", id))),
+    tree.tables.length ? branch("tables", t("Turntables"), tree.tables.length, () => tree.tables.map((id) => leaf("table", id))) : "",
     branch("readings", t("Readings"), [...groups.values()].reduce((sum, ids) => sum + ids.size, 0), () => [...groups].map(([table, ids]) => make("li", {}, branch(`table ${table}`, known(table.replaceAll("_", " ")), ids.size, () => [...ids].map((id) => leaf("reading", id, id.slice(table.length + 1))))))),
     branch("exclusions", t("Excluded by people"), bench.state.exclusions.length, () => bench.state.exclusions.map((row) => leaf(...placeOf(row.what, row.id), `${t(`kind ${row.what}`)} ${row.id}`))),
   );
