@@ -6,8 +6,8 @@ from typing import Any
 
 from adjust.model.errors import SurveyError
 from adjust.model.observations import PositionRef
-from adjust.model.subsets import with_positions
-from adjust.model.survey import Datum, Point, Survey
+from adjust.model.subsets import Item, with_positions
+from adjust.model.survey import Datum, Instrument, Point, Survey
 
 _PARTS = ("cameras", "stations", "tables", "targets", "image_blocks", "table_readings", "pairs", "levels", "alignments",
           "laser_spots", "on_surfaces", "surfaces", "beams")  # fmt: skip
@@ -42,7 +42,7 @@ def joint_survey(epochs: Mapping[str, Survey], stable: Collection[str]) -> Surve
     points: dict[str, Point] = {}
     parts: dict[str, list[Any]] = {name: [] for name in ("distances", "coordinates", "coordinate_differences", "setups",
                                                          "readings", "reading_covariances")}  # fmt: skip
-    instruments: dict[str, Any] = {}
+    instruments: dict[str, Instrument] = {}
     for epoch, survey in epochs.items():
         for point in survey.points:
             name = point.point_id if point.point_id in stable else epoch_name(point.point_id, epoch)
@@ -59,7 +59,7 @@ def joint_survey(epochs: Mapping[str, Survey], stable: Collection[str]) -> Surve
     return replace(whole, **observed)
 
 
-def _renamed(item: Any, epoch: str, stable: Collection[str]) -> Any:
+def _renamed(item: Item, epoch: str, stable: Collection[str]) -> Item:
     """An observation or setup of one epoch, with its own ids and points."""
     changed: dict[str, Any] = {}
     for name in {"setup_id", *_IDS} & set(item.__dataclass_fields__):

@@ -2,14 +2,17 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from adjust.model.observations import PositionRef, ReadingCovariance
 from adjust.model.survey import Survey
 
-Item = TypeVar("Item", bound=Any)
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Item = TypeVar("Item", bound="DataclassInstance")
 
 
 def with_positions(item: Item, new: Callable[[PositionRef], PositionRef]) -> Item:

@@ -73,15 +73,24 @@ class ReducedArrays(NamedTuple):
     WL: FloatArray
 
 
-def rows(
-    block: IntArray, camera: IntArray, lenses: LensArrays, R: FloatArray, t: FloatArray, X: FloatArray, uv: FloatArray,
-    W: FloatArray, A: FloatArray, chi: FloatArray, depth: FloatArray,
-) -> None:  # fmt: skip
+class SightArrays(NamedTuple):
+    """Image points (K): their image (block); the images (B): camera, R (B, 3, 3), t (B, 3) m; X (K, 3) m, uv px, W."""
+
+    block: IntArray
+    camera: IntArray
+    R: FloatArray
+    t: FloatArray
+    X: FloatArray
+    uv: FloatArray
+    W: FloatArray
+
+
+def rows(lenses: LensArrays, sights: SightArrays, A: FloatArray, chi: FloatArray, depth: FloatArray) -> None:
     """Whitened rows A of all image points; chi (B,), least depth (B,) of the images.
 
     The derivative by the point equals that by the translation of the pose.
     """
-    _rows(block, camera, *lenses, R, t, X, uv, W, A, chi, depth)
+    _rows(sights.block, sights.camera, *lenses, *sights[2:], A, chi, depth)
 
 
 def block_squares(block: IntArray, A: FloatArray, out: FloatArray) -> None:

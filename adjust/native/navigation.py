@@ -90,6 +90,25 @@ class FoundArrays(NamedTuple):
     match: IntArray
 
 
+class PriorArrays(NamedTuple):
+    """What is known of the pose (4, 4) before: components rows (k,) of its tangent, B (6, r) by the calibration."""
+
+    pose: FloatArray
+    B: FloatArray
+    rows: IntArray
+
+
+class PoseArrays(NamedTuple):
+    """Room for a solution: pose (4, 4), residual (n,), H (n, 6), M (n, r), covariance C (6, 6), gain (6, n)."""
+
+    pose: FloatArray
+    residual: FloatArray
+    H: FloatArray
+    M: FloatArray
+    C: FloatArray
+    gain: FloatArray
+
+
 def spot_rows(
     system: SystemArrays, pose: FloatArray, spots: SpotArrays, residual: FloatArray, H: FloatArray, M: FloatArray
 ) -> bool:
@@ -102,19 +121,16 @@ def spot_rows(
 
 
 def gauss_newton(
-    system: SystemArrays, start: FloatArray, spots: SpotArrays, R: FloatArray, prior_pose: FloatArray,
-    prior_B: FloatArray, prior_rows: IntArray, pose: FloatArray, residual: FloatArray, H: FloatArray, M: FloatArray,
-    C: FloatArray, gain: FloatArray,
-) -> tuple[int, bool, float, float, float]:  # fmt: skip
-    """Fill pose (4, 4), residual (n,), H (n, 6), M (n, r), covariance C (6, 6) and gain (6, n) at the solution.
+    system: SystemArrays, start: FloatArray, spots: SpotArrays, R: FloatArray, prior: PriorArrays, out: PoseArrays
+) -> tuple[int, bool, float, float, float]:
+    """Fill ``out`` at the solution.
 
     R (n, n): covariance of spots and prior without the errors common to all epochs. Returns DONE, OPEN (a direction is)
     or UNSETTLED, whether all beacons are in front, v' inv(Sigma) v, ln det Sigma and ln det C.
     """
-    n, r = M.shape
+    n, r = out.M.shape
     numbers, work = np.zeros(4), np.empty(n * (n + 14 + r))
-    state = _gauss_newton(*system, start, *spots, R, prior_pose, prior_B, prior_rows, pose, residual, H, M, C, gain,
-                          numbers, work)  # fmt: skip
+    state = _gauss_newton(*system, start, *spots, R, *prior, *out, numbers, work)
     return state, bool(numbers[0]), float(numbers[1]), float(numbers[2]), float(numbers[3])
 
 

@@ -38,22 +38,31 @@ class ReductionArrays(NamedTuple):
     place: IntArray
 
 
-def reduce_poses(
-    run: IntArray, a: ReductionArrays, at: BlocksAt, keys: ByKeys, damping: float, H: FloatArray, L: FloatArray,
-    T: FloatArray, diagonal: FloatArray, rest: FloatArray, bad: IntArray,
-) -> None:  # fmt: skip
-    """Reduce the poses in run[1:]: L (J, 6, 6) upper and T stay for what follows; the sums are those of turn = run[0].
+class ReducedPoses(NamedTuple):
+    """What reduction gives: L (J, 6, 6) upper and T of the poses, for what follows, and sums over each turn's.
 
-    rest (runs, n + 1, n + 1): upper triangle of the normal matrix of the interface and the residual, diagonal that
-    before anything was reduced. damping: share of its own diagonal that is added to a pose's. bad[turn]: a pose without
-    an inverse, else left alone.
+    rest (runs, n + 1, n + 1): upper triangle of the normal matrix of the interface and the residual, diagonal (runs, n)
+    that before anything was reduced. bad (runs,): a pose without an inverse, else left alone.
+    """
+
+    L: FloatArray
+    T: FloatArray
+    diagonal: FloatArray
+    rest: FloatArray
+    bad: IntArray
+
+
+def reduce_poses(
+    run: IntArray, a: ReductionArrays, at: BlocksAt, keys: ByKeys, damping: float, H: FloatArray, out: ReducedPoses
+) -> None:
+    """Reduce the poses in run[1:]; the sums are those of turn = run[0].
+
+    damping: share of its own diagonal that is added to a pose's.
     """
     segments, C, D, width = keys
     size = max(int(np.diff(a.col_ptr)[run[1:]].max(initial=0)) + 7, int(width.max(initial=0)) + 1)
     work, to = np.empty(size * (2 * size + 6 + MAX_LOCAL)), np.empty(size, dtype=np.int64)
-    _reduce_poses(
-        run, *a, *at.blocks, *at.lenses, *segments, width, C, D, damping, H, L, T, diagonal, rest, bad, work, to
-    )
+    _reduce_poses(run, *a, *at.blocks, *at.lenses, *segments, width, C, D, damping, H, *out, work, to)
 
 
 def pose_steps(a: ReductionArrays, L: FloatArray, T: FloatArray, d: FloatArray, out: FloatArray) -> float:

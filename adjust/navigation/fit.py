@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
-from adjust.native.navigation import DONE, SpotArrays, gauss_newton
+from adjust.native.navigation import DONE, PoseArrays, PriorArrays, SpotArrays, gauss_newton
 from adjust.navigation.system import Sightings, System
 from adjust.spatial.rigid import inverse, rotation_exp, rotation_log
 from adjust.spatial.rigid_motions import right_jacobian_inverse
@@ -95,21 +95,22 @@ def fit_pose(
     cov = seen.cov[used]
     for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
         R[even + i, even + j] = cov[:, i, j]
-    prior_pose, prior_B, prior_rows = start, _NO_B, _NO_ROWS
+    known = PriorArrays(np.ascontiguousarray(start), _NO_B, _NO_ROWS)
     if prior is not None:
-        prior_pose, prior_B, prior_rows = prior.pose, np.ascontiguousarray(prior.B), prior.rows
+        known = PriorArrays(np.ascontiguousarray(prior.pose), np.ascontiguousarray(prior.B), prior.rows)
         R[n:, n:] = prior.cov[np.ix_(prior.rows, prior.rows)]
-    pose, C, gain = np.empty((4, 4)), np.empty((6, 6)), np.empty((6, n + k))
-    residual, H, M = np.empty(n + k), np.empty((n + k, 6)), np.empty((n + k, r))
+    m = n + k
+    out = PoseArrays(np.empty((4, 4)), np.empty(m), np.empty((m, 6)), np.empty((m, r)), np.empty((6, 6)),
+                     np.empty((6, m)))  # fmt: skip
     state, in_front, chi_square, log_det, log_det_cov = gauss_newton(
         system.arrays, np.ascontiguousarray(start), SpotArrays(seen.camera[used], beacon, seen.uv[used]), R,
-        np.ascontiguousarray(prior_pose), prior_B, prior_rows, pose, residual, H, M, C, gain,
+        known, out,
     )  # fmt: skip
     if state != DONE:
         return None
     return PoseFit(
-        pose, used, beacon, C, gain[:, :n], gain[:, n:], gain @ M, float(chi_square), n + k - 6, float(log_det),
-        float(log_det_cov), residual, R + M @ M.T, H, M, bool(in_front),
+        out.pose, used, beacon, out.C, out.gain[:, :n], out.gain[:, n:], out.gain @ out.M, float(chi_square), m - 6,
+        float(log_det), float(log_det_cov), out.residual, R + out.M @ out.M.T, out.H, out.M, bool(in_front),
     )  # fmt: skip
 
 

@@ -1,14 +1,12 @@
 """Pose networks between g2o files and project folders."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
-from adjust.model.observations import FrameRef, Pair
-from adjust.model.survey import PoseParameter, Station, Survey
+from adjust.model.survey import Survey
 from adjust.pose_network.from_survey import network_from_survey
 from survey.folder.text import id_problem
 from survey.interop.networks.g2o import Information, read_g2o_file, write_g2o
@@ -33,26 +31,7 @@ def survey_from_g2o(
     for station in network.station_ids:
         if (problem := id_problem(station)) is not None:
             raise SurveyError(f"{source}: vertex {station}: {problem}")
-    held = set(network.held.tolist())
-    stations = []
-    for i, station in enumerate(network.station_ids):
-        known = bool(np.isfinite(network.station_translations[i]).all())
-        value = _pose(network.station_rotations[i], network.station_translations[i]) if known else None
-        pose = PoseParameter(value, "held" if i in held else "free")
-        stations.append(Station(station, world_from_station=pose))
-    frames = [FrameRef("station", s) for s in network.station_ids]
-    pairs = tuple(
-        Pair(network.pair_ids[e], frames[int(network.a_idx[e])], frames[int(network.b_idx[e])],
-             _pose(network.rotations[e], network.translations[e]), network.cov[e])
-        for e in range(network.n_pairs)
-    )  # fmt: skip
-    return Survey(stations=tuple(stations), pairs=pairs), found.notes
-
-
-def _pose(rotation: Any, translation: Any) -> Pose3:
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, translation
-    return Pose3(matrix)
+    return network.as_survey, found.notes
 
 
 def project_to_g2o(source: Path, target: Path, information: Information) -> tuple[int, int, str, tuple[str, ...]]:

@@ -140,6 +140,15 @@ def test_held_points_get_their_covariance_in_an_inner_datum() -> None:
     for i in range(8):
         cov = again.estimates["point", f"P{i}"].cov
         np.testing.assert_allclose(moved.estimates["point", f"P{i}"].cov, cov, atol=1e-5 * np.abs(cov).max())
+    # held points stand in a joint covariance of whole parameters too, with no error before
+    names = [("point", "P1"), ("point", "P0"), ("orientation", "S2")]
+    before = result.joint(names)
+    assert not before[3:6].any()
+    np.testing.assert_allclose(before[np.ix_([0, 1, 2, 6], [0, 1, 2, 6])], result.precision.joint([names[0], names[2]]))
+    expected = again.joint(names)
+    np.testing.assert_allclose(moved.joint(names), expected, atol=1e-5 * np.abs(expected).max())
+    with pytest.raises(SurveyError, match="was moved to another datum"):
+        in_datum(moved, Datum("inner"))
 
 
 def test_a_datum_that_is_observed_cannot_be_chosen() -> None:

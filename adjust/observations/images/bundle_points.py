@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 
 from adjust.model.survey import FloatArray
-from adjust.native.bundles import rows
+from adjust.native.bundles import SightArrays, rows
 from adjust.native.lenses import MAX_LENS
 from adjust.observations.images.bundles import BundleBatch
 
@@ -53,8 +53,8 @@ class PointFactor:
         x = b.world[self.point] if self.point_key is None else np.asarray(values.atPoint3(self.point_key))
         mine = slice(self.k, self.k + 1)
         A, place = np.zeros((1, 2, MAX_LENS + 7)), np.zeros(1, dtype=np.int64)
-        rows(place, b.camera[self.block : self.block + 1], s.lenses, R, t, x[None].copy(), b.uv[mine], b.W[mine], A,
-             np.zeros(1), np.zeros(1))  # fmt: skip
+        sight = SightArrays(place, b.camera[self.block : self.block + 1], R, t, x[None].copy(), b.uv[mine], b.W[mine])
+        rows(s.lenses, sight, A, np.zeros(1), np.zeros(1))
         return A[0], C
 
     def _by_keys(self, A: FloatArray, C: FloatArray) -> list[FloatArray]:

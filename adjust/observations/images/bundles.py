@@ -21,6 +21,7 @@ from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.bundles import (
     BundleArrays,
     ReducedArrays,
+    SightArrays,
     add_direct,
     back_substitute,
     between_poses,
@@ -239,9 +240,8 @@ class BundleBatch:
         s, c = self.state, self.chains
         self.world[self._free] = s.points[self._free_rows]
         self.X[:] = self.world[self.point]
-        rows(
-            self.block, self.camera, s.lenses, c.R, c.t, self.X, self.uv, W, self.A, self.chi, self.depth,
-        )  # fmt: skip
+        sights = SightArrays(self.block, self.camera, c.R, c.t, self.X, self.uv, W)
+        rows(s.lenses, sights, self.A, self.chi, self.depth)
 
     def prepare(self, values: gtsam.Values, jacobians: bool, damping: float = 0.0) -> None:
         """Evaluate at ``values`` (already loaded into the state). Raises IndeterminateError for undetermined points."""

@@ -18,7 +18,7 @@ from adjust.frames.unknowns import Unknowns
 from adjust.model.errors import IndeterminateError
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import run_split, split_blocks
-from adjust.native.reduction import WEAKEST_PIVOT, ReductionArrays, leaf_rows, pose_steps, reduce_poses
+from adjust.native.reduction import WEAKEST_PIVOT, ReducedPoses, ReductionArrays, leaf_rows, pose_steps, reduce_poses
 from adjust.observations.images.batch import ImageBatch
 from adjust.observations.images.segments import first_seen, ranges
 
@@ -119,13 +119,11 @@ class PoseReduction:
     def reduce(self, damping: float) -> bool:
         """Reduce at the values the batch was last prepared at; False where something has no inverse to speak of."""
         batch, n, count = self.batch, self.interface.n, len(self._turns)
-        rest, diagonal = np.zeros((count, n + 1, n + 1)), np.zeros((count, n))
-        bad = np.full(count, -1, dtype=np.int64)
-        run_split(
-            reduce_poses, self._turns, self.arrays, batch.at(batch.W), batch.by_keys, damping, batch.H, self.L, self.T,
-            diagonal, rest, bad,
-        )  # fmt: skip
-        return bool((bad < 0).all()) and self._serve(rest.sum(axis=0), diagonal.sum(axis=0))
+        out = ReducedPoses(
+            self.L, self.T, np.zeros((count, n)), np.zeros((count, n + 1, n + 1)), np.full(count, -1, dtype=np.int64)
+        )
+        run_split(reduce_poses, self._turns, self.arrays, batch.at(batch.W), batch.by_keys, damping, batch.H, out)
+        return bool((out.bad < 0).all()) and self._serve(out.rest.sum(axis=0), out.diagonal.sum(axis=0))
 
     def _serve(self, N: FloatArray, diagonal: FloatArray) -> bool:
         """Square root of what is left, as the rows of the factor."""

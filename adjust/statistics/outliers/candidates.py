@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from adjust.graph.assembly import AdjustmentGraph
-from adjust.model.observations import ReadingCovariance
+from adjust.model.observations import ImageBlock, ReadingCovariance
 from adjust.model.survey import BoolArray, IntArray, Survey
 
 _FIELD = {
@@ -85,7 +85,7 @@ def without(survey: Survey, found: Candidates, rejected: Iterable[int]) -> Surve
     return replace(survey, **changed)
 
 
-def _blocks(survey: Survey, found: Candidates, out: BoolArray) -> tuple[Any, ...]:
+def _blocks(survey: Survey, found: Candidates, out: BoolArray) -> tuple[ImageBlock, ...]:
     if not found.n_image:
         return survey.image_blocks
     blocks = []

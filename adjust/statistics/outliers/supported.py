@@ -7,13 +7,13 @@ nothing to determine it: it goes, with the observations that hang on it. What an
 never dropped: a station that nobody has measured is an error of the survey, not a decision of its owner.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from adjust.frames.unknowns import Chain, FrameTree, Unknowns
+from adjust.frames.unknowns import FrameTree, Link, Unknowns
 from adjust.model.errors import listed
 from adjust.model.observations import FrameRef, ImageBlock, PositionRef
 from adjust.model.result import ParameterName
@@ -21,6 +21,7 @@ from adjust.model.survey import Survey
 from adjust.observations.geometry.building import carrier_of
 from adjust.statistics.outliers.undetermined_points import without_named_points
 
+Item = TypeVar("Item")
 Needs = frozenset[ParameterName]
 _NOTHING: Needs = frozenset()
 _OF_A_POSE = 3
@@ -60,7 +61,7 @@ class _Needs:
         self._names: list[ParameterName] = []
         self.of_blocks = [self._of_block(b) for b in survey.image_blocks]
 
-    def _of_chain(self, chain: Chain | list[Any]) -> Needs:
+    def _of_chain(self, chain: Sequence[Link]) -> Needs:
         for link in chain:
             if link.slot not in self._of_slot:
                 self._of_slot[link.slot] = self._slot(link.slot)
@@ -176,7 +177,7 @@ def _is_of_epoch(name: ParameterName) -> bool:
 def _without(survey: Survey, needs: _Needs, lost: Needs) -> Survey:
     """Less the lost unknowns and the (unused) observations that need them."""
 
-    def left(items: Iterable[Any], of_each: Iterable[Needs]) -> tuple[Any, ...]:
+    def left(items: Iterable[Item], of_each: Iterable[Needs]) -> tuple[Item, ...]:
         return tuple(item for item, mine in zip(items, of_each, strict=True) if not mine & lost)
 
     others: dict[str, Any] = {name: left(survey.others[name], of_each) for name, of_each in needs.others().items()}
