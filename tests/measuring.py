@@ -22,9 +22,12 @@ class Measuring:
     """A plugin of the process that looks on, and of each that works."""
 
     def __init__(self) -> None:
-        self.before = _computed_s()
+        self.before = 0.0
         self.files: Counter[str] = Counter()
         self.tests: dict[str, tuple[float, float, bool]] = {}
+
+    def pytest_collection_finish(self) -> None:
+        self.before = _computed_s()
 
     @pytest.hookimpl(wrapper=True, tryfirst=True)
     def pytest_runtest_makereport(self, item: pytest.Item) -> Any:

@@ -34,6 +34,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
     return {p.relative_to(folder / "out").as_posix() for p in (folder / "out").rglob("*") if p.is_file()}
 
 
+@pytest.mark.slow
 def test_wheel_has_every_source_and_nothing_else(installed: set[str]) -> None:
     wanted = {
         p.relative_to(ROOT).as_posix()

@@ -66,6 +66,7 @@ def _circle(imports: Mapping[str, set[str]]) -> list[str]:
     return []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", PACKAGES)
 def test_no_module_imports_itself_round_about(package: str) -> None:
     imports = {name: of for name, of in _imports(ROOT).items() if name.split(".")[0] == package}
@@ -105,6 +106,7 @@ def _upward(imports: Mapping[str, set[str]], package: str, floors: Mapping[str, 
             if of in inside and floors[inside[of]] < floors[inside[m]]]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", PACKAGES)
 def test_every_room_imports_rooms_below_it_only(package: str) -> None:
     assert _upward(_imports(ROOT), package, _floors(package)) == []

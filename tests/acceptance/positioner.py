@@ -14,7 +14,8 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.adjustment import adjust
-from adjust.graph.assembly import values_of
+from adjust.graph.assembly import GraphBuilder, values_of
+from adjust.graph.solver import solve
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, Pair, TableReading
 from adjust.model.result import Adjustment, ObservationResidual
@@ -153,10 +154,9 @@ def blockwise_covariance(
     for block in np.array_split(np.arange(n), n_blocks):
         kept = np.setdiff1d(np.arange(n), block)
         pairs, readings = (tuple(items[i] for i in kept) for items in (whole.pairs, whole.table_readings))
-        result = adjust(replace(whole, pairs=pairs, table_readings=readings), start)
-        estimate = result.estimates[("table_geometry", POSITIONER)]
-        if not isinstance(estimate.value, Pose3):
-            values.append([estimate.value[estimate.components.index(name)] for name in AXIS_PARAMETERS])
+        graph = GraphBuilder(replace(whole, pairs=pairs, table_readings=readings), {}).build(start)
+        axes = graph.unknowns.by_name["table_geometry", POSITIONER]
+        values.append(solve(graph).values.atVector(axes.key))
     d = np.array(values) - np.mean(values, axis=0)
     return BlockCovariance((n_blocks - 1) / n_blocks * d.T @ d, n_blocks)
 

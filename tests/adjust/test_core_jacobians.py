@@ -82,6 +82,7 @@ def test_condensed_blocks_on_tables_of_all_kinds(axes: tuple[str, ...]) -> None:
     check_images(survey, start, ALL_LINKS)
 
 
+@pytest.mark.slow
 def test_condensed_blocks_with_tied_and_held_lens_parameters() -> None:
     ties = (Tie("fy", "fx", 1.0125), Tie("k4", "k1", -0.3))
     survey, start = h.everything(3, ties=ties)
@@ -90,6 +91,7 @@ def test_condensed_blocks_with_tied_and_held_lens_parameters() -> None:
     check_images(replace(survey, cameras=cameras), start, ALL_LINKS)
 
 
+@pytest.mark.slow
 def test_condensed_blocks_with_held_links_and_part_of_the_table_geometry() -> None:
     survey, start = h.everything(4)
     held = {name: PoseParameter(p, "held") for name, p in start.poses.items()}

@@ -76,6 +76,7 @@ def test_values_that_change_in_place_are_evaluated_anew(which: str) -> None:
     assert graph.prepare(values, jacobians=True).number != at.number
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["reduced", "readings"])
 def test_the_solver_changes_nothing_that_it_was_given(kind: str) -> None:
     """Start, reduction, weights and sigmas stay, though sigmas with centring follow the distances of the solution."""

@@ -42,6 +42,7 @@ def test_uneven_axes_are_named_first(
     assert any(isinstance(e, SetKey) and e.path == ("tables", "turntable", "harmonics", key) for e in first.edits)
 
 
+@pytest.mark.slow
 def test_an_even_axis_is_not_suspected() -> None:
     survey = taken_for_even({})
     assert not list(unsteady_axes(Case(survey, adjust(survey))))

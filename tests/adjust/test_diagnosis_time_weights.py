@@ -70,6 +70,7 @@ def test_motion_that_was_forgotten() -> None:
     assert adjust(first.changed()).sigma0 == pytest.approx(adjust(good).sigma0, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("made", [stereo, partial(head_on_table, n_table_epochs=4, n_free_epochs=3)])
 def test_what_stands_still_is_not_blamed(made) -> None:
     assert list(forgotten_motion(Case(made(2)[0]))) == []

@@ -38,6 +38,7 @@ def test_distances_of_one_set_up_in_another_unit(plane: bool, factor: float, sai
     assert said in first.cause
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plane", [pytest.param(False, marks=pytest.mark.slow), True])
 @pytest.mark.parametrize("setup", ["S2", None])
 @pytest.mark.parametrize(
@@ -127,5 +128,6 @@ def test_a_robots_poses_in_another_convention(change, name: str, ids: tuple[str,
     assert "m from the hand" in first.cause  # what no residual shows: both sides inverted
 
 
+@pytest.mark.slow
 def test_a_robots_poses_as_they_are() -> None:
     assert list(misread_pairs(robot(lambda i, p: p))) == []

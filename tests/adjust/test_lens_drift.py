@@ -55,6 +55,7 @@ def check_gradient(graph: AdjustmentGraph, values: gtsam.Values) -> None:
         np.testing.assert_allclose(gradient.at(unknown.key), numeric, rtol=1e-5, atol=1e-5 * np.abs(numeric).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["blocks", "walk", "temperature"])
 @pytest.mark.parametrize("lab", ["boards", "beacons"])
 def test_derivatives_by_the_changes(kind: str, lab: str) -> None:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from gtsam import Pose3
 
 from adjust.graph.assembly import GraphBuilder
@@ -38,6 +39,7 @@ class Names(Rewriting):
         return super().epochs(name, {**given, "later": usual}, usual)
 
 
+@pytest.mark.slow
 def test_every_parameter_is_met_once_under_the_name_of_its_unknown() -> None:
     survey, truth = full_lab(1)
     start, names = h.start_at(truth), Names()

@@ -15,7 +15,7 @@ from survey.simulate import head_on_table, single_camera
 
 @pytest.fixture(scope="module")
 def table():
-    return head_on_table(1)[0]
+    return head_on_table(1, n_table_epochs=6, n_free_epochs=4)[0]
 
 
 def _unused(survey, *blocks):

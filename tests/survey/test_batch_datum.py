@@ -107,6 +107,7 @@ def test_a_point_that_moved_is_found(tmp_path: Path) -> None:
     assert {name.split("/")[1] for name in alarming(trends)} == {"P5"}
 
 
+@pytest.mark.slow
 def test_epochs_without_a_common_datum_are_left_out_by_name(records: list[Record], tmp_path: Path) -> None:
     survey = night(3)
     lost = {r.reading_id for r in survey.readings if r.to.point_id == "P12"}

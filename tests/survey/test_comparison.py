@@ -73,6 +73,7 @@ def test_rotations_leave_the_displacement_empty(tmp_path, capsys):
     assert all(m["sigma_rotation_arcsec"][0] > 1.0 for m in found["congruence"]["motions"])
 
 
+@pytest.mark.slow
 def test_errors_say_which_folder(epochs, tmp_path, capsys):
     assert main(["compare", str(epochs[0]), str(tmp_path / "none")]) == 1
     assert f"{tmp_path / 'none'}: no such folder" in capsys.readouterr().err

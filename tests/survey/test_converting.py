@@ -82,6 +82,7 @@ def test_a_project_holds_the_first_station_and_is_what_the_words_say(tmp_path):
     np.testing.assert_allclose(np.linalg.inv(pair.cov)[:3, 3:], info[3:, :3], rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_an_adjusted_project_gives_its_adjusted_poses(tmp_path, capsys):
     source = _write(tmp_path / "a.g2o", _lines())
     assert main(["convert", str(source), str(tmp_path / "a")]) == 0
@@ -117,6 +118,7 @@ def test_what_is_there_is_not_replaced_and_what_cannot_be_held_is_refused(tmp_pa
     assert not (tmp_path / "c.g2o").exists()
 
 
+@pytest.mark.slow
 def test_names_and_unused_pairs_are_said_to_be_lost(tmp_path, capsys):
     folder = tmp_path / "a"
     assert main(["convert", str(_write(tmp_path / "a.g2o", _lines())), str(folder)]) == 0

@@ -105,6 +105,7 @@ def test_blocks_alone_are_read_where_that_is_asked_for(tmp_path: Path, capsys: p
         read_g2o_file(path, block_diagonal=True)
 
 
+@pytest.mark.slow
 def test_a_converted_network_gives_the_minimum_of_all_its_pairs(tmp_path: Path) -> None:
     sim = simulate(4, 3, seed=5, extra=8, wrong=2)
     plain = solve_network(sim.network)

@@ -66,6 +66,7 @@ def test_named_spots(folder, lab, use_table):
         )
 
 
+@pytest.mark.slow
 def test_table_names_the_spots(unnamed, lab):
     outcome = navigate_job(unnamed, progress=False)
     truth = {(b.camera_id, b.epoch_id): b for b in lab[0].image_blocks if b.target_id is None}

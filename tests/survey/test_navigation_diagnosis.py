@@ -15,6 +15,8 @@ from survey.jobs.navigating.job import NavigateRequest, navigate_job
 from survey.project.writing import write_project
 from survey.simulate import beacons
 
+pytestmark = pytest.mark.slow
+
 Planted = Callable[[Survey], Survey]
 
 

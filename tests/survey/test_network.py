@@ -414,6 +414,7 @@ def test_surveys_with_more_than_pairs_grow_from_their_last_solution(tmp_path, ca
         np.testing.assert_allclose(entry["world_from_station"]["translation_mm"], expected, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_what_is_wrong_in_what_is_added_is_named_with_its_own_line(tmp_path, capsys):
     """A new pair given the other way round: the line is that of the folder that holds what is new."""
     survey, _ = _network(6, combinations(range(6), 2), 1.0)

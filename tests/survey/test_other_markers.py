@@ -46,6 +46,7 @@ def declared(target: Charuco | MarkerGrid, **other: object) -> Charuco | MarkerG
     return type(target)(**{**vars(target), **other})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", [BOARD, GRID], ids=["charuco", "grid"])
 def test_other_dictionary_print_and_mirror_image_are_told(target: Charuco | MarkerGrid) -> None:
     image = image_of(target)
@@ -62,6 +63,7 @@ def test_other_dictionary_print_and_mirror_image_are_told(target: Charuco | Mark
         assert (found.dictionary, found.inverted, found.mirrored) == (target.dictionary, inverted, mirrored)
 
 
+@pytest.mark.slow
 def test_an_old_pattern_is_told() -> None:
     found = other_markers(image_of(declared(BOARD, legacy=True)), BOARD)
     assert found is not None
@@ -74,6 +76,7 @@ def test_nothing_is_read_out_of_noise() -> None:
     assert other_markers(cv2.normalize(noise, None, 0, 255, cv2.NORM_MINMAX), BOARD) is None
 
 
+@pytest.mark.slow
 def test_the_command_says_what_to_write(tmp_path: Path) -> None:
     lab = tmp_path / "lab"
     (lab / "images" / "c").mkdir(parents=True)

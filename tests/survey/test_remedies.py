@@ -232,6 +232,7 @@ def test_what_there_is_not_is_refused(tmp_path: Path, old: str, new: str, said: 
         read(tmp_path)
 
 
+@pytest.mark.slow
 def test_an_epoch_without_a_temperature_is_named(tmp_path: Path) -> None:
     survey, _ = uneven()
     first = next(iter(survey.temperatures))

@@ -511,6 +511,7 @@ def test_json_is_one_line_for_an_entry_and_for_a_list_of_numbers():
             solution_json({"x": nothing})
 
 
+@pytest.mark.slow
 def test_files_are_the_same_for_any_number_of_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Statistics and files that are made beside each other."""
     adjusted = adjust(head_on_table(2, n_cameras=2, n_table_epochs=6, n_free_epochs=4)[0])

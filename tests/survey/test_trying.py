@@ -84,6 +84,7 @@ def files(folder: Path) -> dict[str, bytes]:
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "kind"), FORMED)
 def test_change_makes_the_survey_that_was_tried_and_is_taken_back(name: str, kind: str, tmp_path: Path) -> None:
     mistake = next(m for m in MISTAKES if m.name == name and kind in m.kinds)

@@ -111,6 +111,7 @@ def planted(name: str, kind: str, size: float, folder: Path, title: str = "") ->
     return folder
 
 
+@pytest.mark.slow
 def test_forgotten_motion_is_named_with_its_line_and_mended(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -149,6 +150,7 @@ def test_a_slipped_decimal_is_named_with_its_line_and_mended(
     assert main(["adjust", str(lab), "--quiet", "--try", "1"]) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("column", "row", "factor", "says"),
     [("value_m", "slope_distance2-1", 0.1, "reading slope_distance2-1: its decimal point has slipped"),

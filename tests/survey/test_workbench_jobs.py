@@ -47,12 +47,13 @@ def test_images_are_detected_one_by_one_and_the_project_is_adjusted(pictures, tm
 def test_another_project_is_begun_beside_this_one_and_found_again(pictures, tmp_path):
     folder = shutil.copytree(pictures, tmp_path / "lab")
     (tmp_path / "recordings").mkdir()
-    for path in (folder / "images").glob("*/*"):
+    some = sorted((folder / "images").glob("*/*"))[:2]
+    for path in some:
         shutil.copy(path, tmp_path / "recordings" / path.name)
     bench = Workbench(folder)
     told = bench.start("recordings", "new")
     assert told.summary["folder"] == str(tmp_path / "new")
-    assert set(read(tmp_path / "new").images) == {("recordings", p.stem) for p in (folder / "images").glob("*/*")}
+    assert set(read(tmp_path / "new").images) == {("recordings", p.stem) for p in some}
     assert bench.show("new").summary == {"folder": str(tmp_path / "new")}
     with pytest.raises(SurveyError, match="name the folder of the new project"):
         bench.start("recordings", " ")

@@ -9,6 +9,8 @@ from survey.examples import write_example
 from survey.jobs.adjusting.job import adjust_job
 from survey.workbench.session import Workbench
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def adjusted(tmp_path_factory):

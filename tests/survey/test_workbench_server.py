@@ -398,6 +398,7 @@ def test_remedies_jobs_and_the_network_are_asked_for_as_the_page_does(mine):
         assert post(client, "/api/jobs/batch", {}).status_code == 403
 
 
+@pytest.mark.slow
 def test_the_page_goes_to_another_project(mine):
     other = shutil.copytree(mine, mine.parent / "other")
     text = (other / "survey.toml").read_text()
