@@ -118,7 +118,7 @@ def mixed(place: Path, n: int) -> Commands:
     usual = LabSize()
     some = full_lab(1, size=usual)[0]
     share = n / (sum(len(b.uv) for b in some.image_blocks) + some.n_others_used)
-    size = LabSize(**{k: max(round(share * v), 2) for k, v in vars(usual).items()})
+    size = LabSize(**{k: max(round(share * v), 4) for k, v in vars(usual).items()})
     return _written(place, full_lab(1, size=replace(size, n_table_epochs=min(size.n_table_epochs, MOST_TURNS)))[0])
 
 
