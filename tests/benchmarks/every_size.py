@@ -37,6 +37,8 @@ LONGEST_S = 60.0
 """Processor seconds that one command may need, were it linear; a larger one is not run."""
 START_S = 0.6
 """What loading the program takes at any size."""
+MOST_TURNS = 20
+"""Epochs of the table before a camera, for which the board has room in its images."""
 Commands = dict[str, list[str]]
 
 
@@ -113,11 +115,11 @@ def pairs(place: Path, n: int) -> Commands:
 
 def mixed(place: Path, n: int) -> Commands:
     """The whole laboratory: cameras, table, beacons, relay stations, tape and total station."""
-    epochs = LabSize()
-    some = full_lab(1, size=epochs)[0]
+    usual = LabSize()
+    some = full_lab(1, size=usual)[0]
     share = n / (sum(len(b.uv) for b in some.image_blocks) + some.n_others_used)
-    size = LabSize(**{k: max(round(share * v), 4) for k, v in vars(epochs).items()})
-    return _written(place, some if share < 1.0 else full_lab(1, size=size)[0])
+    size = LabSize(**{k: max(round(share * v), 4) for k, v in vars(usual).items()})
+    return _written(place, full_lab(1, size=replace(size, n_table_epochs=min(size.n_table_epochs, MOST_TURNS)))[0])
 
 
 def spots(place: Path, n: int) -> Commands:

@@ -26,12 +26,17 @@ _ROTATIONS = ("rotation_quaternion_wxyz", "rotation_euler_xyz_deg")
 _SIGMAS = POSE_KEYS[4:-1]
 
 
+def is_unit(length: Any) -> Any:
+    """Whether a quaternion of that length is one, or of those lengths (n,): what stands in files is rounded."""
+    return abs(length - 1.0) <= 1e-3
+
+
 def rotation_from_quaternion(wxyz: FloatArray) -> Rot3 | None:
     """The rotation of a quaternion, or None where its length is not 1 within 1e-3."""
     if not max(map(abs, wxyz.tolist())) < 2.0:  # nor is there an end to what stands in files
         return None
     length = math.sqrt(wxyz @ wxyz)
-    if not abs(length - 1.0) <= 1e-3:
+    if not is_unit(length):
         return None
     return Rot3.Quaternion(*(wxyz / length).tolist())
 

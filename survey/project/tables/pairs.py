@@ -11,7 +11,7 @@ from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.spatial.rotation_forms import euler_from_matrix, tangent_cov_from_euler
 from survey.folder.units import to_si
-from survey.project.declared.poses import rotation_from_euler, rotation_from_quaternion
+from survey.project.declared.poses import is_unit, rotation_from_euler
 from survey.project.project import Sigmas
 from survey.project.tables.covariance import covariance_from_sigmas, covariance_problem
 from survey.project.tables.reading import FLAGS, Layout, Table, first_row, group_names
@@ -58,12 +58,12 @@ def read_pairs(table: Table, names: Names, sigmas: Sigmas) -> tuple[Pair, ...]:
     cov = _pair_covariances(table, is_pose, rotations)
     groups, used = group_names(table, "pair"), table.flags("used").tolist()
     translation = to_si(np.stack([table.numbers(name) for name in TRANSLATION], axis=1), "mm")
+    scaled = cov * np.array([sigmas.scale.get(group, 1.0) ** 2 for group in groups])[:, None, None]
     pairs = []
     for row, (a, b) in enumerate(read_ends(table, names)):
         k = 6 if is_pose[row] else 3
         b_from_a = Pose3(rotations[row], translation[row]) if is_pose[row] else rotations[row]
-        scaled = cov[row, :k, :k] * sigmas.scale.get(groups[row], 1.0) ** 2
-        pairs.append(Pair(pair_ids[row], a, b, b_from_a, scaled, groups[row], used[row]))
+        pairs.append(Pair(pair_ids[row], a, b, b_from_a, scaled[row, :k, :k], groups[row], used[row]))
     return tuple(sorted(pairs, key=lambda pair: natural_key(pair.pair_id)))
 
 
@@ -89,14 +89,15 @@ def _pair_rotations(table: Table) -> list[Rot3]:
         raise table.error(row, f"the rotation is given {found} of {','.join(QUATERNION)} and {','.join(EULER)}")
     wxyz = np.stack([table.numbers(name) for name in QUATERNION], axis=1)
     euler = to_si(np.stack([table.numbers(name) for name in EULER], axis=1), "deg")
-    rotations = []
-    for row in range(len(table)):
-        rotation = rotation_from_quaternion(wxyz[row]) if by_quaternion[row] else rotation_from_euler(euler[row])
-        if rotation is None:
-            length = np.linalg.norm(wxyz[row])
-            raise table.error(row, f"the quaternion qw,qx,qy,qz has length {length:g}, not 1; correct it")
-        rotations.append(rotation)
-    return rotations
+    with np.errstate(invalid="ignore", over="ignore"):
+        length = np.linalg.norm(wxyz, axis=1)
+        bad = by_quaternion & ~is_unit(length)
+        unit = (wxyz / length[:, None]).tolist()
+    if bad.any():
+        row = first_row(bad)
+        raise table.error(row, f"the quaternion qw,qx,qy,qz has length {length[row]:g}, not 1; correct it")
+    return [Rot3.Quaternion(*q) if known else rotation_from_euler(angles)
+            for q, known, angles in zip(unit, by_quaternion.tolist(), euler, strict=True)]  # fmt: skip
 
 
 def _pair_covariances(table: Table, is_pose: BoolArray, rotations: list[Rot3]) -> FloatArray:
