@@ -21,6 +21,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock, Pair, TableReading
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, Survey
+from adjust.spatial.rigid import rigid
 from adjust.spatial.rigid_motions import Motions, exp, right_jacobian, right_jacobian_inverse
 
 Reading = Callable[[gtsam.Values], tuple[FloatArray, list[tuple[int, FloatArray]]]]
@@ -67,9 +68,7 @@ class Shifts:
             slots = [slot for _, slot in found]
             for run in runs([t for t, _ in found], self._epoch[slots[0]][0]):
                 for i in run:
-                    first = min(max(run.start, i - _AROUND // 2), max(run.start, run.stop - 1 - _AROUND))
-                    near = range(first, min(run.stop, first + _AROUND + 1))
-                    yield slots[i], [slots[i], *(slots[j] for j in near if j != i)]
+                    yield slots[i], [slots[i], *(slots[j] for j in _near(run, i) if j != i)]
 
     def of_image(self, block: ImageBlock, chain: Chain) -> list[tuple[ImageBlock, Chain]]:
         """Parts of an image block that were exposed at one moment each, in its order, and their chains."""
@@ -133,6 +132,29 @@ class Shifts:
             one = np.eye(1)
             u.vectors[name] = VectorMap(("jitter",), (self.times.unit,), np.zeros(1), one, key, ("jitter",), ("prior",))
         return u.vectors[name]
+
+
+def _near(run: range, i: int) -> range:
+    """The epochs of a run from which it is known how things move about the i-th."""
+    first = min(max(run.start, i - _AROUND // 2), max(run.start, run.stop - 1 - _AROUND))
+    return range(first, min(run.stop, first + _AROUND + 1))
+
+
+def nearest(times: Sequence[float], time: float) -> list[float]:
+    """Of the times of a body's epochs those from which it is known how it moves about one of them, that one first."""
+    order = sorted(times)
+    i = order.index(time)
+    run = next(r for r in runs(order, ("epochs",)) if i in r)
+    return [time, *(order[j] for j in _near(run, i) if j != i)]
+
+
+def between(poses: Sequence[FloatArray], times: Sequence[float], dt: float) -> FloatArray:
+    """(4, 4) a time dt after the first of the times, from poses (4, 4) at all of them."""
+    w, by_dt = weights(np.array([times]) - times[0], np.array([dt]))
+    every = np.array(poses)
+    motions = Motions(every[:, :3, :3], every[:, :3, 3])
+    R, t, _ = moved_poses(motions[:1], motions[1:], Interpolated(w, by_dt, np.zeros((1, 0))))
+    return rigid(R[0], t[0])
 
 
 def _parts(u: Unknowns, nodes: Sequence[int], clocks: Sequence[VectorMap]) -> list[tuple[int, int, int]]:

@@ -52,7 +52,7 @@ def _miss(x: FloatArray, uv: FloatArray) -> float:
     q = one @ H.T
     with np.errstate(divide="ignore", invalid="ignore"):
         miss = (q[:, :2] / q[:, 2:] - b) / scale
-    return float(np.sqrt(np.minimum(np.nan_to_num(miss, nan=1e6) ** 2, 1e12).mean()))
+    return float(np.sqrt((np.minimum(np.abs(np.nan_to_num(miss, nan=1e6)), 1e6) ** 2).mean()))
 
 
 def _normalized(x: FloatArray) -> tuple[FloatArray, float]:
