@@ -7,7 +7,6 @@ from functools import cached_property
 import numpy as np
 from gtsam import Pose3
 
-from adjust.frames.clocks import between, nearest
 from adjust.frames.lens_states import block_starts
 from adjust.frames.runs import MOVING
 from adjust.frames.tables import table_motions
@@ -20,6 +19,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import Clock, FloatArray, Survey, Target
+from adjust.observations.clocks import between, nearest
 from adjust.spatial.rigid import inverse, rigid
 
 Altered = Mapping[ParameterName, Pose3 | FloatArray]

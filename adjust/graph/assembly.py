@@ -9,7 +9,6 @@ import gtsam
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.frames.clocks import Shifts, collect_clocks, reading_residual
 from adjust.frames.state import State, collect_vectors
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Chain, FrameTree, Unknowns
 from adjust.model.boards import deformation, warming_of
@@ -18,6 +17,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import Coordinates, FrameRef, ImageBlock, Pair, PositionRef, frame_text, position_text
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey, VectorParameter, VectorPrior
+from adjust.observations.clocks import Shifts, collect_clocks, reading_residual, shift
 from adjust.observations.factors import (
     ChainPose,
     ObservationFactor,
@@ -110,8 +110,8 @@ class AdjustmentGraph:
     ``graph`` has every observation as a factor on its unknowns and nothing else; ``system`` is a view of it for the
     solver, in which points and poses that nothing else touches are reduced.
     bundles: image blocks of unknown points, in parts that are reduced each by itself. image_order: of every image block
-    its number in the survey and its part: 0 in ``images``, i in the bundle before the i-th. image_numbers: of every block
-    in ``images`` the number in the survey of that which it is, or a part of.
+    its number in the survey and its part: 0 in ``images``, i in the bundle before the i-th. image_numbers: of every
+    block in ``images`` the number in the survey of that which it is, or a part of.
     reduction: of the poses that only image points touch; None where it would not pay. pairs: those between two fixed
     stations, ``others[first_pair + pairs.rows[e]]`` the e-th; singles: the others that are in no batch.
     """
@@ -349,7 +349,7 @@ class GraphBuilder:
         if self.times is not None:
             parts_of, pair_chains = self._at_their_times(self.times, parts_of, pair_chains)
         self.vector_starts |= geometry.starts
-        state = State(self.survey, self.unknowns)
+        state = State(self.survey, self.unknowns, shift)
         pairs = self._pair_batch(state)
         at = {ref: self._position(state, ref, chain) for ref, chain in positions.items()}
         values = self._values(start)

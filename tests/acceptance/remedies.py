@@ -168,7 +168,8 @@ REMEDIES: dict[str, Callable[[], Remedy]] = {
         "late, rows one by one", board_before_cameras, _RIGHT, {"offset": 0.02, "line_time": 4e-6}),
     "epochs at times of their own": lambda: late(
         "epochs at times of their own", board_before_cameras, _RIGHT, {"offset": 0.01}, 2e-3),
-    "table read late": lambda: late("table read late", head_on_moving_table, ("table_clock", "turntable"), {"offset": 8e-4}),
+    "table read late": lambda: late(
+        "table read late", head_on_moving_table, ("table_clock", "turntable"), {"offset": 8e-4}),
     "robot read late": lambda: late("robot read late", camera_on_hand, ("pose_clock", "hand"), {"offset": 2.5e-3}),
 }  # fmt: skip
 

@@ -36,8 +36,8 @@ class Previous:
     """A solution that was written: poses and points by parameter name; covs as written, by the same names.
 
     factor: by which sigmas were multiplied. vectors: components as
-    ``solution.json`` has them, of lenses (with ``model``) and their changes, table angles and geometry, warps and clocks,
-    by parameter name.
+    ``solution.json`` has them, of lenses (with ``model``) and their changes, table angles and geometry, warps and
+    clocks, by parameter name.
     """
 
     poses: Mapping[ParameterName, Pose3]
@@ -146,7 +146,8 @@ def _vectors(found: Mapping[str, Any]) -> Iterator[tuple[ParameterName, Mapping[
         for owner, entry in found[section].items():
             if isinstance(clock := entry.get("clock"), dict):
                 yield (kind, owner), clock
-                yield from (((kind, owner, e), own) for e, own in clock.get("epochs", {}).items() if isinstance(own, dict))
+                own = clock.get("epochs", {}).items()
+                yield from (((kind, owner, epoch), time) for epoch, time in own if isinstance(time, dict))
     for camera, entry in found["cameras"].items():
         if isinstance(entry.get("lens"), dict):
             yield ("lens", camera), entry["lens"]

@@ -15,6 +15,7 @@ import gtsam
 import numpy as np
 
 from adjust.frames.runs import MOVING, runs
+from adjust.frames.state import State
 from adjust.frames.unknowns import Chain, Link, ShiftedSlot, Unknowns, VectorMap, vector_map
 from adjust.model.clocks import CLOCK, EpochTimes, clocks_of, epoch_times
 from adjust.model.errors import SurveyError
@@ -223,6 +224,38 @@ def moved_poses(own: Motions, others: Motions, at: Interpolated) -> tuple[FloatA
     by_clock = speed[:, :, None] * at.by_clock[:, None, :]
     moved = own @ exp(xi)
     return moved.rotation, _t(moved), np.concatenate([by_nodes, by_clock], axis=2)
+
+
+def shift(state: State, values: gtsam.Values, slots: Sequence[ShiftedSlot]) -> None:
+    """Poses of slots at the times of clocks, and their derivatives; what they follow from is in the state."""
+    alike: dict[tuple[str, int, int], list[ShiftedSlot]] = {}
+    for s in slots:
+        table = state.unknowns.table_slots.get(s.nodes[0])
+        place = "" if table is None else table.table_id, len(s.nodes), len(s.by_clocks)
+        alike.setdefault(place, []).append(s)
+    for (table_id, *_), of in alike.items():
+        at, i = interpolated(of, values), [s.slot for s in of]
+        if table_id:
+            R, t, D = _between_readings(state, values, of, at)
+        else:
+            own, others = [s.nodes[0] for s in of], [n for s in of for n in s.nodes[1:]]
+            first, rest = (Motions(state.slot_R[x], state.slot_t[x]) for x in (own, others))
+            R, t, D = moved_poses(first, rest, at)
+        state.slot_R[i], state.slot_t[i] = R, t
+        state.D[state.derived_index[i], :, : D.shape[2]] = D
+
+
+def _between_readings(
+    state: State, values: gtsam.Values, slots: Sequence[ShiftedSlot], at: Interpolated
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Of slots of one table R, t, and derivatives by the angles of all nodes, free geometry and clocks."""
+    tables = [[state.unknowns.table_slots[n] for n in s.nodes] for s in slots]
+    angles = np.array([[values.atVector(t.angles_key) for t in nodes] for nodes in tables])
+    R, t, D = state.of_table(values, tables[0][0], np.einsum("sk,ska->sa", at.w, angles))
+    k = angles.shape[2]
+    by_nodes = np.einsum("sk,sia->sika", at.w, D[:, :, :k]).reshape(len(slots), 6, -1)
+    speed = D[:, :, :k] @ np.einsum("sk,ska->sa", at.by_dt, angles)[..., None]
+    return R, t, np.concatenate([by_nodes, D[:, :, k:], speed * at.by_clock[:, None, :]], axis=2)
 
 
 def _t(motions: Motions) -> FloatArray:
