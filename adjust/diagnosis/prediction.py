@@ -8,15 +8,18 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.frames.lens_states import LensTimes
+from adjust.frames.runs import MOVING
 from adjust.frames.tables import table_motions
 from adjust.frames.unknowns import FrameTree, Unknowns
 from adjust.graph.assembly import StartValues
 from adjust.lenses.models import MODELS, camera_constants, project
 from adjust.model.boards import deformed, warming_of
+from adjust.model.clocks import epoch_times
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment, ParameterName
-from adjust.model.survey import Camera, FloatArray, Survey, Target
+from adjust.model.survey import Camera, Clock, FloatArray, Survey, Target
+from adjust.observations.clocks import between, nearest
 from adjust.spatial.rigid import inverse, rigid
 
 Altered = Mapping[ParameterName, Pose3 | FloatArray]
@@ -89,11 +92,41 @@ class Prediction:
         out = np.eye(4)
         for name, inverted in self.links(block):
             new = altered.get(name)
-            value = new.matrix() if isinstance(new, Pose3) else self.link(name)
+            value = new.matrix() if isinstance(new, Pose3) else self._link_of(block, name)
             if value is None:
                 return None
             out = out @ (inverse(value) if inverted else value)
         return self._moved_body(block, out, altered)
+
+    def _link_of(self, block: ImageBlock, name: ParameterName) -> FloatArray | None:
+        """(4, 4) of a link of a block when its camera exposed, of which the middle of its rows is taken."""
+        clock = self._clocks.get(block.camera_id)
+        if clock is None or len(name) != 3 or name[0] not in MOVING:
+            return self.link(name)
+        times, values = epoch_times(self.survey), self._value(("camera_clock", block.camera_id), {})
+        own = self._value(("camera_clock", block.camera_id, block.epoch_id), {})
+        if values is None:
+            return self.link(name)
+        height = next(c.image_size[1] for c in self.survey.cameras if c.camera_id == block.camera_id)
+        rates = {"offset": 1.0, "drift": times.of[name[2]] - times.middle,
+                 "line_time": float(block.uv[:, 1].mean()) - 0.5 * (height - 1)}  # fmt: skip
+        late = sum(rates[n] * v for n, v in zip(clock.parameters.names, values.tolist(), strict=True))
+        late += 0.0 if own is None else float(own[0])
+        near = {times.of[n[2]]: n for n in self._epochs_of(name) if n[2] in times.of}
+        chosen = nearest(list(near), times.of[name[2]])
+        poses = [self.link(near[t]) for t in chosen]
+        known = [p for p in poses if p is not None]
+        return between(known, chosen, late) if len(known) == len(poses) else self.link(name)
+
+    def _epochs_of(self, name: ParameterName) -> list[ParameterName]:
+        """Names of what a link is at all epochs."""
+        if name[0] == "table_motion":
+            return [(*name[:2], r.epoch_id) for r in self.survey.table_readings if r.table_id == name[1]]
+        return [n for n in self.values if n[:2] == name[:2] and len(n) == 3]
+
+    @cached_property
+    def _clocks(self) -> dict[str, Clock]:
+        return {c.camera_id: c.clock for c in self.survey.cameras if c.clock is not None}
 
     def implied(
         self, block: ImageBlock, pose: FloatArray, name: ParameterName, alone: Container[ParameterName] = ()

@@ -1,12 +1,11 @@
 """The current values of all slots, lenses and warps as plain arrays, for the compiled kernels."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 import gtsam
 import numpy as np
 
-from adjust.frames.clocks import Interpolated, interpolated, moved_poses
 from adjust.frames.lens_states import LensStates, lenders
 from adjust.frames.tables import table_motions
 from adjust.frames.unknowns import ShiftedSlot, TableSlot, Unknowns, VectorMap, vector_map
@@ -16,7 +15,8 @@ from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, IntArray, Survey, VectorParameter
 from adjust.native.images import MAX_MAP, LensArrays, WarpArrays
 from adjust.native.lenses import MAX_LENS
-from adjust.spatial.rigid_motions import Motions
+
+Shift = Callable[["State", gtsam.Values, Sequence[ShiftedSlot]], None]
 
 
 class State:
@@ -32,8 +32,9 @@ class State:
     points (P, 3) m: the free ones in the order of their keys, ``point_rows`` says where.
     """
 
-    def __init__(self, survey: Survey, unknowns: Unknowns) -> None:
-        self.unknowns = unknowns
+    def __init__(self, survey: Survey, unknowns: Unknowns, shift: Shift = lambda state, values, slots: None) -> None:
+        """shift: fills slot_R, slot_t and D of the slots at the times of clocks, where there are any."""
+        self.unknowns, self.shift = unknowns, shift
         self.targets = {t.target_id: i for i, t in enumerate(survey.targets)}
         self.lens_states = LensStates(survey, unknowns)
         self.warp_maps: list[VectorMap | None] = [unknowns.vectors.get(("warp", t.target_id)) for t in survey.targets]
@@ -119,7 +120,7 @@ class State:
             self._load_poses(values)
             self._load_points(values)
             self._move_tables(values, self.unknowns.table_slots.values())
-            self._shift(values, self.unknowns.shifted_slots.values())
+            self.shift(self, values, list(self.unknowns.shifted_slots.values()))
         else:
             shifted = [s for slot in slots if (s := self.unknowns.shifted_slots.get(slot)) is not None]
             asked = list(dict.fromkeys([*slots, *(n for s in shifted for n in s.nodes)]))
@@ -128,7 +129,7 @@ class State:
                 found = self.unknowns.slot_key[slot]
                 if found is not None and self.unknowns.derived(slot) is None:
                     self._set(slot, values.atPose3(found))
-            self._shift(values, shifted)
+            self.shift(self, values, shifted)
         if lenses:
             self._load_lenses(values)
 
@@ -178,11 +179,11 @@ class State:
         """Poses of one table's slots, and their derivatives into D."""
         at = [s.slot for s in slots]
         angles = np.array([values.atVector(s.angles_key) for s in slots])
-        self.slot_R[at], self.slot_t[at], derivative = self._of_table(values, slots[0], angles)
+        self.slot_R[at], self.slot_t[at], derivative = self.of_table(values, slots[0], angles)
         self.D[self.derived_index[at], :, : derivative.shape[2]] = derivative
 
     @staticmethod
-    def _of_table(
+    def of_table(
         values: gtsam.Values, slot: TableSlot, angles: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Motions of the table of a slot at angles (n, k): R, t, and derivatives by these and the free geometry."""
@@ -190,36 +191,6 @@ class State:
         given = dict(zip(geometry.names, geometry.full(values).tolist(), strict=True))
         R, t, derivative = table_motions(slot.axes, given, angles)
         return R, t, np.concatenate([derivative[:, :, :k], derivative[:, :, k:] @ geometry.matrix], axis=2)
-
-    def _shift(self, values: gtsam.Values, slots: Iterable[ShiftedSlot]) -> None:
-        """Poses of slots at the times of clocks, and their derivatives into D; what they follow from is there."""
-        alike: dict[tuple[str, int, int], list[ShiftedSlot]] = {}
-        for s in slots:
-            table = self.unknowns.table_slots.get(s.nodes[0])
-            place = "" if table is None else table.table_id, len(s.nodes), len(s.by_clocks)
-            alike.setdefault(place, []).append(s)
-        for (table_id, *_), of in alike.items():
-            at, i = interpolated(of, values), [s.slot for s in of]
-            if table_id:
-                R, t, D = self._between_readings(values, of, at)
-            else:
-                own, others = [s.nodes[0] for s in of], [n for s in of for n in s.nodes[1:]]
-                R, t, D = moved_poses(Motions(self.slot_R[own], self.slot_t[own]),
-                                      Motions(self.slot_R[others], self.slot_t[others]), at)  # fmt: skip
-            self.slot_R[i], self.slot_t[i] = R, t
-            self.D[self.derived_index[i], :, : D.shape[2]] = D
-
-    def _between_readings(
-        self, values: gtsam.Values, slots: Sequence[ShiftedSlot], at: Interpolated
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Of slots of one table R, t, and derivatives by the angles of all nodes, free geometry and clocks."""
-        tables = [[self.unknowns.table_slots[n] for n in s.nodes] for s in slots]
-        angles = np.array([[values.atVector(t.angles_key) for t in nodes] for nodes in tables])
-        R, t, D = self._of_table(values, tables[0][0], np.einsum("sk,ska->sa", at.w, angles))
-        by_angles, k = D[:, :, : angles.shape[2]], angles.shape[2]
-        by_nodes = np.einsum("sk,sia->sika", at.w, by_angles).reshape(len(slots), 6, -1)
-        speed = by_angles @ np.einsum("sk,ska->sa", at.by_dt, angles)[..., None]
-        return R, t, np.concatenate([by_nodes, D[:, :, k:], speed * at.by_clock[:, None, :]], axis=2)
 
 
 def collect_vectors(survey: Survey, unknowns: Unknowns, lenses: dict[str, FloatArray]) -> None:

@@ -9,7 +9,6 @@ import gtsam
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.frames.clocks import Shifts, collect_clocks, reading_residual
 from adjust.frames.state import State, collect_vectors
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Chain, FrameTree, Unknowns
 from adjust.model.boards import deformation, warming_of
@@ -18,6 +17,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import Coordinates, FrameRef, ImageBlock, Pair, PositionRef, frame_text, position_text
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey, VectorParameter, VectorPrior
+from adjust.observations.clocks import Shifts, collect_clocks, reading_residual, shift
 from adjust.observations.factors import (
     ChainPose,
     ObservationFactor,
@@ -110,7 +110,8 @@ class AdjustmentGraph:
     ``graph`` has every observation as a factor on its unknowns and nothing else; ``system`` is a view of it for the
     solver, in which points and poses that nothing else touches are reduced.
     bundles: image blocks of unknown points, in parts that are reduced each by itself. image_order: of every image block
-    its number in the survey and its part: 0 in ``images``, i in the bundle before the i-th.
+    its number in the survey and its part: 0 in ``images``, i in the bundle before the i-th. image_numbers: of every
+    block in ``images`` the number in the survey of that which it is, or a part of.
     reduction: of the poses that only image points touch; None where it would not pay. pairs: those between two fixed
     stations, ``others[first_pair + pairs.rows[e]]`` the e-th; singles: the others that are in no batch.
     """
@@ -122,6 +123,7 @@ class AdjustmentGraph:
     images: ImageBatch
     bundles: tuple[BundleBatch, ...]
     image_order: list[tuple[int, int]]
+    image_numbers: list[int]
     singles: list[ObservationFactor]
     singles_graph: gtsam.NonlinearFactorGraph
     terrestrial: TerrestrialBatch | None = None
@@ -347,7 +349,7 @@ class GraphBuilder:
         if self.times is not None:
             parts_of, pair_chains = self._at_their_times(self.times, parts_of, pair_chains)
         self.vector_starts |= geometry.starts
-        state = State(self.survey, self.unknowns)
+        state = State(self.survey, self.unknowns, shift)
         pairs = self._pair_batch(state)
         at = {ref: self._position(state, ref, chain) for ref, chain in positions.items()}
         values = self._values(start)
@@ -366,6 +368,7 @@ class GraphBuilder:
                 others.add(item.factor)
         for factor in self._holds():
             others.add(factor)
+        numbers = [i for i, free, _ in split if not free for _ in parts_of[i]]
         known = [part for i, free, _ in split if not free for part in parts_of[i]]
         x_in_world = self._world_points() if any(b.target_id is None for b, _ in known) else np.zeros((0, 3))
         images = ImageBatch(self.survey, state, [b for b, _ in known], [chain for _, chain in known], x_in_world)
@@ -388,8 +391,8 @@ class GraphBuilder:
         part_of = {unknown[k][0]: p for p, (part, _) in enumerate(parts, 1) for k in part}
         order = [(i, part_of.get(i, 0)) for i, _, _ in split]
         return AdjustmentGraph(
-            survey, self.unknowns, state, values, images, bundles, order, self.others, others, readings, reduced,
-            pairs, first_pair,
+            survey, self.unknowns, state, values, images, bundles, order, numbers, self.others, others, readings,
+            reduced, pairs, first_pair,
         )  # fmt: skip
 
     def _at_their_times(

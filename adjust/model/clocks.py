@@ -6,7 +6,7 @@ What a camera, a turntable or a robot observed at an epoch of time t it observed
 
 so that a positive offset is a clock that is late. Rows are those of a camera's image points, (height - 1) / 2 its
 middle one; line_time is positive where the upper rows are read first. Where everything is between the epochs follows
-from where it is at them (:mod:`adjust.frames.clocks`).
+from where it is at them (:mod:`adjust.observations.clocks`).
 """
 
 from collections.abc import Iterator, Mapping

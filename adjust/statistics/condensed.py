@@ -60,31 +60,31 @@ class CondensedSystem:
 
     def point_rows(self, row: int) -> tuple[IntArray, FloatArray]:
         """Columns (k,) and the whitened rows (2, k) over them of an image point that is in use."""
-        graph, (ptr, place) = self.system.precision.graph, self._places
-        i = int(np.searchsorted(ptr, row, side="right")) - 1
-        point = row - int(ptr[i])
-        if i not in place:  # its rows are among those of the system
-            first = int(np.flatnonzero(self.block == i)[0])
-            A = self.system.A[first + 2 * point : first + 2 * point + 2]
+        graph = self.system.precision.graph
+        images, at = graph.images, int(graph.image_rows[row])
+        if at >= images.n_points:  # its rows are among those of the system
+            i = int(np.searchsorted(self._first_points, row, side="right")) - 1
+            first = int(np.flatnonzero(self.block == i)[0]) + 2 * (row - int(self._first_points[i]))
+            A = self.system.A[first : first + 2]
             columns = np.unique(A.indices)
             return columns, A[:, columns].toarray()
-        b, which = place[i], np.array([place[i]])
-        local = graph.images.rows(which)[0, 2 * point : 2 * point + 2, :-1]
-        columns = np.concatenate([self.key_columns[key] for key in graph.images.keys[b]])
+        b = int(np.searchsorted(images.ptr, at, side="right")) - 1
+        which, point = np.array([b]), at - int(images.ptr[b])
+        local = images.rows(which)[0, 2 * point : 2 * point + 2, :-1]
+        columns = np.concatenate([self.key_columns[key] for key in images.keys[b]])
         kept = columns >= 0
-        return columns[kept], (local @ graph.images.local_from_keys(which)[0])[:, kept]
+        return columns[kept], (local @ images.local_from_keys(which)[0])[:, kept]
 
     @property
     def n_points(self) -> int:
         """Image points."""
-        return int(self._places[0][-1])
+        return int(self._first_points[-1])
 
     @cached_property
-    def _places(self) -> tuple[IntArray, dict[int, int]]:
-        """First image point of every block, and the place of blocks of known targets among these."""
-        graph = self.system.precision.graph
-        known = [i for i, part in graph.image_order if not part]
-        return np.cumsum([0] + [len(b.uv) for b in graph.survey.image_blocks]), {i: b for b, i in enumerate(known)}
+    def _first_points(self) -> IntArray:
+        """First image point of every block, and the number of all."""
+        blocks = self.system.precision.graph.survey.image_blocks
+        return np.cumsum([0] + [len(b.uv) for b in blocks])
 
 
 def condensed_system(precision: Precision) -> CondensedSystem:
@@ -121,7 +121,7 @@ def _known(
 ) -> ImageRows:  # fmt: skip
     """Blocks of known targets, those of the same size together."""
     images, entries = graph.images, Entries()
-    number = np.array([i for i, part in graph.image_order if not part], dtype=np.int64)
+    number = np.array(graph.image_numbers, dtype=np.int64)
     shapes, columns, sets = _shapes(graph), columns_of_blocks(graph, key_columns), images.alike()
     at, lengths, e = 0, [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
     for mine, part in zip(sets, side_by_side(lambda mine: _condensed(graph, mine, shapes), sets), strict=True):

@@ -45,6 +45,7 @@ def reference_page() -> str:
 def _table(d: Declared) -> str:
     where = f"[{d.path}]" if d.path and not d.path.isupper() else {
         "": "Before the first table", "POSE": "A pose", "EPOCHS": "Poses by epoch", "SIGMA": "`sigma` of named values",
+        "CLOCK": "The clock of a table or a station",
     }[d.path]  # fmt: skip
     title = f"`{where}`" if where.startswith("[") else where
     kind = "" if d.of is None else f' with {d.of[0]} = "{d.of[1]}"'

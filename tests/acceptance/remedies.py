@@ -216,15 +216,13 @@ def outcome(remedy: Remedy, repeats: int, seed: int = 1) -> Outcome:
     """Adjusted again and again with fresh noise, with the terms and without."""
     squares, found, false, k = [], 0, 0, 0
     for i in range(repeats):
-        here = remedy.drawn(remedy.truth, np.random.default_rng(seed + i))
-        for truth in (here, remedy.innocent):
-            result = adjust(resample(remedy.survey, truth, 1000 * seed + i))
-            d, cov, test = _estimated(result, remedy, truth)
-            if truth is remedy.innocent:
-                false += test.significant
-                continue
-            squares.append(float(d @ np.linalg.solve(cov, d)))
-            found, k = found + test.significant, len(d)
+        truth = remedy.drawn(remedy.truth, np.random.default_rng(seed + i))
+        d, cov, test = _estimated(adjust(resample(remedy.survey, truth, 1000 * seed + i)), remedy, truth)
+        squares.append(float(d @ np.linalg.solve(cov, d)))
+        found, k = found + test.significant, len(d)
+    for i in range(repeats):
+        result = adjust(resample(remedy.survey, remedy.innocent, 1000 * seed + i))
+        false += _estimated(result, remedy, remedy.innocent)[2].significant
     return Outcome(k, np.array(squares), found, false)
 
 

@@ -50,8 +50,7 @@ def test_planted_mistake_is_named_first(name: str, kind: str) -> None:
     planted = mistake.plant(survey, truth, NAMED[name, kind])
     first = diagnosed(planted).candidates[0]
     assert (first.hypothesis.name, first.hypothesis.place.ids) == (name, (mistake.about(survey),))
-    # of first and last images of a course nothing is known of speeds: they go, and count as their noise
-    assert first.explained > (0.6 if name in ("rolling shutter", "clock offset") else 0.9)
+    assert first.explained > 0.9
     assert first.sigma0 < 1.1
 
 

@@ -9,6 +9,7 @@ from adjust.adjustment import adjust
 from adjust.diagnosis.prediction import Prediction, adjusted_values
 from adjust.model.survey import LensDrift, Tie, VectorParameter
 from survey.simulate import resample, stereo
+from tests.adjust.moving import board_before_cameras, clock, head_on_moving_table
 
 FREE = ("warp_x", "scale_y", "expansion")
 
@@ -31,3 +32,23 @@ def test_images_are_predicted_with_warp_and_drift(drift: LensDrift) -> None:
         assert uv is not None
         v = result.image_residuals.residuals[ptr[i] : ptr[i + 1]]
         np.testing.assert_allclose(uv - block.uv, v, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("made", "tolerance"),
+    [
+        (lambda: board_before_cameras(10, {"right": clock(0.01, offset=0.03, drift=0.01)},
+                                      {("camera_clock", "right"): np.array([0.03, 0.01])}), 1e-6),
+        (lambda: head_on_moving_table(12, {"left": clock(offset=0.03)}, {("camera_clock", "left"): np.array([0.03])}),
+         0.02),  # poses between readings, not angles
+    ],
+    ids=["board", "table"],
+)  # fmt: skip
+def test_images_are_predicted_when_cameras_expose(made, tolerance: float) -> None:
+    result = adjust(made()[0])
+    predicted, ptr = Prediction(result.survey, adjusted_values(result)), result.image_residuals.block_ptr
+    for i, block in enumerate(result.survey.image_blocks):
+        uv = predicted.uv(block)
+        assert uv is not None
+        v = result.image_residuals.residuals[ptr[i] : ptr[i + 1]]
+        np.testing.assert_allclose(uv - block.uv, v, atol=tolerance)

@@ -49,8 +49,10 @@ def test_simultaneous_cameras_have_no_offset() -> None:
 def test_a_real_session_of_free_running_cameras() -> None:
     """cam1 is 116 +- 9 ms before cam0 by an independent computation; six frames a second."""
     case = Case(read(data_folder("calibration", "unsynchronised")).survey)
-    (found,) = unsynchronised(case)
-    assert found.name == "cameras not simultaneous"
+    found, apart = unsynchronised(case)
+    assert found.name == apart.name == "cameras not simultaneous"
+    assert found.edits
+    assert not apart.edits
     assert found.place.ids == ("cam1",)
     offset = next(o for link in links(case) if link.names == ("cam0", "cam1") if (o := time_offset(link)))
     assert 1e3 * offset.intervals / 6.0 == pytest.approx(-116.0, abs=3 * 9.0)

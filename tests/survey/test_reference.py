@@ -34,7 +34,7 @@ EVERYTHING: dict[str, Any] = {
         "head": {"motion": "epoch", "world_from_station": PRIOR, "epochs": {"e1": PRIOR}},
         "carried": {"motion": "table", "table": "tt"},
     },
-    "tables": {"tt": {"geometry": {"free": ["non_orthogonality", "axis_offset", "zero_1", "zero_2"]}}},
+    "tables": {"tt": {"geometry": {"free": ["non_orthogonality", "axis_offset", "zero_1", "zero_2"]}, "clock": {}}},
     "cameras": {
         "X": {"station": "head", "image_size_px": [640, 480], "lens": {
             "model": "brown", "free": ["fx"], "values": {"fx": 1000, "fy": 1000, "u0": 320, "v0": 240},
@@ -42,7 +42,7 @@ EVERYTHING: dict[str, Any] = {
             "drift": {"parameters": ["fx"], "begins": ["e2"], "sigma": {"fx": 0.1}},
             "shared": {"camera": "Y", "parameters": ["fx"]},
             "crops": {"e3": {"scale": 0.5, "left_px": 10, "free": ["scale"], "sigma": {"scale": 0.1}}},
-        }},
+        }, "clock": {}},
         "Y": {"station": "head", "image_size_px": [640, 480], "lens": {"model": "brown", "free": ["fx"], "values": {
             "fx": 1000, "fy": 1000, "u0": 320, "v0": 240}}},
     },
@@ -60,7 +60,7 @@ EVERYTHING: dict[str, Any] = {
     "datum": {"kind": "inner"},
     "sigmas": {"scale": {"distance": 2.0}},
     "adjustment": {"pairs": "closed"}, "vertical": {"free": ["tilt_1", "tilt_2"], "sigma": {"tilt_1_arcsec": 1.0}},
-    "bearings": {}, "temperatures_degC": {"e1": 21.5},
+    "bearings": {}, "temperatures_degC": {"e1": 21.5}, "times_s": {"e1": 0.5},
     "spots": {"cameras": ["X"]},
     "instruments": {"ts": {"sigma_distance_mm": 1.0}},
     "setups": {"s1": {}},
@@ -92,7 +92,8 @@ PLACES: dict[str, tuple[str, ...]] = {
     "surface_line": ("surfaces", "rail"), "surface_sphere": ("surfaces", "ball"),
     "vector_sigma": ("vertical", "sigma"), "align": ("align", "a1"), "feet": ("align", "a1", "feet_mm"),
     "tolerance": ("tolerances", "t1"), "identification": ("identification",),
-    "temperatures": ("temperatures_degC",), "closure": ("closures", "plate"),
+    "temperatures": ("temperatures_degC",), "closure": ("closures", "plate"), "times": ("times_s",),
+    "camera_clock": ("cameras", "X", "clock"), "clock": ("tables", "tt", "clock"),
 }  # fmt: skip
 NEED_MORE = {("station", "motion"), ("lens", "balance_radius_mm")}
 KEYS = [(d, key) for d in DECLARATIONS for key in d.keys]

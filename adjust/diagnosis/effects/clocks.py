@@ -170,7 +170,7 @@ def _of_tables(case: Case, linear: Linear) -> Iterator[Effect]:
         ):  # fmt: skip
             components = ("offset",) if name == "clock offset" else ("offset", "drift")
             if components[-1] not in freed:
-                shifts = {i: d[:, None] for i, d in zip(ids, D, strict=True)}
+                shifts: dict[tuple[str, ...], FloatArray] = {i: d[:, None] for i, d in zip(ids, D, strict=True)}
                 hypothesis = Hypothesis(
                     name, "", "read the table while it stands still, and measure again",
                     Place("table", (table.table_id,), "clock"), case.survey, (), 1.0, 0,

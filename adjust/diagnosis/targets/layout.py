@@ -54,7 +54,8 @@ def _misses(x: FloatArray, uv: FloatArray) -> FloatArray:
     q = one @ np.swapaxes(H, 1, 2)
     with np.errstate(divide="ignore", invalid="ignore"):
         miss = (q[..., :2] / q[..., 2:] - b) / scale
-    return np.asarray(np.sqrt(np.minimum(np.nan_to_num(miss, nan=1e6) ** 2, 1e12).mean(axis=(1, 2))))
+    square = np.minimum(np.abs(np.nan_to_num(miss, nan=1e6)), 1e6) ** 2
+    return np.asarray(np.sqrt(square.mean(axis=(1, 2))))
 
 
 def _normalized(x: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -4,7 +4,7 @@ The result is that of adjusting everything at once: the minimum does not depend 
 might (free networks, whose datum is that of the start), the search begins anew.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -13,10 +13,12 @@ from gtsam import Pose3, Rot3
 from adjust.adjustment import start_values
 from adjust.graph.assembly import StartValues
 from adjust.lenses.models import MODELS
+from adjust.model.boards import BOARD
+from adjust.model.clocks import CLOCK, clocks_of, epoch_times
 from adjust.model.errors import NotConvergedError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.rewriting import Rewriting, Vector
-from adjust.model.survey import FloatArray, LensParameter, PointParameter, PoseParameter, Survey
+from adjust.model.survey import FloatArray, LensParameter, PointParameter, PoseParameter, Survey, VectorParameter
 from adjust.model.tables import unit_of
 from adjust.pose_network.from_survey import network_from_survey, network_of_pairs
 from adjust.start import find_start
@@ -94,28 +96,44 @@ def survey_start(survey: Survey, previous: Previous) -> StartValues | None:
 
 
 def _known_vectors(survey: Survey, previous: Previous, start: StartValues) -> dict[ParameterName, FloatArray]:
-    """Angles, geometry of tables and warps from before, of those that ``start`` has; what is held keeps its value."""
-    out: dict[ParameterName, FloatArray] = {}
+    """Angles, axes, warps, changes of lenses and clocks from before; what is held keeps its value."""
+    found: dict[ParameterName, FloatArray | None] = {}
+    axes = {t.table_id: tuple(f"axis{i + 1}" for i in range(len(t.axes))) for t in survey.tables}
+    for name in start.vectors:
+        if name[0] == "table_angles":
+            found[name] = previous.vector(name, axes[name[1]], ("rad",) * len(axes[name[1]]))
+    for name, given, units in _terms(survey):
+        value = previous.vector(name, given.names, units)
+        free = [x in given.free for x in given.names]
+        found[name] = None if value is None else np.where(free, value, given.values)
+    for camera in survey.cameras:
+        if (drift := camera.lens.drift) is not None:
+            model, per = MODELS[camera.lens.model], "" if drift.reference_temperature is None else "/K"
+            units = tuple(model.units[model.names.index(x)] + per for x in drift.parameters)
+            for name in _of(previous, ("lens_drift", camera.camera_id)):
+                found[name] = previous.vector(name, drift.parameters, units)
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def _terms(survey: Survey) -> Iterator[tuple[ParameterName, VectorParameter, tuple[str, ...]]]:
+    """Named scalars of owners that a start has no closed form for, with their units."""
     for table in survey.tables:
-        for name in start.vectors:
-            if name[0] == "table_angles" and name[1] == table.table_id:
-                axes = tuple(f"axis{i + 1}" for i in range(len(table.axes)))
-                _take(out, name, previous.vector(name, axes, ("rad",) * len(axes)))
-        geometry = table.geometry
-        units = tuple(unit_of(x) for x in geometry.names)
-        name = ("table_geometry", table.table_id)
-        if name in start.vectors:
-            _take(out, name, previous.vector(name, geometry.names, units), start.vectors[name],
-                  tuple(x in geometry.free for x in geometry.names))  # fmt: skip
-    return out
+        yield ("table_geometry", table.table_id), table.geometry, tuple(unit_of(x) for x in table.geometry.names)
+    for target in survey.targets:
+        if target.warp is not None:
+            yield ("warp", target.target_id), target.warp, tuple(BOARD[x] for x in target.warp.names)
+    clocks = dict(clocks_of(survey))
+    times = epoch_times(survey) if clocks else None
+    for name, clock in clocks.items():
+        unit = "s" if times is None else times.unit
+        yield name, clock.parameters, tuple("1" if CLOCK[x] == "1" else unit for x in clock.parameters.names)
+        if clock.jitter > 0.0 and times is not None:
+            own = VectorParameter(("jitter",), np.zeros(1), ("jitter",))
+            yield from (((*name, epoch), own, (unit,)) for epoch in times.of)
 
 
-def _take(
-    out: dict[ParameterName, FloatArray], name: ParameterName, value: FloatArray | None,
-    held: FloatArray | None = None, free: tuple[bool, ...] = (),
-) -> None:  # fmt: skip
-    if value is not None:
-        out[name] = value if held is None else np.where(free, value, held)
+def _of(previous: Previous, owner: ParameterName) -> list[ParameterName]:
+    return [name for name in previous.vectors if name[:2] == owner]
 
 
 class _Known(Rewriting):

@@ -25,11 +25,10 @@ def read_clock(node: Node, declared: str, timed: bool) -> Clock | None:
     if known and not timed:
         raise clock.error("the times of the epochs are not known; give times_s or epoch_interval_s, or leave it out",
                           known[0])  # fmt: skip
-    if clock.has("jitter_ms") and clock.has("jitter_intervals"):
-        raise clock.error("jitter_ms is given too; keep one of the two", "jitter_intervals")
-    if clock.has("jitter_intervals") and timed:
+    intervals = clock.number("jitter_intervals", 0.0)
+    if timed and intervals != 0.0:
         raise clock.error("the times of the epochs are known; give jitter_ms", "jitter_intervals")
-    jitter = float(to_si(clock.number("jitter_ms", 0.0), "ms")) if timed else clock.number("jitter_intervals", 0.0)
+    jitter = float(to_si(clock.number("jitter_ms", 0.0), "ms")) if timed else intervals
     if not jitter >= 0.0:
         raise clock.error(f"found {jitter:g}; a sigma is not negative", "jitter_ms" if timed else "jitter_intervals")
     given = read_vector(clock, units, ("offset",))

@@ -36,7 +36,8 @@ class Previous:
     """A solution that was written: poses and points by parameter name; covs as written, by the same names.
 
     factor: by which sigmas were multiplied. vectors: components as
-    ``solution.json`` has them, of lenses (with ``model``), table angles and geometry and warps, by parameter name.
+    ``solution.json`` has them, of lenses (with ``model``) and their changes, table angles and geometry, warps and
+    clocks, by parameter name.
     """
 
     poses: Mapping[ParameterName, Pose3]
@@ -141,9 +142,18 @@ def _previous(found: Mapping[str, Any], covs: Mapping[str, FloatArray]) -> Previ
 
 
 def _vectors(found: Mapping[str, Any]) -> Iterator[tuple[ParameterName, Mapping[str, Any]]]:
+    for kind, section in (("camera_clock", "cameras"), ("table_clock", "tables"), ("pose_clock", "stations")):
+        for owner, entry in found[section].items():
+            if isinstance(clock := entry.get("clock"), dict):
+                yield (kind, owner), clock
+                own = clock.get("epochs", {}).items()
+                yield from (((kind, owner, epoch), time) for epoch, time in own if isinstance(time, dict))
     for camera, entry in found["cameras"].items():
         if isinstance(entry.get("lens"), dict):
             yield ("lens", camera), entry["lens"]
+        for block, change in entry.get("lens_drift", {}).get("changes", {}).items():
+            if isinstance(change, dict):
+                yield ("lens_drift", camera, *(() if block == "per_kelvin" else (block,))), change
     for table, entry in found["tables"].items():
         if isinstance(entry.get("geometry"), dict):
             yield ("table_geometry", table), entry["geometry"]

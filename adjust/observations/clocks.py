@@ -15,12 +15,14 @@ import gtsam
 import numpy as np
 
 from adjust.frames.runs import MOVING, runs
+from adjust.frames.state import State
 from adjust.frames.unknowns import Chain, Link, ShiftedSlot, Unknowns, VectorMap, vector_map
 from adjust.model.clocks import CLOCK, EpochTimes, clocks_of, epoch_times
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock, Pair, TableReading
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, Survey
+from adjust.spatial.rigid import rigid
 from adjust.spatial.rigid_motions import Motions, exp, right_jacobian, right_jacobian_inverse
 
 Reading = Callable[[gtsam.Values], tuple[FloatArray, list[tuple[int, FloatArray]]]]
@@ -67,9 +69,7 @@ class Shifts:
             slots = [slot for _, slot in found]
             for run in runs([t for t, _ in found], self._epoch[slots[0]][0]):
                 for i in run:
-                    first = min(max(run.start, i - _AROUND // 2), max(run.start, run.stop - 1 - _AROUND))
-                    near = range(first, min(run.stop, first + _AROUND + 1))
-                    yield slots[i], [slots[i], *(slots[j] for j in near if j != i)]
+                    yield slots[i], [slots[i], *(slots[j] for j in _near(run, i) if j != i)]
 
     def of_image(self, block: ImageBlock, chain: Chain) -> list[tuple[ImageBlock, Chain]]:
         """Parts of an image block that were exposed at one moment each, in its order, and their chains."""
@@ -133,6 +133,29 @@ class Shifts:
             one = np.eye(1)
             u.vectors[name] = VectorMap(("jitter",), (self.times.unit,), np.zeros(1), one, key, ("jitter",), ("prior",))
         return u.vectors[name]
+
+
+def _near(run: range, i: int) -> range:
+    """The epochs of a run from which it is known how things move about the i-th."""
+    first = min(max(run.start, i - _AROUND // 2), max(run.start, run.stop - 1 - _AROUND))
+    return range(first, min(run.stop, first + _AROUND + 1))
+
+
+def nearest(times: Sequence[float], time: float) -> list[float]:
+    """Of the times of a body's epochs those from which it is known how it moves about one of them, that one first."""
+    order = sorted(times)
+    i = order.index(time)
+    run = next(r for r in runs(order, ("epochs",)) if i in r)
+    return [time, *(order[j] for j in _near(run, i) if j != i)]
+
+
+def between(poses: Sequence[FloatArray], times: Sequence[float], dt: float) -> FloatArray:
+    """(4, 4) a time dt after the first of the times, from poses (4, 4) at all of them."""
+    w, by_dt = weights(np.array([times]) - times[0], np.array([dt]))
+    every = np.array(poses)
+    motions = Motions(every[:, :3, :3], every[:, :3, 3])
+    R, t, _ = moved_poses(motions[:1], motions[1:], Interpolated(w, by_dt, np.zeros((1, 0))))
+    return rigid(R[0], t[0])
 
 
 def _parts(u: Unknowns, nodes: Sequence[int], clocks: Sequence[VectorMap]) -> list[tuple[int, int, int]]:
@@ -201,6 +224,38 @@ def moved_poses(own: Motions, others: Motions, at: Interpolated) -> tuple[FloatA
     by_clock = speed[:, :, None] * at.by_clock[:, None, :]
     moved = own @ exp(xi)
     return moved.rotation, _t(moved), np.concatenate([by_nodes, by_clock], axis=2)
+
+
+def shift(state: State, values: gtsam.Values, slots: Sequence[ShiftedSlot]) -> None:
+    """Poses of slots at the times of clocks, and their derivatives; what they follow from is in the state."""
+    alike: dict[tuple[str, int, int], list[ShiftedSlot]] = {}
+    for s in slots:
+        table = state.unknowns.table_slots.get(s.nodes[0])
+        place = "" if table is None else table.table_id, len(s.nodes), len(s.by_clocks)
+        alike.setdefault(place, []).append(s)
+    for (table_id, *_), of in alike.items():
+        at, i = interpolated(of, values), [s.slot for s in of]
+        if table_id:
+            R, t, D = _between_readings(state, values, of, at)
+        else:
+            own, others = [s.nodes[0] for s in of], [n for s in of for n in s.nodes[1:]]
+            first, rest = (Motions(state.slot_R[x], state.slot_t[x]) for x in (own, others))
+            R, t, D = moved_poses(first, rest, at)
+        state.slot_R[i], state.slot_t[i] = R, t
+        state.D[state.derived_index[i], :, : D.shape[2]] = D
+
+
+def _between_readings(
+    state: State, values: gtsam.Values, slots: Sequence[ShiftedSlot], at: Interpolated
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Of slots of one table R, t, and derivatives by the angles of all nodes, free geometry and clocks."""
+    tables = [[state.unknowns.table_slots[n] for n in s.nodes] for s in slots]
+    angles = np.array([[values.atVector(t.angles_key) for t in nodes] for nodes in tables])
+    R, t, D = state.of_table(values, tables[0][0], np.einsum("sk,ska->sa", at.w, angles))
+    k = angles.shape[2]
+    by_nodes = np.einsum("sk,sia->sika", at.w, D[:, :, :k]).reshape(len(slots), 6, -1)
+    speed = D[:, :, :k] @ np.einsum("sk,ska->sa", at.by_dt, angles)[..., None]
+    return R, t, np.concatenate([by_nodes, D[:, :, k:], speed * at.by_clock[:, None, :]], axis=2)
 
 
 def _t(motions: Motions) -> FloatArray:
