@@ -61,8 +61,7 @@ class Trial:
 def tried(hypothesis: Hypothesis, case: Case, base: Misfit) -> Trial:
     """The survey of a hypothesis adjusted from the values of its case, and where that leads nowhere from its own start.
 
-    So it is, too, where these values may be spoilt by what the case does not explain, unless what was found by small
-    steps from them makes it worse. base: what that is.
+    So it is, too, where these values may be spoilt by what the case does not explain. base: what that is.
     """
     survey = hypothesis.changed()
     if survey is None:
@@ -78,8 +77,7 @@ def tried(hypothesis: Hypothesis, case: Case, base: Misfit) -> Trial:
         if best.result is None or misfit.omega < best.misfit.omega:
             best = Trial(hypothesis, misfit, result)
         led = case.is_near or misfit.is_noise()
-        worse = misfit.omega > base.omega
-        if (worse and callable(hypothesis.survey)) or (led and not worse and best.misfit.unused == 0):
+        if led and best.misfit.unused == 0 and misfit.omega < base.omega:
             break
     return best
 
