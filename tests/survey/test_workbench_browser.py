@@ -34,7 +34,7 @@ NAME = "X/tX05/board/c40"
 SECONDS = 30.0
 READY = "document.body.dataset.ready !== undefined"
 VIEWS = ("scene", "plan", "south", "east", "camera", "compare", "history", "angles", "loops", "correlations",
-         "settings", "network", "jobs")  # fmt: skip
+         "settings", "network", "jobs", "capture")  # fmt: skip
 ROWS = "Number(document.querySelector('#tables [role=grid]').getAttribute('aria-rowcount'))"
 
 
@@ -267,7 +267,7 @@ def test_german(page: Page) -> None:
 def said_by_the_page() -> set[str]:
     """Every text that the scripts hand to ``t``, directly or from the lists of views, tables, keys and regions."""
     sources = {path.name: path.read_text() for at in (SHARED, WEB) for path in at.glob("*.js")}
-    sources["capture.js"] = (Path(capture.web.__file__).parent / "app.js").read_text()
+    sources["labcapture.js"] = (Path(capture.web.__file__).parent / "app.js").read_text()
     found = {text for source in sources.values() for text in re.findall(r'\bt\(\s*"((?:[^"\\]|\\.)*)"', source)}
     app = sources["app.js"]
     views = re.search(r"const VIEWS = \{.*?\n\};", app, re.DOTALL)
