@@ -19,6 +19,7 @@ from survey.report.drawing import DARK
 from survey.report.sections import observations
 from survey.solution.anchors import anchor
 from survey.solution.dictionary import RunInfo
+from tests.survey.accessible import FAULTS
 from tests.survey.adjustments import Lab, lab_adjustment
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -192,6 +193,10 @@ def test_nothing_is_wider_than_the_screen_and_no_figure_vanishes(
         assert page_width <= width
         assert smallest > 200
         assert sort_key <= width  # what the rows are sorted by is on the screen
+
+
+def test_every_control_and_heading_has_a_name(english: str, german: str, tmp_path: Path) -> None:
+    assert [seen(page, FAULTS, tmp_path) for page in (english, german)] == [[], []]
 
 
 @pytest.mark.parametrize("dark", [False, True])

@@ -26,6 +26,7 @@ from survey.workbench.pages.beginning import Beginning
 from survey.workbench.rows import columns
 from survey.workbench.server import WEB, Server
 from survey.workbench.session import Workbench
+from tests.survey.accessible import FAULTS
 from tests.survey.test_report_browser import CONTRAST, need_browser
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -185,6 +186,7 @@ def test_every_view_is_drawn(page: Page, view: str) -> None:
             .getImageData(0, 0, c.width, c.height).data; let n = 0; for (let i = 3; i < d.length; i += 4) n += d[i] > 0;
             return n > 300; })()"""
         page.wait(inked)
+    assert p.evaluate(FAULTS) == []
 
 
 def test_the_table_is_a_grid_of_rows_in_sight(page: Page) -> None:
