@@ -13,6 +13,8 @@ import pytest
 from survey.report import page as printing
 
 SECONDS = 30.0
+READY = "document.body.dataset.ready !== undefined"
+"""Of the workbench."""
 # the smallest contrast of any text with what is behind it, by the formula of WCAG 2.1, with that text
 CONTRAST = """(() => {
   const rgb = (text) => text.match(/[\\d.]+/g).map(Number);
@@ -70,7 +72,7 @@ def launched() -> Iterator[Any]:
 class Page:
     """A page, with what it complained of and what it asked of others."""
 
-    def __init__(self, browser: Any, address: str, width: int, ready: str, **given: Any) -> None:
+    def __init__(self, browser: Any, address: str, width: int, ready: str = READY, **given: Any) -> None:
         self.context = browser.new_context(viewport={"width": width, "height": 800}, locale="en-GB", **given)
         self.page = self.context.new_page()
         self.complaints: list[str] = []

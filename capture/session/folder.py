@@ -20,10 +20,10 @@ from capture.devices.camera import GrayImage
 from capture.session.journal import Record
 from survey.folder.locking import SESSION_LOCK, FileLock, holder_of
 from survey.folder.text import atomic_write, decode, read_bytes
+from survey.project.captured import CAPTURE_FOLDER
 from survey.project.project import DEFINITION_FILE, IMAGES_FOLDER, OBSERVATIONS_FOLDER
 from survey.project.tables.files import write_table
 
-CAPTURE_FOLDER = "capture"
 _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # lossless at any level; this one is fast
 
 

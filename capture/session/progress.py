@@ -10,15 +10,10 @@ from typing import Any
 
 from tqdm import tqdm
 
-from capture.session.folder import CAPTURE_FOLDER
 from capture.session.quality_thread import quality_text
 from capture.session.run_session import Taken
 from survey.folder.text import atomic_write
-
-
-def status_path(folder: Path) -> Path:
-    """Where a session says how far it is."""
-    return folder / CAPTURE_FOLDER / "status.json"
+from survey.project.captured import status_path
 
 
 class Progress:

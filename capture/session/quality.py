@@ -1,7 +1,7 @@
 """How good an image is, quickly enough to be told while the session runs: light, sharpness, targets, coverage."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -100,24 +100,3 @@ def _near_edges(squared_gradient: FloatArray) -> BoolArray:
     strong = squared_gradient > max(_EDGE_SHARE**2 * strongest, 1e-6)
     ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))
     return np.asarray(cv2.dilate(strong.astype(np.uint8), ellipse), bool)
-
-
-@dataclass(frozen=True)
-class Coverage:
-    """Which cells of a camera's image have had a target point so far; ``cells`` across and down."""
-
-    image_size: tuple[int, int]
-    cells: tuple[int, int] = (10, 8)
-    hit: frozenset[tuple[int, int]] = frozenset()
-
-    def with_points(self, uv: FloatArray) -> "Coverage":
-        """The coverage with the cells of image points (n, 2) px; points outside the image count for none."""
-        size, cells = np.array(self.image_size, float), np.array(self.cells, float)
-        columns_rows = np.floor((np.asarray(uv, float).reshape(-1, 2) + 0.5) / size * cells).astype(int)
-        inside = np.all((columns_rows >= 0) & (columns_rows < cells), axis=1)
-        return replace(self, hit=self.hit | {(int(i), int(j)) for i, j in columns_rows[inside]})
-
-    @property
-    def share(self) -> float:
-        """Covered share of the cells, 0 to 1."""
-        return len(self.hit) / (self.cells[0] * self.cells[1])

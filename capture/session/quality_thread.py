@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -19,49 +18,15 @@ import numpy as np
 from capture.devices.camera import Frame
 from capture.plan.plan import CapturePlan
 from capture.plan.poses import definition_of
-from capture.session.folder import CAPTURE_FOLDER
-from capture.session.quality import Coverage, image_quality
-from capture.session.recorded import is_size
-from survey.folder.shapes import NUMBER, Each, misfit
+from capture.session.quality import image_quality
+from survey.project.captured import Coverage, quality_path
+from survey.project.captured import Qualities as SeenBefore
 from survey.project.targets import DetectableTarget, PointList
 
 Qualities = Mapping[str, Mapping[str, Any]]
 
 
-def _is_uv(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(map(NUMBER, value))
-
-
-_ROW = {"camera_id": str, "epoch_id": str, "width": is_size, "height": is_size, "points": Each([_is_uv])}
 _BEHIND = 4  # epochs that may wait; more, and the session waits for the oldest
-
-
-def quality_path(folder: Path) -> Path:
-    """Where the qualities of a project's images are."""
-    return folder / CAPTURE_FOLDER / "quality.jsonl"
-
-
-def read_qualities(folder: Path) -> list[dict[str, Any]]:
-    """All lines that are whole, the last of each image."""
-    path = quality_path(folder)
-    rows: dict[tuple[str, str], dict[str, Any]] = {}
-    for line in path.read_bytes().split(b"\n") if path.exists() else []:
-        with suppress(ValueError, KeyError, TypeError, RecursionError):
-            row = json.loads(line)
-            if misfit(row, _ROW) is None:
-                rows[row["camera_id"], row["epoch_id"]] = row
-    return list(rows.values())
-
-
-def coverages(rows: list[dict[str, Any]]) -> dict[str, Coverage]:
-    """Coverage of every camera by the target points of its images."""
-    found: dict[str, Coverage] = {}
-    for row in rows:
-        covered = found.get(row["camera_id"], Coverage((row["width"], row["height"])))
-        for uv in row["points"].values():
-            covered = covered.with_points(np.array(uv, float).reshape(-1, 2))
-        found[row["camera_id"]] = covered
-    return found
 
 
 def targets_by_camera(plan: CapturePlan) -> Callable[[str], Mapping[str, DetectableTarget]]:
@@ -84,7 +49,9 @@ class QualityWatch:
     def __init__(self, plan: CapturePlan) -> None:
         self._path = quality_path(plan.project)
         self._targets = targets_by_camera(plan)
-        self._coverage = coverages(read_qualities(plan.project))
+        before = SeenBefore(plan.project)
+        before.read()
+        self._coverage = before.coverage
         self._pool = ThreadPoolExecutor(1, "image quality")
         self._waiting: deque[Future[Qualities]] = deque()
         self._last: Qualities = {}

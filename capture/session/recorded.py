@@ -9,20 +9,8 @@ from typing import Any
 
 from adjust.model.errors import SurveyError
 from survey.folder.shapes import NUMBER, WHOLE, Each, Either, misfit
-from survey.folder.text import id_problem
+from survey.project.captured import LOCATION, is_id, is_size
 from survey.project.project import IMAGES_FOLDER
-
-_SIZE = 2**16  # px; larger sensors there are none
-
-
-def is_size(value: Any) -> bool:
-    """Whether a value can be the width or height of an image."""
-    return WHOLE(value) and 0 < value < _SIZE
-
-
-def is_id(value: Any) -> bool:
-    """Whether a value can be an id."""
-    return isinstance(value, str) and id_problem(value) is None
 
 
 def _is_time(value: Any) -> bool:
@@ -30,7 +18,6 @@ def _is_time(value: Any) -> bool:
     return bool(WHOLE(value) and value >= 0)
 
 
-LOCATION = {"readback_deg": [NUMBER], "setpoint_deg": [Either((NUMBER, None))]}
 _IMAGE = {
     "path": str, "sha256": str, "width": is_size, "height": is_size, "bits": WHOLE, "block_id": WHOLE,
     "host_time_ns": WHOLE, "features": Each(Either((bool, NUMBER, str))),

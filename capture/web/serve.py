@@ -18,7 +18,7 @@ from urllib.parse import unquote, urlsplit
 
 from adjust.model.errors import SurveyError
 from capture.plan.plan import read_plan
-from capture.web.state import FolderView, LiveView, View, png_of
+from capture.web.state import LiveView, SessionView, View, png_of
 from survey.report.modules import WEB as SHARED
 from survey.workbench import guard
 
@@ -74,10 +74,7 @@ class _Handler(BaseHTTPRequestHandler):
             file, kind = _FILES[path]
             self._answer(file.read_bytes(), f"{kind}; charset=utf-8")
         elif path == "/status.json":
-            view = self.server.view
-            status = view.status()
-            shown_now = {name: s.as_dict() for name in status["cameras"] if (s := view.shown(name)) is not None}
-            said = {**status, "shown": shown_now, "may_move": self.server.token is not None}
+            said = {**self.server.view.status(), "may_move": self.server.token is not None}
             self._answer(json.dumps(said).encode(), "application/json")
         elif path.startswith("/image/") and path.endswith(".png"):
             shown = self.server.view.shown(unquote(path.removeprefix("/image/").removesuffix(".png")))
@@ -163,7 +160,7 @@ def serve(
     token = guard.new_token() if allow_move else None
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDINGS)  # in all threads from here on: this one waits for them
     try:
-        view: View = LiveView(plan, allow_move) if live else FolderView(plan)
+        view: View = LiveView(plan, allow_move) if live else SessionView(plan)
     except BaseException:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         raise

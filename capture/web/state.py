@@ -1,58 +1,35 @@
 """What the page shows: from the files of a project while a session works on it, or live from cameras and table."""
 
-import json
 import threading
 import time
-from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from adjust.model.errors import SurveyError
-from adjust.model.survey import FloatArray
-from capture.devices.camera import GrayImage
 from capture.devices.turntables.moving import MovingTable
 from capture.plan.plan import CapturePlan
 from capture.plan.table import make_table
 from capture.session.cameras import PlannedCameras
-from capture.session.folder import lock_holder, session_lock
-from capture.session.progress import status_path
-from capture.session.quality import Coverage, image_quality
-from capture.session.quality_thread import coverages, read_qualities, targets_by_camera
-from capture.session.recorded import LOCATION, is_id
+from capture.session.folder import session_lock
+from capture.session.quality import image_quality
+from capture.session.quality_thread import targets_by_camera
 from capture.session.resume import last_readback
 from capture.session.table_jobs import jog_target, table_status
-from survey.detection.gray import read_image
-from survey.folder.shapes import NUMBER, WHOLE, Each, misfit
-from survey.project.project import IMAGES_FOLDER
+from survey.project.captured import Coverage
+from survey.workbench.pages.capturing import FolderView, Shown, coverage_dict
 
 _LIVE_S = 0.3
-_STATUS = {
-    "state": str, "message?": str, "done?": WHOLE, "total?": WHOLE, "seconds_left?": NUMBER, "epoch_id?": is_id,
-    "after?": LOCATION, "images?": Each(str), "quality?": Each(dict),
-}  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class Shown:
-    """An image and the target points (n, 2) px in it."""
-
-    image: GrayImage
-    points: FloatArray
-
-    def as_dict(self) -> dict[str, Any]:
-        """Size (px) and points for the page, which draws them over the image."""
-        return {"size": [self.image.shape[1], self.image.shape[0]], "points": np.round(self.points, 2).tolist()}
 
 
 class View(Protocol):
     """What the server asks for."""
 
     def status(self) -> dict[str, Any]:
-        """Progress, quality and coverage as plain values."""
+        """Progress, quality and coverage as plain values; ``shown``: of every camera's last image size and points."""
         ...
 
     def shown(self, camera_id: str) -> Shown | None:
@@ -72,67 +49,11 @@ class View(Protocol):
         ...
 
 
-def _coverage_dict(found: Mapping[str, Coverage]) -> dict[str, Any]:
-    return {
-        name: {"cells": list(c.cells), "hit": sorted(map(list, c.hit)), "share": round(c.share, 4)}
-        for name, c in found.items()
-    }
-
-
-class FolderView:
+class SessionView(FolderView):
     """Read-only: all from the files that a session writes."""
 
     def __init__(self, plan: CapturePlan) -> None:
-        self._plan = plan
-        self._last: dict[str, tuple[str, Shown]] = {}  # by camera, of which epoch
-
-    def status(self) -> dict[str, Any]:
-        """See ``View``."""
-        told: dict[str, Any] = {}
-        with suppress(OSError, ValueError, RecursionError):
-            said = json.loads(status_path(self._plan.project).read_text(encoding="utf-8"))
-            told = said if misfit(said, _STATUS) is None else {}
-        running = lock_holder(self._plan.project)
-        if running is None and told.get("state") in ("running", "paused"):
-            told |= {"state": "broken off", "message": "the session's process has ended; start it again to go on"}
-        rows = read_qualities(self._plan.project)
-        return {
-            "state": "not started",
-            "total": len(self._plan.shots),
-            "done": 0,
-            **told,
-            "live": False,
-            "cameras": [camera.camera_id for camera in self._plan.cameras],
-            "coverage": _coverage_dict(coverages(rows)),
-        }
-
-    def shown(self, camera_id: str) -> Shown | None:
-        """See ``View``."""
-        status = self.status()
-        epoch_id, planned = status.get("epoch_id"), {camera.camera_id for camera in self._plan.cameras}
-        if epoch_id is None or camera_id not in planned:
-            return None
-        known = self._last.get(camera_id)
-        if known is not None and known[0] == epoch_id:
-            return known[1]
-        shown = self._read(camera_id, epoch_id)
-        if shown is not None and len(shown.points):  # what is looked at later may find more
-            self._last[camera_id] = epoch_id, shown
-        return shown
-
-    def _read(self, camera_id: str, epoch_id: str) -> Shown | None:
-        try:
-            read = read_image(self._plan.project / IMAGES_FOLDER / camera_id / f"{epoch_id}.png")
-        except SurveyError:
-            return None
-        if read.ndim != 2:
-            return None
-        image: GrayImage = np.asarray(read, np.uint16) if read.dtype == np.uint16 else np.asarray(read, np.uint8)
-        for row in reversed(read_qualities(self._plan.project)):
-            if (row["camera_id"], row["epoch_id"]) == (camera_id, epoch_id):
-                points = [np.array(uv, float).reshape(-1, 2) for uv in row["points"].values()]
-                return Shown(image, np.concatenate([np.zeros((0, 2)), *points]))
-        return Shown(image, np.zeros((0, 2)))
+        super().__init__(plan.project, [camera.camera_id for camera in plan.cameras], len(plan.shots))
 
     def jog(self, words: list[str]) -> None:
         """See ``View``."""
@@ -208,9 +129,10 @@ class LiveView:
             "live": True,
             "cameras": [camera.camera_id for camera in self._plan.cameras],
             "quality": dict(self._quality),
-            "coverage": _coverage_dict(dict(self._coverage)),
+            "coverage": coverage_dict(dict(self._coverage)),
             "table": table,
             "time": time.monotonic(),
+            "shown": {name: shown.as_dict() for name, shown in dict(self._shown).items()},
         }
 
     def shown(self, camera_id: str) -> Shown | None:
@@ -239,9 +161,10 @@ class LiveView:
         self._lock.release()
 
 
-def png_of(image: GrayImage, longest_px: int | None) -> bytes:
+def png_of(image: npt.NDArray[np.generic], longest_px: int | None) -> bytes:
     """The image in 8 bit, made smaller where it has more than ``longest_px``."""
-    gray = image if image.dtype == np.uint8 else np.clip(image / max(float(image.max()), 1.0) * 255.0, 0, 255)
+    deep = image.dtype != np.uint8
+    gray = np.clip(image.astype(float) / max(float(np.max(image)), 1.0) * 255.0, 0, 255) if deep else image
     factor = min(1.0, (longest_px or max(image.shape)) / max(image.shape))
     size = (round(image.shape[1] * factor), round(image.shape[0] * factor))
     small = cv2.resize(gray.astype(np.uint8), size, interpolation=cv2.INTER_AREA)

@@ -31,7 +31,7 @@ def picture(images: Mapping[tuple[str, str], Path], key: tuple[str, str], size: 
     from survey.detection.gray import gray_values, read_image
 
     path = images[key]
-    if not stat.S_ISREG(os.lstat(path).st_mode) or path.parent.is_symlink():
+    if not is_plain(path):
         raise SurveyError(f"{path}: is a link or no file; put the image itself into the project")
     stored = read_image(path)
     image: Any = stored if stored.dtype == np.uint8 else _in_8_bit(gray_values(stored))
@@ -41,6 +41,11 @@ def picture(images: Mapping[tuple[str, str], Path], key: tuple[str, str], size: 
     if factor < 1.0:
         image = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     return _encoded(path, ".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]), "image/jpeg"
+
+
+def is_plain(path: Path) -> bool:
+    """Whether an image is a file and neither it nor the folder of its camera a link. Raises OSError."""
+    return stat.S_ISREG(os.lstat(path).st_mode) and not path.parent.is_symlink()
 
 
 def _in_8_bit(image: "Gray32") -> "Gray8":

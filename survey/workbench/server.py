@@ -86,6 +86,8 @@ class Server:
             Way("GET", "/api/camera/{camera}", ("camera_view",), self._camera),
             Way("GET", "/api/camera/{camera}/difference", ("lens_change",), self._difference),
             Way("GET", "/api/compare", ("compare",), self._compare),
+            Way("GET", "/api/capture", ("capture_status",), self._capture),
+            Way("GET", "/api/capture/{camera}", ("capture_picture",), self._captured),
             Way("GET", "/api/halves", ("cross_validate",), self._halves),
             Way("GET", "/api/statistics/{part}", ("statistics_part",), self._statistics),
             Way("POST", "/api/preview", ("preview",), self._preview),
@@ -262,8 +264,7 @@ class Server:
     async def _image(self, request: Request) -> Response:
         key = request.path_params["camera"], request.path_params["epoch"]
         project = self.bench.situation.everything
-        asked = whole_of(request, "size") or 1600
-        size = None if request.query_params.get("size") == "full" else asked if asked <= 4096 else 1600
+        size = _size_of(request)
         if key not in project.images:
             return JSONResponse({"error": "no such image"}, 404)
         tag = pictures.etag(project.detected.get(key), project.images[key], size)
@@ -272,6 +273,14 @@ class Server:
             return Response(status_code=304, headers=kept)
         data, kind = await asyncio.to_thread(self.bench.picture, *key, size)
         return Response(data, media_type=kind, headers=kept)
+
+    async def _capture(self, _request: Request) -> Response:
+        return JSONResponse(await asyncio.to_thread(self.shown.capture_status))
+
+    async def _captured(self, request: Request) -> Response:
+        camera, size = request.path_params["camera"], _size_of(request)
+        data, kind = await asyncio.to_thread(self.shown.capture_picture, camera, size)
+        return Response(data, media_type=kind)
 
     # acting
 
@@ -373,6 +382,12 @@ class Server:
     def _changed(self) -> dict[str, Any]:
         found = self.bench.changes
         return {"version": self.bench.version, "changes": None if found is None else found.as_dict(500)}
+
+
+def _size_of(request: Request) -> int | None:
+    """Pixels of the longer side that a picture is asked for with; None for all."""
+    asked = whole_of(request, "size") or 1600
+    return None if request.query_params.get("size") == "full" else asked if asked <= 4096 else 1600
 
 
 def _run_of(request: Request) -> int:

@@ -4,7 +4,8 @@ import pytest
 from gtsam import Pose3, Rot3
 
 from capture.devices.camera import Frame
-from capture.session.quality import Coverage, edge_blur_px, image_quality
+from capture.session.quality import edge_blur_px, image_quality
+from survey.project.captured import Coverage
 from survey.project.targets import Checkerboard
 from survey.simulate.rendering import BrownCamera, Imaging, PlacedTarget, render
 

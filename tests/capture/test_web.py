@@ -17,7 +17,7 @@ from capture.plan.plan import read_plan
 from capture.session.run import run_plan
 from capture.simulated import controller
 from capture.web.serve import PageServer
-from capture.web.state import FolderView, LiveView, png_of
+from capture.web.state import LiveView, SessionView, png_of
 from survey.workbench.guard import loopback_address
 from tests.capture.session_runs import write_plan
 from tests.capture.table_server import table_server
@@ -70,7 +70,7 @@ def test_moving_needs_live(tmp_path, capsys):
 
 def test_other_addresses_of_this_machine_do_not_answer(tmp_path):
     """127.0.0.2 is this machine too, but the socket is bound to 127.0.0.1 alone."""
-    with served(FolderView(read_plan(write_plan(tmp_path)))) as server:
+    with served(SessionView(read_plan(write_plan(tmp_path)))) as server:
         assert server.socket.getsockname()[0] == "127.0.0.1"
         other = ("127.0.0.2", server.server_address[1])
         with pytest.raises(ConnectionRefusedError), socket.create_connection(other, 1.0):
@@ -79,7 +79,7 @@ def test_other_addresses_of_this_machine_do_not_answer(tmp_path):
 
 def test_page_before_during_and_after_a_session(tmp_path):
     plan = write_plan(tmp_path)
-    view = FolderView(read_plan(plan))
+    view = SessionView(read_plan(plan))
     with served(view) as server:
         status, page, headers = ask(server, "GET", "/")
         assert status == 200
@@ -104,7 +104,7 @@ def test_session_that_died_is_said(tmp_path):
     run_plan(read_plan(plan), shown=False)
     file = tmp_path / "lab" / "capture" / "status.json"
     file.write_text(file.read_text().replace('"finished"', '"running"'))
-    assert FolderView(read_plan(plan)).status()["state"] == "broken off"
+    assert SessionView(read_plan(plan)).status()["state"] == "broken off"
 
 
 _OTHER = ["/../plan.toml", "/image/..%2f..%2fplan.png", "/image/%2e%2e/x.png", "/plan.toml", "//etc"]
@@ -112,7 +112,7 @@ _OTHER = ["/../plan.toml", "/image/..%2f..%2fplan.png", "/image/%2e%2e/x.png", "
 
 @pytest.mark.parametrize("path", _OTHER)
 def test_no_other_file_is_served(tmp_path, path):
-    with served(FolderView(read_plan(write_plan(tmp_path)))) as server:
+    with served(SessionView(read_plan(write_plan(tmp_path)))) as server:
         assert ask(server, "GET", path)[0] == 404
 
 
@@ -133,7 +133,7 @@ def test_no_other_file_is_served(tmp_path, path):
 )
 def test_other_sites_are_kept_out(tmp_path, headers):
     """DNS rebinding shows in the Host header, a foreign page in Origin."""
-    with served(FolderView(read_plan(write_plan(tmp_path)))) as server:
+    with served(SessionView(read_plan(write_plan(tmp_path)))) as server:
         for path in ("/", "/status.json", "/image/X.png"):
             assert ask(server, "GET", path, headers)[0] == 403
         assert ask(server, "POST", "/stop", headers, {})[0] == 403
@@ -142,14 +142,14 @@ def test_other_sites_are_kept_out(tmp_path, headers):
 @pytest.mark.parametrize("host", ["localhost:9000", "127.0.0.1", "127.0.0.1:8780", "[::1]:22"])
 def test_page_answers_through_a_forwarded_port(tmp_path, host):
     """The browser knows the port at its own end; an origin must still be the page itself."""
-    with served(FolderView(read_plan(write_plan(tmp_path)))) as server:
+    with served(SessionView(read_plan(write_plan(tmp_path)))) as server:
         assert ask(server, "GET", "/status.json", {"Host": host})[0] == 200
         assert ask(server, "GET", "/status.json", {"Host": host, "Origin": f"http://{host}"})[0] == 200
         assert ask(server, "GET", "/status.json", {"Host": host, "Origin": "http://localhost:1"})[0] == 403
 
 
 def test_head_is_answered_without_a_body(tmp_path):
-    with served(FolderView(read_plan(write_plan(tmp_path)))) as server:
+    with served(SessionView(read_plan(write_plan(tmp_path)))) as server:
         status, body, headers = ask(server, "HEAD", "/")
         assert (status, body) == (200, b"")
         assert int(headers["Content-Length"]) == len(ask(server, "GET", "/")[1])
@@ -159,7 +159,7 @@ def test_head_is_answered_without_a_body(tmp_path):
 
 @pytest.mark.slow
 def test_client_that_leaves_is_no_traceback(tmp_path, capsys):
-    with served(FolderView(read_plan(write_plan(tmp_path)))) as server:
+    with served(SessionView(read_plan(write_plan(tmp_path)))) as server:
         for sent in (b"GET / HTTP/1.1\r\nHost: localhost\r\n", b"GET /app.js HTTP/1.1\r\nHost: localhost\r\n\r\n"):
             for _ in range(20):
                 with socket.create_connection(server.server_address[:2]) as client:

@@ -8,7 +8,7 @@ import pytest
 from capture.plan.plan import read_plan
 from capture.session.run import run_plan
 from capture.web.serve import PageServer
-from capture.web.state import FolderView
+from capture.web.state import SessionView
 from tests.browsing import CONTRAST, Page
 from tests.capture.session_runs import write_plan
 
@@ -20,7 +20,7 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Of a session that has taken its images."""
     plan = read_plan(write_plan(tmp_path_factory.mktemp("view")))
     run_plan(plan, shown=False)
-    with PageServer(FolderView(plan)) as server:
+    with PageServer(SessionView(plan)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield server.url
         server.shutdown()

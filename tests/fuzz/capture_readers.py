@@ -148,9 +148,9 @@ def _angles_table(folder: Path) -> object:
 
 def _shown(folder: Path) -> object:
     from capture.plan.plan import read_plan
-    from capture.web.state import FolderView
+    from capture.web.state import SessionView
 
-    view = FolderView(read_plan(folder / "plan.toml"))
+    view = SessionView(read_plan(folder / "plan.toml"))
     return view.status(), view.shown("X"), view.shown("Y")
 
 

@@ -17,6 +17,7 @@ from survey.report.sections import observations
 from survey.solution.anchors import anchor
 from survey.solution.dictionary import RunInfo
 from tests.browsing import CONTRAST, asked, need_browser
+from tests.survey.accessible import FAULTS
 from tests.survey.adjustments import Lab, lab_adjustment
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -128,6 +129,10 @@ def test_nothing_is_wider_than_the_screen_and_no_figure_vanishes(
         assert page_width <= width
         assert smallest > 200
         assert sort_key <= width  # what the rows are sorted by is on the screen
+
+
+def test_every_control_and_heading_has_a_name(browser: Any, english: str, german: str, tmp_path: Path) -> None:
+    assert [asked(browser, page, tmp_path, FAULTS) for page in (english, german)] == [[[]], [[]]]
 
 
 @pytest.mark.parametrize("dark", [False, True])

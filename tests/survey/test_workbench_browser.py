@@ -25,13 +25,13 @@ from survey.workbench.rows import columns
 from survey.workbench.server import WEB, Server
 from survey.workbench.session import Workbench
 from tests.browsing import CONTRAST, Page
+from tests.survey.accessible import FAULTS
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 WRONG = ("tX05", "X", "board", "c40")  # an image point that is moved by 4 px
 NAME = "X/tX05/board/c40"
-READY = "document.body.dataset.ready !== undefined"
 VIEWS = ("scene", "plan", "south", "east", "camera", "compare", "history", "angles", "loops", "correlations",
-         "settings", "network", "jobs")  # fmt: skip
+         "settings", "network", "jobs", "capture")  # fmt: skip
 ROWS = "Number(document.querySelector('#tables [role=grid]').getAttribute('aria-rowcount'))"
 
 
@@ -68,7 +68,7 @@ def address(folder: Path) -> Iterator[str]:
 @pytest.fixture
 def page(browser: Any, address: str) -> Iterator[Page]:
     """The page as first opened on a desk; it may complain of nothing."""
-    found = Page(browser, address, 1280, READY)
+    found = Page(browser, address, 1280)
     yield found
     found.context.close()
     assert found.complaints == []
@@ -116,7 +116,7 @@ def test_back_and_links_lead_to_places(page: Page) -> None:
 @pytest.fixture(scope="module")
 def desk(browser: Any, address: str) -> Iterator[Page]:
     """A page on which views are chosen one after the other; it may complain of nothing."""
-    found = Page(browser, address, 1280, READY)
+    found = Page(browser, address, 1280)
     yield found
     found.context.close()
 
@@ -141,6 +141,7 @@ def test_every_view_is_drawn(desk: Page, view: str) -> None:
             .getImageData(0, 0, c.width, c.height).data; let n = 0; for (let i = 3; i < d.length; i += 4) n += d[i] > 0;
             return n > 300; })()"""
         desk.wait(inked)
+    assert p.evaluate(FAULTS) == []
     assert desk.complaints == []
 
 
@@ -214,7 +215,7 @@ def test_nothing_of_a_project_becomes_markup(page: Page) -> None:
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1280, 390])
 def test_readable_on_desk_and_phone(browser: Any, address: str, scheme: str, width: int) -> None:
-    page = Page(browser, address, width, READY, color_scheme=scheme)
+    page = Page(browser, address, width, color_scheme=scheme)
     p = page.page
     for region in ("left", "tables", "inspector", "tree"):
         p.evaluate(f"document.body.dataset.pane = '{region}'")
@@ -252,7 +253,7 @@ def test_german(page: Page) -> None:
 def said_by_the_page() -> set[str]:
     """Every text that the scripts hand to ``t``, directly or from the lists of views, tables, keys and regions."""
     sources = {path.name: path.read_text() for at in (SHARED, WEB) for path in at.glob("*.js")}
-    sources["capture.js"] = (Path(capture.web.__file__).parent / "app.js").read_text()
+    sources["labcapture.js"] = (Path(capture.web.__file__).parent / "app.js").read_text()
     found = {text for source in sources.values() for text in re.findall(r'\bt\(\s*"((?:[^"\\]|\\.)*)"', source)}
     app = sources["app.js"]
     views = re.search(r"const VIEWS = \{.*?\n\};", app, re.DOTALL)
@@ -374,7 +375,7 @@ def test_images_are_detected_and_shown_as_they_come(browser: Any, tmp_path: Path
         name.unlink()
     token = new_token()
     with Listening(Server(Workbench(tmp_path / "lab"), token), "127.0.0.1", 0) as listening:
-        page = Page(browser, f"{listening.address}#token={token}&view=findings,jobs", 1280, READY)
+        page = Page(browser, f"{listening.address}#token={token}&view=findings,jobs", 1280)
         p = page.page
         page.wait("document.querySelector('#left .verdict').textContent.includes('nothing to adjust')")
         page.done(lambda: p.get_by_label("Run: Detect").click())

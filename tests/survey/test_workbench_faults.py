@@ -84,7 +84,7 @@ def page(browser: Any, tmp_path: Path) -> Iterator[tuple[Page, Path]]:
     bench = Workbench(folder)
     bench.adjust()
     with Listening(Server(bench, token), "127.0.0.1", 0) as listening:
-        found = Page(browser, f"{listening.address}#token={token}", 1280, READY)
+        found = Page(browser, f"{listening.address}#token={token}", 1280)
         yield found, folder
         found.context.close()
         assert [text for text in found.complaints if "404" not in text] == []  # the example has no pictures

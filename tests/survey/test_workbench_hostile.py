@@ -17,9 +17,9 @@ from survey.workbench.guard import new_token
 from survey.workbench.live import Listening
 from survey.workbench.server import Server
 from survey.workbench.session import Workbench
-from tests.survey.test_report_browser import need_browser
+from tests.browsing import Page
 from tests.survey.test_workbench import exclusions
-from tests.survey.test_workbench_browser import VIEWS, Page, need_playwright
+from tests.survey.test_workbench_browser import VIEWS
 from tests.survey.test_workbench_server import HERE, TOKEN, exclude, image_of, page, post, ways
 
 ODD = '"><img src=x onerror=window.ran=1><script>window.ran=1</script>'
@@ -192,27 +192,24 @@ def harmful(folder: Path) -> None:
 
 @pytest.mark.browser
 @pytest.mark.slow
-def test_markup_in_a_project_is_text_in_every_view(tmp_path):
+def test_markup_in_a_project_is_text_in_every_view(browser, tmp_path):
     harmful(tmp_path / "lab")
     bench, token = Workbench(tmp_path / "lab"), new_token()
     bench.adjust()
-    with need_playwright().sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=need_browser(), args=["--no-sandbox"])
-        with Listening(Server(bench, token), "127.0.0.1", 0) as listening:
-            found = Page(browser, f"{listening.address}#token={token}&image={ODD}", 1280)
-            p = found.page
-            seen = p.inner_text("body")
-            for k in range(p.locator("#tables [role=tab]").count()):
-                p.locator("#tables [role=tab]").nth(k).click()
-                seen += p.inner_text("#tables")
-            for view in ("findings", "image", *VIEWS):
-                p.locator("#right .chooser select").select_option(view)
-                found.wait("!document.querySelector('#right [aria-busy=true]')")
-                seen += p.inner_text("#right")
-            p.evaluate("location.hash = '#camera=' + encodeURIComponent(`<img src=x onerror=window.ran=1>`)")
-            p.wait_for_timeout(100)
-            assert p.evaluate("window.ran === undefined && !document.querySelector('img, body script, i')")
-            assert seen.count(ODD) >= 3
-            found.context.close()
-        browser.close()
+    with Listening(Server(bench, token), "127.0.0.1", 0) as listening:
+        found = Page(browser, f"{listening.address}#token={token}&image={ODD}", 1280)
+        p = found.page
+        seen = p.inner_text("body")
+        for k in range(p.locator("#tables [role=tab]").count()):
+            p.locator("#tables [role=tab]").nth(k).click()
+            seen += p.inner_text("#tables")
+        for view in ("findings", "image", *VIEWS):
+            p.locator("#right .chooser select").select_option(view)
+            found.wait("!document.querySelector('#right [aria-busy=true]')")
+            seen += p.inner_text("#right")
+        p.evaluate("location.hash = '#camera=' + encodeURIComponent(`<img src=x onerror=window.ran=1>`)")
+        p.wait_for_timeout(100)
+        assert p.evaluate("window.ran === undefined && !document.querySelector('img, body script, i')")
+        assert seen.count(ODD) >= 3
+        found.context.close()
     assert [text for text in found.complaints if "404" not in text and "409" not in text] == []

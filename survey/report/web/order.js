@@ -35,9 +35,10 @@ export function ranks(names) {
 
 /**
  * @typedef {{key: string, title: string, names?: string[], codes?: ArrayLike<number>, code?: (i: number) => number,
- *   values?: ArrayLike<number>, digits?: number, size?: boolean, text?: (i: number) => string, wide?: number}} Column
+ *   values?: ArrayLike<number>, digits?: number, size?: boolean, text?: (i: number) => string, wide?: number,
+ *   label?: string}} Column
  * names with codes (or what tells the code of a row: a million need no array of them), or values; `size`: large ones are
- * of interest whatever their sign
+ * of interest whatever their sign; `label`: what a column without a title is called where it is not seen
  */
 
 /** What tells the place of a row's name among the names of its column. @param {Column} column @returns {(i: number) => number} */

@@ -57,7 +57,7 @@ export class Table {
     this.scroll.style.setProperty("--columns", widths.map((rem) => `minmax(0, ${rem}fr)`).join(" "));
     this.scroll.style.setProperty("--width", `${widths.reduce((sum, rem) => sum + rem + 0.6, 1)}rem`);
     this.head.replaceChildren(...this.data.columns.map((column, k) => {
-      const head = make("button", { type: "button", tabindex: -1, class: column.values ? "r" : "l", onclick: () => this.sort(k, this.sorted?.column === k ? !this.sorted.up : !this.data.columns[k].size) }, column.title);
+      const head = make("button", { type: "button", tabindex: -1, class: column.values ? "r" : "l", "aria-label": column.title ? null : column.label, onclick: () => this.sort(k, this.sorted?.column === k ? !this.sorted.up : !this.data.columns[k].size) }, column.title);
       return make("span", { role: "columnheader", "aria-colindex": k + 1 }, head);
     }));
   }

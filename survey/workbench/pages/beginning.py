@@ -11,6 +11,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
 from survey.project.project import DEFINITION_FILE, IMAGES_FOLDER
 from survey.solution.dictionary import plain
+from survey.workbench.pages.capturing import FolderView
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +57,15 @@ class Folder:
 
     def __init__(self, folder: str | Path, read_only: bool = False) -> None:
         self.folder, self.read_only = Path(folder), read_only
+        self._session = FolderView(self.folder)
+
+    def capture_status(self) -> dict[str, Any]:
+        """How far a capture session in the folder is, its last images and what they cover, as plain values."""
+        return self._session.status()
+
+    def capture_picture(self, camera_id: str, size: int | None = None) -> tuple[bytes, str]:
+        """The last image of a camera as bytes and their media type. Raises SurveyError."""
+        return self._session.picture(camera_id, size)
 
     def start(self, images: str | Path, folder: str | Path) -> Told:
         """Begin another project with images that lie beside this one, or anywhere, as ``labsurvey init`` does.

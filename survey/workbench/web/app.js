@@ -21,6 +21,7 @@ import { CompareView, HistoryView } from "./compare.js";
 import { CameraView, CorrelationsView, HalvesView, LoopsView, TableAnglesView } from "./relations.js";
 import { NetworkView } from "./network.js";
 import { JobsView } from "./jobs.js";
+import { CaptureView } from "./capture.js";
 import { SettingsView } from "./settings.js";
 import { drawBeginning } from "./beginning.js";
 
@@ -42,6 +43,7 @@ const VIEWS = {
   correlations: ["Correlations", () => new CorrelationsView(bench)],
   network: ["Network", () => new NetworkView(bench)],
   jobs: ["Jobs", () => new JobsView(bench, actions)],
+  capture: ["Capture", () => new CaptureView()],
   settings: ["Datum", () => new SettingsView(bench, actions)],
 };
 const page = {

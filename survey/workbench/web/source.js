@@ -65,6 +65,9 @@ export function picture(image, size) {
   return pictures.get(key);
 }
 
+/** The last image of a camera that takes images now, whatever it was before. @param {string} image camera/epoch @param {string|number} size @returns {Promise<ImageBitmap>} */
+export const captured = async (image, size) => createImageBitmap(await (await ask(`/api/capture/${encodeURIComponent(image.split("/")[0])}?size=${size}`)).blob());
+
 /** Messages of the server as they come; a connection that broke is taken up again. @param {(message: any) => void} told */
 export function live(told, wait = 500) {
   const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/live`);
