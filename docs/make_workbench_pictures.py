@@ -26,7 +26,15 @@ from survey.workbench.guard import new_token
 from survey.workbench.live import Listening
 from survey.workbench.server import Server
 from survey.workbench.session import Workbench
-from tests.survey.test_workbench_faults import HIGHLIGHT, POINT, READING, REFLECTED, place_in, write_reflection, write_spoilt
+from tests.survey.test_workbench_faults import (
+    HIGHLIGHT,
+    POINT,
+    READING,
+    REFLECTED,
+    place_in,
+    write_reflection,
+    write_spoilt,
+)
 
 CHROMIUM = "/usr/bin/chromium"
 DESK, PHONE = (1440, 900), (390, 844)
@@ -105,6 +113,7 @@ def mistakes(browser: Any, place: Path, out: Path) -> None:
         assert REFLECTED in page.evaluate("location.hash")
         page.locator("#right button", has_text="1:1").click()
         page.keyboard.press("o")
+        page.mouse.move(2, 2)
         shot(page, out / "workbench-mistake-reflection.png")
 
 
