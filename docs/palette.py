@@ -11,7 +11,7 @@ _MOST, _SAMPLE = 256, 40000
 
 
 def write_palette_png(path: Path, png: bytes) -> None:
-    """Write a picture given as PNG with the 256 colours that are nearest to its own (k-means over different colours)."""
+    """Write a picture given as PNG with the 256 colours nearest to its own (k-means over different colours)."""
     picture = cv2.cvtColor(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
     height, width = picture.shape[:2]
     codes = (picture.astype(np.uint32) * np.array([65536, 256, 1], dtype=np.uint32)).sum(axis=2).ravel()
@@ -32,8 +32,9 @@ def write_palette_png(path: Path, png: bytes) -> None:
     rows = np.zeros((height, width + 1), np.uint8)  # each begins with the number of its filter: none
     rows[:, 1:] = nearest[which].reshape(height, width)
     head = struct.pack(">IIBBBBB", width, height, 8, 3, 0, 0, 0)
-    parts = ((b"IHDR", head), (b"PLTE", palette.astype(np.uint8).tobytes()), (b"IDAT", zlib.compress(rows.tobytes(), 9)))
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(*part) for part in (*parts, (b"IEND", b""))))
+    parts = ((b"IHDR", head), (b"PLTE", palette.astype(np.uint8).tobytes()),
+             (b"IDAT", zlib.compress(rows.tobytes(), 9)), (b"IEND", b""))  # fmt: skip
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(*part) for part in parts))
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:

@@ -147,7 +147,8 @@ def test_places_of_the_workbench_lead_to_rows_of_the_report(english: str, tmp_pa
     shown = f"(() => {{ location.hash = {json.dumps(anchor(kind, name))}; }})()"
     page = english.replace("</body>", f"<script>{shown}</script></body>")
     if kind in ("point", "camera", "target", "table", "group"):
-        measure = "[...document.querySelectorAll('main .here')].map((e) => (e.cells?.[0] ?? e).textContent.split(', ')[0])"
+        measure = """[...document.querySelectorAll("main .here")]
+          .map((e) => (e.cells?.[0] ?? e).textContent.split(", ")[0])"""
         assert seen(page, measure, tmp_path) == [{"group": "image points"}.get(name, name)]
         return
     rows = "'#all .rows .row'" if kind == "image" else "'#all .row[aria-selected=true]'"

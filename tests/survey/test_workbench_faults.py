@@ -147,7 +147,7 @@ def place_in(page: Any, uv: tuple[float, float], size: tuple[int, int] = (1280, 
 
 @pytest.mark.parametrize("page", [write_reflection], indirect=True)
 def test_a_reflection_is_seen_in_the_image_and_left_out(page: tuple[Page, Path]) -> None:
-    """The page opens with the image of the largest residual; its vector is clicked, the picture looked at pixel by pixel."""
+    """The page opens with the image of the largest residual; it is clicked, and the picture looked at pixel by pixel."""
     shown, folder = page
     p: Any = shown.page
     click = Clicks(shown)

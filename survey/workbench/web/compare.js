@@ -13,7 +13,7 @@ export function changesText(changes) {
   const { before: a, after: b } = changes;
   const fact = (title, x, y) => make("div", {}, make("span", { class: "quiet" }, title), make("b", {}, x === y ? x : `${x} → ${y}`));
   const rows = changes.components.slice(0, MOST).map((c) => [
-    make("span", {}, link(anchor("param", c.name), c.name), make("div", { class: "quiet" }, `${significant(c.before, 7)} → ${significant(c.after, 7)}`)),
+    make("span", {}, link(anchor("param", c.name), c.name), c.before === null ? null : make("div", { class: "quiet" }, `${significant(c.before, 7)} → ${significant(c.after, 7)}`)),
     number(c.sigmas, 2), `${c.difference > 0 ? "+" : ""}${significant(c.difference, 3)} ${c.unit}`, number(c.ratio, 3)]);
   return make("div", {},
     make("div", { class: "cards" }, fact(t("verdict"), t(`verdict ${a.verdict}`), t(`verdict ${b.verdict}`)), fact("sigma0", number(a.sigma0, 4), number(b.sigma0, 4)),
