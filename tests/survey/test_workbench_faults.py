@@ -51,7 +51,7 @@ def _misread(row: dict[str, str]) -> dict[str, str]:
 
 
 def write_spoilt(folder: Path) -> None:
-    """A head on a table with the three mistakes."""
+    """A head on a table with three mistakes."""
     write_example("head", folder)
     _rows(folder / "observations/image_points.csv", _spoilt)
     _rows(folder / "observations/table_angles.csv", _misread)
@@ -147,7 +147,7 @@ def place_in(page: Any, uv: tuple[float, float], size: tuple[int, int] = (1280, 
 
 @pytest.mark.parametrize("page", [write_reflection], indirect=True)
 def test_a_reflection_is_seen_in_the_image_and_left_out(page: tuple[Page, Path]) -> None:
-    """The page opens with the image of the largest residual; it is clicked, and the picture looked at pixel by pixel."""
+    """The page opens with the image of the largest residual; it is clicked and looked at pixel by pixel."""
     shown, folder = page
     p: Any = shown.page
     click = Clicks(shown)
