@@ -1,4 +1,4 @@
-"""Pictures of the page of ``labsurvey open``, by Chromium.
+"""Pictures of the page of ``labsurvey open``, by Chromium, of at most 256 colours each.
 
 Run in the project's folder: python -m docs.make_workbench_pictures FOLDER docs/pictures
 FOLDER is a project, such as that of: labsurvey example full-lab FOLDER. The others are made on the way.
@@ -10,22 +10,35 @@ import itertools
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 from playwright.sync_api import sync_playwright
 
 from adjust.model.errors import SurveyError
+from docs.palette import write_palette_png
 from survey.examples import write_example
 from survey.workbench.guard import new_token
 from survey.workbench.live import Listening
 from survey.workbench.server import Server
 from survey.workbench.session import Workbench
-from tests.survey.test_workbench_faults import write_spoilt
+from tests.survey.test_workbench_faults import (
+    HIGHLIGHT,
+    POINT,
+    READING,
+    REFLECTED,
+    place_in,
+    write_reflection,
+    write_spoilt,
+)
 
 CHROMIUM = "/usr/bin/chromium"
 DESK, PHONE = (1440, 900), (390, 844)
+SMALL = (1280, 800)
 Act = Callable[[Any], None]
 
 
@@ -38,33 +51,137 @@ def _detect(page: Any) -> None:
     page.wait_for_timeout(9000)
 
 
-# name: place, width, colours, what is done before
-OF_FOLDER: dict[str, tuple[str, int, str, Act]] = {
-    "workbench": ("", 1280, "light", _nothing),
-    "workbench-scene": ("point=B07&view=camera,scene", 1280, "dark", _nothing),
-    "workbench-phone": ("view=findings,image", 390, "dark", _nothing),
+def _without_an_image(page: Any) -> None:
+    """Something to compare: the image shown is left out."""
+    page.keyboard.press("X")
+    page.locator("dialog input").fill("motion blur")
+    _done(page, lambda: page.keyboard.press("Enter"))
+    page.keyboard.press("s")
+
+
+# name: place, colours, what is done before
+OF_FOLDER: dict[str, tuple[str, str, Act]] = {
+    "workbench": ("", "light", _nothing),
+    "workbench-scene": ("point=B07&view=camera,scene", "dark", _nothing),
+    "workbench-flat": ("point=B07&view=plan,south", "light", _nothing),
+    "workbench-halves": ("camera=Z&view=halves,camera", "light", _nothing),
+    "workbench-angles": ("view=angles,correlations", "dark", _nothing),
+    "workbench-compare": ("image=X/hX05&view=compare,history", "light", _without_an_image),
 }
-OF_EXAMPLES: dict[str, tuple[str, str, int, str, Act]] = {
-    "workbench-remedy": ("spoilt", "view=findings,angles", 1280, "light", _nothing),
-    "workbench-network": ("total-station", "view=settings,network", 1280, "dark", _nothing),
-    "workbench-detect": ("one-camera", "view=jobs,image", 1280, "light", _detect),
+OF_EXAMPLES: dict[str, tuple[str, str, str, Act]] = {
+    "workbench-network": ("total-station", "view=settings,network", "dark", _nothing),
+    "workbench-loops": ("relay", "view=loops,scene", "light", _nothing),
+    "workbench-detect": ("one-camera", "view=jobs,image", "light", _detect),
 }
+ON_A_PHONE = (("", "left"), ("image=X/hX05", "right"), ("point=B07&view=findings,scene", "right"), ("", "tables"),
+              ("obs=image_point:X/hX05/board/r7c2", "inspector"))  # fmt: skip
 
 
 def main(folder: Path, out: Path) -> None:
     """Write every picture as a PNG."""
     with sync_playwright() as playwright, tempfile.TemporaryDirectory() as place:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        for name, how in OF_FOLDER.items():
-            picture(browser, folder, out / f"{name}.png", *how)
+        mistakes(browser, Path(place), out)
         for name, (example, *how) in OF_EXAMPLES.items():
             mine = Path(place) / name / "lab"
-            if example == "spoilt":
-                write_spoilt(mine)
-            else:
-                write_example(example, mine)
+            write_example(example, mine)
             picture(browser, mine, out / f"{name}.png", *how)
+        phone(browser, folder, out / "workbench-phone.png")
+        for name, how in OF_FOLDER.items():
+            picture(browser, folder, out / f"{name}.png", *how)
         browser.close()
+
+
+def mistakes(browser: Any, place: Path, out: Path) -> None:
+    """Every step of the tutorial of four mistakes."""
+    write_spoilt(place / "spoilt")
+    write_reflection(place / "reflection")
+    with opened(browser, place / "spoilt", "view=findings,angles") as page:
+        shot(page, out / "workbench-remedy.png")
+        _done(page, lambda: page.keyboard.press("m"))
+        for anchor, reason, name in ((POINT, "reflection", "corner"), (READING, "misread", "angle")):
+            page.locator(f'#left a[data-id="{anchor}"]').first.click()
+            page.locator("#inspector button", has_text="Leave out …").click()
+            page.locator("dialog input").fill(reason)
+            shot(page, out / f"workbench-mistake-{name}.png")
+            _done(page, lambda: page.locator("dialog button.primary").click())
+        page.keyboard.press("d")
+        shot(page, out / "workbench-mistake-mended.png")
+    with opened(browser, place / "reflection", "") as page:
+        page.locator("#right canvas").first.click(position=place_in(page, HIGHLIGHT))
+        page.wait_for_timeout(500)
+        assert REFLECTED in page.evaluate("location.hash")
+        page.locator("#right button", has_text="1:1").click()
+        page.keyboard.press("o")
+        page.mouse.move(2, 2)
+        shot(page, out / "workbench-mistake-reflection.png")
+
+
+def _done(page: Any, act: Callable[[], Any]) -> None:
+    page.evaluate("delete document.body.dataset.done")
+    act()
+    _until(page, "document.body.dataset.done !== undefined")
+
+
+@contextmanager
+def opened(
+    browser: Any, folder: Path, place: str, colours: str = "light", size: tuple[int, int] = SMALL
+) -> Iterator[Any]:  # fmt: skip
+    """The page of a project at a place."""
+    bench, token = Workbench(folder), new_token()
+    try:
+        bench.adjust()
+    except SurveyError as error:
+        print(f"{folder}: {error}", file=sys.stderr)
+    with Listening(Server(bench, token), "127.0.0.1", 0) as listening:
+        sized = {"width": size[0], "height": size[1]}
+        context = browser.new_context(viewport=sized, color_scheme=colours, locale="en-GB")
+        page = context.new_page()
+        page.on("console", lambda said: print(folder.name, place, said.text, file=sys.stderr))
+        page.goto(f"{listening.address}#token={token}&{place}")
+        _until(page, "document.body.dataset.ready !== undefined")
+        yield page
+        context.close()
+
+
+def picture(browser: Any, folder: Path, out: Path, place: str, colours: str, act: Act) -> None:
+    """One picture of a place, after something was done there."""
+    with opened(browser, folder, place, colours) as page:
+        page.wait_for_timeout(1500)
+        act(page)
+        shot(page, out)
+
+
+def phone(browser: Any, folder: Path, out: Path) -> None:
+    """The parts of a phone's page beside each other, light and dark in turn."""
+    parts = []
+    for k, (place, region) in enumerate(ON_A_PHONE):
+        with opened(browser, folder, place, ("light", "dark")[k % 2], PHONE) as page:
+            page.evaluate(f"document.querySelector('#tabs button:nth-child({1 + _REGIONS.index(region)})').click()")
+            parts.append(cv2.imdecode(np.frombuffer(_settled(page).screenshot(), np.uint8), cv2.IMREAD_COLOR))
+    write_palette_png(out, cv2.imencode(".png", np.hstack(parts))[1].tobytes())
+
+
+_REGIONS = ("tree", "left", "right", "tables", "inspector")
+
+
+def shot(page: Any, out: Path) -> None:
+    """What is seen, once nothing is computed any more."""
+    write_palette_png(out, _settled(page).screenshot())
+    print(f"{out}: {out.stat().st_size / 1e3:.0f} kB")
+
+
+def _settled(page: Any) -> Any:
+    page.wait_for_timeout(800)
+    _until(page, "document.querySelector('[aria-busy=true]') === null")
+    page.wait_for_timeout(500)
+    return page
+
+
+def _until(page: Any, condition: str, seconds: float = 30.0) -> None:
+    end = time.monotonic() + seconds
+    while not page.evaluate(condition) and time.monotonic() < end:
+        time.sleep(0.05)
 
 
 def every(folder: Path, out: Path) -> None:
@@ -83,16 +200,14 @@ def every(folder: Path, out: Path) -> None:
             page = context.new_page()
             page.on("console", lambda said, mark=mark: print(mark, said.text, file=sys.stderr))
             page.goto(f"{listening.address}#token={token}")
-            settled(page)
-            for region in ("left", "tree", "tables", "inspector") if size is PHONE else ("left",):
+            _until(page, "document.body.dataset.results !== undefined")
+            for region in _REGIONS if size is PHONE else ("left",):
                 page.evaluate(f"document.body.dataset.pane = '{region}'")
-                page.screenshot(path=out / f"{region}-{mark}")
+                _settled(page).screenshot(path=out / f"{region}-{mark}")
             page.evaluate("document.body.dataset.pane = 'right'")
-            chooser = page.locator("#right .chooser select")
-            for view in chooser.locator("option").evaluate_all("(all) => all.map((one) => one.value)"):
+            for view in page.locator("#right .chooser option").evaluate_all("(all) => all.map((one) => one.value)"):
                 page.locator("#right .chooser select").select_option(view)
-                page.wait_for_timeout(1500)
-                page.screenshot(path=out / f"{view}-{mark}")
+                _settled(page).screenshot(path=out / f"{view}-{mark}")
             report = out / f"report-{language}.html"
             report.write_text(report_html(bench.adjustment, bench.run(), None, bench.statistics, language))
             page.goto(report.resolve().as_uri())
@@ -100,32 +215,6 @@ def every(folder: Path, out: Path) -> None:
             page.screenshot(path=out / f"report-{mark}", full_page=True)
             context.close()
         browser.close()
-
-
-def picture(browser: Any, folder: Path, out: Path, place: str, width: int, colours: str, act: Act) -> None:
-    """One picture of a place, after something was done there."""
-    bench, token = Workbench(folder), new_token()
-    try:
-        bench.adjust()
-    except SurveyError as error:
-        print(f"{folder}: {error}", file=sys.stderr)
-    with Listening(Server(bench, token), "127.0.0.1", 0) as listening:
-        size = {"width": width, "height": 800}
-        context = browser.new_context(viewport=size, color_scheme=colours, locale="en-GB")
-        page = context.new_page()
-        page.goto(f"{listening.address}#token={token}&{place}")
-        settled(page)
-        act(page)
-        page.screenshot(path=out)
-        context.close()
-
-
-def settled(page: Any, seconds: float = 20.0) -> None:
-    """Waits until the views are drawn."""
-    end = time.monotonic() + seconds
-    while page.evaluate("document.body.dataset.ready === undefined") and time.monotonic() < end:
-        time.sleep(0.05)
-    page.wait_for_timeout(2500)
 
 
 if __name__ == "__main__":

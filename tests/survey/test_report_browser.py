@@ -80,9 +80,8 @@ def test_places_of_the_workbench_lead_to_rows_of_the_report(
     }[kind]  # fmt: skip
     place = "#" + quote(anchor(kind, name).removeprefix("#"), safe="=:/")
     if kind in ("point", "camera", "target", "table", "group"):
-        measure = (
-            "[...document.querySelectorAll('main .here')].map((e) => (e.cells?.[0] ?? e).textContent.split(', ')[0])"
-        )
+        measure = """[...document.querySelectorAll("main .here")]
+          .map((e) => (e.cells?.[0] ?? e).textContent.split(", ")[0])"""
         assert asked(browser, english, tmp_path, measure, place=place) == [[{"group": "image points"}.get(name, name)]]
         return
     rows = "'#all .rows .row'" if kind == "image" else "'#all .row[aria-selected=true]'"

@@ -176,12 +176,9 @@ def test_places_that_the_terminal_names_are_places_of_the_page(page: Page, folde
     ("image=X/tX05", "image X/tX05"), ("obs=image_point:X/tX05/board/c41", "observation X/tX05/board/c41"),
     ("reading=table_angles:turntable/tX05", "reading turntable/tX05"), ("param=lens/X/fx", "parameter lens/X/fx"),
     ("camera=Y", "camera Y"), ("epoch=tX05", "epoch tX05"), ("target=board", "target board"),
-    ("group=image", "group image"),
-    ("station=head", "station head"), ("table=turntable", "turntable"), ("run=1", ""),
+    ("group=image", "group image"), ("station=head", "station head"), ("table=turntable", "turntable"), ("run=1", ""),
 ])  # fmt: skip
-def test_every_kind_of_place_opens_what_it_names(
-    browser: Any, address: str, folder: Path, place: str, shown: str
-) -> None:
+def test_every_kind_of_place_opens_what_it_names(browser: Any, address: str, place: str, shown: str) -> None:
     """As a link from a terminal or a mail: behind the token, in a page that was not open before."""
     page = Page(browser, f"{address}&{place}", 1280)
     p = page.page

@@ -1,24 +1,28 @@
-"""Three planted mistakes of different kinds, found and mended in the page alone, by so many clicks each."""
+"""Four planted mistakes of different kinds, found and mended in the page alone, by so many clicks each."""
 
 import csv
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
 from survey.examples import write_example
+from survey.notebook.steps import detect
 from survey.project.exclusions import read_exclusions
 from survey.workbench.guard import new_token
 from survey.workbench.live import Listening
 from survey.workbench.server import Server
 from survey.workbench.session import Workbench
 from tests.browsing import Page
-from tests.survey.test_workbench_browser import READY
 
 pytestmark = [pytest.mark.slow, pytest.mark.browser]
 
 POINT = "image_point:X/tX05/board/c40"  # moved by 4 px
+REFLECTED = "image_point:left/e05/board/r3c4"
+HIGHLIGHT = (806.0, 664.0)  # px: 7 from the corner that is meant
 READING = "table_angles:turntable/tZ05"  # typed wrong by half a degree
 
 
@@ -46,10 +50,28 @@ def _misread(row: dict[str, str]) -> dict[str, str]:
 
 
 def write_spoilt(folder: Path) -> None:
-    """A head on a table with the three mistakes."""
+    """A head on a table with three mistakes."""
     write_example("head", folder)
     _rows(folder / "observations/image_points.csv", _spoilt)
     _rows(folder / "observations/table_angles.csv", _misread)
+
+
+def write_reflection(folder: Path) -> None:
+    """Two cameras and a board with a lamp mirrored in it, beside a corner; another program took that for the corner."""
+    write_example("stereo", folder)
+    path = folder / "images/left/e05.png"
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    u, v = HIGHLIGHT
+    cv2.ellipse(image, (round(u), round(v)), (9, 6), 30, 0, 360, 250, -1, cv2.LINE_AA)
+    cv2.imwrite(str(path), image)
+    detect(folder)  # which does without that corner
+    table = folder / "observations/image_points.csv"
+    lines = table.read_text().splitlines()
+    at = next(k for k, line in enumerate(lines) if line.startswith("e05,left,board,r3c3,"))
+    cells = lines[at].split(",")
+    lines.insert(at + 1, ",".join([*cells[:3], "r3c4", repr(u), repr(v), *cells[6:]]))
+    table.write_text("\n".join(lines) + "\n")
 
 
 class Clicks:
@@ -76,10 +98,10 @@ class Clicks:
 
 
 @pytest.fixture
-def page(browser: Any, tmp_path: Path) -> Iterator[tuple[Page, Path]]:
-    """A page of a head on a table with the three mistakes."""
+def page(request: pytest.FixtureRequest, browser: Any, tmp_path: Path) -> Iterator[tuple[Page, Path]]:
+    """A page of a project that the function given has spoilt."""
     folder = tmp_path / "lab"
-    write_spoilt(folder)
+    request.param(folder)
     token = new_token()
     bench = Workbench(folder)
     bench.adjust()
@@ -90,6 +112,7 @@ def page(browser: Any, tmp_path: Path) -> Iterator[tuple[Page, Path]]:
         assert [text for text in found.complaints if "404" not in text] == []  # the example has no pictures
 
 
+@pytest.mark.parametrize("page", [write_spoilt], indirect=True)
 def test_three_mistakes_are_mended_in_the_page_alone(page: tuple[Page, Path]) -> None:
     shown, folder = page
     p: Any = shown.page
@@ -110,3 +133,41 @@ def test_three_mistakes_are_mended_in_the_page_alone(page: tuple[Page, Path]) ->
     for _ in range(3):
         shown.done(lambda: p.locator("#undo").click())
     assert "mirrored" in p.inner_text("#left .remedy")
+
+
+def place_in(page: Any, uv: tuple[float, float], size: tuple[int, int] = (1280, 1024)) -> dict[str, float]:
+    """Where a pixel is on the canvas of an image that is seen as a whole."""
+    box = page.locator("#right canvas").first.bounding_box()
+    scale = min(box["width"] / size[0], box["height"] / size[1])
+    return {axis: 0.5 * (box[side] - scale * n) + scale * (x + 0.5)
+            for axis, side, n, x in zip("xy", ("width", "height"), size, uv, strict=True)}  # fmt: skip
+
+
+@pytest.mark.parametrize("page", [write_reflection], indirect=True)
+def test_a_reflection_is_seen_in_the_image_and_left_out(page: tuple[Page, Path]) -> None:
+    """The page opens with the image of the largest residual; it is clicked and looked at pixel by pixel."""
+    shown, folder = page
+    p: Any = shown.page
+    click = Clicks(shown)
+    shown.wait("document.body.dataset.picture !== undefined")
+    assert p.inner_text("#right .bar b") == "left · e05"
+    click.n += 1
+    place = place_in(p, HIGHLIGHT)
+    p.locator("#right canvas").first.click(position=place)
+    shown.wait(f"location.hash.includes({REFLECTED!r})")
+    click("#right button", "1:1")
+    p.locator("#right canvas").first.press("o")  # without marks
+    p.wait_for_timeout(400)
+    picture = cv2.imdecode(np.frombuffer(p.locator("#right canvas").first.screenshot(), np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert picture is not None
+    x, y = round(place["x"]), round(place["y"])
+    bright = picture[y - 8 : y + 8, x - 8 : x + 8] > 240  # the board's white is 222
+    assert bright.mean() > 0.25, "where the point was clicked the highlight is seen, pixel by pixel"
+    p.keyboard.press("o")
+    click("#inspector button", "Leave out …")
+    p.locator("dialog input").fill("reflection of a lamp")
+    click("dialog button.primary", renews=True)
+    assert click.n == 4
+    assert p.inner_text("#verdict") == "✓ Passed"
+    rows, _ = read_exclusions(folder / "observations")
+    assert [(f"{r.exclusion.name}", r.exclusion.reason) for r in rows] == [(REFLECTED, "reflection of a lamp")]

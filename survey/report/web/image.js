@@ -57,6 +57,7 @@ export class ImageView {
       held.delete(event.pointerId);
       if (name === "pointerup" && this.moved < 5) this.click(event);
     });
+    canvas.addEventListener("pointerleave", () => { this.hover = -1; if (this.bitmap) this.note.textContent = ""; });
     canvas.addEventListener("keydown", (event) => {
       const by = { ArrowLeft: [40, 0], ArrowRight: [-40, 0], ArrowUp: [0, 40], ArrowDown: [0, -40] }[event.key];
       if (by) { event.preventDefault(); this.pan(by[0], by[1]); }

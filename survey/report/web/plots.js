@@ -119,7 +119,7 @@ export function residualField(points, camera, size) {
  */
 export function scatter(label, series, how) {
   const xs = series.flatMap((s) => s.x), ys = series.flatMap((s) => s.y).filter(Number.isFinite);
-  const x0 = Math.min(...xs), x1 = Math.max(...xs), top = Math.max(...ys.map(Math.abs), how.band ?? 0, 1e-12) * 1.08;
+  const x0 = Math.min(...xs), x1 = Math.max(...xs), top = Math.max(...(how.band ? [1.5 * how.band] : ys.map(Math.abs)), 1e-12) * 1.08; // what is far beyond the band is an arrow at the edge
   let places = [];
   const { canvas } = surface(label, (context, width, height) => {
     const left = 52, bottom = 30, to = (x, y) => [left + ((x - x0) / Math.max(1e-300, x1 - x0)) * (width - left - 16), 8 + (0.5 - y / (2 * top)) * (height - bottom - 8)];
@@ -139,11 +139,12 @@ export function scatter(label, series, how) {
     places = [];
     series.forEach((one, k) => one.x.forEach((x, i) => {
       if (!Number.isFinite(one.y[i])) return;
-      const [u, v] = to(x, one.y[i]);
+      const far = Math.abs(one.y[i]) > top, sign = Math.sign(one.y[i]), [u, v] = to(x, far ? (sign * top) / 1.03 : one.y[i]);
       places.push([u, v, one.anchors?.[i]]);
       context.fillStyle = context.strokeStyle = colour(["blue", "warn", "good", "soft"][k % 4]);
       context.beginPath();
-      if (k % 2) context.rect(u - 3, v - 3, 6, 6);
+      if (far) { context.moveTo(u, v - 6 * sign); context.lineTo(u + 5, v + 4 * sign); context.lineTo(u - 5, v + 4 * sign); context.fillText(significant(one.y[i], 3), u + 7, v + 4); }
+      else if (k % 2) context.rect(u - 3, v - 3, 6, 6);
       else context.arc(u, v, 3.4, 0, 7);
       if (k % 4 > 1) context.stroke();
       else context.fill();

@@ -76,6 +76,7 @@ export class SceneView {
     });
     canvas.addEventListener("pointerup", (event) => { held.delete(event.pointerId); if (this.moved < 5) this.click(event); });
     canvas.addEventListener("pointercancel", (event) => held.delete(event.pointerId));
+    canvas.addEventListener("pointerleave", () => { this.note.textContent = ""; });
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("keydown", (event) => {
       const turn = { ArrowLeft: [0.1, 0], ArrowRight: [-0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[event.key];

@@ -13,14 +13,14 @@ export function changesText(changes) {
   const { before: a, after: b } = changes;
   const fact = (title, x, y) => make("div", {}, make("span", { class: "quiet" }, title), make("b", {}, x === y ? x : `${x} → ${y}`));
   const rows = changes.components.slice(0, MOST).map((c) => [
-    link(anchor("param", c.name), c.name), number(c.sigmas, 2), `${c.difference > 0 ? "+" : ""}${significant(c.difference, 3)} ${c.unit}`,
-    significant(c.before, 8), significant(c.after, 8), number(c.ratio, 3)]);
+    make("span", {}, link(anchor("param", c.name), c.name), c.before === null ? null : make("div", { class: "quiet" }, `${significant(c.before, 7)} → ${significant(c.after, 7)}`)),
+    number(c.sigmas, 2), `${c.difference > 0 ? "+" : ""}${significant(c.difference, 3)} ${c.unit}`, number(c.ratio, 3)]);
   return make("div", {},
     make("div", { class: "cards" }, fact(t("verdict"), t(`verdict ${a.verdict}`), t(`verdict ${b.verdict}`)), fact("sigma0", number(a.sigma0, 4), number(b.sigma0, 4)),
       fact(t("redundancy"), count(a.redundancy), count(b.redundancy)), fact(t("suspects"), count(a.n_suspects ?? 0), count(b.n_suspects ?? 0))),
     changes.gone?.length ? make("p", {}, t("Only before: {names}", { names: changes.gone.join(", ") })) : null,
     changes.new?.length ? make("p", {}, t("Only after: {names}", { names: changes.new.join(", ") })) : null,
-    plainTable(t("Before and after"), [t("parameter"), t("in sigmas"), t("difference"), t("before"), t("after"), t("sigma ratio")], rows, [1, 2, 3, 4, 5]),
+    plainTable(t("Before and after"), [`${t("parameter")}: ${t("before")} → ${t("after")}`, t("in sigmas"), t("difference"), t("sigma ratio")], rows, [1, 2, 3]),
     make("p", { class: "quiet" }, t("{n} components, the one that moved by most of its sigmas first", { n: count(changes.n_components ?? changes.components.length) })));
 }
 

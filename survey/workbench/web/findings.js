@@ -66,9 +66,9 @@ export class FindingsView {
   }
 
   suspects(title, rows) {
-    return plainTable(title, [t("observation"), "w", t("limit"), t("residual"), "r"],
-      rows.map((s) => [make("span", {}, make("a", { href: s.anchor, data: { id: s.place[1] } }, s.kind === "image_point" ? s.text : `${t(`kind ${s.kind}`)} ${s.text}`), s.why === 0 ? "" : make("span", { class: "pill" }, t("left out"))),
-        s.w === null ? t("{k} of {n} points", { k: s.n_points, n: s.n_in_image }) : number(s.w, 2), s.share === null ? "–" : `${number(100 * s.share, 0)} %`, s.residual === undefined ? "–" : `${[s.residual].flat().map((x) => significant(x, 2)).join(", ")} ${s.unit}`, number(s.redundancy, 2)]), [1, 2, 3, 4]);
+    return plainTable(title, [t("observation"), "w", t("limit"), t("residual")],
+      rows.map((s) => [link(s.anchor, s.kind === "image_point" ? s.text : `${t(`kind ${s.kind}`)} ${s.text}`, { data: { id: s.place[1] }, class: s.why === 0 ? null : "out", title: s.why === 0 ? null : t("left out") }),
+        s.w === null ? t("{k} of {n} points", { k: s.n_points, n: s.n_in_image }) : number(s.w, 2), s.share === null ? "–" : `${number(100 * s.share, 0)}\u00a0%`, s.residual === undefined ? "–" : `${[s.residual].flat().map((x) => significant(x, 2)).join(", ")} ${s.unit}`]), [1, 2, 3]);
   }
 
   groups(rows) {

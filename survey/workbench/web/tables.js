@@ -78,7 +78,7 @@ export class Tables {
       columns: [{ key: "camera", title: t("camera"), ...coded("camera") }, { key: "epoch", title: t("kind epoch"), ...coded("epoch") }, { key: "target", title: t("target"), ...coded("target") },
         { key: "point", title: t("point"), names: all, code: (i) => of[data.block[i]][data.point[i]], wide: 5 },
         { key: "residual", title: t("residual, px"), values: residual, digits: 3, size: true }, { key: "w", title: "w", values: data.w, digits: 2, size: true },
-        ...(data.redundancy ? [{ key: "r", title: "r", values: data.redundancy, digits: 3 }] : []), { key: "used", title: t("used"), values: data.used, digits: 0, text: (i) => (data.used[i] ? "✓" : "✕") }],
+        ...(data.redundancy ? [{ key: "r", title: "r", values: data.redundancy, digits: 3 }] : []), { key: "used", title: t("used"), values: data.used, digits: 0, wide: 3.6, text: (i) => (data.used[i] ? "✓" : "✕") }],
       kind: "obs", sort: "w",
     };
   }
@@ -86,8 +86,8 @@ export class Tables {
   readings() {
     const rows = this.bench.readings;
     return { n: rows.length, id: (i) => rows[i].id, state: (i) => (rows[i].used ? (rows[i].share > 1 ? "suspect" : "") : "out"), kind: "reading", sort: "w",
-      columns: [named("table", t("sort of reading"), rows.map((r) => known(r.table.replaceAll("_", " ")))), named("name", t("reading"), rows.map((r) => r.name)), named("component", t("component"), rows.map((r) => r.component)),
-        { ...number4("observed", t("observed"), rows), wide: 7, text: (i) => measure(rows[i].observed, rows[i].unit, 7) }, number4("residual", t("residual"), rows, true), named("unit", t("unit"), rows.map((r) => r.sigma_unit ?? "")), numbers("w", "w", rows.map((r) => r.w), { digits: 2, size: true }), numbers("r", "r", rows.map((r) => r.redundancy), { digits: 3 }), numbers("used", t("used"), rows.map((r) => Number(r.used)), { text: (i) => (rows[i].used ? "✓" : "✕") })] };
+      columns: [named("table", t("sort of reading"), rows.map((r) => known(r.table.replaceAll("_", " ")))), named("name", t("reading"), rows.map((r) => r.name)), named("component", t("component"), rows.map((r) => r.component), { wide: 5 }),
+        { ...number4("observed", t("observed"), rows), wide: 7, text: (i) => measure(rows[i].observed, rows[i].unit, 6) }, { ...number4("residual", t("residual"), rows, true), wide: 6, text: (i) => measure(rows[i].residual, rows[i].sigma_unit, 3) }, numbers("w", "w", rows.map((r) => r.w), { digits: 2, size: true }), numbers("r", "r", rows.map((r) => r.redundancy), { digits: 3 }), numbers("used", t("used"), rows.map((r) => Number(r.used)), { wide: 3.6, text: (i) => (rows[i].used ? "✓" : "✕") })] };
   }
 
   parameters() {
