@@ -402,6 +402,4 @@ class _Search:
             )
         points = {p.point_id: x for p, x in zip(survey.points, self.points.x, strict=True)}
         reasons = tuple(self.reasons[i] for i in order)
-        return Start(
-            self.lenses, poses, points, vectors, order, reasons, tuple(rms.tolist()), tuple(self.notes)
-        )
+        return Start(self.lenses, poses, points, vectors, order, reasons, tuple(rms.tolist()), tuple(self.notes))
