@@ -133,7 +133,10 @@ def hand_poses(survey: Survey) -> dict[str, dict[str, tuple[int, Pose3]]]:
 
 def with_pairs(survey: Survey, new: Mapping[int, Pair]) -> Survey:
     """The survey with other pairs at these positions."""
-    return replace(survey, pairs=tuple(new.get(i, p) for i, p in enumerate(survey.pairs)))
+    pairs = list(survey.pairs)
+    for i, pair in new.items():
+        pairs[i] = pair
+    return replace(survey, pairs=tuple(pairs))
 
 
 @dataclass(frozen=True)

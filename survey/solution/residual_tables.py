@@ -194,4 +194,3 @@ def _rows(
     parts = [(WORD, 0), comma, (WORD, 1), *value, *value, comma, (WORD, 2), *value * 5, (WORD, 3)]
     values = columns * np.column_stack([factor, factor, small, small, one, one, one])
     return record_rows(Words.of(words), word, values, parts, 12)[0]
-
