@@ -245,7 +245,7 @@ except ControllerError as error:
     assert "own limits -40 to 40" in str(error), error
 controller._motors[0].velocity.put(0.5, wait=True)  # 95 s to where it is sent
 status = table.set(np.radians([60.0, -30.0]))
-while np.degrees(table.position[0]) < 12.6:  # the record loses a STOP that comes before it moves
+while not controller.read(0).moving:  # the record loses a STOP that comes before it moves
     time.sleep(0.01)
 table.stop()
 try:
