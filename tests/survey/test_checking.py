@@ -51,7 +51,7 @@ def test_a_folder_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 def test_the_page_names_every_kind_of_finding() -> None:
     root = Path(__file__).parents[2]
-    source = (root / "adjust/diagnosis/beforehand.py").read_text(encoding="utf-8")
+    source = "".join(p.read_text(encoding="utf-8") for p in (root / "adjust/diagnosis/beforehand").glob("*.py"))
     page = (root / "docs/check.md").read_text(encoding="utf-8")
     kinds = set(re.findall(r'Finding\(\s*"(?:problem|weak)", "([^"]+)"', source))
     assert len(kinds) > 8
