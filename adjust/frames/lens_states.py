@@ -9,7 +9,7 @@ import numpy as np
 from adjust.frames.unknowns import Unknowns, VectorMap, vector_map
 from adjust.lenses.crops import UNITS, CroppedLens, crop_size, cropped_lens, whole_image
 from adjust.lenses.models import MODELS, LensModel, camera_constants
-from adjust.model.errors import SurveyError
+from adjust.model.errors import SurveyError, natural_key
 from adjust.model.result import ParameterName
 from adjust.model.survey import (
     CROP,
@@ -91,7 +91,10 @@ def _starts(survey: Survey, camera: Camera, begins: Iterable[str], key: str) -> 
 
 
 class LensTimes:
-    """Which lens the images of a survey have: of an epoch without image, or of none (None), what the last one has."""
+    """Which lens the images of a survey have.
+
+    Of an epoch without image: what the last one before it has, in the order of names; of no epoch (None): the last one.
+    """
 
     def __init__(self, survey: Survey) -> None:
         self.survey = survey
@@ -144,7 +147,10 @@ class LensTimes:
 
 
 def _at(starts: Mapping[str, str | None], epoch_id: str | None) -> str | None:
-    return starts[str(epoch_id)] if str(epoch_id) in starts else [None, *starts.values()][-1]
+    if epoch_id is not None and epoch_id in starts:
+        return starts[epoch_id]
+    before = [e for e in starts if epoch_id is None or natural_key(e) <= natural_key(epoch_id)]
+    return starts[before[-1]] if before else next(iter(starts.values()), None)
 
 
 def whole_images(survey: Survey) -> Survey:
