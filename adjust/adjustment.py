@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from gtsam import Pose3
 
-from adjust.frames.lens_states import whole_images
+from adjust.frames.lens_times import whole_images
 from adjust.frames.tables import check_harmonics
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS
 from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from gtsam import Pose3
 
-from adjust.frames.lens_states import LensTimes
+from adjust.frames.lens_times import LensTimes
 from adjust.lenses.models import MODELS, camera_constants, project
 from adjust.model.observations import FrameRef, ImageBlock
 from adjust.model.result import Adjustment

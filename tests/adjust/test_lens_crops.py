@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from adjust.adjustment import adjust
-from adjust.frames.lens_states import LensTimes, whole_images
+from adjust.frames.lens_times import LensTimes, whole_images
 from adjust.lenses.crops import cropped_lens, whole_image
 from adjust.lenses.models import MODELS, lens_constants, project
 from adjust.model.errors import SurveyError

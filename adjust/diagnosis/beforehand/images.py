@@ -8,7 +8,7 @@ import numpy as np
 from adjust.diagnosis.beforehand.finding import Finding
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.time.forgotten_motion import forgotten_motion
-from adjust.frames.lens_states import LensTimes, whole_images
+from adjust.frames.lens_times import LensTimes, whole_images
 from adjust.model.errors import listed
 from adjust.model.survey import Camera, FloatArray, IntArray, Survey
 
