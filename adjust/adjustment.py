@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from gtsam import Pose3
 
+from adjust.frames.lens_times import whole_images
 from adjust.frames.runs import within_motion
 from adjust.frames.tables import check_harmonics
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS
@@ -320,5 +321,6 @@ def _lens_warnings(graph: AdjustmentGraph, result: Adjustment) -> list[str]:
 
 
 def _largest_radius(graph: AdjustmentGraph, camera_id: str, centre: FloatArray) -> float:
-    parts = [np.zeros((0, 2)), *(b.uv for b in graph.survey.image_blocks if b.camera_id == camera_id)]
+    blocks = whole_images(graph.survey).image_blocks
+    parts = [np.zeros((0, 2)), *(b.uv for b in blocks if b.camera_id == camera_id)]
     return float(np.linalg.norm(np.concatenate(parts) - centre, axis=1).max(initial=0.0))

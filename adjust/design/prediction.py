@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from gtsam import Pose3
 
-from adjust.frames.lens_states import LensTimes
+from adjust.frames.lens_times import LensTimes
 from adjust.graph.assembly import GraphBuilder, StartValues
 from adjust.lenses.models import MODELS, camera_constants, lens_residuals, project
 from adjust.model.boards import deformed, warming_of

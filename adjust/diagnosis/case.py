@@ -10,7 +10,7 @@ from gtsam import Pose3
 
 from adjust.adjustment import AdjustOptions, adjust, start_values
 from adjust.diagnosis.prediction import Altered, Prediction, adjusted_values, started_values
-from adjust.frames.lens_states import whole_images
+from adjust.frames.lens_times import whole_images
 from adjust.graph.assembly import StartValues, values_of
 from adjust.graph.solver import SolveOptions
 from adjust.model.boards import deformed

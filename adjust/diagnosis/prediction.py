@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from gtsam import Pose3
 
-from adjust.frames.lens_states import LensTimes
+from adjust.frames.lens_times import LensTimes
 from adjust.frames.runs import MOVING
 from adjust.frames.tables import table_motions
 from adjust.frames.unknowns import FrameTree, Unknowns

@@ -8,7 +8,7 @@ from types import MappingProxyType
 import numpy as np
 from gtsam import Pose3
 
-from adjust.frames.lens_states import LensTimes
+from adjust.frames.lens_times import LensTimes
 from adjust.lenses.crops import crop_size, cropped_lens
 from adjust.lenses.models import MODELS, camera_constants
 from adjust.model.errors import SurveyError

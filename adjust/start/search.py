@@ -11,7 +11,8 @@ from types import MappingProxyType
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.frames.lens_states import lenders, whole_images
+from adjust.frames.lens_states import lenders
+from adjust.frames.lens_times import whole_images
 from adjust.frames.unknowns import FrameTree, Unknowns
 from adjust.lenses.models import MODELS
 from adjust.model.boards import deformed

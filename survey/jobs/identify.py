@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from gtsam import Pose3
 
-from adjust.lenses.models import MODELS, lens_constants, project
+from adjust.frames.lens_times import LensTimes
+from adjust.lenses.models import MODELS, camera_constants, project
 from adjust.model.observations import FrameRef, ImageBlock
 from adjust.model.result import Adjustment
 from adjust.model.subsets import only_between
@@ -62,7 +63,7 @@ def identify_spots(
         if pose is None:
             notes.append(f"{where}: its pose is not known without the spots; name them in image_points")
             continue
-        predicted = predict(survey, adjustment, spot_block.camera_id, pose, positions)
+        predicted = predict(survey, adjustment, spot_block.camera_id, pose, positions, spot_block.epoch_id)
         pairs, ambiguous = match(spot_block.uv, predicted, gate_px)
         if ambiguous:
             notes.append(f"{where}: {ambiguous} spots lie near more than one beacon and are left out")
@@ -86,14 +87,15 @@ def predict(
     camera_id: str,
     world_from_camera: Pose3,
     positions: Mapping[str, FloatArray],
+    epoch_id: str | None = None,
 ) -> dict[str, FloatArray]:
-    """Image points (2,) px of the world points that are in front of a camera and inside its image."""
+    """Image points (2,) px of the world points that are in front of a camera and inside its image of an epoch."""
     camera = next(c for c in survey.cameras if c.camera_id == camera_id)
-    estimate = adjustment.estimates[("lens", camera_id)].value
-    if isinstance(estimate, Pose3) or not positions:
+    if not positions:
         return {}
-    model = MODELS[camera.lens.model]
-    constants = lens_constants(model, camera.image_size, camera.lens.pixel_size_mm)
+    model, times = MODELS[camera.lens.model], LensTimes(survey)
+    values = {n: np.asarray(e.value) for n, e in adjustment.estimates.items() if n[0].startswith("lens")}
+    lens = times.lens(camera, epoch_id, values.get)
     names = list(positions)
     R, t = world_from_camera.rotation().matrix(), world_from_camera.translation()
     q = (np.array([positions[n] for n in names]) - t) @ R
@@ -101,8 +103,8 @@ def predict(
     front = q[:, 2] > 0.3 * np.linalg.norm(q, axis=1)
     if not front.any():
         return {}
-    uv = project(model, estimate, constants, q[front])
-    width, height = camera.image_size
+    uv = project(model, lens, camera_constants(camera), q[front])
+    width, height = times.size(camera, epoch_id)
     inside = np.all((uv > -0.5) & (uv < np.array([width, height]) - 0.5), axis=1)
     seen = [n for n, ok in zip(names, front, strict=True) if ok]
     return {n: x for n, x, ok in zip(seen, uv, np.atleast_1d(inside), strict=True) if ok}

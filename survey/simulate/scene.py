@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from gtsam import Pose3
 
-from adjust.frames.lens_states import block_starts, crop_starts
+from adjust.frames.lens_times import block_starts, crop_starts
 from adjust.model.boards import BOARD
 from adjust.model.observations import FrameRef, ImageBlock, PositionRef
 from adjust.model.result import ParameterName

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from adjust.adjustment import adjust
-from adjust.frames.lens_states import LensTimes, whole_images
+from adjust.frames.lens_times import LensTimes, whole_images
 from adjust.lenses.crops import cropped_lens, whole_image
 from adjust.lenses.models import MODELS, lens_constants, project
 from adjust.model.errors import SurveyError
@@ -134,3 +134,13 @@ def test_what_is_no_crop_is_refused(free: tuple[str, ...], since: str, said: str
     cameras = (survey.cameras[0], replace(camera, lens=replace(camera.lens, crops=crops)))
     with pytest.raises(SurveyError, match=said):
         h.build(replace(survey, cameras=cameras), h.start_at(truth))
+
+
+def test_an_epoch_without_image_has_the_lens_of_the_last_image_before_it() -> None:
+    survey, truth = cropped(*stereo(4, n_pairs=10), CROP)
+    camera, times = survey.cameras[1], LensTimes(survey)
+    ((since, _),) = camera.lens.crops.items()
+    whole, part = (times.lens(camera, epoch, truth.get) for epoch in ("e01", since))
+    assert not np.allclose(whole, part)
+    for epoch, lens in (("e00", whole), ("e01b", whole), (f"{since}b", part), ("e99", part), (None, part)):
+        np.testing.assert_array_equal(times.lens(camera, epoch, truth.get), lens)

@@ -3,12 +3,16 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from survey.cli import main
 from survey.planning.checking import check_job
+from survey.project import SpotBlock, write_project
+from survey.simulate import beacons, single_camera
 from tests.data import data_folder
 
 
@@ -51,13 +55,52 @@ def test_a_folder_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 def test_the_page_names_every_kind_of_finding() -> None:
     root = Path(__file__).parents[2]
-    source = (root / "adjust/diagnosis/beforehand.py").read_text(encoding="utf-8")
+    source = "".join(p.read_text(encoding="utf-8") for p in (root / "adjust/diagnosis/beforehand").glob("*.py"))
     page = (root / "docs/check.md").read_text(encoding="utf-8")
     kinds = set(re.findall(r'Finding\(\s*"(?:problem|weak)", "([^"]+)"', source))
     assert len(kinds) > 8
     assert {k for k in kinds if f"| {k} |" not in page} == set()
 
 
-def test_what_to_measure_next_comes_from_the_plan(tmp_path: Path) -> None:
+def test_what_to_measure_next_is_told_without_a_plan(tmp_path: Path) -> None:
     folder = Path(shutil.copytree(data_folder("calibration", "unsynchronised"), tmp_path / "session"))
-    assert any("plan.toml" in note for note in check_job(folder).notes)
+    outcome = check_job(folder)
+    assert len(outcome.next_best) == 5
+    assert all("tilted" in name for name in outcome.next_best)  # candidates that are usual, where no plan.toml is
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["total-station", "alignment", "relay", "relay-station", "head"])
+def test_ready_examples_have_no_findings(name: str, tmp_path: Path) -> None:
+    assert main(["example", name, str(tmp_path / "lab"), "--quiet"]) == 0
+    outcome = check_job(tmp_path / "lab")
+    assert outcome.beforehand.findings == ()
+    assert bool(outcome.next_best) == (name not in ("alignment", "relay-station"))  # where nothing usual can be added
+
+
+def test_a_camera_that_misses_a_corner_is_told_and_where_boards_help_most(tmp_path: Path) -> None:
+    survey, _ = single_camera(1)
+    middle = (np.array(survey.cameras[0].image_size) - 1.0) / 2.0
+    kept = [~((b.uv - middle) * [-1, -1] > 0.35 * middle).all(axis=1) for b in survey.image_blocks]
+    blocks = tuple(b.part(k) for b, k in zip(survey.image_blocks, kept, strict=True) if k.sum() > 30)
+    write_project(tmp_path, replace(survey, image_blocks=blocks))
+    outcome = check_job(tmp_path)
+    assert [f.kind for f in outcome.beforehand.findings] == ["corner not covered"]
+    assert len(outcome.next_best) == 5
+    assert all(re.fullmatch(r"board at the .* of C1, tilted", name) for name in outcome.next_best)
+    assert outcome.summary()["coverage"]["C1"]["corners_empty"] == ["top left"]
+    assert "measure next (where it can be seen): " in outcome.text()
+
+
+def test_spots_without_names_are_not_held_against_the_survey(tmp_path: Path) -> None:
+    survey, _ = beacons(1)
+    write_project(tmp_path / "named", survey)
+    assert check_job(tmp_path / "named").n_problems == 0
+    nights = {b.epoch_id for b in survey.image_blocks if b.target_id is None}
+    dark = tuple(b for b in survey.image_blocks if b.epoch_id not in nights)
+    spots = [SpotBlock(b.camera_id, b.epoch_id, tuple(f"s{i}" for i in range(len(b.uv))), b.uv, b.cov)
+             for b in survey.image_blocks if b.target_id is None]  # fmt: skip
+    write_project(tmp_path / "spots", replace(survey, image_blocks=dark), spots=spots)
+    outcome = check_job(tmp_path / "spots")
+    assert outcome.n_problems == 0
+    assert any("images show spots" in note for note in outcome.notes)

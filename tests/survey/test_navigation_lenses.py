@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from adjust.adjustment import adjust
-from adjust.frames.lens_states import LensTimes
+from adjust.frames.lens_times import LensTimes
 from adjust.lenses.crops import cropped_lens
 from adjust.lenses.models import MODELS
 from adjust.model.errors import SurveyError

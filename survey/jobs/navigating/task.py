@@ -123,10 +123,10 @@ def calibrating(project: Project, station: str, epochs: Sequence[str]) -> Survey
     carried = next(s for s in survey.stations if s.station_id == station).table_id
     readings = tuple(r for r in survey.table_readings if not (r.table_id == carried and r.epoch_id in out))
     left = with_images_left(survey, replace(survey, image_blocks=blocks, table_readings=readings))
-    return supported(_with_known_points(left))[0]
+    return supported(with_known_points(left))[0]
 
 
-def _with_known_points(survey: Survey) -> Survey:
+def with_known_points(survey: Survey) -> Survey:
     """Without the points that the remaining observations do not determine: seen by fewer than two images, or given."""
     seen: dict[int, set[tuple[str, str]]] = {}
     for b in survey.image_blocks:

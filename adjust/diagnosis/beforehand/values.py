@@ -1,0 +1,122 @@
+"""Sigmas and values that look like another unit, or like a decimal point that has slipped."""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from adjust.diagnosis.beforehand.finding import Finding
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import Hypothesis
+from adjust.diagnosis.names.given import wrong_given
+from adjust.diagnosis.units.conventions import ANGLES, LENGTH_RATIOS, LENGTHS, SLIPS
+from adjust.diagnosis.units.readings import misread_readings
+from adjust.model.errors import listed
+from adjust.model.observations import PositionRef
+from adjust.model.result import Adjustment
+from adjust.model.survey import Survey
+
+_ODD_SIGMA = 100.0
+"""No instrument is a hundred times as good as another in one survey; units of lengths and angles differ by that."""
+_NEAR, _OFF = 0.02, 0.1
+"""Of a length and of a turn: what start values miss by at most, and what no right value does."""
+_CLEAR = 20.0
+"""Misfit before over misfit after of a single value: ten sigmas off, and then none."""
+
+
+def valued(case: Case, expected: Adjustment | None) -> Iterator[Finding]:
+    """All of them. expected: its survey has all observations as the start values predict them."""
+    yield from _sigmas(case.survey)
+    slips = list(_slips(case.survey, expected.survey)) if expected is not None else []
+    given = max(_tried(wrong_given, case), key=lambda h: h.evidence, default=None)  # which many readings contradict
+    read = None if slips else max(_tried(misread_readings, case), key=lambda h: h.evidence, default=None)
+    if (best := given or read) is not None:
+        slips = [_Slip(best.place.ids[0], best.cause, frozenset())]
+    for slip in _joined(case.survey, slips):
+        yield Finding("problem", "slipped decimal", (slip.name,), slip.said, "write it as it was read")
+
+
+@dataclass(frozen=True)
+class _Slip:
+    """An observation by its name, what is wrong, and the points that it concerns."""
+
+    name: str
+    said: str
+    points: frozenset[str]
+
+
+def _joined(survey: Survey, slips: list[_Slip]) -> list[_Slip]:
+    """Several at one point whose coordinates are observed are one: these, for the start values came from them."""
+    seen = {ref.point_id for c in survey.coordinates for ref in c.positions if ref.frame is None}
+    common = sorted(frozenset.intersection(*(s.points for s in slips)) & seen) if len(slips) > 1 else []
+    if not common:
+        return slips
+    said = f"point {common[0]}: the decimal point of its coordinates has slipped, or that of all lengths to it"
+    return [_Slip(common[0], said, frozenset(common))]
+
+
+def _tried(make: Callable[[Case], Iterable[Hypothesis]], case: Case) -> list[Hypothesis]:
+    return [h for h in make(case) if h.name == "slipped decimal" and h.evidence > _CLEAR]
+
+
+def _slips(given: Survey, predicted: Survey) -> Iterator[_Slip]:
+    """Lengths and angles that fit as soon as their decimal point is moved, and do not as they stand."""
+    distances, readings = ({o.distance_id: o.value for o in predicted.distances},
+                           {o.reading_id: o.value for o in predicted.readings})  # fmt: skip
+    for d in (d for d in given.distances if d.used and d.distance_id in distances):
+        if said := _slipped(f"distance {d.distance_id}", d.value, distances[d.distance_id], 1e3, "mm"):
+            yield _Slip(d.distance_id, said, _points((d.a, d.b)))
+    for r in (r for r in given.readings if r.used and r.reading_id in readings):
+        to, is_length = readings[r.reading_id], r.kind in LENGTHS
+        factor, unit = (1.0, "m") if is_length else (180.0 / np.pi, "deg")
+        if is_length or r.kind in ANGLES:
+            to = to if is_length else to % (2.0 * np.pi)
+            if said := _slipped(f"{r.kind} {r.reading_id}", r.value, to, factor, unit):
+                yield _Slip(r.reading_id, said, _points((r.at, r.to)))
+
+
+def _points(refs: Iterable[PositionRef]) -> frozenset[str]:
+    return frozenset(str(ref.point_id) for ref in refs if ref.frame is None)
+
+
+def _slipped(what: str, value: float, predicted: float, factor: float, unit: str) -> str:
+    """What is wrong; nothing where the value fits as it stands, or by no factor."""
+    if abs(value - predicted) < _OFF * abs(predicted):
+        return ""
+    by = next((by for by in SLIPS if abs(by * value - predicted) < _NEAR * abs(predicted)), None)
+    return "" if by is None else (f"{what}: its decimal point has slipped: {factor * value:.10g} {unit}, by what the "
+                                  f"rest says {factor * by * value:.10g} {unit}")  # fmt: skip
+
+
+def _sigmas(survey: Survey) -> Iterator[Finding]:
+    """Sigmas and values that look like another unit."""
+    by_kind: dict[str, list[tuple[str, float]]] = {}
+    for r in survey.readings:
+        by_kind.setdefault(r.kind, []).append((r.reading_id, r.sigma))
+    for d in survey.distances:
+        by_kind.setdefault("distance", []).append((d.distance_id, d.sigma))
+    for kind, found in by_kind.items():
+        usual = float(np.median([s for _, s in found]))
+        odd = [n for n, s in found if not usual / _ODD_SIGMA < s < usual * _ODD_SIGMA]
+        if odd:
+            yield Finding("problem", "suspicious sigma", tuple(odd), f"{kind} {listed(odd, 6)}: the sigma is more than "
+                          f"{_ODD_SIGMA:.0f} times off that of the others", "check its unit")  # fmt: skip
+    yield from _lengths(survey)
+
+
+def _lengths(survey: Survey) -> Iterator[Finding]:
+    """Distances that stand to the others of their set-up as a unit to another."""
+    by_setup: dict[str, list[tuple[str, float]]] = {}
+    for r in survey.readings:
+        if r.kind in ("slope_distance", "horizontal_distance"):
+            by_setup.setdefault(r.setup_id, []).append((r.reading_id, r.value))
+    typical = {s: float(np.median([v for _, v in found])) for s, found in by_setup.items() if len(found) >= 3}
+    if len(typical) < 2:
+        return
+    usual = float(np.median(list(typical.values())))
+    for setup_id, length in typical.items():
+        ratio = length / usual
+        if not 0.02 < ratio < 50.0:
+            near = min(LENGTH_RATIOS, key=lambda said: abs(float(np.log(LENGTH_RATIOS[said] * ratio))))
+            yield Finding("problem", "suspicious unit", (setup_id,), f"distances of set-up {setup_id} are {ratio:.3g} "
+                          f"times those of the others: perhaps they {near}", "check value_m and value_mm")  # fmt: skip
