@@ -177,7 +177,7 @@ def _free(status: Any, components: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _components(path: str, entry: Mapping[str, Any]) -> Iterator[Number]:
-    """Number and sigma of every free component of a lens, a table, a warp or a clock, whose keys end with their units."""
+    """Number and sigma of every free component of a lens, table, warp or clock, whose keys end with their units."""
     for component in _free(entry["status"], ()):
         value_key, sigma_key = _key(entry, component), _key(entry, f"sigma_{component}")
         if value_key and sigma_key and entry[value_key] is not None and entry[sigma_key] is not None:

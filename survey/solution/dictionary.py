@@ -331,9 +331,7 @@ def _tables(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, Any
 def _drift(adjustment: Adjustment, camera_id: str, scale: Scale) -> dict[str, Any]:
     """How a lens changes: by the epoch at which a block begins, or per kelvin; and whether it changes at all."""
     found = {n: e for n, e in adjustment.estimates.items() if n[:2] == ("lens_drift", camera_id)}
-    test = significance_of_changes(
-        adjustment, ("lens_drift", camera_id), "lens_drift", scale.sigmas == "a_posteriori"
-    )
+    test = significance_of_changes(adjustment, ("lens_drift", camera_id), "lens_drift", scale.sigmas == "a_posteriori")
     parts = {n[2] if len(n) > 2 else "per_kelvin": vector_entry(e, scale) for n, e in found.items()}
     return {"changes": parts, "significance": {} if test is None else {test.term: _test(test)}}
 
