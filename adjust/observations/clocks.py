@@ -60,7 +60,7 @@ class Shifts:
         self._epoch: dict[int, tuple[ParameterName, float]] = {}
         self._epoch_ids: dict[int, str] = {}
         for name, slot in self.unknowns.slot_of.items():
-            if name[0] in MOVING and len(name) == 3:
+            if name[0] in MOVING and len(name) == 3 and name[2] in self.times.of:
                 body, time = name[:2], self.times.of[name[2]]
                 series.setdefault(body, []).append((time, slot))
                 self._epoch[slot], self._epoch_ids[slot] = (body, time), name[2]

@@ -19,9 +19,10 @@ _SINGLE_POSES = (
     ("cameras", "station_from_camera"), ("stations", "mount_from_station"), ("stations", "world_from_station"),
     ("tables", "world_from_table"), ("targets", "world_from_target"), ("targets", "station_from_target"),
 )  # fmt: skip
-_VECTORS = (("cameras", "lens"), ("tables", "geometry"), ("targets", "warp"))
+_VECTORS = (("cameras", "lens"), ("tables", "geometry"), ("targets", "warp"), ("cameras", "clock"), ("tables", "clock"),
+            ("stations", "clock"))  # fmt: skip
 _ROTATION = POSE_COMPONENTS[:3]
-_UNIT = re.compile(r"px|mm|deg|arcsec|ppm|m|1|per_\w+|")
+_UNIT = re.compile(r"px|mm|deg|arcsec|ppm|ms|us|intervals|m|1|per_\w+|")
 
 
 _SUMMARY = {
@@ -176,7 +177,7 @@ def _free(status: Any, components: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _components(path: str, entry: Mapping[str, Any]) -> Iterator[Number]:
-    """Number and sigma of every free component of a lens, a table or a warp, whose keys end with their units."""
+    """Number and sigma of every free component of a lens, table, warp or clock, whose keys end with their units."""
     for component in _free(entry["status"], ()):
         value_key, sigma_key = _key(entry, component), _key(entry, f"sigma_{component}")
         if value_key and sigma_key and entry[value_key] is not None and entry[sigma_key] is not None:

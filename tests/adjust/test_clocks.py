@@ -5,6 +5,8 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from gtsam import Pose3
+from scipy.stats import chi2
 
 from adjust.adjustment import adjust
 from adjust.frames.runs import within_motion
@@ -12,7 +14,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 from adjust.observations.clocks import weights
-from survey.simulate import Truth
+from survey.simulate import Truth, resample
 from tests.adjust import helpers as h
 from tests.adjust.moving import board_before_cameras, camera_on_hand, clock, head_on_moving_table
 
@@ -151,3 +153,23 @@ def test_times_that_cannot_be_are_refused() -> None:
         adjust(replace(survey, times={e: t for e, t in survey.times.items() if e != "e03"}))
     with pytest.raises(SurveyError, match="two of its epochs have the same time"):
         adjust(replace(survey, times=dict.fromkeys(survey.times, 0.0)))
+
+
+def test_sigmas_of_poses_are_true_beside_a_clock() -> None:
+    """All poses of the board, the camera's place and its clock together, over repeats."""
+    survey, truth = board_before_cameras(12, {"right": clock(offset=0.02)}, {RIGHT: np.array([0.02])})
+    squares, freedom = 0.0, 0
+    for seed in range(10):
+        result = adjust(resample(survey, truth, seed))
+        names = [n for n, e in result.estimates.items() if e.cov.any() and n[0] != "lens"]
+        d = []
+        for name in names:
+            value, true = result.estimates[name].value, truth[name]
+            both = isinstance(value, Pose3) and isinstance(true, Pose3)
+            d.append(Pose3.Logmap(true.between(value)) if both else np.asarray(value) - np.asarray(true))
+        x = np.concatenate(d)
+        squares += float(x @ np.linalg.solve(np.asarray(result.precision.joint(names)), x))
+        freedom += len(x)
+    assert freedom == 10 * (12 * 6 + 6 + 1)
+    low, high = chi2.ppf([5e-4, 1 - 5e-4], freedom)
+    assert low <= squares <= high

@@ -98,6 +98,12 @@ def test_clocks_reach_result_report_and_terminal(tmp_path: Path) -> None:
     assert all(own["sigma_jitter_ms"] > 0.0 for own in entry["epochs"].values())
     assert "Clock" in report_html(solution.adjustment, solution.run)
     assert "eigene Zeiten" in report_html(solution.adjustment, solution.run, None, None, "de")
+    found = solution.precision.consistency
+    assert found is not None
+    (epoch,) = (part for part in found.parts if (part.kind, part.name) == ("epoch", "e04"))
+    assert epoch.n == 2 * 54 * 2
+    assert epoch.redundancy < epoch.n
+    assert not epoch.fails
     text = summary_text(solution.adjustment, solution.run)
     assert "clock line time" in text
     assert "clock offset" in text

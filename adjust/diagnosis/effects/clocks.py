@@ -128,9 +128,7 @@ def _late(survey: Survey, cameras: Sequence[str], weight: Any) -> Shifts:
     return out
 
 
-def _camera_effect(
-    case: Case, linear: Linear, name: str, weight: Any, cameras: list[str], freed: Freed
-) -> Effect:
+def _camera_effect(case: Case, linear: Linear, name: str, weight: Any, cameras: list[str], freed: Freed) -> Effect:
     first = of_shifts(linear, _late(linear.result.survey, cameras, weight))
     worst = cameras[int(np.argmax(np.abs(first.theta)))]
 
@@ -182,9 +180,7 @@ def _of_tables(case: Case, linear: Linear) -> Iterator[Effect]:
             yield _gear_effect(case, linear, table.table_id, k, dict(zip(ids, D, strict=True)))
 
 
-def _gear_effect(
-    case: Case, linear: Linear, table_id: str, axis: int, D: dict[tuple[str, ...], FloatArray]
-) -> Effect:
+def _gear_effect(case: Case, linear: Linear, table_id: str, axis: int, D: dict[tuple[str, ...], FloatArray]) -> Effect:
     shifts = {i: d[:, None] for i, d in D.items()}
 
     def mended(r: TableReading, theta: float) -> TableReading:
