@@ -35,7 +35,7 @@ _FAR = 25.0
 """Variance factor from which a solution may be another one than that of the observations without their mistake."""
 _WARM, _START, _LOST_ROUNDS = 0.4, 0.4, 3
 """What adjusting from near values costs, and what finding start values does, against a whole adjustment."""
-_SOLVE = SolveOptions(max_step=1e-3, max_iterations=40, settled=1e-5)
+_SOLVE = SolveOptions(max_step=1e-3, max_iterations=40, settled=1e-6)
 """A survey that is right converges soon, and is only compared with others."""
 
 

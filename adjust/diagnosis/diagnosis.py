@@ -82,11 +82,11 @@ def diagnose(case: Case, families: Sequence[Family] | None = None) -> Diagnosis:
     looked_at = 0
     stages = _all_families() if families is None else [families]
     for stage, rooms in enumerate(stages, start=1):
-        kept = _KEPT * (stage < len(stages))
+        reserve = _KEPT * (stage < len(stages))
         formed = [h for family in rooms for h in _formed(family, case)]
         looked_at += sum(h.looked_at for h in formed)
         queue = _in_turn(queue + formed)
-        while queue and case.budget.left > kept:
+        while queue and case.budget.left > (0.0 if _done(trials, 0.0) else reserve):
             first = queue.pop(0)
             names.append(first.name)
             trial = tried(first, case, base)

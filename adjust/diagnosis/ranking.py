@@ -43,8 +43,9 @@ def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candi
     Each drop of v'Pv is tested against chi-square with as many degrees of freedom as the change has parameters, at a
     level shared by all hypotheses that were looked at (Sidak). Compared with each other by v'Pv plus p ln n
     (Schwarz 1978), with variances of each group as they suit each best: else wrong sigmas would explain all that a
-    cause leaves. A cause explains the misfit if half of it goes, or if what is left is noise; it is not named where
-    another one, though it explains less than that, is a hundred times as likely.
+    cause leaves. A cause explains the misfit if half of it goes, or if what is left is noise; it leaves no more
+    observations out than before, and none where nothing was adjusted before, save as few as noise hides. It is not
+    named where another one, though it explains less than that, is a hundred times as likely.
     """
     good = [t for t in trials if t.result is not None]
     if not good:
@@ -58,7 +59,9 @@ def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candi
         statistic = (base.omega - _cost(trial)) / scale
         share = (base.omega - _cost(trial)) / max(base.excess, 1e-9)
         enough = share > _EXPLAINED or (trial.misfit.is_noise(_NOISE) and not trial.hypothesis.penalty)
-        if statistic > critical and enough and trial.misfit.unused <= base.unused and probability > _LIKELY:
+        most = base.unused if base.redundancy else 0  # where nothing was adjusted, any part that is explains much
+        whole = trial.misfit.unused <= most or trial.misfit.is_noise(_NOISE)
+        if statistic > critical and enough and whole and probability > _LIKELY:
             sigma0 = trial.result.sigma0 if trial.result is not None else float("nan")
             explained = float(np.clip(share, 0.0, 1.0))
             out.append(Candidate(trial.hypothesis, explained, statistic, critical, float(probability), sigma0))

@@ -66,8 +66,9 @@ class Linear:
 
     @cached_property
     def e(self) -> FloatArray:
-        """(m,), zero for what is not in use."""
-        return np.asarray(self._used * self.system.e)
+        """(m,) at the minimum, zero for what is not in use: what is left to go of an adjustment is gone from here."""
+        e = self._used * self.system.e
+        return np.asarray(e - self.A @ times_covariance(self.system, (self.A.T @ e)[:, None])[:, 0])
 
     @cached_property
     def _used(self) -> FloatArray:

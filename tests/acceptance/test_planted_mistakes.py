@@ -40,6 +40,7 @@ SEARCHED = (  # names that closed forms find, and small mistakes among much nois
     ("target height", "hall", 0.1), ("gear ratio", "head", 1e-3), ("clock offset", "hand", 0.05),
     ("left-handed frames", "hand", 0.0), ("images turned", "head", 0.2), ("pairs inverted", "poses", 7.0),
     ("order of quaternions", "poses", 12.0), ("the same twice", "poses", 100.0), ("sigmas of a group", "hall", 0.1),
+    ("correlated observations", "hall", 12.0), ("motion forgotten", "relay", 11.0), ("pairs inverted", "poses", 0.0),
 )  # fmt: skip
 
 
@@ -58,6 +59,18 @@ def test_planted_mistake_is_named_first(name: str, kind: str) -> None:
 def test_small_or_far_off_mistake_is_named_first(name: str, kind: str, size: float) -> None:
     mistake = next(m for m in MISTAKES if m.name == name and kind in m.kinds and size in m.sizes)
     assert outcome_of(mistake, kind, size)["outcome"] == "first"
+
+
+def test_size_that_makes_it_worse_is_taken_back() -> None:
+    """Found at values that the mistake has spoilt, it is no size at those that it has led to."""
+    mistake = next(m for m in MISTAKES if m.name == "focus touched")
+    assert outcome_of(mistake, "stereo", 0.03, 90210)["outcome"] == "first"
+
+
+def test_part_that_can_be_adjusted_is_no_explanation() -> None:
+    """A camera called another one, whose images are then left out, is not named for that."""
+    mistake = next(m for m in MISTAKES if m.title == "or the table")
+    assert outcome_of(mistake, "head", 20.0, 90210)["outcome"] != "another"
 
 
 def test_diagnosis_keeps_to_its_budget() -> None:

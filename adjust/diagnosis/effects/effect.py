@@ -10,6 +10,7 @@ import numpy as np
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.score import Linear, Score
+from adjust.diagnosis.trial import misfit_of
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
@@ -51,9 +52,11 @@ class Effect:
 
         def made() -> Survey | None:
             at, (theta, result, sigmas) = self, self._estimated(case, linear, self.first.theta)
-            nearer = self.nearer(result, theta)
-            if nearer is not None:
-                at, (theta, result, sigmas) = nearer, nearer._estimated(case, linear, theta)
+            fits = misfit_of(result, result.survey).is_noise()
+            nearer = None if fits else self.nearer(result, theta)
+            found_there = None if nearer is None else nearer._estimated(case, linear, theta)
+            if nearer is not None and found_there is not None and found_there[1].omega < result.omega:
+                at, (theta, result, sigmas) = nearer, found_there
             of = at.hypothesis
             as_found = {"cause": at.said(theta, sigmas), "place": of.place, "edits": of.edits, "change": of.change}
             theta, changes = at.known(theta, sigmas) or (theta, as_found)
@@ -81,8 +84,11 @@ class Effect:
     def _estimated(
         self, case: Case, linear: Linear, theta: FloatArray
     ) -> tuple[FloatArray, Adjustment, FloatArray]:
-        """Its size, the adjustment at which that was found, and the sigmas (k,)."""
-        cov, now, last = self.first.cov, linear, np.inf
+        """Its size, the adjustment at which that was found, and the sigmas (k,).
+
+        A size is one of a change of the values there: where these were spoilt, the next one may be worse, and is none.
+        """
+        cov, now, last, made = self.first.cov, linear, np.inf, list[tuple[FloatArray, Survey]]()
         for _ in range(ROUNDS - 1):
             try:
                 survey = self.mended(now.result, theta)
@@ -90,13 +96,17 @@ class Effect:
                 more = self.score(new)
             except SurveyError:
                 break
+            if made and new.result.omega > now.result.omega:
+                theta = made[-1][0]
+                break
+            made.append((theta, survey))
             if more.drop < _SMALL * new.scale:
                 cov, now = more.cov if more.seen else cov, new
-                self._last.append((theta, survey))
                 break
             if more.drop > _SLOW * last:
                 break
             theta, cov, now, last = self.added(theta, more.theta), more.cov, new, more.drop
+        self._last.extend(made[-1:])
         return theta, now.result, np.sqrt(np.maximum(np.diag(cov), 0.0) * now.scale)
 
 

@@ -15,6 +15,8 @@ from adjust.model.observations import ReadingCovariance
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.testing.distributions import chi2
 
+_Common = tuple[str, list[IntArray], float]
+"""A kind of readings, its sets, and the error that each set has in common over their own sigma."""
 _ALPHA = 1e-6
 _FEWEST, _SETS = 3, 3
 _TRIED = (1.0, 3.0, 10.0)
@@ -30,6 +32,7 @@ def correlated_readings(case: Case) -> Iterator[Hypothesis]:
     if len(result.survey.readings) != len(survey.readings):
         return
     w = result.reading_residuals.residual / result.reading_residuals.sigma
+    found = list[_Common]()
     for kind in dict.fromkeys(r.kind for r in survey.readings if r.kind != "direction"):
         sets = _sets(survey, kind)
         if len(sets) < _SETS:
@@ -37,9 +40,10 @@ def correlated_readings(case: Case) -> Iterator[Hypothesis]:
         between = sum(len(s) * float(w[s].mean()) ** 2 for s in sets)
         if between > float(chi2.isf(_ALPHA, len(sets))):
             n = float(np.mean([len(s) for s in sets]))
-            common = float(np.sqrt(max(between / len(sets) - 1.0, 0.0) / n))
-            for factor in _TRIED:  # what the unknowns take over of a common error does not show in residuals
-                yield _hypothesis(survey, kind, sets, factor * common)
+            found.append((kind, sets, float(np.sqrt(max(between / len(sets) - 1.0, 0.0) / n))))
+    for some in ([found] if len(found) > 1 else []) + [[one] for one in found]:
+        for factor in _TRIED:  # what the unknowns take over of a common error does not show in residuals
+            yield _hypothesis(survey, some, factor)
 
 
 def _sets(survey: Survey, kind: str) -> list[IntArray]:
@@ -50,17 +54,19 @@ def _sets(survey: Survey, kind: str) -> list[IntArray]:
     return [np.array(rows) for rows in by_setup.values() if len(rows) >= _FEWEST]
 
 
-def _hypothesis(survey: Survey, kind: str, sets: list[IntArray], common: float) -> Hypothesis:
+def _hypothesis(survey: Survey, found: list[_Common], factor: float) -> Hypothesis:
     joint, penalty = [], 0.0
-    for rows in sets:
-        sigma: FloatArray = np.array([survey.readings[i].sigma for i in rows])
-        cov = np.diag(sigma**2) + common**2 * np.outer(sigma, sigma)
-        joint.append(ReadingCovariance(tuple(survey.readings[i].reading_id for i in rows), cov))
-        penalty += float(np.log1p(len(rows) * common**2))
+    for _, sets, own in found:
+        for rows in sets:
+            sigma: FloatArray = np.array([survey.readings[i].sigma for i in rows])
+            cov = np.diag(sigma**2) + (factor * own) ** 2 * np.outer(sigma, sigma)
+            joint.append(ReadingCovariance(tuple(survey.readings[i].reading_id for i in rows), cov))
+            penalty += float(np.log1p(len(rows) * (factor * own) ** 2))
+    kinds, common = tuple(kind for kind, _, _ in found), factor * max(own for _, _, own in found)
     return Hypothesis(
-        "correlated observations", f"the readings of kind {kind} of a set-up have an error in common, about "
-        f"{common:.2g} times their own sigma: they are given as independent",
+        "correlated observations", f"the readings of kind {' and '.join(kinds)} of a set-up have an error in common, "
+        f"about {common:.2g} times their own sigma: they are given as independent",
         "give their covariance, or free the constant they share (an instrument's offset or index, a height)",
-        Place("group", (kind,), "sigma"), replace(survey, reading_covariances=tuple(joint)), (), _LAST, 1, len(_TRIED),
-        penalty=penalty,
+        Place("group", kinds, "sigma"), replace(survey, reading_covariances=tuple(joint)), (), _LAST, len(found),
+        len(_TRIED), penalty=penalty,
     )  # fmt: skip
