@@ -7,7 +7,7 @@ Each tail is computed where it is small, so that a probability of 1e-300 keeps i
 from typing import Any
 
 import numpy as np
-from scipy import special
+import scipy
 
 Numbers = Any
 
@@ -18,22 +18,22 @@ class chi2:  # noqa: N801  # the name that statisticians and SciPy use
     @staticmethod
     def ppf(p: Numbers, k: Numbers) -> Numbers:
         """Quantile of probability p below."""
-        return 2.0 * special.gammaincinv(np.multiply(0.5, k), p)
+        return 2.0 * scipy.special.gammaincinv(np.multiply(0.5, k), p)
 
     @staticmethod
     def isf(p: Numbers, k: Numbers) -> Numbers:
         """Quantile of probability p above."""
-        return 2.0 * special.gammainccinv(np.multiply(0.5, k), p)
+        return 2.0 * scipy.special.gammainccinv(np.multiply(0.5, k), p)
 
     @staticmethod
     def cdf(x: Numbers, k: Numbers) -> Numbers:
         """Probability below x."""
-        return special.gammainc(np.multiply(0.5, k), np.maximum(0.0, np.multiply(0.5, x)))
+        return scipy.special.gammainc(np.multiply(0.5, k), np.maximum(0.0, np.multiply(0.5, x)))
 
     @staticmethod
     def sf(x: Numbers, k: Numbers) -> Numbers:
         """Probability above x."""
-        return special.gammaincc(np.multiply(0.5, k), np.maximum(0.0, np.multiply(0.5, x)))
+        return scipy.special.gammaincc(np.multiply(0.5, k), np.maximum(0.0, np.multiply(0.5, x)))
 
 
 class ncx2:  # noqa: N801  # the name that statisticians and SciPy use
@@ -42,17 +42,17 @@ class ncx2:  # noqa: N801  # the name that statisticians and SciPy use
     @staticmethod
     def sf(x: Numbers, k: Numbers, c: Numbers) -> Numbers:
         """Probability above x, to 1e-15: enough for the power of a test, not for far tails."""
-        return 1.0 - special.chndtr(x, k, c)
+        return 1.0 - scipy.special.chndtr(x, k, c)
 
     @staticmethod
     def ppf(p: Numbers, k: Numbers, c: Numbers) -> Numbers:
         """Quantile of probability p below."""
-        return special.chndtrix(p, k, c)
+        return scipy.special.chndtrix(p, k, c)
 
     @staticmethod
     def isf(p: Numbers, k: Numbers, c: Numbers) -> Numbers:
         """Quantile of probability p above."""
-        return special.chndtrix(np.subtract(1.0, p), k, c)
+        return scipy.special.chndtrix(np.subtract(1.0, p), k, c)
 
 
 class norm:  # noqa: N801  # the name that statisticians and SciPy use
@@ -61,17 +61,17 @@ class norm:  # noqa: N801  # the name that statisticians and SciPy use
     @staticmethod
     def ppf(p: Numbers) -> Numbers:
         """Quantile of probability p below."""
-        return special.ndtri(p)
+        return scipy.special.ndtri(p)
 
     @staticmethod
     def isf(p: Numbers) -> Numbers:
         """Quantile of probability p above."""
-        return -special.ndtri(p)
+        return -scipy.special.ndtri(p)
 
     @staticmethod
     def sf(x: Numbers) -> Numbers:
         """Probability above x."""
-        return special.ndtr(np.negative(x))
+        return scipy.special.ndtr(np.negative(x))
 
 
 class student:  # noqa: N801  # as the others
@@ -80,12 +80,12 @@ class student:  # noqa: N801  # as the others
     @staticmethod
     def ppf(p: Numbers, k: Numbers) -> Numbers:
         """Quantile of probability p below."""
-        return special.stdtrit(k, p)
+        return scipy.special.stdtrit(k, p)
 
     @staticmethod
     def sf(x: Numbers, k: Numbers) -> Numbers:
         """Probability above x."""
-        return special.stdtr(k, np.negative(x))
+        return scipy.special.stdtr(k, np.negative(x))
 
 
 class fisher:  # noqa: N801  # as the others
@@ -94,17 +94,17 @@ class fisher:  # noqa: N801  # as the others
     @staticmethod
     def ppf(p: Numbers, m: Numbers, n: Numbers) -> Numbers:
         """Quantile of probability p below."""
-        return special.fdtri(m, n, p)
+        return scipy.special.fdtri(m, n, p)
 
     @staticmethod
     def isf(p: Numbers, m: Numbers, n: Numbers) -> Numbers:
         """Quantile of probability p above."""
-        return 1.0 / special.fdtri(n, m, p)
+        return 1.0 / scipy.special.fdtri(n, m, p)
 
     @staticmethod
     def sf(x: Numbers, m: Numbers, n: Numbers) -> Numbers:
         """Probability above x."""
-        return special.fdtrc(m, n, x)
+        return scipy.special.fdtrc(m, n, x)
 
 
 class beta:  # noqa: N801  # as the others
@@ -113,4 +113,4 @@ class beta:  # noqa: N801  # as the others
     @staticmethod
     def ppf(p: Numbers, a: Numbers, b: Numbers) -> Numbers:
         """Quantile of probability p below."""
-        return special.betaincinv(a, b, p)
+        return scipy.special.betaincinv(a, b, p)

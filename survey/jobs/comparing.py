@@ -16,7 +16,7 @@ from adjust.model.result import Adjustment
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.congruence_text import congruence_dict, congruence_text
 from survey.project import Project, read
-from survey.solution.dictionary import plain
+from survey.solution.plain import plain
 from survey.solution.quantities import ARCSEC_PER_RAD, SigmaKind
 
 ALPHA = 0.05

@@ -16,7 +16,7 @@ from survey.planning.page import html_page
 from survey.report import drawing as d
 from survey.report.charts import Series, chart
 from survey.report.markup import figures, fixed, general, section, table
-from survey.solution.dictionary import plain
+from survey.solution.plain import plain
 
 PAPER = BeaconField()
 BOUNDED = BeaconField(nearest_m=0.1)

@@ -21,7 +21,7 @@ from adjust.model.survey import FloatArray
 from survey.planning.building import Planned
 from survey.planning.navigation import NavigationOutcome
 from survey.planning.plan_file import Plan
-from survey.solution.dictionary import plain
+from survey.solution.plain import plain
 from survey.solution.quantities import ARCSEC_PER_RAD, key_of, sigma_unit_for_people
 
 _MOST = 8

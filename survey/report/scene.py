@@ -15,8 +15,8 @@ from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Target
 from survey.report import drawing as d
 from survey.report.markup import json_script, part
-from survey.solution.dictionary import plain
 from survey.solution.frames import AdjustedFrames
+from survey.solution.plain import plain
 from survey.solution.quantities import Scale
 
 _MOST_EPOCHS = 24

@@ -13,7 +13,8 @@ from adjust.model.errors import DiagnosedError, IndeterminateError, NotConverged
 from survey.report.language import group_name, message, speaking, t
 from survey.report.markup import count, document, element, general, joined, note, part, section, table
 from survey.report.sections.diagnosis import causes
-from survey.solution.dictionary import RunInfo, plain
+from survey.solution.dictionary import RunInfo
+from survey.solution.plain import plain
 from survey.solution.quantities import key_of, pose_dict, unit_for_people
 from survey.solution.records import solution_json
 

@@ -18,6 +18,7 @@ from survey.project.detected import DetectedImage
 from survey.project.project import LeftOut
 from survey.solution.instruments import instrument_entries
 from survey.solution.left_out import left_out_dict
+from survey.solution.plain import plain
 from survey.solution.quantities import PoseColumns, Scale, SigmaKind, point_entry, pose_columns, scale_of, vector_entry
 from survey.solution.records import Form, Records
 from survey.solution.statistics import Statistics
@@ -27,8 +28,6 @@ from survey.solution.verdict import findings, fit_of, suspects, verdict
 CORRELATION_LIMIT = 0.95
 # parameters for which "zero" is no sensible hypothesis
 _NEVER_ZERO = {"fx", "fy", "u0", "v0", "c", "xp", "yp"}
-_AS_IT_IS = frozenset((str, int, bool, type(None)))
-_FLOATS = {float}
 PoseOf = Callable[[tuple[str, ...], str], dict[str, Any]]
 CONVENTIONS = {
     "poses": "a_from_b takes coordinates in b to coordinates in a; camera x right, y down, z forward",
@@ -122,28 +121,6 @@ def _free_datum(adjustment: Adjustment) -> dict[str, Any]:
         return {}
     carriers = ["/".join(name) for name in datum_carriers(adjustment)]
     return {"free_datum": {"open_motions": directions.T.tolist(), "carried_by": carriers}}
-
-
-def plain(value: Any) -> Any:
-    """Only what JSON knows: mappings and sequences kept, numbers as Python's, None for what is not finite."""
-    kind = type(value)
-    if kind in _AS_IT_IS or kind is Records:
-        return value
-    if kind is float:
-        return value if math.isfinite(value) else None
-    if kind is list and set(map(type, value)) == _FLOATS and all(map(math.isfinite, value)):
-        return value
-    if isinstance(value, Mapping):
-        return {str(k): v if type(v) in _AS_IT_IS else plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [plain(v) for v in value]
-    if isinstance(value, bool | np.bool_):
-        return bool(value)
-    if isinstance(value, float | np.floating):
-        return float(value) if np.isfinite(value) else None
-    if isinstance(value, int | np.integer):
-        return int(value)
-    return str(value)
 
 
 def _summary(adjustment: Adjustment, run: RunInfo, scale: Scale, statistics: Statistics | None) -> dict[str, Any]:

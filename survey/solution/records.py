@@ -15,6 +15,7 @@ import numpy as np
 
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.text import NUMBERS, TEXT, WORD, Words, record_rows
+from survey.solution.plain import PlainRecords
 
 Column = np.ndarray[Any, Any] | Sequence[str]
 """Of n records: floats, whole numbers or truths (n,), lists of floats (n, k), or n words."""
@@ -30,7 +31,7 @@ class Form:
     tree: Tree
 
 
-class Records(Mapping[str, dict[str, Any]]):
+class Records(PlainRecords):
     """Entries by name, in the order of ``names``; every one is of one form, or stands apart with plain values."""
 
     def __init__(

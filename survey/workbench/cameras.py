@@ -21,9 +21,9 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import ParameterName
 from adjust.model.survey import Camera
 from survey.folder.text import suggestion
-from survey.solution.dictionary import plain
 from survey.solution.earlier.changes import Snapshot
 from survey.solution.earlier.runs import load_run
+from survey.solution.plain import plain
 from survey.workbench.jobs import Jobs
 
 _CELLS = 24

@@ -15,10 +15,11 @@ from survey.project.observed import Observed, name_of_residual
 from survey.report.language import message
 from survey.report.scene import scene_values
 from survey.solution.anchors import ANCHORED, anchor, anchors_in
-from survey.solution.dictionary import plain, solution_dict
+from survey.solution.dictionary import solution_dict
 from survey.solution.earlier.changes import snapshot
 from survey.solution.earlier.runs import list_runs
 from survey.solution.frames import AdjustedFrames
+from survey.solution.plain import plain
 from survey.solution.quantities import ARCSEC_PER_RAD, sigma_unit_for_people, sigmas_of, status_of, unit_for_people
 from survey.solution.verdict import suspects
 from survey.workbench.jobs import Jobs
@@ -116,7 +117,10 @@ def readings(bench: Jobs) -> dict[str, Any]:
 
 
 def parameters(bench: Jobs) -> dict[str, Any]:
-    """Every component of every parameter: value, sigma and status in the units shown, as columns."""
+    """Every component of every parameter: value, sigma and status in the units shown, as columns.
+
+    A column of texts has each of them once: ``texts``, and by row their places, ``codes``.
+    """
     out: dict[str, list[Any]] = {k: [] for k in ("name", "component", "value", "unit", "sigma", "sigma_unit", "status")}
     for name, e in bench.adjustment.estimates.items():
         pose, sigmas = isinstance(e.value, Pose3), sigmas_of(e, bench.scale)
@@ -131,7 +135,14 @@ def parameters(bench: Jobs) -> dict[str, Any]:
                    sigma_unit if pose else unit, sigmas[k] * sigma_factor, sigma_unit, status)  # fmt: skip
             for key, value in zip(out, row, strict=True):
                 out[key].append(value)
-    return {"version": bench.version, "sigmas": bench.scale.sigmas, "columns": plain(out)}
+    columns = {k: values if k in ("value", "sigma") else _coded(values) for k, values in out.items()}
+    return {"version": bench.version, "sigmas": bench.scale.sigmas, "columns": plain(columns)}
+
+
+def _coded(values: Sequence[str]) -> dict[str, list[Any]]:
+    places: dict[str, int] = {}
+    codes = [places.setdefault(value, len(places)) for value in values]
+    return {"texts": list(places), "codes": codes}
 
 
 def findings(bench: Jobs) -> dict[str, Any]:

@@ -19,8 +19,8 @@ CODE = """
 import sys
 import time
 from survey.cli import main
-code = main(["adjust", sys.argv[1], "--quiet"])
-print("CODE", code, "LOADED", *sorted(set(sys.argv[2:]) & set(sys.modules)))
+code = main([sys.argv[1], sys.argv[2], "--quiet"])
+print("CODE", code, "LOADED", *sorted(set(sys.argv[3:]) & set(sys.modules)))
 """
 
 
@@ -31,10 +31,9 @@ def network(tmp_path_factory):
     return folder
 
 
-def loaded(folder, names):
-    run = subprocess.run(
-        [sys.executable, "-c", CODE, str(folder), *names], capture_output=True, text=True, timeout=300, check=True
-    )
+def loaded(folder, names, command="adjust"):
+    asked = [sys.executable, "-c", CODE, command, str(folder), *names]
+    run = subprocess.run(asked, capture_output=True, text=True, timeout=300, check=True)
     last = run.stdout.splitlines()[-1].split()
     assert last[:3] == ["CODE", "0", "LOADED"]
     return last[3:]
@@ -42,6 +41,11 @@ def loaded(folder, names):
 
 def test_a_network_of_readings_loads_nothing_that_it_does_not_need(network):
     assert loaded(network, NEEDLESS) == []
+
+
+def test_a_list_of_runs_loads_nothing_that_adjusts(network):
+    names = ("scipy.special", "scipy.sparse", "adjust.adjustment", "adjust.graph", "adjust.precision", "jinja2")
+    assert loaded(network, (*NEEDLESS, *names), "runs") == []
 
 
 def test_the_times_of_the_stages_are_the_time_that_passed(network, capsys):

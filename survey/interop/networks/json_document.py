@@ -5,7 +5,7 @@ from typing import Any
 
 from adjust.model.observations import PositionRef
 from survey.interop.networks.values import NetworkValues, between_points, point_of
-from survey.solution.dictionary import plain
+from survey.solution.plain import plain
 
 FORMAT = "labsurvey-network-1"
 

@@ -6,7 +6,7 @@ const ARRAYS = { u1: Uint8Array, u2: Uint16Array, u4: Uint32Array, i4: Int32Arra
  * @typedef {{n: number, version: number, limit: number, blocks: {camera: string, epoch: string, target: string|null}[],
  *   points: Object<string, string[]>, block: ArrayLike<number>, point: ArrayLike<number>, u: Float32Array, v: Float32Array,
  *   du: Float32Array, dv: Float32Array, w: Float32Array, used: Uint8Array, why: Uint8Array, images: string[],
- *   imageIdx: Map<string, number>, imageOf: Uint32Array, first: Uint32Array, rows: Uint32Array}} Points
+ *   imageIdx: Map<string, number>, imageOf: Uint32Array, first: Uint32Array, rows: Uint32Array|null}} Points
  */
 
 /**
@@ -26,7 +26,7 @@ export function columns(buffer) {
   return out;
 }
 
-/** Rows of an image k are `rows[first[k]] ... rows[first[k + 1] - 1]`. @param {any} data */
+/** Rows of an image k are `rows[first[k]] ... rows[first[k + 1] - 1]`, without `rows` `first[k]` and so on. @param {any} data */
 export function withImages(data) {
   const idx = new Map();
   const of = Uint32Array.from(data.blocks, (block) => {
@@ -37,15 +37,22 @@ export function withImages(data) {
   const first = new Uint32Array(idx.size + 1);
   for (let i = 0; i < data.n; i++) first[of[data.block[i]] + 1]++;
   for (let k = 0; k < idx.size; k++) first[k + 1] += first[k];
-  const next = first.slice(), rows = new Uint32Array(data.n);
-  for (let i = 0; i < data.n; i++) rows[next[of[data.block[i]]]++] = i;
+  let inOrder = true; // as tables are written: then a row needs no place of its own
+  for (let i = 1; i < data.n; i++) inOrder &&= of[data.block[i]] >= of[data.block[i - 1]];
+  const next = first.slice(), rows = inOrder ? null : new Uint32Array(data.n);
+  for (let i = 0; rows && i < data.n; i++) rows[next[of[data.block[i]]]++] = i;
   return { ...data, images: [...idx.keys()], imageIdx: idx, imageOf: of, first, rows };
 }
+
+/** The row at a place of that order. @param {any} data @param {number} j */
+export const rowAt = (data, j) => (data.rows ? data.rows[j] : j);
 
 /** Rows of one image. @param {any} data @param {string} image camera/epoch @returns {Uint32Array} */
 export function rowsOfImage(data, image) {
   const k = data.imageIdx.get(image);
-  return k === undefined ? new Uint32Array() : data.rows.subarray(data.first[k], data.first[k + 1]);
+  if (k === undefined) return new Uint32Array();
+  const from = data.first[k], to = data.first[k + 1];
+  return data.rows ? data.rows.subarray(from, to) : Uint32Array.from({ length: to - from }, (_, j) => from + j);
 }
 
 /** The name of the point of a row. @param {any} data @param {number} i */

@@ -82,7 +82,7 @@ export class ImageView {
       if (at >= 0) { const block = data.blocks[data.block[at]]; image = `${block.camera}/${block.epoch}`; if (kind === "point") this.row = at; }
     }
     if (!image && this.all.length) {
-      const at = this.worstOf(data.rows), block = data.blocks[data.block[at]];
+      const at = this.worstOf(null), block = data.blocks[data.block[at]];
       image = block ? `${block.camera}/${block.epoch}` : this.all[0];
     }
     if (image !== this.image) this.open(image);
@@ -93,11 +93,11 @@ export class ImageView {
   /** All images: those with points, or those of the project in which nothing was found yet. */
   get all() { const { images } = this.bench.points; return images.length ? images : this.bench.images ?? []; }
 
-  /** @param {ArrayLike<number>} rows */
+  /** @param {ArrayLike<number>|null} rows null: all */
   worstOf(rows) {
-    const { w } = this.bench.points;
-    let at = rows.length ? rows[0] : -1;
-    for (let k = 0; k < rows.length; k++) if (w[rows[k]] > w[at] || !(w[at] >= 0)) at = rows[k];
+    const { w } = this.bench.points, n = rows?.length ?? w.length, row = (k) => (rows ? rows[k] : k);
+    let at = n ? row(0) : -1;
+    for (let k = 0; k < n; k++) if (w[row(k)] > w[at] || !(w[at] >= 0)) at = row(k);
     return at;
   }
 

@@ -1,5 +1,6 @@
 // Plots of one camera over its image, and of series: small pictures drawn from values, with their scale beside them.
 
+import { rowAt } from "./columns.js";
 import { colour, make, surface } from "./dom.js";
 import { count, significant, t } from "./words.js";
 
@@ -96,7 +97,7 @@ export function residualField(points, camera, size) {
   for (const [k, image] of points.images.entries()) {
     if (!image.startsWith(`${camera}/`)) continue;
     for (let j = points.first[k]; j < points.first[k + 1]; j++) {
-      const i = points.rows[j], a = Math.min(columns - 1, Math.max(0, Math.floor((points.u[i] / size[0]) * columns))), b = Math.min(rows - 1, Math.max(0, Math.floor((points.v[i] / size[1]) * rows))), at = b * columns + a;
+      const i = rowAt(points, j), a = Math.min(columns - 1, Math.max(0, Math.floor((points.u[i] / size[0]) * columns))), b = Math.min(rows - 1, Math.max(0, Math.floor((points.v[i] / size[1]) * rows))), at = b * columns + a;
       if (!points.used[i] || !Number.isFinite(points.du[i])) continue;
       n[at]++;
       sums[0][at] += points.du[i];

@@ -1,5 +1,6 @@
 // From the server's answers to what the views draw.
 
+import { rowAt } from "./columns.js";
 import { parts } from "./store.js";
 
 /** Until there is a solution, what the results in the folder say stands for it. @param {any} raw answer of /api/state */
@@ -17,7 +18,7 @@ export const readingsOf = (raw) => raw.rows;
 
 /** Columns to rows, with the whole name of each component. @param {any} raw */
 export function parametersOf(raw) {
-  const c = raw.columns;
+  const c = Object.fromEntries(Object.entries(raw.columns).map(([key, column]) => [key, column.codes?.map((k) => column.texts[k]) ?? column]));
   return c.name.map((name, i) => ({ name: `${name}/${c.component[i]}`, owner: name, component: c.component[i], value: c.value[i], unit: c.unit[i], sigma: c.sigma[i], sigma_unit: c.sigma_unit[i], treatment: c.status[i] }));
 }
 
@@ -54,7 +55,7 @@ export function leftOut(data) {
   const out = new Map();
   for (let k = 0; k < data.images.length; k++) {
     let n = 0;
-    for (let j = data.first[k]; j < data.first[k + 1]; j++) n += 1 - data.used[data.rows[j]];
+    for (let j = data.first[k]; j < data.first[k + 1]; j++) n += 1 - data.used[rowAt(data, j)];
     if (n) out.set(data.images[k], n);
   }
   return out;

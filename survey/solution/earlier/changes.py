@@ -9,9 +9,8 @@ from gtsam import Pose3
 
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import FloatArray
-from survey.solution.dictionary import plain
+from survey.solution.plain import plain
 from survey.solution.quantities import sigma_unit_for_people, unit_for_people
-from survey.solution.verdict import suspects, verdict
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +76,8 @@ def _number(value: float | None) -> str:
 
 def snapshot(adjustment: Adjustment) -> Snapshot:
     """A solution as it is."""
+    from survey.solution.verdict import suspects, verdict  # here: runs that are only listed do without
+
     found, test = suspects(adjustment), adjustment.global_test
     level, reason = verdict(adjustment, found)
     return Snapshot(adjustment.estimates, plain({

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gtsam import Pose3
@@ -26,8 +26,11 @@ from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write, decode, read_bytes
 from survey.project.exclusions import Exclusion, Name
 from survey.project.project import DEFINITION_FILE, RESULTS
-from survey.solution.dictionary import RunInfo, plain
 from survey.solution.earlier.changes import Snapshot, snapshot
+from survey.solution.plain import plain
+
+if TYPE_CHECKING:  # loads what adjusts
+    from survey.solution.dictionary import RunInfo
 
 RUNS, MOST = "runs", 50
 _RUN, _ESTIMATES, _SOLUTION = "run.json", "estimates.npz", "solution.json"
@@ -68,7 +71,7 @@ def _exclusion(e: Exclusion) -> dict[str, Any]:
 
 
 def record_run(
-    folder: Path, place: Path, adjustment: Adjustment, run: RunInfo, solution: Mapping[str, Any], author: str
+    folder: Path, place: Path, adjustment: Adjustment, run: "RunInfo", solution: Mapping[str, Any], author: str
 ) -> tuple[str, ...]:
     """Keep a run: its files made in ``place`` with its results, while ``folder`` is changed; old files that go then."""
     runs, there = _readable(folder), [int(path.parent.name) for path in _places(folder)]

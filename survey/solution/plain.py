@@ -1,0 +1,36 @@
+"""Values as JSON knows them; loads nothing that a list of runs does not need."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+_AS_IT_IS = frozenset((str, int, bool, type(None)))
+_FLOATS = {float}
+
+
+class PlainRecords(Mapping[str, dict[str, Any]]):
+    """Entries by name whose values are what JSON knows already."""
+
+
+def plain(value: Any) -> Any:
+    """Only what JSON knows: mappings and sequences kept, numbers as Python's, None for what is not finite."""
+    kind = type(value)
+    if kind in _AS_IT_IS or isinstance(value, PlainRecords):
+        return value
+    if kind is float:
+        return value if math.isfinite(value) else None
+    if kind is list and set(map(type, value)) == _FLOATS and all(map(math.isfinite, value)):
+        return value
+    if isinstance(value, Mapping):
+        return {str(k): v if type(v) in _AS_IT_IS else plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [plain(v) for v in value]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    if isinstance(value, int | np.integer):
+        return int(value)
+    return str(value)
