@@ -7,7 +7,8 @@ import numpy as np
 
 from adjust.lenses.crops import crop_size, cropped_lens, whole_image
 from adjust.lenses.models import MODELS, camera_constants
-from adjust.model.errors import SurveyError, natural_key
+from adjust.model.errors import SurveyError
+from adjust.model.names import natural_key
 from adjust.model.result import ParameterName
 from adjust.model.survey import Camera, FloatArray, ImageCrop, LensDrift, Survey
 

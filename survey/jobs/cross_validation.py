@@ -1,8 +1,8 @@
 """The job behind ``labsurvey cross-validate``: the epochs in two halves, each adjusted by itself, the lenses compared.
 
 Two halves that agree to within their uncertainties are the best evidence that the sigmas of a calibration can be
-believed; a lens model that lacks something makes them disagree by more (as mrcal's cross-validation does, see its
-documentation "how to run a calibration", Kogan 2023).
+believed; a lens model that lacks something makes them disagree by more (as in mrcal's cross-validation, see the page of
+that name in its tour).
 """
 
 from collections.abc import Sequence

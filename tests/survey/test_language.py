@@ -30,7 +30,7 @@ SURVEY, ADJUST = (Path(str(package.__file__)).parent for package in (survey, adj
 PAGES = (*SURVEY.glob("report/**/*.py"), *SURVEY.glob("batch/*.py"))  # what is said in the reader's language
 TEMPLATES = SURVEY / "report" / "templates"
 TERMINAL = ("beforehand.py", "between.py", "trajectory.py")
-"""What speaks on a terminal alone, of the diagnosis; its room ``table`` makes warnings, not causes."""
+"""What speaks on a terminal alone, of the diagnosis."""
 NAMES = """angles from another zero|axes or unit of given coordinates|axis of a table runs out|cameras exchanged
 cameras not simultaneous|clock drift|clock offset|correlated observations|encoder of a table|epochs exchanged
 epochs shifted|focus touched|gear ratio|gear ratio of axis 7|given points exchanged|images copied|images mirrored
@@ -38,8 +38,10 @@ images of another camera|images resized|images shifted|images turned|instrument 
 motion forgotten|odd sigma|order of Euler angles|order of quaternions|pairs inverted|pixel origin|point moved
 points exchanged|prism constant|rolling shutter|rotations inverted|rows and columns|rows of another set-up
 sense of rotation|set-up turned|shift in other axes|sigmas of a group|sign of height differences|slipped decimal
-station moved|table moved|targets exchanged|the same twice|unit of angles|unit of lengths|unit of shifts"""
-"""Kinds of causes: names by which programs tell them apart, shown to nobody."""
+station moved|table moved|targets exchanged|the same twice|unit of angles|unit of lengths|unit of shifts
+its images contradict those of all others|no exchange of the axes, unit or shift by one epoch explains it
+which no reading of table"""
+"""Kinds of causes and marks of lines, by which programs tell them apart: shown to nobody."""
 OTHERS = [language for language in LANGUAGES if language != "en"]
 
 
@@ -128,9 +130,9 @@ def said_by_diagnosis() -> set[str]:
     """Sentences of causes and remedies, and what they are put together from."""
     out = set()
     for path in ADJUST.glob("diagnosis/**/*.py"):
-        if path.name not in TERMINAL and path.parent.name != "table":
+        if path.name not in TERMINAL:
             out |= set(_said(ast.parse(path.read_text(encoding="utf-8"))))
-    out = {re.sub("(?<=[a-z])7", ": 7", re.sub("7(?=[a-z])", "7 ", x)) for x in out}  # values with signs of their own
+    out = {re.sub("(?<=says)7", ": 7", re.sub("7(?=[a-z])", "7 ", x)) for x in out}  # values with signs of their own
     return {x for x in out if re.search("[A-Za-z]{2,} [a-z]{2,}", x)} - set(re.split(r"[|\n]", NAMES))
 
 

@@ -226,6 +226,20 @@ def test_readable_on_desk_and_phone(browser: Any, address: str, scheme: str, wid
     assert page.complaints == []
 
 
+def test_no_table_of_a_view_is_cut(page: Page) -> None:
+    """In German too, whose words are longer."""
+    p = page.page
+    page.wait("document.body.dataset.results !== undefined")
+    for language in ("en", "de"):
+        for view in ("findings", *VIEWS):
+            p.locator("#left .chooser select").select_option(view)
+            page.wait("document.querySelector('#left [aria-busy=true]') === null")
+            cut = "[...document.querySelectorAll('#left .t')].map((t) => t.scrollWidth - t.clientWidth)"
+            assert max([0, *p.evaluate(cut)]) <= 1, (language, view)
+        p.keyboard.press("g")
+        page.wait(f"document.documentElement.lang === '{'de' if language == 'en' else 'en'}'")
+
+
 def test_the_datum_is_chosen_and_taken_back(page: Page, folder: Path) -> None:
     p, before = page.page, (folder / "survey.toml").read_text()
     p.locator("#right .chooser select").select_option("settings")

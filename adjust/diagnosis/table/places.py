@@ -213,9 +213,8 @@ def renumbered(target: Target, place_from_seen: FloatArray, tolerance_m: float) 
         maps = np.linalg.norm((centred @ R.T)[:, None] - centred[None], axis=2).min(axis=1) < 1e-3 * pitch
         if maps.all() and fitting.all() and abs(angle - turn) < 0.1:
             opposite = "at the opposite corner" if turn == np.pi else "at the next corner"
-            return f"its points are numbered from the wrong corner ({opposite}: the pattern turned by " + (
-                f"{np.degrees(turn):.0f} deg)"
-            )
+            return (f"its points are numbered from the wrong corner ({opposite}: the pattern turned by "
+                    f"{np.degrees(turn):.0f} deg)")  # fmt: skip
     shift = place_from_seen[:3, 3]
     if angle < 0.02 and 0.5 * pitch < float(np.linalg.norm(shift)) and 2 * int(fitting.sum()) >= len(x):
         return f"its points are numbered one or more rows or columns off (shift {1e3 * np.linalg.norm(shift):.1f} mm)"

@@ -98,10 +98,10 @@ MISREADINGS: tuple[Misreading, ...] = (
     Misreading("angles from another zero", "are zenith angles of the second face", -1.0, 2.0 * np.pi, ("zenith",)),
     Misreading("sign of height differences", "have the other sign", -1.0, 0.0, ("height_difference",)),
 )
-_SLIPS = (10.0, 0.1, 100.0, 0.01)
+SLIPS = (10.0, 0.1, 100.0, 0.01)
 
 
 def slips(kind: ReadingKind, value: float) -> list[Misreading]:
     """Of the decimal point, tried on single values alone."""
     return [Misreading("slipped decimal", f"has slipped: {value:.9g} for {f * value:.9g} (SI)", f, 0.0, (kind,))
-            for f in _SLIPS]  # fmt: skip
+            for f in SLIPS]  # fmt: skip

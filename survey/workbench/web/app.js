@@ -60,8 +60,8 @@ const page = {
 const KEYS = keysOf(page);
 
 /** New values, then every view with them: observations and what is wrong first. @param {any} answer see `load` */
-async function renew(answer) {
-  const fresh = await load(answer);
+async function renew(answer, anew = false) {
+  const fresh = await load(answer, anew);
   if (bench.beginning) { drawBeginning(bench.beginning, actions); return; }
   drawAll(fresh);
   if (bench.state.changed_files?.length) changedOutside(bench.state.changed_files);
@@ -88,11 +88,10 @@ function changedOutside(files) {
 
 async function otherLanguage() {
   await changeLanguage();
-  bench.state = null; // what the server says is said in its language too
   frame.forget();
   tables.forget();
   by("tree").replaceChildren();
-  await renew(null);
+  await renew(null, true); // what the server says is said in its language too
 }
 
 let pointed = 0;

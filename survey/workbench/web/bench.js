@@ -13,13 +13,14 @@ export const bench = {
 /**
  * Observations and what is wrong with them; whether they are others than before.
  * @param {any} answer a state, what a decision answered, or null to ask for the state
+ * @param {boolean} [anew] also what has not changed, as in another language
  */
-export async function load(answer) {
+export async function load(answer, anew = false) {
   const raw = answer?.state ?? (answer?.version !== undefined && answer.exclusions ? answer : await get("state"));
   bench.beginning = raw.beginning ? raw : null;
   if (raw.beginning) return false;
   const state = stateOf(raw), old = bench.state;
-  const fresh = !old || old.version !== state.version || old.folder !== state.folder || (state.failure ?? "") !== (old.failure ?? "");
+  const fresh = anew || !old || old.version !== state.version || old.folder !== state.folder || (state.failure ?? "") !== (old.failure ?? "");
   if (!fresh) { bench.state = { ...state, changes: old.changes }; return false; }
   const [columns, readings, findings] = await Promise.all([points(old?.folder === state.folder ? bench.points : null), get("readings"), get("findings")]);
   Object.assign(bench, { state, points: columns, readings: readingsOf(readings), limit: readings.limit, findings: findingsOf(findings, raw), sizes: sizesOf(raw), images: raw.tree.cameras.flatMap((c) => c.images.map((epoch) => `${c.id}/${epoch}`)), leftOut: leftOut(columns) });
