@@ -164,6 +164,7 @@ def test_shared_lenses_are_written_and_tested(tmp_path: Path, same: bool) -> Non
         ("crops.e03 = { scale = 0 }", "the scale must be positive"),
         ('crops.e03 = { free = ["zoom"] }', "unknown parameter 'zoom'"),
         ("crops.e03 = { size_px = [0, 10] }", "expected whole numbers"),
+        ("crops.e03 = { left_px = 5000 }", "leaves nothing of the image"),
     ],
 )
 def test_lenses_that_cannot_be_meant_are_refused(tmp_path: Path, table: str, said: str) -> None:

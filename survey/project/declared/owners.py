@@ -4,6 +4,7 @@ from typing import Literal
 
 import numpy as np
 
+from adjust.lenses.crops import crop_size
 from adjust.model.survey import (
     TABLE_GEOMETRY,
     Camera,
@@ -36,6 +37,9 @@ def read_cameras(root: Node, station_ids: tuple[str, ...], timed: bool) -> tuple
         if not node.has("lens"):
             raise node.error(f"the table [cameras.{camera_id}.lens] is missing; add it", "lens")
         lens = read_lens(node.table("lens"))
+        for epoch, crop in lens.crops.items():
+            if min(crop_size(size, crop)) < 1:
+                raise node.table("lens").table("crops").error("leaves nothing of the image; correct it", epoch)
         if node.table("lens").has("shared"):
             others = [c for c, _ in root.tables("cameras") if c != camera_id]
             node.table("lens").table("shared").reference("camera", others, "camera")
