@@ -317,7 +317,7 @@ def test_a_million_points_are_sorted_and_filtered_without_a_pause(page: Page) ->
 
 
 def test_of_a_solution_that_has_gone_the_page_keeps_nothing(browser: Any, tmp_path: Path) -> None:
-    """Bytes that the page holds of each image point once one was left out and taken back: its columns have 49."""
+    """Bytes that the page holds of each image point once one was left out and taken back: its columns have 45."""
     write_project(tmp_path / "lab", stereo(3, n_pairs=300)[0])
     token = new_token()
     with Listening(Server(Workbench(tmp_path / "lab"), token), "127.0.0.1", 0) as listening:
