@@ -29,7 +29,7 @@ from survey.report.language import (
 SURVEY, ADJUST = (Path(str(package.__file__)).parent for package in (survey, adjust))
 PAGES = (*SURVEY.glob("report/**/*.py"), *SURVEY.glob("batch/*.py"))  # what is said in the reader's language
 TEMPLATES = SURVEY / "report" / "templates"
-TERMINAL = ("beforehand.py", "between.py", "trajectory.py")
+TERMINAL = {"beforehand", "between.py", "trajectory.py"}
 """What speaks on a terminal alone, of the diagnosis."""
 NAMES = """angles from another zero|axes or unit of given coordinates|axis of a table runs out|cameras exchanged
 cameras not simultaneous|clock drift|clock offset|correlated observations|encoder of a table|epochs exchanged
@@ -130,7 +130,7 @@ def said_by_diagnosis() -> set[str]:
     """Sentences of causes and remedies, and what they are put together from."""
     out = set()
     for path in ADJUST.glob("diagnosis/**/*.py"):
-        if path.name not in TERMINAL:
+        if not TERMINAL & set(path.parts):
             out |= set(_said(ast.parse(path.read_text(encoding="utf-8"))))
     out = {re.sub("(?<=says)7", ": 7", re.sub("7(?=[a-z])", "7 ", x)) for x in out}  # values with signs of their own
     return {x for x in out if re.search("[A-Za-z]{2,} [a-z]{2,}", x)} - set(re.split(r"[|\n]", NAMES))
