@@ -240,6 +240,15 @@ def test_no_table_of_a_view_is_cut(page: Page) -> None:
         page.wait(f"document.documentElement.lang === '{'de' if language == 'en' else 'en'}'")
 
 
+def test_a_choice_stays_when_values_arrive(page: Page) -> None:
+    p = page.page
+    p.locator("#right .chooser select").select_option("settings")
+    p.locator("#right").get_by_label("Datum", exact=True).select_option("inner")
+    p.evaluate("""(async () => { const { bench } = await import("/bench.js"); bench.parameters = [...bench.parameters];
+        const { select } = await import("/store.js"); select("camera", "Y"); })()""")
+    assert p.locator("#right").get_by_label("Datum", exact=True).input_value() == "inner"
+
+
 def test_the_datum_is_chosen_and_taken_back(page: Page, folder: Path) -> None:
     p, before = page.page, (folder / "survey.toml").read_text()
     p.locator("#right .chooser select").select_option("settings")

@@ -12,6 +12,7 @@ export class SettingsView {
     this.bench = bench;
     this.actions = actions;
     this.element = make("div", { class: "view page", tabindex: 0 });
+    this.chosen = null;
     this.follow();
   }
 
@@ -26,16 +27,17 @@ export class SettingsView {
       held.length ? plainTable(t("Held"), [t("parameter"), t("value")], held.slice(0, MOST).map((p) => [link(anchor("param", p.name), p.name), measure(p.value, p.unit, 7)]), [1]) : null);
   }
 
-  /** Given by what is held, or inner constraints over the points and stations that are chosen (none: all). */
+  /** Given by what is held, or inner constraints over the points and stations that are chosen (none: all). What is chosen and not set yet stays when values arrive. */
   datum(state) {
-    const { datum, tree } = state;
-    const choices = (title, ids, chosen) => make("select", { multiple: true, size: Math.min(8, Math.max(2, ids.length)), "aria-label": title }, ...ids.map((id) => make("option", { value: id, selected: chosen.includes(id) }, id)));
+    const { tree } = state, datum = this.chosen ?? state.datum;
+    const choose = () => { over.hidden = kind.value !== "inner"; this.chosen = { kind: kind.value, points: all(points), stations: all(stations) }; };
+    const choices = (title, ids, chosen) => make("select", { multiple: true, size: Math.min(8, Math.max(2, ids.length)), "aria-label": title, onchange: choose }, ...ids.map((id) => make("option", { value: id, selected: chosen.includes(id) }, id)));
     const points = choices(t("Points"), tree.points, datum.points), stations = choices(t("Stations"), tree.stations, datum.stations);
     const over = make("div", { class: "actions", hidden: datum.kind !== "inner" }, make("label", {}, t("Points"), " ", points), make("label", {}, t("Stations"), " ", stations));
-    const kind = make("select", { "aria-label": t("Datum"), onchange: () => { over.hidden = kind.value !== "inner"; } },
+    const kind = make("select", { "aria-label": t("Datum"), onchange: choose },
       make("option", { value: "given", selected: datum.kind === "given" }, t("datum given")), make("option", { value: "inner", selected: datum.kind === "inner" }, t("datum inner")));
     const all = (field) => (kind.value === "inner" ? [...field.selectedOptions].map((o) => o.value) : []);
-    return make("div", {}, kind, over, state.read_only ? null : make("div", { class: "actions" }, button(t("Set"), () => this.actions.setting({ datum: kind.value, points: all(points), stations: all(stations) }), "", { id: "set-datum" })));
+    return make("div", {}, kind, over, state.read_only ? null : make("div", { class: "actions" }, button(t("Set"), () => { this.chosen = null; this.actions.setting({ datum: kind.value, points: all(points), stations: all(stations) }); }, "", { id: "set-datum" })));
   }
 
   groups(groups, state) {
