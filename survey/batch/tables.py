@@ -14,8 +14,8 @@ from survey.batch.control import Chart
 from survey.batch.record import DONE, FAILED, TEST_FAILED, Record
 from survey.batch.run import counts, exit_code
 from survey.batch.trends import LEVEL, Trends
+from survey.folder.plain import plain
 from survey.folder.text import cell_text
-from survey.solution.plain import plain
 
 STATES = {DONE: "done", FAILED: "error", TEST_FAILED: "does not fit"}
 _MOST_TOLD = 8

@@ -13,10 +13,10 @@ from adjust.epochs.congruence_result import Congruence
 from adjust.epochs.deformation import Deformation, DeformationTest, station_deformations
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
+from survey.folder.plain import plain
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.congruence_text import congruence_dict, congruence_text
 from survey.project import Project, read
-from survey.solution.plain import plain
 from survey.solution.quantities import ARCSEC_PER_RAD, SigmaKind
 
 ALPHA = 0.05

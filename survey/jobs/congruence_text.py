@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from adjust.epochs.congruence_result import Congruence, CongruenceTest, Motion
-from survey.solution.plain import plain
+from survey.folder.plain import plain
 from survey.solution.quantities import ARCSEC_PER_RAD
 
 _MOST = 60

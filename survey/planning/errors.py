@@ -11,12 +11,12 @@ from markupsafe import Markup
 from adjust.design.error_analysis import BeaconField, tolerance
 from adjust.design.error_figures import ErrorFigure, error_figures
 from adjust.model.errors import SurveyError
+from survey.folder.plain import plain
 from survey.folder.replacing import write_set
 from survey.planning.page import html_page
 from survey.report import drawing as d
 from survey.report.charts import Series, chart
 from survey.report.markup import figures, fixed, general, section, table
-from survey.solution.plain import plain
 
 PAPER = BeaconField()
 BOUNDED = BeaconField(nearest_m=0.1)

@@ -18,10 +18,10 @@ from adjust.design import (
 from adjust.design.pose_budget import PoseTolerance
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray
+from survey.folder.plain import plain
 from survey.planning.building import Planned
 from survey.planning.navigation import NavigationOutcome
 from survey.planning.plan_file import Plan
-from survey.solution.plain import plain
 from survey.solution.quantities import ARCSEC_PER_RAD, key_of, sigma_unit_for_people
 
 _MOST = 8

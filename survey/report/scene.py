@@ -13,10 +13,10 @@ from markupsafe import Markup
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Target
+from survey.folder.plain import plain
 from survey.report import drawing as d
 from survey.report.markup import json_script, part
 from survey.solution.frames import AdjustedFrames
-from survey.solution.plain import plain
 from survey.solution.quantities import Scale
 
 _MOST_EPOCHS = 24

@@ -10,11 +10,11 @@ from markupsafe import Markup
 from adjust.diagnosis.diagnosis import Diagnosis
 from adjust.graph.divergence import Stopped, UnknownState
 from adjust.model.errors import DiagnosedError, IndeterminateError, NotConvergedError, SurveyError
+from survey.folder.plain import plain
 from survey.report.language import group_name, message, speaking, t
 from survey.report.markup import count, document, element, general, joined, note, part, section, table
 from survey.report.sections.diagnosis import causes
 from survey.solution.dictionary import RunInfo
-from survey.solution.plain import plain
 from survey.solution.quantities import key_of, pose_dict, unit_for_people
 from survey.solution.records import solution_json
 

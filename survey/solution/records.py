@@ -15,7 +15,7 @@ import numpy as np
 
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.text import NUMBERS, TEXT, WORD, Words, record_rows
-from survey.solution.plain import PlainRecords
+from survey.folder.plain import PlainRecords
 
 Column = np.ndarray[Any, Any] | Sequence[str]
 """Of n records: floats, whole numbers or truths (n,), lists of floats (n, k), or n words."""

@@ -9,9 +9,9 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.navigation import EpochPose, NavigationEpoch, Trajectory
+from survey.folder.plain import plain
 from survey.project import atomic_write
 from survey.project.tables.files import write_table
-from survey.solution.plain import plain
 from survey.solution.quantities import ARCSEC_PER_RAD, pose_dict
 
 _POSE_COLUMNS = (

@@ -20,10 +20,10 @@ from adjust.model.arrays import FloatArray
 from adjust.model.errors import SurveyError
 from adjust.model.result import ParameterName
 from adjust.model.survey import Camera
+from survey.folder.plain import plain
 from survey.folder.text import suggestion
 from survey.solution.earlier.changes import Snapshot
 from survey.solution.earlier.runs import load_run
-from survey.solution.plain import plain
 from survey.workbench.jobs import Jobs
 
 _CELLS = 24

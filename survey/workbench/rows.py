@@ -16,8 +16,8 @@ import numpy.typing as npt
 from adjust.model.observations import FrameRef, ImageBlock, frame_text, position_text
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from survey.folder.plain import plain
 from survey.project.observed import Hits, Observed, name_of_residual
-from survey.solution.plain import plain
 from survey.solution.quantities import sigma_unit_for_people, unit_for_people
 from survey.workbench.places import refs_of
 

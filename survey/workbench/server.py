@@ -21,10 +21,10 @@ from starlette.types import ASGIApp
 
 from adjust.model.errors import SurveyError
 from survey.folder.locking import BusyError
+from survey.folder.plain import plain
 from survey.folder.text import suggestion
 from survey.report.language import LANGUAGES, message, speaking
 from survey.report.modules import WEB as SHARED
-from survey.solution.plain import plain
 from survey.workbench import pictures
 from survey.workbench.bodies import JOBS, Body, BodyError, distance_of, json_of, whole_of
 from survey.workbench.guard import LONGEST_BODY, Guard, TooLongError

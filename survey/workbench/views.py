@@ -10,6 +10,7 @@ from adjust.diagnosis.hypothesis import Place
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Reading
 from adjust.model.result import Adjustment
+from survey.folder.plain import plain
 from survey.folder.text import suggestion
 from survey.project.observed import Observed, name_of_residual
 from survey.report.language import message
@@ -19,7 +20,6 @@ from survey.solution.dictionary import solution_dict
 from survey.solution.earlier.changes import snapshot
 from survey.solution.earlier.runs import list_runs
 from survey.solution.frames import AdjustedFrames
-from survey.solution.plain import plain
 from survey.solution.quantities import ARCSEC_PER_RAD, sigma_unit_for_people, sigmas_of, status_of, unit_for_people
 from survey.solution.verdict import suspects
 from survey.workbench.jobs import Jobs

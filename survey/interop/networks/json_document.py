@@ -4,8 +4,8 @@ import json
 from typing import Any
 
 from adjust.model.observations import PositionRef
+from survey.folder.plain import plain
 from survey.interop.networks.values import NetworkValues, between_points, point_of
-from survey.solution.plain import plain
 
 FORMAT = "labsurvey-network-1"
 

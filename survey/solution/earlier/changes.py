@@ -9,7 +9,7 @@ from gtsam import Pose3
 
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import FloatArray
-from survey.solution.plain import plain
+from survey.folder.plain import plain
 from survey.solution.quantities import sigma_unit_for_people, unit_for_people
 
 

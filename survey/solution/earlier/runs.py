@@ -22,12 +22,12 @@ from gtsam import Pose3
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from survey.folder.arrays import read_arrays
+from survey.folder.plain import plain
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write, decode, read_bytes
 from survey.project.exclusions import Exclusion, Name
 from survey.project.project import DEFINITION_FILE, RESULTS
 from survey.solution.earlier.changes import Snapshot, snapshot
-from survey.solution.plain import plain
 
 if TYPE_CHECKING:  # loads what adjusts
     from survey.solution.dictionary import RunInfo

@@ -9,8 +9,8 @@ from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
+from survey.folder.plain import plain
 from survey.project.project import DEFINITION_FILE, IMAGES_FOLDER
-from survey.solution.plain import plain
 from survey.workbench.pages.capturing import FolderView
 
 
