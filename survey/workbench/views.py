@@ -32,7 +32,7 @@ _CAUSE = "probable cause: "
 
 
 def limits(bench: Jobs) -> tuple[float, float]:
-    """Of |w| of image points (square root of the chi-square test's) and of other observations."""
+    """Of ``|w|`` of image points (square root of the chi-square test's) and of other observations."""
     adjustment = bench.situation.adjustment
     found = bench.kept if adjustment is None else suspects(adjustment)
     return (1.0, 1.0) if found is None else (float(np.sqrt(found.image_limit)), found.w_limit)
@@ -95,7 +95,7 @@ def _tree(bench: Jobs) -> dict[str, Any]:
 def points(
     bench: Jobs, camera: str = "", epoch: str = "", worst: int = 0, known: int | None = None
 ) -> bytes:
-    """Image points as :func:`survey.workbench.rows.columns`: all, those of one image, or the ``worst`` by |w|.
+    """Image points as :func:`survey.workbench.rows.columns`: all, those of one image, or the ``worst`` by ``|w|``.
 
     known: the layout of the rows that the page has; where it is still that, only what the solution says of all.
     """
