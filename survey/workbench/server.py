@@ -258,8 +258,9 @@ class Server:
     async def _halves(self, request: Request) -> Response:
         distance = distance_of(request)
         found = await self._run("compare", lambda: self.bench.cross_validate(distance))
-        cameras = [c.summary() | c.pixels() for c in found.cameras]
-        return JSONResponse(plain(found.summary() | {"version": self.bench.version, "cameras": cameras}))
+        told = {"version": self.bench.version, "cameras": [c.summary() | c.pixels() for c in found.cameras],
+                "notes": [message(note) for note in found.notes]}  # fmt: skip
+        return JSONResponse(plain(found.summary() | told))
 
     async def _image(self, request: Request) -> Response:
         key = request.path_params["camera"], request.path_params["epoch"]
