@@ -14,11 +14,17 @@ from survey.workbench import guard
 
 
 class Live:
-    """Messages to all pages that are open; ``post`` may be called from any thread."""
+    """Messages to all pages that are open; ``post`` may be called from any thread.
+
+    What holds until it is told otherwise, by its type in `STANDING`, is told to a page that joins later, too.
+    """
+
+    STANDING = ("state", "folder")
 
     def __init__(self) -> None:
         self._queues: set[asyncio.Queue[dict[str, Any] | None]] = set()
         self._loop: asyncio.AbstractEventLoop | None = None
+        self._standing: dict[str, dict[str, Any]] = {}
         self.joined = asyncio.Event()
 
     def begin(self) -> None:
@@ -31,6 +37,8 @@ class Live:
             self._loop.call_soon_threadsafe(self._put, message)
 
     def _put(self, message: dict[str, Any] | None) -> None:
+        if message is not None and message["type"] in self.STANDING:
+            self._standing[message["type"]] = message
         for queue in self._queues:
             queue.put_nowait(message)
 
@@ -38,6 +46,8 @@ class Live:
         """Until the page or the server goes."""
         await page.accept()
         queue: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
+        for message in self._standing.values():
+            queue.put_nowait(message)
         self._queues.add(queue)
         self.joined.set()
         gone = asyncio.create_task(_until_gone(page))

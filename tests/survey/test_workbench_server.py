@@ -177,6 +177,21 @@ def test_the_socket_needs_origin_and_token(mine):
             assert "progress" in kinds
 
 
+def test_a_page_that_joins_late_hears_what_others_wrote_before(mine):
+    """What was said while nobody listened is said again; what holds no more is not."""
+    known = {"Origin": "http://127.0.0.1:8790", "Cookie": f"labsurvey={TOKEN}"}
+    with page(mine) as client:
+        post(client, "/api/adjust", {"mode": "cold"})
+        toml, heard = mine / "survey.toml", []
+        toml.write_text(f"{toml.read_text()}\n")
+        with client.websocket_connect(LIVE, headers=known) as socket:
+            while "folder" not in heard:
+                heard.append(socket.receive_json()["type"])
+        with client.websocket_connect(LIVE, headers=known) as socket:
+            late = [socket.receive_json() for _ in range(2)]
+    assert {m["type"]: m.get("changed") for m in late} == {"state": None, "folder": ["survey.toml"]}
+
+
 @pytest.mark.slow
 def test_a_mistake_is_found_seen_left_out_and_taken_back(mine):
     name = wrong_point(mine)

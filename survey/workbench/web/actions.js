@@ -12,8 +12,9 @@ import { show } from "./frame.js";
 import { working } from "./header.js";
 import { bench } from "./bench.js";
 
-/** @param {(answer: any) => Promise<void>} renew shows what came of it; null: what there is now */
-export function actionsOf(renew) {
+/** @param {(answer: any) => Promise<void>} renew shows what came of it; null: what there is now
+ *  @param {() => void} outside says which files others changed */
+export function actionsOf(renew, outside) {
   let busy = false;
   const base = () => ({ base: bench.state.version });
 
@@ -26,13 +27,13 @@ export function actionsOf(renew) {
     working(t("adjusting …"));
     try {
       await renew(await ask());
-      by("message").replaceChildren();
       tell(said || t("Done in {s} s.", { s: number((performance.now() - started) / 1000, 2) }) + changedShortly(bench.state.changes));
     } catch (error) {
       tell(error.status === 409 ? t("Not done: {why}", { why: error.message }) : error.message, "warn");
       if (error.status === 409) await renew(null).catch(() => {});
     } finally {
       busy = false;
+      outside();
       working("");
       document.body.removeAttribute("aria-busy");
     }

@@ -25,7 +25,7 @@ import { CaptureView } from "./capture.js";
 import { SettingsView } from "./settings.js";
 import { drawBeginning } from "./beginning.js";
 
-const actions = actionsOf(renew);
+const actions = actionsOf(renew, () => changedOutside());
 const tables = new Tables(bench, { show: frame.show });
 const VIEWS = {
   findings: ["Findings", () => new FindingsView(bench, actions)],
@@ -64,7 +64,7 @@ async function renew(answer, anew = false) {
   const fresh = await load(answer, anew);
   if (bench.beginning) { drawBeginning(bench.beginning, actions); return; }
   drawAll(fresh);
-  if (bench.state.changed_files?.length) changedOutside(bench.state.changed_files);
+  changedOutside(bench.state.changed_files ?? []);
   if (!fresh || !bench.state.solved || !(await loadResults())) return;
   frame.drawPanes();
   tables.renew("parameters");
@@ -82,9 +82,16 @@ function drawAll(fresh) {
   drawInspector(bench, actions);
 }
 
-function changedOutside(files) {
-  by("message").replaceChildren(make("span", { class: "warn" }, t("{files} changed outside this page.", { files: files.join(", ") })), button(t("Load again"), () => actions.reload()));
+/** Said where nothing runs, for what runs may end it; unsaid when it holds no more. */
+function changedOutside(files = bench.state?.changed_files ?? []) {
+  if (bench.state) bench.state.changed_files = files;
+  const said = by("message").querySelector(".outside");
+  if (files.length && !actions.busy) by("message").replaceChildren(make("span", { class: "warn outside" }, t("{files} changed outside this page.", { files: files.join(", ") })), button(t("Load again"), () => actions.reload()));
+  else if (!files.length && said) by("message").replaceChildren();
 }
+
+/** Others made the state that the server has now. */
+const isNew = ({ version, unsaved }) => version !== bench.state.version || unsaved !== bench.state.unsaved;
 
 async function otherLanguage() {
   await changeLanguage();
@@ -114,10 +121,10 @@ function pressed(event) {
 /** A message of the server. @param {any} message */
 function told(message) {
   if (message.type === "progress") working(t("step {n}, v'Pv {omega}", { n: message.step ?? message.iteration ?? 0, omega: significant(message.omega, 5) }));
-  else if (message.type === "state" && !actions.busy && bench.state) { working(""); renew(null); }
+  else if (message.type === "state" && !actions.busy && bench.state && isNew(message)) { working(""); renew(null); }
   else if (message.type === "error") { working(""); renew(null); }
   else if (message.type === "detected") { bench.arrived.push(message); frame.viewOf(JobsView)?.arrive(message); working(t("detecting {image}", { image: message.image })); }
-  else if (message.type === "folder" && message.changed?.length && !actions.busy) changedOutside(message.changed);
+  else if (message.type === "folder") changedOutside(message.changed);
   else if (message.type === "lost") document.body.classList.add("lost");
   else if (message.type === "connected") { document.body.classList.remove("lost"); if (!bench.state?.solved) renew(null); }
 }
