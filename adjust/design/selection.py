@@ -25,6 +25,7 @@ from adjust.graph.assembly import StartValues
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray, Survey
+from adjust.precision.precision import precision_of
 
 Criterion = Literal["D", "A"]
 
@@ -136,7 +137,7 @@ class Updater:
 
 def components_of(adjustment: Adjustment, names: Sequence[ParameterName]) -> tuple[Component, ...]:
     """Every component of these unknowns."""
-    by_name = adjustment.precision.unknowns.by_name
+    by_name = precision_of(adjustment).unknowns.by_name
     return tuple(
         Component(n, c, u) for n in names for c, u in zip(by_name[n].components, by_name[n].units, strict=True)
     )
@@ -156,7 +157,7 @@ def select(
     base = expected if expected is not None else expect(survey, start)
     names = tuple(dict.fromkeys(c.name for c in wanted))
     informed = inform(survey, start, candidates, names)
-    by_name, at, k = base.precision.unknowns.by_name, {}, 0
+    by_name, at, k = precision_of(base).unknowns.by_name, {}, 0
     for name in informed.names:
         at[name] = k
         k += by_name[name].dim
