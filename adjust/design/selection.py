@@ -26,6 +26,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.precision.precision import precision_of
+from adjust.testing.quadratic_forms import pseudo_half
 
 Criterion = Literal["D", "A"]
 
@@ -128,10 +129,7 @@ class Updater:
         Qw = self.Q[np.ix_(self.wanted, self.wanted)]
         s = np.sqrt(np.diag(Qw))
         s = np.where(s > 0, s, 1.0)
-        C = Qw / np.outer(s, s)
-        values, vectors = np.linalg.eigh(C)
-        keep = values > 1e-11 * values[-1]
-        return np.asarray(vectors[:, keep] / np.sqrt(values[keep]) / s[:, None])
+        return np.asarray(pseudo_half(Qw / np.outer(s, s), 0.0, 1e-11)[0] / s[:, None])
 
 
 

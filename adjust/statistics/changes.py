@@ -26,6 +26,7 @@ from adjust.statistics.normal import Normal
 from adjust.statistics.result import Change, ChangeShift
 from adjust.statistics.system import LinearSystem
 from adjust.testing.distributions import chi2, fisher, norm
+from adjust.testing.quadratic_forms import pseudo_squares
 
 _SEEN = 1e-4
 """Share of a column that no unknown takes over, below which it is not told from rounding."""
@@ -123,7 +124,7 @@ class ChangeSearch:
             for c in candidates:
                 if named[c.unit.kind, c.unit.name, c.unit.what] >= _MOST_OF_ONE:
                     continue
-                T, q = _statistics(c.M, c.g)
+                T, q = pseudo_squares(c.g, c.M, _SEEN)
                 z = np.where(q > 0, _normal_score(T, np.maximum(q, 1)), -np.inf)
                 j = int(z.argmax()) if len(z) else -1
                 if j >= 0 and z[j] > (best[0] if best is not None else -np.inf):
@@ -131,7 +132,7 @@ class ChangeSearch:
             if best is None:
                 break
             _, c, j, M, g = best
-            (T,), (q,) = _statistics(M[None], g[None])
+            T, q = pseudo_squares(g, M, _SEEN)
             p = float(chi2.sf(T, max(q, 1)))
             if relative and left > q and omega > T:
                 p = max(p, float(fisher.sf(T / q / ((omega - T) / (left - q)), q, left - q)))
@@ -300,14 +301,6 @@ def _given(c: _Candidates, known: _Chosen) -> _Candidates:
     K = _from_runs_on(across) * c.scale[:, :, None]
     M = c.M - K @ known.inverse @ K.transpose(0, 2, 1)
     return replace(c, M=0.5 * (M + M.transpose(0, 2, 1)), g=c.g - K @ known.amounts)
-
-
-def _statistics(M: FloatArray, g: FloatArray) -> tuple[FloatArray, IntArray]:
-    """T (J,) and its degrees of freedom (J,)."""
-    values, vectors = np.linalg.eigh(M)
-    seen = values > _SEEN
-    along = np.einsum("jqk,jq->jk", vectors, g)
-    return np.where(seen, along**2 / np.where(seen, values, 1.0), 0.0).sum(axis=1), seen.sum(axis=1)
 
 
 def _normal_score(T: FloatArray, q: IntArray) -> FloatArray:
