@@ -132,17 +132,18 @@ class ChangeSearch:
             if best is None:
                 break
             _, c, j, M, g = best
-            T, q = pseudo_squares(g, M, _SEEN)
+            drop, rank = pseudo_squares(g, M, _SEEN)
+            T, q = float(drop), int(rank)
             p = float(chi2.sf(T, max(q, 1)))
             if relative and left > q and omega > T:
                 p = max(p, float(fisher.sf(T / q / ((omega - T) / (left - q)), q, left - q)))
             if not p < level:
                 break
             spread = (omega - T) / (left - q) if relative and left > q and omega > T else 1.0
-            out.append(_change(c, j, M, g, float(T), int(q), p, max(spread, 1.0)))
+            out.append(_change(c, j, M, g, T, q, p, max(spread, 1.0)))
             chosen.append(self._chosen(c, j, chosen))
             candidates = [_given(x, chosen[-1]) for x in candidates]
-            omega, left = omega - float(T), left - int(q)
+            omega, left = omega - T, left - q
         return tuple(out)
 
     # -- what may change ---------------------------------------------------------------------------------------------
