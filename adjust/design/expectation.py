@@ -6,7 +6,8 @@ import numpy as np
 
 from adjust.adjustment import AdjustOptions, assemble
 from adjust.design.exact import exact
-from adjust.graph.assembly import GraphBuilder, StartValues
+from adjust.graph.assembly import StartValues
+from adjust.graph.building import GraphBuilder
 from adjust.graph.rank import readable
 from adjust.graph.solver import settled
 from adjust.model.result import CAUTIOUS_SIGMAS, Adjustment, ParameterName

@@ -17,7 +17,8 @@ from adjust.design.expectation import shared_names
 from adjust.design.noise import disturbed
 from adjust.design.readings import displaced, reading_sigmas
 from adjust.frames.unknowns import Unknown
-from adjust.graph.assembly import GraphBuilder, StartValues
+from adjust.graph.assembly import StartValues
+from adjust.graph.building import GraphBuilder
 from adjust.graph.solver import settled
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName

@@ -59,7 +59,7 @@ class ImageResiduals:
 class ReadingResiduals:
     """Residuals of all readings (N,), in the order of ``Survey.readings``; rad or m.
 
-    sigma: a priori, with the target's centring. residual: adjusted minus observed. residual_sigma: of the residual.
+    sigma: a priori, with the target's centring. residual: adjusted minus observed.
     redundancy: diag(Q_vv P). test: w^2 with w = (P v)_i / sqrt((P Q_vv P)_ii), chi-square with one degree of freedom,
     the square of ``standardized`` but for readings with a joint covariance. weighted_square: shares of v'Pv.
     """
@@ -68,7 +68,6 @@ class ReadingResiduals:
     adjusted: FloatArray
     residual: FloatArray
     sigma: FloatArray
-    residual_sigma: FloatArray
     redundancy: FloatArray
     standardized: FloatArray
     test: FloatArray
