@@ -1,5 +1,6 @@
 """What an adjustment gives back. Every estimated quantity is one ``Estimate`` under its ``ParameterName``."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -207,11 +208,11 @@ class Component:
     n: int
     redundancy: float
     omega: float
-    freedom: float
-    p: float
-    lower: float
-    upper: float
     status: str
+    freedom: float = math.nan
+    p: float = math.nan
+    lower: float = math.nan
+    upper: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)

@@ -119,28 +119,19 @@ class ChangeSearch:
         candidates = self.candidates  # M and g are given what was found, step by step
         omega, left = self.adjustment.omega, self.adjustment.redundancy
         while len(out) < _MOST:
-            best: tuple[float, _Candidates, int, FloatArray, FloatArray] | None = None
             named = Counter((x.kind, x.name, x.what) for x in out)
-            for c in candidates:
-                if named[c.unit.kind, c.unit.name, c.unit.what] >= _MOST_OF_ONE:
-                    continue
-                T, q = pseudo_squares(c.g, c.M, _SEEN)
-                z = np.where(q > 0, _normal_score(T, np.maximum(q, 1)), -np.inf)
-                j = int(z.argmax()) if len(z) else -1
-                if j >= 0 and z[j] > (best[0] if best is not None else -np.inf):
-                    best = float(z[j]), c, j, c.M[j], c.g[j]
+            best = _clearest([c for c in candidates if named[c.unit.kind, c.unit.name, c.unit.what] < _MOST_OF_ONE])
             if best is None:
                 break
-            _, c, j, M, g = best
-            drop, rank = pseudo_squares(g, M, _SEEN)
-            T, q = float(drop), int(rank)
-            p = float(chi2.sf(T, max(q, 1)))
+            c, j, T, q = best
+            p, spread = float(chi2.sf(T, max(q, 1))), 1.0
             if relative and left > q and omega > T:
-                p = max(p, float(fisher.sf(T / q / ((omega - T) / (left - q)), q, left - q)))
+                spread = (omega - T) / (left - q)
+                p = max(p, float(fisher.sf(T / q / spread, q, left - q)))
             if not p < level:
                 break
-            spread = (omega - T) / (left - q) if relative and left > q and omega > T else 1.0
-            out.append(_change(c, j, M, g, T, q, p, max(spread, 1.0)))
+            u, shifts = c.unit, _shifts(c, j, T, max(spread, 1.0))
+            out.append(Change(u.kind, u.name, u.what, u.epochs[j + 1] if len(u.epochs) > 1 else "", T, q, p, shifts))
             chosen.append(self._chosen(c, j, chosen))
             candidates = [_given(x, chosen[-1]) for x in candidates]
             omega, left = omega - T, left - q
@@ -310,18 +301,27 @@ def _normal_score(T: FloatArray, q: IntArray) -> FloatArray:
     return np.asarray(((T / q) ** (1.0 / 3.0) - 1.0 + c) / np.sqrt(c))
 
 
-def _change(
-    c: _Candidates, j: int, M: FloatArray, g: FloatArray, T: float, q: int, p: float, spread: float
-) -> Change:
-    u = c.unit
-    epoch = u.epochs[j + 1] if len(u.epochs) > 1 else ""
+def _clearest(candidates: Sequence[_Candidates]) -> tuple[_Candidates, int, float, int] | None:
+    """Whose change is the least likely, which of its changes, its statistic and degrees of freedom."""
+    best, most = None, -np.inf
+    for c in candidates:
+        T, q = pseudo_squares(c.g, c.M, _SEEN)
+        z = np.where(q > 0, _normal_score(T, np.maximum(q, 1)), -np.inf)
+        j = int(z.argmax()) if len(z) else -1
+        if j >= 0 and z[j] > most:
+            best, most = (c, j, float(T[j]), int(q[j])), float(z[j])
+    return best
+
+
+def _shifts(c: _Candidates, j: int, T: float, spread: float) -> tuple[ChangeShift, ...]:
+    """The components that explain it, with variances ``spread`` times the a priori ones."""
+    M, g = c.M[j], c.g[j]
     index = _explaining(M, g, T, spread)
     inverse = np.linalg.pinv(M[np.ix_(index, index)], rcond=1e-9, hermitian=True)
     amount, sigma = -inverse @ g[index] * c.scale[j, index], np.sqrt(spread * np.diag(inverse)) * c.scale[j, index]
     order = np.argsort(-np.abs(amount) / np.maximum(sigma, 1e-300), kind="stable")
-    said = [u.components[i] for i in index]
-    shifts = tuple(ChangeShift(said[i][0], said[i][1], float(amount[i]), float(sigma[i])) for i in order)
-    return Change(u.kind, u.name, u.what, epoch, T, q, p, shifts)
+    said = [c.unit.components[i] for i in index]
+    return tuple(ChangeShift(*said[i], float(amount[i]), float(sigma[i])) for i in order)
 
 
 def _explaining(M: FloatArray, g: FloatArray, T: float, spread: float) -> list[int]:

@@ -20,7 +20,7 @@ import numpy as np
 from adjust.model.errors import SurveyError
 from capture.devices.camera import GrayImage, ImageSource
 from capture.simulated.angles import AnglesFile
-from capture.simulated.aravis import AravisCamera
+from tests.capture.aravis import AravisCamera
 
 _READY = "ready"
 _START_S = 60.0  # on a busy machine
