@@ -321,7 +321,7 @@ def _shifts(c: _Candidates, j: int, T: float, spread: float) -> tuple[ChangeShif
     amount, sigma = -inverse @ g[index] * c.scale[j, index], np.sqrt(spread * np.diag(inverse)) * c.scale[j, index]
     order = np.argsort(-np.abs(amount) / np.maximum(sigma, 1e-300), kind="stable")
     said = [c.unit.components[i] for i in index]
-    return tuple(ChangeShift(*said[i], float(amount[i]), float(sigma[i])) for i in order)
+    return tuple(ChangeShift(said[i][0], said[i][1], float(amount[i]), float(sigma[i])) for i in order)
 
 
 def _explaining(M: FloatArray, g: FloatArray, T: float, spread: float) -> list[int]:
