@@ -10,7 +10,8 @@ from scipy.linalg import qr
 
 from adjust.design.exact import exact
 from adjust.design.rows import DesignMatrix, design_matrix
-from adjust.graph.assembly import GraphBuilder, StartValues
+from adjust.graph.assembly import StartValues
+from adjust.graph.building import GraphBuilder
 from adjust.model.errors import SurveyError
 from adjust.model.observations import (
     Alignment,

@@ -6,11 +6,13 @@ import numpy as np
 
 from adjust.adjustment import AdjustOptions, assemble
 from adjust.design.exact import exact
-from adjust.graph.assembly import GraphBuilder, StartValues
+from adjust.graph.assembly import StartValues
+from adjust.graph.building import GraphBuilder
 from adjust.graph.rank import readable
 from adjust.graph.solver import settled
 from adjust.model.result import CAUTIOUS_SIGMAS, Adjustment, ParameterName
 from adjust.model.survey import FloatArray, Survey
+from adjust.precision.precision import precision_of
 from adjust.statistics.weakness import inflated
 
 _PART, _MOST = 0.25, 6  # of the largest share: what is named of a direction, and how many
@@ -48,7 +50,7 @@ def expect(survey: Survey, start: StartValues) -> Adjustment:
 
 def shared_names(adjustment: Adjustment) -> tuple[ParameterName, ...]:
     """The unknowns that do not belong to one epoch alone."""
-    return tuple(n for n in adjustment.precision.unknowns.by_name if not of_one_epoch(n))
+    return tuple(n for n in precision_of(adjustment).unknowns.by_name if not of_one_epoch(n))
 
 
 def of_one_epoch(name: ParameterName) -> bool:
@@ -58,7 +60,7 @@ def of_one_epoch(name: ParameterName) -> bool:
 
 def component_names(adjustment: Adjustment, names: tuple[ParameterName, ...]) -> list[tuple[str, str]]:
     """(unknown as people say it, component) of every row of ``precision.joint(names)``."""
-    by_name = adjustment.precision.unknowns.by_name
+    by_name = precision_of(adjustment).unknowns.by_name
     return [(readable(by_name[n]), c) for n in names for c in by_name[n].components]
 
 

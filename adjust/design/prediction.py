@@ -7,7 +7,8 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.frames.lens_times import LensTimes
-from adjust.graph.assembly import GraphBuilder, StartValues
+from adjust.graph.assembly import StartValues
+from adjust.graph.building import GraphBuilder
 from adjust.lenses.models import MODELS, camera_constants, lens_residuals, project
 from adjust.model.boards import deformed, warming_of
 from adjust.model.errors import SurveyError

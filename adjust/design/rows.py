@@ -10,7 +10,8 @@ from itertools import pairwise
 import numpy as np
 from scipy import sparse
 
-from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
+from adjust.graph.assembly import AdjustmentGraph, StartValues
+from adjust.graph.building import GraphBuilder
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.observations.factors import ObservationFactor
 from adjust.statistics.system import Columns, ItemRows, points_apart, survey_rows

@@ -25,6 +25,8 @@ from adjust.graph.assembly import StartValues
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray, Survey
+from adjust.precision.precision import precision_of
+from adjust.testing.quadratic_forms import pseudo_half
 
 Criterion = Literal["D", "A"]
 
@@ -127,16 +129,13 @@ class Updater:
         Qw = self.Q[np.ix_(self.wanted, self.wanted)]
         s = np.sqrt(np.diag(Qw))
         s = np.where(s > 0, s, 1.0)
-        C = Qw / np.outer(s, s)
-        values, vectors = np.linalg.eigh(C)
-        keep = values > 1e-11 * values[-1]
-        return np.asarray(vectors[:, keep] / np.sqrt(values[keep]) / s[:, None])
+        return np.asarray(pseudo_half(Qw / np.outer(s, s), 0.0, 1e-11)[0] / s[:, None])
 
 
 
 def components_of(adjustment: Adjustment, names: Sequence[ParameterName]) -> tuple[Component, ...]:
     """Every component of these unknowns."""
-    by_name = adjustment.precision.unknowns.by_name
+    by_name = precision_of(adjustment).unknowns.by_name
     return tuple(
         Component(n, c, u) for n in names for c, u in zip(by_name[n].components, by_name[n].units, strict=True)
     )
@@ -156,7 +155,7 @@ def select(
     base = expected if expected is not None else expect(survey, start)
     names = tuple(dict.fromkeys(c.name for c in wanted))
     informed = inform(survey, start, candidates, names)
-    by_name, at, k = base.precision.unknowns.by_name, {}, 0
+    by_name, at, k = precision_of(base).unknowns.by_name, {}, 0
     for name in informed.names:
         at[name] = k
         k += by_name[name].dim

@@ -17,13 +17,15 @@ from adjust.design.expectation import shared_names
 from adjust.design.noise import disturbed
 from adjust.design.readings import displaced, reading_sigmas
 from adjust.frames.unknowns import Unknown
-from adjust.graph.assembly import GraphBuilder, StartValues
+from adjust.graph.assembly import StartValues
+from adjust.graph.building import GraphBuilder
 from adjust.graph.solver import settled
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, Survey
 from adjust.native.parallel import workers
 from adjust.testing.distributions import chi2
+from adjust.testing.quadratic_forms import pseudo_squares
 
 _CHUNK = 8
 
@@ -99,12 +101,10 @@ def _summary(
     Q = expected.precision.joint(names)
     s = np.sqrt(np.diag(Q))
     scale = np.where(s > 0, s, 1.0)
-    values, vectors = np.linalg.eigh(Q / np.outer(scale, scale))
-    keep = values > 1e-11 * values[-1]
-    white = (errors / scale) @ (vectors[:, keep] / np.sqrt(values[keep]))
-    dof, t = int(keep.sum()), len(errors)
+    squares, rank = pseudo_squares(errors / scale, Q / np.outer(scale, scale), 0.0, 1e-11)
+    dof, t = int(rank), len(errors)
     low, high = chi2.ppf([0.005, 0.995], t * dof) / t
-    mean = float(np.mean(np.sum(white**2, axis=1)))
+    mean = float(np.mean(squares))
     return Trials(names, errors, s, omega, expected.redundancy, failed, mean, dof, (float(low), float(high)))
 
 

@@ -24,7 +24,7 @@ from adjust.start.lenses import Sighting, start_lens
 from adjust.start.views import View, Views, focal_px, joined, make_views, rays_by_block
 
 if TYPE_CHECKING:
-    from adjust.diagnosis.score import Linear
+    from adjust.diagnosis.linear import Linear
 
 CAP = 50.0
 """The most that one component of an observation counts: what is left out, or cannot be predicted, counts so."""
@@ -152,7 +152,7 @@ class Case:
     @cached_property
     def linear(self) -> "Linear | None":
         """The adjustment with all images in use, as a linear system; None where there is none."""
-        from adjust.diagnosis.score import Linear  # here: what fails as a whole needs none
+        from adjust.diagnosis.linear import Linear  # here: what fails as a whole needs none
 
         if self.result is None or not self.result.redundancy > 0:
             return None

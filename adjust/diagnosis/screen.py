@@ -13,7 +13,8 @@ import numpy as np
 
 from adjust.adjustment import start_values
 from adjust.diagnosis.case import CAP, Case
-from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues, values_of
+from adjust.graph.assembly import AdjustmentGraph, StartValues, values_of
+from adjust.graph.building import GraphBuilder
 from adjust.model.errors import SurveyError
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.observations.terrestrial import equations as k

@@ -1,7 +1,6 @@
 """One hypothesis, tried: its survey adjusted, and what is left unexplained."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -142,7 +141,7 @@ def _left_out(survey: Survey) -> set[tuple[str, ...]]:
     return pairs | {(r.table_id, r.epoch_id) for r in survey.table_readings if not r.used}
 
 
-def _n_components(observed: Any) -> int:
+def _n_components(observed: object) -> int:
     """Of one observation: the finite variances of its covariance, one where it has a sigma."""
     cov = getattr(observed, "cov", None)
     return 1 if cov is None else int(np.isfinite(np.diag(cov)).sum())

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from adjust.frames.lens_times import block_starts, crop_starts
+from adjust.frames.lens_times import block_starts, changed, crop_starts
 from adjust.frames.unknowns import Unknowns, VectorMap, vector_map
 from adjust.lenses.crops import UNITS, CroppedLens, cropped_lens
 from adjust.lenses.models import MODELS, LensModel, camera_constants
@@ -101,6 +101,7 @@ class LensStates:
 
     def __init__(self, survey: Survey, unknowns: Unknowns) -> None:
         self.maps = [unknowns.vectors[("lens", c.camera_id)] for c in survey.cameras]
+        self._lenses = survey.cameras
         self.states = [LensState(i) for i in range(len(survey.cameras))]
         self.priors: list[tuple[ParameterName, ParameterName | None, FloatArray]] = []
         """Steps of random walks: of the second change (of none) to the first, with their sigmas."""
@@ -125,11 +126,11 @@ class LensStates:
 
     def whole(self, i: int, values: gtsam.Values) -> FloatArray:
         """All parameters (n,) of state i, of the whole image."""
-        own = self.maps[self.states[i].camera]
-        out = own.full(values)
-        for change, factor in self.states[i].changes:
-            columns = [own.free.index(x) for x in change.names]
-            out = out + factor * (own.matrix[:, columns] @ change.full(values))
+        state = self.states[i]
+        out = self.maps[state.camera].full(values)
+        for change, factor in state.changes:
+            by = (factor * change.full(values)).tolist()
+            out = changed(self._lenses[state.camera], out, dict(zip(change.names, by, strict=True)))
         return out
 
     def parts(self, i: int) -> list[LensPart]:

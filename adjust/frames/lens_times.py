@@ -39,6 +39,14 @@ def _starts(survey: Survey, camera: Camera, begins: Iterable[str], key: str) -> 
     return out
 
 
+def changed(camera: Camera, lens: FloatArray, by: Mapping[str, float]) -> FloatArray:
+    """A lens (n,) of the camera with so much added to some of its parameters, and its share to what is tied to them."""
+    out, names = lens.copy(), MODELS[camera.lens.model].names
+    by = {**by, **{tie.name: tie.factor * by[tie.to] for tie in camera.lens.ties if tie.to in by}}
+    out[[names.index(x) for x in by]] += list(by.values())
+    return out
+
+
 class LensTimes:
     """Which lens the images of a survey have.
 
@@ -70,13 +78,11 @@ class LensTimes:
         own, model = value(("lens", camera.camera_id)), MODELS[camera.lens.model]
         if own is None:
             raise SurveyError(f"camera {camera.camera_id!r}: its lens has no values yet; adjust the project first")
-        out, drift = own.copy(), camera.lens.drift
+        out, drift = own, camera.lens.drift
         if drift is not None and (change := self._change(camera, drift, epoch_id, value)) is not None:
-            by = dict(zip(drift.parameters, change, strict=True))
-            by |= {tie.name: tie.factor * by[tie.to] for tie in camera.lens.ties if tie.to in by}
-            out[[model.names.index(x) for x in by]] += list(by.values())
+            out = changed(camera, out, dict(zip(drift.parameters, change, strict=True)))
         if (crop := self.crop(camera, epoch_id)) is None:
-            return out
+            return out.copy()
         found = value(("lens_crop", camera.camera_id, crop[0]))
         given = np.asarray(crop[1].parameters.values, dtype=float)
         return cropped_lens(model, out, camera_constants(camera), given if found is None else found).values

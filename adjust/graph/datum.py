@@ -16,7 +16,7 @@ from gtsam import Pose3
 from scipy import sparse
 
 from adjust.frames.unknowns import Unknown
-from adjust.graph.assembly import AdjustmentGraph, Evaluation, inner_datum_keys
+from adjust.graph.assembly import AdjustmentGraph, Evaluation
 from adjust.model.errors import SurveyError
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, IntArray
@@ -190,7 +190,7 @@ def inner_datum(graph: AdjustmentGraph, at: Evaluation) -> InnerDatum | None:
     """
     if graph.survey.datum.kind != "inner":
         return None
-    keys = inner_datum_keys(graph.survey, graph.unknowns)
+    keys = _inner_datum_keys(graph)
     if not keys:
         raise SurveyError("datum kind 'inner' needs free points or free fixed stations; name some, or hold something")
     base, linear = at.values, graph.linearized(at)
@@ -257,3 +257,17 @@ def minimal_datum(
         mine = np.sort(index[chosen][owner[chosen] == number])
         out[keys[number]] = (mine - stack.at[keys[number]].start, root[mine])
     return out
+
+
+def _inner_datum_keys(graph: AdjustmentGraph) -> list[int]:
+    """The unknowns that the survey names (or all points, else all stations) for inner constraints."""
+    survey, by_name = graph.survey, graph.unknowns.by_name
+    datum = survey.datum
+    points = datum.points or (() if datum.stations else tuple(p.point_id for p in survey.points))
+    keys = [u.key for p in points if (u := by_name.get(("point", p)))]
+    stations = datum.stations
+    if not datum.points and not datum.stations and not keys:
+        stations = tuple(s.station_id for s in survey.stations)
+    named = set(stations)
+    keys += [u.key for name, u in by_name.items() if name[0] == "world_from_station" and name[1] in named]
+    return keys

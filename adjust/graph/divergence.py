@@ -12,7 +12,7 @@ from adjust.graph.datum import normal_diagonal, stacking, visible_keys
 from adjust.graph.rank import readable
 from adjust.model.errors import SurveyError
 from adjust.model.observations import position_text
-from adjust.model.result import ParameterName
+from adjust.model.stopped import GroupFit, Pull, Stopped, UnknownState
 from adjust.model.survey import FloatArray
 
 _GROUPS, _OWNERS, _MOVED = 4, 3, 4
@@ -30,53 +30,6 @@ class Misfit:
     owner: str
     text: str
     square: float
-
-
-@dataclass(frozen=True)
-class GroupFit:
-    """A group of n observations: root mean square over sigmas at the start and where it stopped; its worst owners."""
-
-    group: str
-    n: int
-    at_start: float
-    where_stopped: float
-    worst: tuple[tuple[str, float], ...]
-
-
-@dataclass(frozen=True)
-class Pull:
-    """What the gradient of v'Pv asks of the unknowns of a kind: how many of its own sigmas each would go by itself.
-
-    largest: the unknown that is pulled most, and by how much; rms: over all n components.
-    """
-
-    kind: str
-    n: int
-    rms: float
-    largest: tuple[str, float]
-
-
-@dataclass(frozen=True, eq=False)
-class UnknownState:
-    """An unknown at the start and where it stopped: a Pose3, or (n,) free components in ``units``."""
-
-    name: ParameterName
-    components: tuple[str, ...]
-    units: tuple[str, ...]
-    start: Pose3 | FloatArray
-    value: Pose3 | FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class Stopped:
-    """Where an adjustment stopped that found no minimum. last_step: of any unknown, in its sigmas."""
-
-    iterations: int
-    omega: float
-    last_step: float
-    groups: tuple[GroupFit, ...]
-    gradient: tuple[Pull, ...]
-    unknowns: tuple[UnknownState, ...]
 
 
 def stopped_at(

@@ -6,7 +6,7 @@ its documentation "differencing", Kogan 2017), and uncertainties are either thos
 which carries the camera, or, for a camera by itself, those of the difference so fitted, to first order.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +27,8 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Estimate, ParameterName
 from adjust.model.survey import Camera
 
+GRID = 24
+"""Columns of the pixels at which lenses are looked at."""
 _STEPS = 30
 _SMALL = 1e-12
 
@@ -86,12 +88,21 @@ def covered(uv: FloatArray, points: FloatArray, reach: float) -> BoolArray:
     return np.asarray(cKDTree(points).query(uv)[0] <= reach)
 
 
-def pixel_grid(image_size: tuple[int, int], columns: int = 24) -> FloatArray:
+def pixel_grid(image_size: tuple[int, int], columns: int = GRID) -> FloatArray:
     """Pixels (n, 2) evenly over an image, its corners among them."""
     width, height = image_size
     rows = max(2, round(columns * height / width))
     u, v = np.meshgrid(np.linspace(0, width - 1, columns), np.linspace(0, height - 1, rows))
     return np.column_stack([u.ravel(), v.ravel()])
+
+
+def compared_pixels(
+    lenses: Sequence[Optics], image_size: tuple[int, int], observed: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Pixels (n, 2) over an image at which all these lenses are one to one, and which have observed points near."""
+    uv = pixel_grid(image_size)
+    uv = uv[np.logical_and.reduce([invertible(lens, uv) for lens in lenses])]
+    return uv, covered(uv, observed, image_size[0] / GRID)
 
 
 def lens_difference(

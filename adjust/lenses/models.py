@@ -25,6 +25,7 @@ BEYOND_LIMIT = 1.02
 WELL_INSIDE = 0.9
 """Share of that radius up to which a solution is the one on this side of the fold, wherever it was started."""
 MAX_ITERATIONS = 50
+_NEWTON = kernels.Newton(MAX_ITERATIONS, RAY_TOLERANCE, PIXEL_TOLERANCE)
 
 
 @dataclass(frozen=True)
@@ -287,10 +288,8 @@ def _forward_rays(model: LensModel, values: FloatArray, constants: FloatArray, u
 
     def solved(tangents: FloatArray, uv: FloatArray, most: float) -> BoolArray:
         found = np.zeros(len(uv), dtype=np.bool_)
-        run_split(
-            kernels.tangents_of, split_blocks(np.arange(len(uv) + 1)), model.kind, lens, constants, uv, MAX_ITERATIONS,
-            RAY_TOLERANCE, PIXEL_TOLERANCE, tangents, found,
-        )  # fmt: skip
+        runs = split_blocks(np.arange(len(uv) + 1))
+        run_split(kernels.tangents_of, runs, kernels.Lens(model.kind, lens, constants), uv, _NEWTON, tangents, found)
         if np.isfinite(profile.limit):
             found &= np.hypot(tangents[:, 0], tangents[:, 1]) * scale <= profile.limit * most
         return found

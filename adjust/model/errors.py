@@ -1,11 +1,10 @@
 """What a user can cause and mend, everything else is a bug and keeps its traceback; names in what is said of it."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from adjust.diagnosis.diagnosis import Diagnosis
-    from adjust.graph.divergence import Stopped
+    from adjust.model.stopped import Stopped  # for types alone: it loads GTSAM
 
 
 class SurveyError(Exception):
@@ -34,10 +33,23 @@ class NotConvergedError(SurveyError):
         self.stopped = stopped
 
 
+class Explanation(Protocol):
+    """What explains that a survey does not fit: see :class:`adjust.diagnosis.diagnosis.Diagnosis`."""
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """For people: one for each cause, the likeliest first."""
+        ...
+
+    def told(self) -> list[dict[str, str | float | bool | list[str]]]:
+        """The causes for machines."""
+        ...
+
+
 class DiagnosedError(SurveyError):
     """An adjustment that failed, with what explains it."""
 
-    def __init__(self, message: str, diagnosis: "Diagnosis") -> None:
+    def __init__(self, message: str, diagnosis: Explanation) -> None:
         super().__init__(message)
         self.diagnosis = diagnosis
 

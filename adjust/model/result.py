@@ -1,19 +1,16 @@
 """What an adjustment gives back. Every estimated quantity is one ``Estimate`` under its ``ParameterName``."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from gtsam import Pose3
 
+from adjust.model.errors import Explanation
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
-
-if TYPE_CHECKING:
-    from adjust.diagnosis.diagnosis import Diagnosis
-    from adjust.precision.precision import Covariances
-    from adjust.statistics.result import Decision, VarianceComponents
 
 # ("lens", camera) ("station_from_camera", camera) ("world_from_station", station[, epoch])
 # ("mount_from_station", station) ("world_from_table", table) ("table_geometry", table) ("table_angles", table, epoch)
@@ -63,7 +60,7 @@ class ImageResiduals:
 class ReadingResiduals:
     """Residuals of all readings (N,), in the order of ``Survey.readings``; rad or m.
 
-    sigma: a priori, with the target's centring. residual: adjusted minus observed. residual_sigma: of the residual.
+    sigma: a priori, with the target's centring. residual: adjusted minus observed.
     redundancy: diag(Q_vv P). test: w^2 with w = (P v)_i / sqrt((P Q_vv P)_ii), chi-square with one degree of freedom,
     the square of ``standardized`` but for readings with a joint covariance. weighted_square: shares of v'Pv.
     """
@@ -72,7 +69,6 @@ class ReadingResiduals:
     adjusted: FloatArray
     residual: FloatArray
     sigma: FloatArray
-    residual_sigma: FloatArray
     redundancy: FloatArray
     standardized: FloatArray
     test: FloatArray
@@ -195,6 +191,96 @@ class GlobalTest:
         )
 
 
+@dataclass(frozen=True)
+class Component:
+    """The variance component of one group.
+
+    factor: estimated variance factor, on top of the a priori variances (1: they were right); sigma: its standard
+    deviation. n: observed components. redundancy, omega: of the group, with the estimated factors. freedom: equivalent
+    degrees of freedom 2 factor^2 / sigma^2. p: of a factor as far from 1 where the a priori variances are right;
+    lower, upper: confidence limits. status: "estimated", "fixed" (not asked for, or a prior), "vanished" (its residuals
+    are smaller than any variance explains), "unseparable", "no redundancy".
+    """
+
+    group: str
+    factor: float
+    sigma: float
+    n: int
+    redundancy: float
+    omega: float
+    status: str
+    freedom: float = math.nan
+    p: float = math.nan
+    lower: float = math.nan
+    upper: float = math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class VarianceComponents:
+    """Variance components of all groups. correlation: (k, k) between those in ``estimated``, in that order.
+
+    unseparable: sets of groups of which the observations tell only a mixture. iterations: solutions of the survey.
+    """
+
+    components: tuple[Component, ...]
+    estimated: tuple[str, ...]
+    correlation: FloatArray
+    unseparable: tuple[tuple[str, ...], ...]
+    iterations: int
+    converged: bool
+    method: str
+
+    def factor(self, group: str) -> float:
+        """The factor of a group, 1 where there is none."""
+        return next((c.factor for c in self.components if c.group == group), 1.0)
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One step of an outlier search: what was left out or taken back, why and when.
+
+    kind, ids: as ``ObservationResidual``; of image points kind "image", ids (camera, epoch, target or "points",
+    point). statistic, freedom, p, limit: the test that decided. error: estimated gross error in sigmas of the
+    observation. round: of the non-linear solutions, counted from 1. how: "test", "robust", "exchange".
+    """
+
+    action: Literal["rejected", "readmitted"]
+    kind: str
+    group: str
+    ids: tuple[str, ...]
+    statistic: float
+    freedom: int
+    p: float
+    limit: float
+    error: float
+    round: int
+    how: str
+
+    def text(self) -> str:
+        """For people."""
+        did = "left out" if self.action == "rejected" else "taken back"
+        return (
+            f"{did}: {self.kind} {' '.join(self.ids)}: off by {self.error:.1f} sigma, test {self.statistic:.1f} "
+            f"(limit {self.limit:.1f}), p {self.p:.2g}"
+        )
+
+
+class JointCovariances(Protocol):
+    """Covariances of the adjusted unknowns, a priori; see :class:`adjust.precision.precision.Covariances`."""
+
+    def joint(self, names: Sequence[ParameterName]) -> FloatArray:
+        """Of several unknowns, stacked in this order (of vectors their free components)."""
+        ...
+
+    def whole(self, names: Sequence[ParameterName], sizes: Sequence[int]) -> FloatArray:
+        """The same of all components, so many of each of these parameters; zero where one is held."""
+        ...
+
+    def following(self, spreads: Sequence[Mapping[int, FloatArray]], sizes: Sequence[int]) -> FloatArray:
+        """Of quantities that follow from unknowns: each (n, dim) by key; n of each in ``sizes``."""
+        ...
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Adjustment:
     """A solved survey with its precision.
@@ -224,12 +310,12 @@ class Adjustment:
     max_step: float
     converged: bool
     warnings: tuple[str, ...]
-    precision: "Covariances"
+    precision: JointCovariances
     reading_residuals: ReadingResiduals | None = None
-    variance_components: "VarianceComponents | None" = None
-    decisions: tuple["Decision", ...] = ()
+    variance_components: VarianceComponents | None = None
+    decisions: tuple[Decision, ...] = ()
     n_screened: int = 0
-    diagnosis: "Diagnosis | None" = None
+    diagnosis: Explanation | None = None
 
     @cached_property
     def other_arrays(self) -> OtherArrays:

@@ -7,6 +7,8 @@ finite numbers without meaning; the caller tests the depth. The fisheye alone se
 The fit of a lens together with the poses of what its camera sees is in ``calibration.h``.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
@@ -31,6 +33,22 @@ _fit_lens = Function(
     "kind values[n] constants[4] directions[n,p] ptr[B+1] x[N,3] uv[N,2] iterations poses[B,4,4] squares[N] cov[p,p] "
     "work[*]",
 )
+class Lens(NamedTuple):
+    """A lens as the core takes it: number of its model, parameters (n,), constants (4,)."""
+
+    kind: int
+    values: FloatArray
+    constants: FloatArray
+
+
+class Newton(NamedTuple):
+    """How rays are found: steps at most, relative size of the last one, and how near (px) they must come."""
+
+    iterations: int
+    small: float
+    pixels: float
+
+
 _NO_ROWS = np.zeros((0, 2, N_COLUMNS))
 
 
@@ -64,32 +82,30 @@ def _check(kind: int, lens: FloatArray) -> None:
 
 
 def tangents_of(
-    run: IntArray, kind: int, lens: FloatArray, constants: FloatArray, uv: FloatArray, iterations: int,
-    small: float, pixels: float, tangents: FloatArray, solved: BoolArray,
-) -> None:  # fmt: skip
+    run: IntArray, lens: Lens, uv: FloatArray, newton: Newton, tangents: FloatArray, solved: BoolArray
+) -> None:
     """Tangents (n, 2) = x/z, y/z of the rays of image points (n, 2) px, by Newton from the given ones, in place.
 
-    run: the points to do, one after the other. small: relative size of the last step. solved (n,): those within
-    ``pixels`` of their image point, where the lens does not turn the image over.
+    run: the points to do, one after the other. solved (n,): those so near to their image point, where the lens does not
+    turn the image over.
     """
-    _tangents_of(int(run[0]), int(run[-1]) + 1, kind, lens, constants, uv, iterations, small, pixels, tangents, solved)
+    _tangents_of(int(run[0]), int(run[-1]) + 1, *lens, uv, *newton, tangents, solved)
 
 
 def fit_lens(
-    kind: int, values: FloatArray, constants: FloatArray, directions: FloatArray, ptr: IntArray, x: FloatArray,
-    uv: FloatArray, iterations: int, poses: FloatArray,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """Least squares over ``values + directions @ p`` and the poses camera_from_target (B, 4, 4), both in place.
+    lens: Lens, directions: FloatArray, ptr: IntArray, x: FloatArray, uv: FloatArray, iterations: int, poses: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Least squares over ``lens.values + directions @ p`` and the poses camera_from_target (B, 4, 4), both in place.
 
     directions: (n, p), what of the lens may move. x: (N, 3) m, uv: (N, 2) px, view after view by ``ptr`` (B + 1,).
     Huber weights at three times the median. Returns the squares (N,) px^2 of what is left, and the covariance (p, p) of
     the free components for residuals of variance one, infinite where they are not determined.
     """
-    _check(kind, values)
+    _check(lens.kind, lens.values)
     p, N, B = directions.shape[1], len(x), len(poses)
     if max(directions.shape) > MAX_LENS:
         raise ValueError(f"fit_lens: directions must be at most ({MAX_LENS}, {MAX_LENS}), not {directions.shape}")
     squares, cov = np.empty(N), np.empty((p, p))
     work = np.empty(3 * N + B * (16 + 12 * (p + 7)))
-    _fit_lens(kind, values, constants, directions, ptr, x, uv, iterations, poses, squares, cov, work)
+    _fit_lens(*lens, directions, ptr, x, uv, iterations, poses, squares, cov, work)
     return squares, cov

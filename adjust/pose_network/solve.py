@@ -7,7 +7,8 @@ from functools import cached_property
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
+from adjust.graph.assembly import AdjustmentGraph, StartValues
+from adjust.graph.building import GraphBuilder
 from adjust.graph.datum import inner_datum
 from adjust.graph.solver import Solved, SolveOptions, solve
 from adjust.model.errors import IndeterminateError, NotConvergedError

@@ -5,10 +5,15 @@ chordal problem with orthogonality relaxed, solved directly: R_a = R_b R_ba is l
 do not meet each other. It needs isotropic weights, and so do the positions; one elimination serves both.
 """
 
+import heapq
+from collections.abc import Iterable, Mapping
+
 import gtsam
 import numpy as np
+from gtsam import Pose3
 
 from adjust.model.errors import IndeterminateError
+from adjust.model.observations import Pair
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.elimination import PoseFactor, clique_pattern, pair_gradient
 from adjust.pose_network.network import PoseNetwork
@@ -143,3 +148,24 @@ def translation_sigmas(network: PoseNetwork) -> FloatArray:
     turn = np.trace(network.cov[:, :3, :3], axis1=1, axis2=2) / 3.0
     length = np.nan_to_num((network.translations**2).sum(axis=1))
     return np.asarray(np.sqrt(np.where(network.is_pose, shift + turn * length, np.inf)))
+
+
+def carried(known: Mapping[str, Pose3], pairs: Iterable[Pair]) -> dict[str, Pose3]:
+    """``world_from_station`` of stations that pairs reach from known ones, each by the best pair that reaches it."""
+    every, near, poses = list(pairs), dict[str, list[tuple[float, int]]](), dict(known)
+    for i, pair in enumerate(every):
+        for end in (pair.a, pair.b):
+            near.setdefault(end.frame_id, []).append((float(np.trace(pair.cov)), i))
+    waiting = [x for station, mine in near.items() if station in known for x in mine]
+    heapq.heapify(waiting)
+    while waiting:
+        pair = every[heapq.heappop(waiting)[1]]
+        a, b, motion = pair.a.frame_id, pair.b.frame_id, pair.b_from_a
+        if (a in poses) == (b in poses):
+            continue
+        b_from_a = motion if isinstance(motion, Pose3) else Pose3(motion, np.zeros(3))
+        new, pose = (b, poses[a].compose(b_from_a.inverse())) if a in poses else (a, poses[b].compose(b_from_a))
+        poses[new] = pose
+        for x in near[new]:
+            heapq.heappush(waiting, x)
+    return {station: pose for station, pose in poses.items() if station not in known}

@@ -90,9 +90,8 @@ def compare_head(adjusted: Adjustment) -> HeadComparison:
     )  # fmt: skip
     found, (names, cov) = calibrate(given), propagate(given)
     at = {name: i for i, name in enumerate(names)}
-    poses = [_table_pose(adjusted, table, found, axes, at, cov)]
-    for k in (main, *others):
-        poses.append(_camera_pose(adjusted, station, found, axes, at, cov, k, k == main))
+    both = _Both(adjusted, found, axes, at, cov)
+    poses = [_table_pose(both, table), *(_camera_pose(both, station, k, k == main) for k in (main, *others))]
     if any(name in table.geometry.free for name in _GEOMETRY):
         notes += ("the published steps take the table's axes as perfect; the joint adjustment estimates them",)
     return HeadComparison(main, tuple(poses), notes)
@@ -240,10 +239,19 @@ def _outside(cov: FloatArray, pose: Pose3) -> FloatArray:
     return np.asarray(np.sqrt(np.clip(np.diag(turn @ cov @ turn.T), 0.0, None)))
 
 
-def _table_pose(
-    adjusted: Adjustment, table: Table, found: Calibration, axes: _Axes, at: Mapping[tuple[str, str], int],
-    cov: FloatArray,
-) -> ComparedPose:  # fmt: skip
+@dataclass(frozen=True, eq=False)
+class _Both:
+    """The joint adjustment and the steps' calibration, whose cov (n, n) has its components at these places."""
+
+    adjusted: Adjustment
+    found: Calibration
+    axes: _Axes
+    at: Mapping[tuple[str, str], int]
+    cov: FloatArray
+
+
+def _table_pose(both: _Both, table: Table) -> ComparedPose:
+    adjusted, found, axes, at, cov = both.adjusted, both.found, both.axes, both.at, both.cov
     name = ("world_from_table", table.table_id)
     own = found.world_from_table
     pose = Pose3(Rot3(axes.world @ own.rotation().matrix() @ axes.mount.T), axes.world @ own.translation())
@@ -257,10 +265,8 @@ def _table_pose(
     return ComparedPose(name, pose, joint, claimed, sigma, _joint_sigma(adjusted, (name,), np.eye(6), joint))
 
 
-def _camera_pose(
-    adjusted: Adjustment, station: Station, found: Calibration, axes: _Axes, at: Mapping[tuple[str, str], int],
-    cov: FloatArray, camera_id: str, is_main: bool,
-) -> ComparedPose:  # fmt: skip
+def _camera_pose(both: _Both, station: Station, camera_id: str, is_main: bool) -> ComparedPose:
+    adjusted, found, axes, at, cov = both.adjusted, both.found, both.axes, both.at, both.cov
     k, names = camera_id.lower(), axes.camera if is_main else np.eye(3)
     own = found.mount_from_station.compose(found.station_from_camera(camera_id))
     pose = Pose3(Rot3(axes.mount @ own.rotation().matrix() @ names.T), axes.mount @ own.translation())
@@ -274,10 +280,10 @@ def _camera_pose(
     turns = np.radians(found.rotations[f"C_{k}^b"].sigma_deg)
     claimed = np.concatenate([abs(names) @ turns, abs(axes.mount) @ along])
     joint = _mount_from_camera(adjusted, station, camera_id)
-    both = ("mount_from_station", station.station_id), ("station_from_camera", camera_id)
-    station_from_camera = _pose(adjusted, both[1])
+    names_of = ("mount_from_station", station.station_id), ("station_from_camera", camera_id)
+    station_from_camera = _pose(adjusted, names_of[1])
     J = np.hstack([station_from_camera.inverse().AdjointMap(), np.eye(6)])
-    sigmas = _joint_sigma(adjusted, both, J, joint)
+    sigmas = _joint_sigma(adjusted, names_of, J, joint)
     return ComparedPose(("mount_from_camera", camera_id), pose, joint, claimed, sigma, sigmas)
 
 

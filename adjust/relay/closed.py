@@ -14,7 +14,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import fields, is_dataclass, replace
-from typing import Any
 
 import numpy as np
 from gtsam import Pose3, Rot3
@@ -116,7 +115,7 @@ def _frames_of(survey: Survey) -> Iterator[FrameRef]:
         yield from _frames_in(getattr(survey, kind))
 
 
-def _frames_in(value: Any) -> Iterator[FrameRef]:
+def _frames_in(value: object) -> Iterator[FrameRef]:
     if isinstance(value, FrameRef):
         yield value
     elif isinstance(value, tuple):

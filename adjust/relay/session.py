@@ -23,6 +23,7 @@ from adjust.observations.factors import pose_prior_factor
 from adjust.observations.pairs import NoiseCache, checked_arrays, native_factor
 from adjust.pose_network.from_survey import network_from_survey
 from adjust.pose_network.network import PoseNetwork
+from adjust.pose_network.start import carried
 from adjust.relay.growth import Batch, Growth, Tree, moved_over
 
 _SHARE = 0.3
@@ -168,32 +169,13 @@ class NetworkSession:
             fresh.add(pair.pair_id)
             if pair.a.kind != "station" or pair.b.kind != "station" or pair.a.frame_id == pair.b.frame_id:
                 raise SurveyError(f"pair {pair.pair_id!r} does not join two stations")
-        ordered = sorted((p for p in pairs if isinstance(p.b_from_a, Pose3)), key=lambda p: float(np.trace(p.cov)))
-        start: dict[str, Pose3] = {}
-        while True:
-            found = next((p for p in ordered if self._known(p.a.frame_id, start) != self._known(p.b.frame_id, start)),
-                         None)  # fmt: skip
-            if found is None:
-                break
-            a, b = found.a.frame_id, found.b.frame_id
-            measured = found.b_from_a
-            if not isinstance(measured, Pose3):
-                continue
-            if self._known(b, start):
-                start[a] = self._pose_of(b, start).compose(measured)
-            else:
-                start[b] = self._pose_of(a, start).compose(measured.inverse())
         named = dict.fromkeys(r.frame_id for p in pairs for r in (p.a, p.b))
-        lost = [s for s in named if not self._known(s, start)]
+        known = {s: self.estimate(s) for s in named if s in self._index}
+        start = carried(known, (p for p in pairs if isinstance(p.b_from_a, Pose3)))
+        lost = [s for s in named if s not in known and s not in start]
         if lost:
             raise SurveyError(f"no pair with a translation ties {', '.join(lost[:8])} to the network; measure one")
         return [s for s in named if s in start], start
-
-    def _known(self, station: str, start: dict[str, Pose3]) -> bool:
-        return station in self._index or station in start
-
-    def _pose_of(self, station: str, start: dict[str, Pose3]) -> Pose3:
-        return start[station] if station in start else self.estimate(station)
 
     def _moved(self, ends: list[int], new: set[int]) -> dict[str, tuple[float, float]]:
         """Stations that moved since last asked, found by spreading from the ends of the added pairs."""

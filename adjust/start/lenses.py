@@ -17,7 +17,7 @@ from adjust.lenses.models import (
 )
 from adjust.model.errors import SurveyError
 from adjust.model.survey import Camera, FloatArray
-from adjust.native.lenses import fit_lens
+from adjust.native.lenses import Lens, fit_lens
 from adjust.native.views import homographies
 from adjust.start.closed_forms.absolute_pose import best_poses
 from adjust.start.closed_forms.zhang import pinhole_from_homographies
@@ -245,9 +245,8 @@ class _LensSearch:
         x, uv = (np.concatenate([getattr(s, name) for s in images]) for name in ("x", "uv"))
         ptr = np.cumsum([0] + [len(s.x) for s in images])
         values, poses = start.copy(), poses.copy()
-        squares, cov = fit_lens(
-            self.model.kind, values, self.constants, np.ascontiguousarray(directions), ptr, x, uv, iterations, poses
-        )
+        lens = Lens(self.model.kind, values, self.constants)
+        squares, cov = fit_lens(lens, np.ascontiguousarray(directions), ptr, x, uv, iterations, poses)
         median = float(np.median(squares))  # of a 2-D normal's square it is s^2 ln 4
         return _Fit(values, poses, float(np.sqrt(median)), cov * (median / np.log(4.0)))
 

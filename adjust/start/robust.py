@@ -14,10 +14,10 @@ from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.solver import Solved, SolveOptions, solve
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.precision.precision import Precision, image_residuals
-from adjust.testing.criteria import cauchy_weights, cautious, limits, typical_factor
+from adjust.testing.criteria import cauchy_weights, limits, typical_factor
+from adjust.testing.gross_errors import Search, State, Verdicts, all_at_once, one_group
 
 _FAMILY = 0.001
-_ROUNDS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,29 +42,23 @@ def scale(test: FloatArray) -> float:
 def screen(graph: AdjustmentGraph, solved: Solved, options: SolveOptions) -> Screened:
     """Look for gross errors; ends in a least squares of the points that are left. The graph keeps them."""
     given = graph.used()
-    used = given.copy()
-    precision = Precision(graph, solved)
-    test = image_residuals(precision).test
-    if not cautious(test[used], np.full(int(used.sum()), 2)) and _suspects(test, used).any():
+    freedom = np.where(given, 2, 0)
+
+    def tested(solved: Solved, used: BoolArray) -> tuple[Screened, Verdicts]:
+        precision = Precision(graph, solved)
+        return Screened(solved, precision, used), one_group(image_residuals(precision).test, freedom, used)
+
+    def solved_without(used: BoolArray, before: State[Screened] | None) -> tuple[Screened, Verdicts]:
+        graph.set_weights(used.astype(np.float64))
+        return tested(solve(graph, options, start=None if before is None else before.solution.solved.values), used)
+
+    search = Search(solved_without, _FAMILY, all_at_once, many=1)
+    state = search.judged(*tested(solved, given))
+    if state.failing.any() and not state.tests.cautious.any():
+        used = given.copy()
         start = _reweighted(graph, solved, used, options)
-        for _ in range(_ROUNDS):
-            solved = solve(graph, options, start=start)
-            precision = Precision(graph, solved)
-            now = given & ~_suspects(image_residuals(precision).test, given)
-            if (now == used).all():
-                break
-            used = now
-            graph.set_weights(used.astype(np.float64))
-            start = solved.values
-        else:  # still changing its mind: what is returned is the least squares of what it says is used
-            solved = solve(graph, options, start=start)
-            precision = Precision(graph, solved)
-    return Screened(solved, precision, used)
-
-
-def _suspects(test: FloatArray, used: BoolArray) -> BoolArray:
-    factor = scale(test[used])
-    return np.asarray(used & (test > limit(int(used.sum())) * factor))
+        state = search.settled(search.judged(*tested(solve(graph, options, start=start), used)))
+    return state.solution
 
 
 def _reweighted(graph: AdjustmentGraph, solved: Solved, used: BoolArray, options: SolveOptions) -> gtsam.Values:

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from adjust.model.errors import SurveyError
-from adjust.model.result import Adjustment, ParameterName
+from adjust.model.result import Adjustment, ParameterName, VarianceComponents
 from adjust.model.survey import FloatArray, IntArray
-from adjust.statistics.result import BudgetEntry, BudgetLine, VarianceComponents
+from adjust.statistics.result import BudgetEntry, BudgetLine
 from adjust.statistics.system import LinearSystem, linear_system
 from adjust.statistics.weakness import covariance_columns
 from adjust.testing.distributions import norm, student

@@ -26,6 +26,7 @@ from adjust.statistics.normal import Normal
 from adjust.statistics.result import Change, ChangeShift
 from adjust.statistics.system import LinearSystem
 from adjust.testing.distributions import chi2, fisher, norm
+from adjust.testing.quadratic_forms import pseudo_squares
 
 _SEEN = 1e-4
 """Share of a column that no unknown takes over, below which it is not told from rounding."""
@@ -118,30 +119,22 @@ class ChangeSearch:
         candidates = self.candidates  # M and g are given what was found, step by step
         omega, left = self.adjustment.omega, self.adjustment.redundancy
         while len(out) < _MOST:
-            best: tuple[float, _Candidates, int, FloatArray, FloatArray] | None = None
             named = Counter((x.kind, x.name, x.what) for x in out)
-            for c in candidates:
-                if named[c.unit.kind, c.unit.name, c.unit.what] >= _MOST_OF_ONE:
-                    continue
-                T, q = _statistics(c.M, c.g)
-                z = np.where(q > 0, _normal_score(T, np.maximum(q, 1)), -np.inf)
-                j = int(z.argmax()) if len(z) else -1
-                if j >= 0 and z[j] > (best[0] if best is not None else -np.inf):
-                    best = float(z[j]), c, j, c.M[j], c.g[j]
+            best = _clearest([c for c in candidates if named[c.unit.kind, c.unit.name, c.unit.what] < _MOST_OF_ONE])
             if best is None:
                 break
-            _, c, j, M, g = best
-            (T,), (q,) = _statistics(M[None], g[None])
-            p = float(chi2.sf(T, max(q, 1)))
+            c, j, T, q = best
+            p, spread = float(chi2.sf(T, max(q, 1))), 1.0
             if relative and left > q and omega > T:
-                p = max(p, float(fisher.sf(T / q / ((omega - T) / (left - q)), q, left - q)))
+                spread = (omega - T) / (left - q)
+                p = max(p, float(fisher.sf(T / q / spread, q, left - q)))
             if not p < level:
                 break
-            spread = (omega - T) / (left - q) if relative and left > q and omega > T else 1.0
-            out.append(_change(c, j, M, g, float(T), int(q), p, max(spread, 1.0)))
+            u, shifts = c.unit, _shifts(c, j, T, max(spread, 1.0))
+            out.append(Change(u.kind, u.name, u.what, u.epochs[j + 1] if len(u.epochs) > 1 else "", T, q, p, shifts))
             chosen.append(self._chosen(c, j, chosen))
             candidates = [_given(x, chosen[-1]) for x in candidates]
-            omega, left = omega - float(T), left - int(q)
+            omega, left = omega - T, left - q
         return tuple(out)
 
     # -- what may change ---------------------------------------------------------------------------------------------
@@ -302,32 +295,33 @@ def _given(c: _Candidates, known: _Chosen) -> _Candidates:
     return replace(c, M=0.5 * (M + M.transpose(0, 2, 1)), g=c.g - K @ known.amounts)
 
 
-def _statistics(M: FloatArray, g: FloatArray) -> tuple[FloatArray, IntArray]:
-    """T (J,) and its degrees of freedom (J,)."""
-    values, vectors = np.linalg.eigh(M)
-    seen = values > _SEEN
-    along = np.einsum("jqk,jq->jk", vectors, g)
-    return np.where(seen, along**2 / np.where(seen, values, 1.0), 0.0).sum(axis=1), seen.sum(axis=1)
-
-
 def _normal_score(T: FloatArray, q: IntArray) -> FloatArray:
     """As a standard normal quantity, also where p is too small for a number (Wilson and Hilferty 1931)."""
     c = 2.0 / (9.0 * q)
     return np.asarray(((T / q) ** (1.0 / 3.0) - 1.0 + c) / np.sqrt(c))
 
 
-def _change(
-    c: _Candidates, j: int, M: FloatArray, g: FloatArray, T: float, q: int, p: float, spread: float
-) -> Change:
-    u = c.unit
-    epoch = u.epochs[j + 1] if len(u.epochs) > 1 else ""
+def _clearest(candidates: Sequence[_Candidates]) -> tuple[_Candidates, int, float, int] | None:
+    """Whose change is the least likely, which of its changes, its statistic and degrees of freedom."""
+    best, most = None, -np.inf
+    for c in candidates:
+        T, q = pseudo_squares(c.g, c.M, _SEEN)
+        z = np.where(q > 0, _normal_score(T, np.maximum(q, 1)), -np.inf)
+        j = int(z.argmax()) if len(z) else -1
+        if j >= 0 and z[j] > most:
+            best, most = (c, j, float(T[j]), int(q[j])), float(z[j])
+    return best
+
+
+def _shifts(c: _Candidates, j: int, T: float, spread: float) -> tuple[ChangeShift, ...]:
+    """The components that explain it, with variances ``spread`` times the a priori ones."""
+    M, g = c.M[j], c.g[j]
     index = _explaining(M, g, T, spread)
     inverse = np.linalg.pinv(M[np.ix_(index, index)], rcond=1e-9, hermitian=True)
     amount, sigma = -inverse @ g[index] * c.scale[j, index], np.sqrt(spread * np.diag(inverse)) * c.scale[j, index]
     order = np.argsort(-np.abs(amount) / np.maximum(sigma, 1e-300), kind="stable")
-    said = [u.components[i] for i in index]
-    shifts = tuple(ChangeShift(said[i][0], said[i][1], float(amount[i]), float(sigma[i])) for i in order)
-    return Change(u.kind, u.name, u.what, epoch, T, q, p, shifts)
+    said = [c.unit.components[i] for i in index]
+    return tuple(ChangeShift(said[i][0], said[i][1], float(amount[i]), float(sigma[i])) for i in order)
 
 
 def _explaining(M: FloatArray, g: FloatArray, T: float, spread: float) -> list[int]:

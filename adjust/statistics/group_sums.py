@@ -13,7 +13,6 @@ equations; the covariance of the estimated factors, relative to themselves, is 2
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy
@@ -25,6 +24,9 @@ from adjust.statistics.system import LinearSystem
 
 _SMALL = 500
 """Unknowns up to which the normal matrices of the groups are full ones."""
+
+
+Matrix = FloatArray | sparse.csr_matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +46,7 @@ class GroupSums:
     N: sparse, or dense in small systems, which is several times faster.
     """
 
-    N: tuple[Any, ...]
+    N: tuple[Matrix, ...]
     b: FloatArray
     c: FloatArray
     n: FloatArray
@@ -103,7 +105,7 @@ def group_sums(
 def moments(sums: GroupSums, theta: FloatArray) -> Moments:
     """Squares, redundancies and information at variance factors ``theta`` (G,)."""
     G, n = len(theta), sums.b.shape[1]
-    K: list[Any] = [N / t for N, t in zip(sums.N, theta, strict=True)]
+    K: list[Matrix] = [N / t for N, t in zip(sums.N, theta, strict=True)]
     b = sums.b / theta[:, None]
     whitened = [_whitened(m, theta) for m in sums.mixed]
     of_datum = sums.datum.T @ sums.datum
@@ -137,7 +139,7 @@ def _inverse(N: FloatArray) -> FloatArray:
     return np.asarray(full * np.outer(scale, scale))
 
 
-def _own_trace(N: Any, Q: FloatArray) -> float:
+def _own_trace(N: Matrix, Q: FloatArray) -> float:
     """tr(Q N) of a symmetric N."""
     if not sparse.issparse(N):
         return float(np.vdot(N, Q))
@@ -151,7 +153,7 @@ def _whitened(m: MixedBlock, theta: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(m.cov) * np.outer(d, d))
 
 
-def _products(X: Sequence[FloatArray], K: Sequence[Any], Q: FloatArray, mixed: bool) -> FloatArray:
+def _products(X: Sequence[FloatArray], K: Sequence[Matrix], Q: FloatArray, mixed: bool) -> FloatArray:
     """1/2 [tr(Q K_h Q K_g) + tr(Q K_h' Q K_g)], (G, G); both are the same for symmetric K."""
     G = len(X)
     out = np.zeros((G, G))

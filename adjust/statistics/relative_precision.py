@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from gtsam import Pose3
 
-from adjust.graph.assembly import GraphBuilder, values_of
+from adjust.graph.assembly import values_of
+from adjust.graph.building import GraphBuilder
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment, ParameterName

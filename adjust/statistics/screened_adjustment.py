@@ -8,11 +8,10 @@ import numpy as np
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.graph.assembly import StartValues, values_of
 from adjust.model.errors import NotConvergedError, SurveyError, listed
-from adjust.model.result import Adjustment
+from adjust.model.result import Adjustment, Component, VarianceComponents
 from adjust.model.survey import Survey
 from adjust.statistics.outliers.search import OutlierSearch, SearchOptions, disagreeing_pairs, search_outliers
 from adjust.statistics.outliers.watched import watchable
-from adjust.statistics.result import Component, VarianceComponents
 from adjust.statistics.scaling import scaled_survey
 from adjust.statistics.variance_components import ComponentOptions, Scaled, estimate_variance_components
 from adjust.testing.criteria import limits

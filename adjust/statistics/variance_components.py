@@ -6,19 +6,18 @@ would leave the positive factors or go far, the scoring of their logarithms. In 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.graph.assembly import StartValues, values_of
 from adjust.model.errors import SurveyError
-from adjust.model.result import Adjustment
+from adjust.model.result import Adjustment, Component, VarianceComponents
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.precision.precision import precision_of
 from adjust.statistics.group_sums import GroupSums, Moments, group_sums, moments
 from adjust.statistics.normal import DENSE
-from adjust.statistics.result import Component, VarianceComponents
 from adjust.statistics.scaling import scaled_survey
 from adjust.statistics.system import LinearSystem, linear_system, mixed_blocks
 from adjust.testing.distributions import chi2
@@ -110,8 +109,10 @@ def _totals(
 ) -> VarianceComponents:
     """The last step's components with factors over the a priori variances."""
     components = tuple(
-        _component(c.group, total[c.group], c.sigma / c.factor * total[c.group], c.n, c.redundancy, c.omega,
-                   "vanished" if c.status == "estimated" and total[c.group] < 10.0 * _VANISHED else c.status, options)
+        _tested(Component(
+            c.group, total[c.group], c.sigma / c.factor * total[c.group], c.n, c.redundancy, c.omega,
+            "vanished" if c.status == "estimated" and total[c.group] < 10.0 * _VANISHED else c.status,
+        ), options)
         for c in found.components
     )  # fmt: skip
     return VarianceComponents(components, found.estimated, found.correlation, found.unseparable, iterations, converged,
@@ -140,7 +141,8 @@ def _simplified(adjustment: Adjustment, wanted: Sequence[str], options: Componen
         status = "estimated" if enough else "no redundancy" if g.group in wanted else "fixed"
         factor = max(g.factor, _VANISHED) if enough else 1.0
         sigma = factor * np.sqrt(2.0 / g.redundancy) if enough else np.nan
-        out.append(_component(g.group, factor, float(sigma), g.n_observations, g.redundancy, g.omega, status, options))
+        component = Component(g.group, factor, float(sigma), g.n_observations, g.redundancy, g.omega, status)
+        out.append(_tested(component, options))
     names = tuple(c.group for c in out if c.status == "estimated")
     return VarianceComponents(tuple(out), names, np.eye(len(names)), (), 1, True, "foerstner")
 
@@ -242,8 +244,9 @@ def _named(
         status = "fixed" if not chosen[g] else "no redundancy"
         if at >= 0:
             status = "unseparable" if len(shared[at]) > 1 else "vanished" if found.vanished[g] else "estimated"
-        out.append(_component(name, float(found.theta[g]), float(sigma), int(counts[g]), float(found.moments.r[g]),
-                              float(found.moments.q[g]), status, options))  # fmt: skip
+        component = Component(name, float(found.theta[g]), float(sigma), int(counts[g]), float(found.moments.r[g]),
+                              float(found.moments.q[g]), status)  # fmt: skip
+        out.append(_tested(component, options))
     d = np.sqrt(np.diag(cov))
     correlation: FloatArray = np.asarray(cov / np.outer(d, d), dtype=float)
     return VarianceComponents(
@@ -252,16 +255,13 @@ def _named(
     )  # fmt: skip
 
 
-def _component(
-    group: str, factor: float, sigma: float, n: int, redundancy: float, omega: float, status: str,
-    options: ComponentOptions,
-) -> Component:  # fmt: skip
-    """Limits and test from chi-square with the equivalent degrees of freedom (Satterthwaite 1946)."""
-    if status == "vanished" or not (np.isfinite(sigma) and sigma > 0.0 and factor > 0.0):
-        nan = float("nan")
-        return Component(group, factor, sigma, n, redundancy, omega, nan, nan, nan, nan, status)
+def _tested(given: Component, options: ComponentOptions) -> Component:
+    """With limits and test from chi-square with the equivalent degrees of freedom (Satterthwaite 1946)."""
+    factor, sigma = given.factor, given.sigma
+    if given.status == "vanished" or not (np.isfinite(sigma) and sigma > 0.0 and factor > 0.0):
+        return given
     freedom = 2.0 * factor**2 / sigma**2
     low, high = chi2.ppf([0.5 - 0.5 * options.level, 0.5 + 0.5 * options.level], freedom)
     p = 2.0 * min(float(chi2.cdf(factor * freedom, freedom)), float(chi2.sf(factor * freedom, freedom)))
-    return Component(group, factor, sigma, n, redundancy, omega, freedom, min(1.0, p), float(factor * freedom / high),
-                     float(factor * freedom / low), status)  # fmt: skip
+    return replace(given, freedom=freedom, p=min(1.0, p), lower=float(factor * freedom / high),
+                   upper=float(factor * freedom / low))  # fmt: skip

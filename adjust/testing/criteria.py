@@ -134,7 +134,9 @@ def sidak(family_alpha: float, n_tests: int) -> float:
 
 def limits(family_alpha: float, freedom: IntArray, n_tests: int) -> FloatArray:
     """What one of ``n_tests`` chi-square tests of these degrees of freedom (n,) exceeds at Sidak's level."""
-    return np.asarray(chi2.isf(sidak(family_alpha, n_tests), np.maximum(freedom, 1)))
+    some = np.maximum(freedom, 1)
+    every = chi2.isf(sidak(family_alpha, n_tests), np.arange(1, int(some.max(initial=1)) + 1))  # there are few kinds
+    return np.asarray(every[some - 1])
 
 
 @lru_cache(maxsize=1024)

@@ -128,6 +128,11 @@ def worst_first(state: State[S], returned: BoolArray) -> tuple[BoolArray, BoolAr
     return none, state.fitting & ~returned
 
 
+def all_at_once(state: State[S], returned: BoolArray) -> tuple[BoolArray, BoolArray]:
+    """Everything that fails goes, and everything that fits comes back."""
+    return state.failing, state.fitting & ~returned
+
+
 def best_back_first(state: State[S], returned: BoolArray) -> tuple[BoolArray, BoolArray]:
     """What fits best comes back; when none does, the worst goes."""
     none, back = np.zeros(len(returned), dtype=np.bool_), state.fitting & ~returned

@@ -7,7 +7,7 @@ to its redundancy r, and their squares to half its variance.
 import numpy as np
 import scipy
 
-from adjust.model.survey import FloatArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.testing.distributions import chi2, norm
 
 _STEPS = 100
@@ -16,14 +16,30 @@ _DETERMINED = 1e-9
 _NEAR = 1e-4
 
 
+def pseudo_half(M: FloatArray, least: float, share: float = 0.0) -> tuple[FloatArray, IntArray]:
+    """H (..., n, n) with ``H H' = M^+`` and the rank (...,) of symmetric matrices M.
+
+    Open are directions whose eigenvalue is not above ``least``, nor above that ``share`` of the largest one.
+    """
+    values, vectors = np.linalg.eigh(M)
+    seen = values > np.maximum(least, share * values.max(axis=-1, keepdims=True, initial=0.0))
+    half = vectors * np.where(seen, 1.0 / np.sqrt(np.where(seen, values, 1.0)), 0.0)[..., None, :]
+    return half, seen.sum(axis=-1)
+
+
+def pseudo_squares(g: FloatArray, M: FloatArray, least: float, share: float = 0.0) -> tuple[FloatArray, IntArray]:
+    """``g' M^+ g`` (...,) of g (..., n), and the rank of M."""
+    half, rank = pseudo_half(M, least, share)
+    return np.asarray((np.einsum("...qk,...q->...k", half, g) ** 2).sum(axis=-1)), rank
+
+
 def pseudo_square(d: FloatArray, Q: FloatArray) -> tuple[float, int, FloatArray]:
     """``d' Q^+ d``, the rank of Q, and ``Q^+`` (n, n), of d (n,) with covariance Q; in sigmas, as units do not mix."""
     s = np.sqrt(np.maximum(np.diag(Q), 1e-300))
-    values, vectors = np.linalg.eigh(Q / np.outer(s, s))
-    kept = values > _DETERMINED * max(1.0, float(values.max(initial=0.0)))
-    half = vectors[:, kept] / np.sqrt(values[kept]) / s[:, None]
+    half, rank = pseudo_half(Q / np.outer(s, s), _DETERMINED, _DETERMINED)
+    half = half / s[:, None]
     y = half.T @ d
-    return float(y @ y), int(kept.sum()), half @ half.T
+    return float(y @ y), int(rank), half @ half.T
 
 
 def pseudo_square_beside(d: FloatArray, Q: FloatArray, held: FloatArray) -> tuple[float, int]:

@@ -17,11 +17,9 @@ from scipy.stats import chi2
 from adjust.graph.assembly import values_of
 from adjust.lenses.compared import (
     Difference,
-    covered,
-    invertible,
+    compared_pixels,
     lens_difference,
     optics_of,
-    pixel_grid,
     projection_covariance,
     worst_sigma,
 )
@@ -34,8 +32,6 @@ from survey.project import Project
 from survey.project.exclusions import Exclusion, Name
 from survey.project.reading import leaving_out
 from survey.solution.quantities import scale_of
-
-_CELLS = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,10 +198,7 @@ def _lens(camera: Camera, parts: Sequence[Adjustment], factors: Sequence[float],
     if not free:
         return f"camera {camera.camera_id}: its lens is held"
     lenses = [optics_of(camera, p.estimates) for p in parts]
-    uv = pixel_grid(camera.image_size, _CELLS)
-    uv = uv[invertible(lenses[0], uv) & invertible(lenses[1], uv)]
-    observed = np.concatenate([b.uv for half in seen for b in half])
-    near = covered(uv, observed, camera.image_size[0] / _CELLS)
+    uv, near = compared_pixels(lenses, camera.image_size, np.concatenate([b.uv for half in seen for b in half]))
     if near.sum() < 6:
         return f"camera {camera.camera_id}: its image points cover too little of the image"
     found = lens_difference(lenses[0], lenses[1], uv, distance, near)

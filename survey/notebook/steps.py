@@ -17,7 +17,7 @@ from survey.notebook.html import heading, html_table
 from survey.notebook.solution import Solution
 from survey.project import AdjustmentOptions, Project
 from survey.project import read as read_project
-from survey.project.project import lines_text, observed, owners
+from survey.project.project import lines_text, observed
 
 
 def read(folder: str | Path) -> Project:
@@ -76,11 +76,6 @@ class Problem:
     def observed(self) -> dict[str, int]:
         """How many observations of each kind there are."""
         return observed(self.survey, sum(len(b.uv) for b in self.project.spots))
-
-    @property
-    def owners(self) -> dict[str, int]:
-        """How many cameras, stations, points ... there are."""
-        return owners(self.survey)
 
     def solve(self, *, progress: bool = False) -> Solution:
         """The next step; see :func:`solve`."""

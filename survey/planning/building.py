@@ -13,7 +13,7 @@ from adjust.model.errors import SurveyError, listed
 from adjust.model.observations import Coordinates, Distance, ImageBlock, Pair, PositionRef, TableReading
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import Camera, FloatArray, IntArray, Point, PointParameter, PoseParameter, Station, Survey
-from survey.planning.plan_file import ByHand, Measurements, Moment, Moments, Plan
+from survey.planning.plan_file import ByHand, Measurements, Moment, Moments, NewPoint, Plan
 from survey.planning.plan_readings import Terrestrial, lengths_between, terrestrial_candidates, with_usual_sigmas
 from survey.project import Project
 
@@ -322,7 +322,7 @@ def _candidates(
             continue
         out.append(Candidate(_epoch_text(m), "epoch", own, tuple(_readings(m, project))))
     for new in plan.candidates.points:
-        found = _new_beacon(whole, start, new.name, new.x_in_world, new.sigma, plan, project, planned)
+        found = _new_beacon(whole, start, new, plan, project, planned)
         out += [found] if found is not None else []
         blind += [new.name] if found is None else []
     c: Measurements = plan.candidates
@@ -347,18 +347,17 @@ def _epoch_text(m: Moment) -> str:
 
 
 def _new_beacon(
-    whole: Survey, start: StartValues, name: str, x: FloatArray, sigma: float, plan: Plan, project: Project,
-    planned: Sequence[Moment],
-) -> Candidate | None:  # fmt: skip
+    whole: Survey, start: StartValues, new: NewPoint, plan: Plan, project: Project, planned: Sequence[Moment]
+) -> Candidate | None:
     """A beacon seen in the planned images that show world points, or surveyed."""
-    point, n = Point(name, PointParameter(x)), len(whole.points)
+    point, n = Point(new.name, PointParameter(new.x_in_world)), len(whole.points)
     sigma_px = _sigma_px(plan, project)
     blocks = tuple(
         _block(c, m.epoch_id, None, np.array([n]), sigma_px) for m in planned if m.points for c in m.cameras
     )
-    one = Candidate(name, "beacon", blocks, points=(point,))
+    one = Candidate(new.name, "beacon", blocks, points=(point,))
     seen = predict(with_candidates(whole, [one]), start, blocks, plan.seeing)
-    surveyed = (_coordinates(PositionRef(name), sigma),) if np.isfinite(sigma) else ()
+    surveyed = (_coordinates(PositionRef(new.name), new.sigma),) if np.isfinite(new.sigma) else ()
     if not seen:
         return None
     return replace(one, image_blocks=seen, coordinates=surveyed)

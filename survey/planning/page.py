@@ -5,6 +5,7 @@ from gtsam import Pose3
 from markupsafe import Markup
 
 from adjust.design import group_redundancy
+from adjust.precision.precision import precision_of
 from survey.planning.navigation import NavigationOutcome
 from survey.planning.summary import PlanningOutcome, meets, people, pose_sigmas, tolerance_values
 from survey.report import drawing as d
@@ -96,7 +97,7 @@ def _seen(o: PlanningOutcome) -> Markup:
 
 
 def _sigmas(o: PlanningOutcome) -> Markup:
-    by_name = o.expected.precision.unknowns.by_name
+    by_name = precision_of(o.expected).unknowns.by_name
     rows = []
     for name in (n for n in by_name if len(n) < 3):
         estimate, unknown = o.expected.estimates[name], by_name[name]

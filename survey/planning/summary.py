@@ -18,6 +18,7 @@ from adjust.design import (
 from adjust.design.pose_budget import PoseTolerance
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray
+from adjust.precision.precision import precision_of
 from survey.folder.plain import plain
 from survey.planning.building import Planned
 from survey.planning.navigation import NavigationOutcome
@@ -113,7 +114,7 @@ def plan_summary(o: PlanningOutcome) -> dict[str, Any]:
 
 
 def _sigmas(o: PlanningOutcome) -> dict[str, dict[str, float]]:
-    by_name = o.expected.precision.unknowns.by_name
+    by_name = precision_of(o.expected).unknowns.by_name
     out = {}
     for name, unknown in by_name.items():
         estimate = o.expected.estimates[name]
@@ -231,7 +232,7 @@ def plan_text(o: PlanningOutcome) -> str:
 
 
 def _sigma_lines(o: PlanningOutcome) -> list[str]:
-    by_name = o.expected.precision.unknowns.by_name
+    by_name = precision_of(o.expected).unknowns.by_name
     out = ["  expected sigmas (a priori)"]
     names = [n for n in by_name if len(n) < 3]
     for name in names[: 4 * _MOST]:

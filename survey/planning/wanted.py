@@ -7,6 +7,7 @@ from adjust.design import Component, components_of, shared_names
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
+from adjust.precision.precision import precision_of
 from survey.folder.text import suggestion
 from survey.planning.plan_file import Requirement
 
@@ -21,7 +22,7 @@ def wanted_components(expected: Adjustment, patterns: Sequence[str]) -> tuple[Co
     shared = components_of(expected, shared_names(expected))
     if not patterns or EVERYTHING in patterns:
         return shared
-    every = components_of(expected, tuple(expected.precision.unknowns.by_name))
+    every = components_of(expected, tuple(precision_of(expected).unknowns.by_name))
     chosen: dict[str, Component] = {}
     for pattern in patterns:
         found = [c for c in every if matches(c, pattern, expected.survey)]

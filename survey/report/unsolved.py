@@ -7,9 +7,8 @@ import numpy as np
 from gtsam import Pose3
 from markupsafe import Markup
 
-from adjust.diagnosis.diagnosis import Diagnosis
-from adjust.graph.divergence import Stopped, UnknownState
 from adjust.model.errors import DiagnosedError, IndeterminateError, NotConvergedError, SurveyError
+from adjust.model.stopped import Stopped, UnknownState
 from survey.folder.plain import plain
 from survey.report.language import group_name, message, speaking, t
 from survey.report.markup import count, document, element, general, joined, note, part, section, table
@@ -37,8 +36,7 @@ def unsolved_files(error: SurveyError, run: RunInfo, in_language: str = "en") ->
 def unsolved_dict(error: SurveyError, run: RunInfo) -> dict[str, Any]:
     """The message, the causes that were tried, the state where it stopped; as plain values."""
     stopped = _stopped(error)
-    told = error.diagnosis.told() if isinstance(error, DiagnosedError) and isinstance(error.diagnosis, Diagnosis) \
-        else []  # fmt: skip
+    told = error.diagnosis.told() if isinstance(error, DiagnosedError) else []
     found = {
         "format": 1,
         "summary": {"folder": run.folder, "title": run.title, "converged": False, "date": run.date,
@@ -55,7 +53,7 @@ def unsolved_dict(error: SurveyError, run: RunInfo) -> dict[str, Any]:
 def _stopped(error: BaseException | None) -> Stopped | None:
     """Of the first error of its chain of causes that knows it."""
     while error is not None:
-        if isinstance(error, NotConvergedError) and isinstance(error.stopped, Stopped):
+        if isinstance(error, NotConvergedError) and error.stopped is not None:
             return error.stopped
         error = error.__cause__
     return None

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from adjust.epochs.states import datum_carriers, open_directions
 from adjust.model.result import Adjustment, Estimate, GroupSummary, ImageResiduals, ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.precision.precision import in_conditions
+from adjust.statistics.score import SharedLens, shared_lenses
 from adjust.testing.distributions import norm
 from adjust.testing.significance import Significance, significance_of_changes, significances
 from survey.folder.plain import plain
@@ -23,9 +24,6 @@ from survey.solution.records import Form, Records
 from survey.solution.statistics import Statistics
 from survey.solution.statistics_dict import statistics_dict
 from survey.solution.verdict import findings, fit_of, suspects, verdict
-
-if TYPE_CHECKING:
-    from adjust.diagnosis.effects.ties import SharedLens
 
 CORRELATION_LIMIT = 0.95
 # parameters for which "zero" is no sensible hypothesis
@@ -218,7 +216,7 @@ def _lens(estimate: Estimate, model: str, scale: Scale) -> dict[str, Any]:
 def _cameras(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, Any]:
     sums = _sums_of_blocks(adjustment.image_residuals)
     out: dict[str, Any] = {}
-    shared = _shared_of(adjustment, scale)
+    shared = {s.camera: s for s in shared_lenses(adjustment, scale.sigmas == "a_posteriori")}
     for camera in adjustment.survey.cameras:
         entry: dict[str, Any] = {"station": camera.station_id, "image_size_px": list(camera.image_size)}
         lens = adjustment.estimates.get(("lens", camera.camera_id))
@@ -329,16 +327,7 @@ def _changes(adjustment: Adjustment, camera_id: str, kind: str, key: str, scale:
     return {key: parts, "significance": {} if test is None else {test.term: _test(test)}}
 
 
-def _shared_of(adjustment: Adjustment, scale: Scale) -> "dict[str, SharedLens]":
-    """By camera the lens that it shares."""
-    if not any(c.lens.shared for c in adjustment.survey.cameras):
-        return {}
-    from adjust.diagnosis.effects.ties import shared_lenses  # here: most surveys need nothing of a diagnosis
-
-    return {s.camera: s for s in shared_lenses(adjustment, scale.sigmas == "a_posteriori")}
-
-
-def _shared(found: "SharedLens", scale: Scale) -> dict[str, Any]:
+def _shared(found: SharedLens, scale: Scale) -> dict[str, Any]:
     """Whose parameters they are, by how much its own would differ from them, and whether they do."""
     name, k = ("lens", found.camera), len(found.names)
     differences = Estimate(name, found.difference, found.names, found.units, found.cov, ("free",) * k)

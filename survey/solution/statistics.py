@@ -7,7 +7,7 @@ from itertools import islice
 import numpy as np
 from gtsam import Pose3
 
-from adjust.model.result import Adjustment, Estimate, ParameterName
+from adjust.model.result import Adjustment, Decision, Estimate, ParameterName, VarianceComponents
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import Beside
 from adjust.precision.precision import precision_of
@@ -20,10 +20,8 @@ from adjust.statistics.result import (
     BudgetEntry,
     Consistency,
     Correlation,
-    Decision,
     RelativePrecision,
     Reliability,
-    VarianceComponents,
     WeakDirection,
 )
 from adjust.statistics.system import LinearSystem

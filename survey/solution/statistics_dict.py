@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from adjust.model.result import Adjustment, ParameterName
+from adjust.model.result import Adjustment, Component, ParameterName
 from adjust.statistics.reliability import observation_name
-from adjust.statistics.result import BudgetEntry, Component, Consistency, Influence, RelativePrecision
+from adjust.statistics.result import BudgetEntry, Consistency, Influence, RelativePrecision
 from survey.solution.quantities import Scale, key_of, sigma_unit_for_people
 from survey.solution.statistics import Statistics
 from survey.solution.tolerances import Verdict, coverage

@@ -6,12 +6,11 @@ import numpy as np
 from gtsam import Rot3
 
 from adjust.lenses.compared import (
+    GRID,
     Optics,
-    covered,
-    invertible,
+    compared_pixels,
     lens_difference,
     optics_of,
-    pixel_grid,
     projection_covariance,
     worst_sigma,
 )
@@ -25,8 +24,6 @@ from survey.folder.text import suggestion
 from survey.solution.earlier.changes import Snapshot
 from survey.solution.earlier.runs import load_run
 from survey.workbench.jobs import Jobs
-
-_CELLS = 24
 
 
 def camera_of(bench: Jobs, camera_id: str) -> Camera:
@@ -48,25 +45,23 @@ def camera_view(bench: Jobs, camera_id: str, distance: float = np.inf) -> dict[s
     """
     camera = camera_of(bench, camera_id)
     lens, (width, height) = optics_of(camera, bench.adjustment.estimates), camera.image_size
-    uv = pixel_grid(camera.image_size)
-    rows = max(2, round(_CELLS * height / width))
+    rows = max(2, round(GRID * height / width))
     points, residuals = _in_use(bench, camera_id)
-    column = np.clip((points[:, 0] + 0.5) / width * _CELLS, 0, _CELLS - 1).astype(int)
+    column = np.clip((points[:, 0] + 0.5) / width * GRID, 0, GRID - 1).astype(int)
     row = np.clip((points[:, 1] + 0.5) / height * rows, 0, rows - 1).astype(int)
-    cell = row * _CELLS + column
-    n = np.bincount(cell, minlength=rows * _CELLS)
+    cell = row * GRID + column
+    n = np.bincount(cell, minlength=rows * GRID)
     with np.errstate(invalid="ignore", divide="ignore"):
-        mean = np.stack([np.bincount(cell, residuals[:, k], rows * _CELLS) / n for k in range(2)], axis=1)
-        rms = np.sqrt(np.bincount(cell, (residuals**2).sum(axis=1), rows * _CELLS) / (2 * n))
-    good = invertible(lens, uv)
+        mean = np.stack([np.bincount(cell, residuals[:, k], rows * GRID) / n for k in range(2)], axis=1)
+        rms = np.sqrt(np.bincount(cell, (residuals**2).sum(axis=1), rows * GRID) / (2 * n))
+    uv, near = compared_pixels([lens], camera.image_size, points)
     return dict(plain({
         "version": bench.version, "camera": camera_id, "size": camera.image_size, "model": lens.model.name,
         "distance_m": None if np.isinf(distance) else distance,
         "principal_point": principal_point_px(lens.model, lens.values, lens.constants),
-        "cells": {"columns": _CELLS, "rows": rows, "n": n, "mean": mean, "rms": rms},
-        "distortion": {"uv": uv[good], "without": _undistorted(lens, uv[good])},
-        "uncertainty": {"uv": uv[good], **_uncertainty(bench, camera, lens, uv[good], distance),
-                        "covered": covered(uv[good], points, width / _CELLS)},
+        "cells": {"columns": GRID, "rows": rows, "n": n, "mean": mean, "rms": rms},
+        "distortion": {"uv": uv, "without": _undistorted(lens, uv)},
+        "uncertainty": {"uv": uv, **_uncertainty(bench, camera, lens, uv, distance), "covered": near},
     }))  # fmt: skip
 
 
@@ -131,10 +126,7 @@ def lens_change(
         then = optics_of(camera, kept.estimates)
     else:
         raise SurveyError("name the run or the other camera that the lens is to be compared with")
-    uv = pixel_grid(camera.image_size)
-    uv = uv[invertible(now, uv) & invertible(then, uv)]
-    points, _ = _in_use(bench, camera_id)
-    near = covered(uv, points, camera.image_size[0] / _CELLS)
+    uv, near = compared_pixels([now, then], camera.image_size, _in_use(bench, camera_id)[0])
     found = lens_difference(then, now, uv, distance, near if near.sum() >= 6 else None)
     rotation = float(np.linalg.norm(Rot3.Logmap(found.second_from_first.rotation())))
     return dict(plain({

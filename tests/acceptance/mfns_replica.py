@@ -13,7 +13,8 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.adjustment import AdjustOptions, assemble
-from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
+from adjust.graph.assembly import AdjustmentGraph, StartValues
+from adjust.graph.building import GraphBuilder
 from adjust.graph.solver import solve
 from adjust.model.observations import Distance, FrameRef, ImageBlock, PositionRef, TableReading
 from adjust.model.result import Adjustment

@@ -14,7 +14,8 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.adjustment import adjust
-from adjust.graph.assembly import GraphBuilder, values_of
+from adjust.graph.assembly import values_of
+from adjust.graph.building import GraphBuilder
 from adjust.graph.solver import solve
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, Pair, TableReading

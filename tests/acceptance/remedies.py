@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from adjust.adjustment import adjust
-from adjust.diagnosis.effects.ties import shared_lenses
 from adjust.lenses.models import MODELS
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import CROP, FloatArray, ImageCrop, LensDrift, LensSharing, Survey, VectorParameter
 from adjust.model.tables import harmonic_names
+from adjust.statistics.score import shared_lenses
 from adjust.testing.distributions import chi2
 from adjust.testing.significance import Significance, significance_of_changes, significances
 from survey.simulate import Truth, head_on_table, resample, stereo

@@ -12,7 +12,8 @@ from gtsam import Pose3, Rot3
 from scipy.stats import chi2
 
 from adjust.adjustment import AdjustOptions, adjust, assemble
-from adjust.graph.assembly import GraphBuilder, StartValues
+from adjust.graph.assembly import StartValues
+from adjust.graph.building import GraphBuilder
 from adjust.graph.solver import solve
 from adjust.model.errors import IndeterminateError
 from adjust.model.observations import FrameRef, LaserSpot, Level, TableReading

@@ -16,7 +16,8 @@ import pytest
 from gtsam import Pose3
 from scipy.stats import binom, chi2
 
-from adjust.graph.assembly import AdjustmentGraph, GraphBuilder
+from adjust.graph.assembly import AdjustmentGraph
+from adjust.graph.building import GraphBuilder
 from adjust.graph.solver import solve
 from adjust.model.result import ParameterName
 from adjust.model.survey import Datum, FloatArray, Survey

@@ -12,7 +12,8 @@ from gtsam import Pose3
 from scipy.stats import chi2
 
 from adjust.adjustment import AdjustOptions, assemble
-from adjust.graph.assembly import GraphBuilder, StartValues
+from adjust.graph.assembly import StartValues
+from adjust.graph.building import GraphBuilder
 from adjust.graph.solver import SolveOptions, solve
 from adjust.model.errors import IndeterminateError
 from adjust.model.observations import Distance, FrameRef, LaserSpot, Level, PositionRef, Reading

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
-from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
+from adjust.graph.assembly import AdjustmentGraph, StartValues
+from adjust.graph.building import GraphBuilder
 from adjust.graph.solver import Solved, SolveOptions, solve
 from adjust.lenses.models import MODELS
 from adjust.model.observations import Coordinates, Distance, FrameRef, ImageBlock, PositionRef, TableReading

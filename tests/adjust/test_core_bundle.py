@@ -6,7 +6,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
+from adjust.graph.assembly import AdjustmentGraph, StartValues
+from adjust.graph.building import GraphBuilder
 from adjust.graph.solver import SolveOptions, solve
 from adjust.model.errors import IndeterminateError
 from adjust.model.observations import Coordinates, Distance, PositionRef

@@ -7,11 +7,12 @@ import pytest
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.diagnosis.effects.effect import of_shape
-from adjust.diagnosis.score import Linear, score
+from adjust.diagnosis.linear import Linear
 from adjust.diagnosis.units.conventions import MISREADINGS, Misreading, shrinking
 from adjust.graph.solver import SolveOptions
 from adjust.model.boards import deformation
 from adjust.model.survey import Survey
+from adjust.statistics.score import score
 from survey.simulate import stereo
 
 

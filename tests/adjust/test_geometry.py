@@ -148,7 +148,7 @@ class Plainly:
     def __getattr__(self, name):
         if name != "chains":
             raise AttributeError(name)
-        from adjust.graph.assembly import GraphBuilder
+        from adjust.graph.building import GraphBuilder
 
         survey = self.survey
         frames = GraphBuilder(survey, {c.camera_id: c.lens.values for c in survey.cameras}).frames

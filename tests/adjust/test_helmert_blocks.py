@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adjust.graph.assembly import AdjustmentGraph, GraphBuilder
+from adjust.graph.assembly import AdjustmentGraph
+from adjust.graph.building import GraphBuilder
 from adjust.graph.solver import solve
 from adjust.model.observations import Distance, PositionRef
 from adjust.model.survey import Datum, FloatArray, IntArray, Survey

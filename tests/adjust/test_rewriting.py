@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gtsam import Pose3
 
-from adjust.graph.assembly import GraphBuilder
+from adjust.graph.building import GraphBuilder
 from adjust.model.result import ParameterName
 from adjust.model.rewriting import Rewriting, Vector
 from adjust.model.survey import PointParameter, PoseParameter

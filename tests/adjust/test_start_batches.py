@@ -7,7 +7,7 @@ from scipy.optimize import least_squares
 
 from adjust.lenses.models import MODELS, default_start, lens_constants
 from adjust.model.errors import SurveyError
-from adjust.native.lenses import fit_lens
+from adjust.native.lenses import Lens, fit_lens
 from adjust.native.views import refine_poses
 from adjust.spatial.rigid import rigid, rotation_exp
 from adjust.start.closed_forms.absolute_pose import best_poses, pose_solutions
@@ -68,7 +68,7 @@ def test_a_lens_and_its_poses_are_the_robust_least_squares_of_plain_rows():
     values = default_start(MODELS["brown"], (1280, 1024), 1550.0)
     directions = np.ascontiguousarray(np.eye(13)[:, places])
     start = np.array([rigid(rotation_exp(turn + 0.01), shift + 0.01) for turn, shift in motions])
-    squares, cov = fit_lens(0, values, lens_constants("brown", (1280, 1024)), directions, len(x) * np.arange(7),
+    squares, cov = fit_lens(Lens(0, values, lens_constants("brown", (1280, 1024))), directions, len(x) * np.arange(7),
                             np.tile(x, (6, 1)), uv, 25, start)  # fmt: skip
     expected = np.linalg.inv(solved.jac.T @ solved.jac)[:5, :5]
     sigma = 0.3 * np.sqrt(np.diag(expected))
@@ -91,7 +91,7 @@ def test_what_the_images_leave_open_has_an_infinite_covariance():
     constants, ptr = lens_constants("brown", (1280, 1024)), np.array([0, 20])
     values[2] = 3.0
     directions = np.outer(np.eye(13)[2], [1.0, 2.0])
-    squares, cov = fit_lens(0, values, constants, directions, ptr, x, uv, 25, pose[None].copy())
+    squares, cov = fit_lens(Lens(0, values, constants), directions, ptr, x, uv, 25, pose[None].copy())
     assert abs(values[2]) < 0.1
     assert np.isinf(np.diag(cov)).all()
     assert squares.max() < 1e-2

@@ -4,7 +4,7 @@ import gtsam
 import numpy as np
 from gtsam import Pose3
 
-from adjust.graph.assembly import GraphBuilder
+from adjust.graph.building import GraphBuilder
 from tests.benchmarks.data import calibration, rough_start, survey
 
 

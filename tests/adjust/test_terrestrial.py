@@ -8,7 +8,8 @@ import pytest
 from gtsam import Pose3, Rot3
 
 from adjust.adjustment import adjust
-from adjust.graph.assembly import GraphBuilder, StartValues
+from adjust.graph.assembly import StartValues
+from adjust.graph.building import GraphBuilder
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, PositionRef, Reading, ReadingCovariance
 from adjust.model.survey import (

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from adjust.adjustment import adjust
-from adjust.graph.assembly import GraphBuilder
+from adjust.graph.building import GraphBuilder
 from adjust.graph.datum import gauge, inner_datum
 from adjust.graph.solver import solve
 from adjust.model.errors import SurveyError

@@ -12,7 +12,8 @@ from gtsam import Pose3
 from scipy.spatial.transform import Rotation
 
 from adjust.adjustment import AdjustOptions, assemble
-from adjust.graph.assembly import GraphBuilder, StartValues
+from adjust.graph.assembly import StartValues
+from adjust.graph.building import GraphBuilder
 from adjust.graph.solver import solve
 from adjust.model.observations import Distance, ImageBlock, PositionRef
 from adjust.model.result import ParameterName

@@ -22,8 +22,8 @@ from capture.devices.camera import Camera
 from capture.devices.cameras import open_camera
 from capture.devices.cameras.simulated import SimulatedCamera
 from capture.session.trigger_set import TriggerSet
-from capture.simulated.gige_server import GigeServer
 from tests.capture.camera_helpers import gige_port
+from tests.capture.gige_server import GigeServer
 
 WIDTH, HEIGHT = 640, 512
 BLOCK = 250  # images between two looks at the memory

@@ -9,7 +9,7 @@ import numpy as np
 
 from adjust.adjustment import AdjustOptions, adjust, assemble, start_values
 from adjust.frames.unknowns import Unknowns
-from adjust.graph.assembly import GraphBuilder
+from adjust.graph.building import GraphBuilder
 from adjust.graph.solver import SolveOptions, solve
 from adjust.model.survey import FloatArray, Survey
 from adjust.start import find_start

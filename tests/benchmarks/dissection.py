@@ -16,7 +16,8 @@ from time import perf_counter, process_time
 import numpy as np
 
 from adjust.adjustment import AdjustOptions, assemble
-from adjust.graph.assembly import AdjustmentGraph, GraphBuilder
+from adjust.graph.assembly import AdjustmentGraph
+from adjust.graph.building import GraphBuilder
 from adjust.graph.solver import solve
 from adjust.model.observations import Coordinates, PositionRef
 from adjust.model.survey import Datum, Survey

@@ -9,7 +9,7 @@ from time import perf_counter
 
 import numpy as np
 
-from adjust.graph.assembly import GraphBuilder
+from adjust.graph.building import GraphBuilder
 from tests.benchmarks import tables
 from tests.benchmarks.data import calibration, rough_start, survey
 

@@ -10,7 +10,8 @@ import gtsam
 from adjust import adjustment
 from adjust.adjustment import AdjustOptions, assemble
 from adjust.frames.state import State
-from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
+from adjust.graph.assembly import AdjustmentGraph, StartValues
+from adjust.graph.building import GraphBuilder
 from adjust.graph.solver import _Loop, solve
 from adjust.observations.images.reduction import PoseReduction
 from adjust.observations.pairs import PairBatch

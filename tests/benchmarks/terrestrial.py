@@ -13,7 +13,8 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial import cKDTree
 
 from adjust.adjustment import AdjustOptions, assemble
-from adjust.graph.assembly import GraphBuilder, StartValues
+from adjust.graph.assembly import StartValues
+from adjust.graph.building import GraphBuilder
 from adjust.graph.solver import solve
 from adjust.model.observations import PositionRef, Reading
 from adjust.model.survey import BoolArray, Datum, FloatArray, IntArray, Point, PointParameter, Setup, Survey

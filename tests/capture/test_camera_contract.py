@@ -17,8 +17,8 @@ from capture.devices.camera import (
     UnknownFeatureError,
 )
 from capture.devices.cameras import open_camera
-from capture.simulated.gige_server import GigeServer
 from tests.capture.camera_helpers import GIGE, PYLON, VIKY, gige_port, require_silence, set_up
+from tests.capture.gige_server import GigeServer
 
 pytestmark = pytest.mark.slow
 

@@ -14,8 +14,8 @@ from capture.devices.camera import Camera, DisconnectedError, FetchTimeoutError,
 from capture.devices.cameras import discover
 from capture.devices.cameras.u3v import U3vCamera
 from capture.session.trigger_set import TriggerSet
-from capture.simulated.gige_server import GigeServer
 from tests.capture.camera_helpers import GIGE, gige_port, number_in, open_camera, set_up
+from tests.capture.gige_server import GigeServer
 
 pytestmark = [pytest.mark.hardware, pytest.mark.slow]
 

@@ -15,7 +15,6 @@ from capture.session.quality import image_quality
 from capture.session.trigger_set import TriggerSet
 from capture.simulated.angles import AnglesFile, write_angles
 from capture.simulated.folder import ANGLES, read_lab, write_lab
-from capture.simulated.gige_server import GigeServer
 from capture.simulated.laboratory import CAMERA_IDS, LabPose, LabSize, SimulatedLab, make_lab
 from survey.detection.detect import detect_image
 from survey.detection.results import SpotOptions
@@ -24,6 +23,7 @@ from survey.project import read
 from survey.simulate.parts import BOARD
 from survey.simulate.scene import Scene
 from tests.capture.camera_helpers import GIGE, gige_port
+from tests.capture.gige_server import GigeServer
 
 
 @pytest.fixture(scope="module")

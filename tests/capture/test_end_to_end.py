@@ -15,11 +15,11 @@ from scipy.stats import chi2
 
 from capture.cli import main
 from capture.simulated.folder import write_lab
-from capture.simulated.gige_server import GigeServer
 from capture.simulated.laboratory import LabSize
 from survey.jobs.adjusting.job import adjust_job
 from survey.solution.covariances import read_covariances
 from tests.capture.camera_helpers import GIGE, gige_port
+from tests.capture.gige_server import GigeServer
 from tests.capture.table_server import table_server
 
 pytestmark = pytest.mark.slow

@@ -11,9 +11,9 @@ import pytest
 
 import survey.jobs.adjusting.job as job
 from adjust.graph.assembly import AdjustmentGraph
-from adjust.graph.divergence import Stopped, UnknownState
 from adjust.graph.solver import SolveOptions, solve
 from adjust.model.errors import NotConvergedError, SurveyError
+from adjust.model.stopped import Stopped, UnknownState
 from survey.cli import main
 from survey.project.writing import write_project
 from survey.simulate import stereo

@@ -9,7 +9,8 @@ import numpy as np
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, SetKey
 from adjust.frames.tables import check_harmonics
-from adjust.graph.assembly import GraphBuilder, values_of
+from adjust.graph.assembly import values_of
+from adjust.graph.building import GraphBuilder
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey, Table

@@ -16,10 +16,11 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect, Shifts, of_others, of_shifts
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.late import Freed, as_unknowns
-from adjust.diagnosis.score import Linear, Score, drift_times
+from adjust.diagnosis.linear import Linear
 from adjust.diagnosis.sequences import hand_poses
 from adjust.model.observations import ImageBlock, TableReading
 from adjust.model.survey import FloatArray, Survey
+from adjust.statistics.score import Score, drift_times
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline

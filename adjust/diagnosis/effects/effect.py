@@ -9,12 +9,13 @@ import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
-from adjust.diagnosis.score import Linear, Score
+from adjust.diagnosis.linear import Linear
 from adjust.diagnosis.trial import misfit_of
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 from adjust.precision.precision import noise_of
+from adjust.statistics.score import Score
 
 ROUNDS = 6
 _SLOW = 0.5  # share of the last drop that the next one is at most, while it is on its way

@@ -8,9 +8,10 @@ import numpy as np
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect, of_shape
 from adjust.diagnosis.hypothesis import Hypothesis, Place, ScaleKey, SetKey
-from adjust.diagnosis.score import Linear, Score
+from adjust.diagnosis.linear import Linear
 from adjust.diagnosis.targets.size import reshaped, well_known
 from adjust.model.survey import FloatArray, Survey, Target
+from adjust.statistics.score import Score
 
 _SCALE = "target scaled"
 _SHAPES: tuple[tuple[str, FloatArray, str, str], ...] = (

@@ -12,13 +12,14 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect
 from adjust.diagnosis.hypothesis import Edit, Hypothesis, LeaveOut, Place
 from adjust.diagnosis.lens_keys import block_keys, crop_keys, key_text
+from adjust.diagnosis.linear import Linear
 from adjust.diagnosis.prediction import Prediction, adjusted_values
-from adjust.diagnosis.score import Linear, Part, Score, drift_times
 from adjust.diagnosis.sequences import with_pairs
 from adjust.model.observations import FrameRef, ImageBlock, Pair
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.statistics.normal import DENSE
+from adjust.statistics.score import Part, Score, drift_times
 
 FOCAL, CENTRE = ("fx", "fy", "c"), ("u0", "v0", "xp", "yp")
 _FEWEST = 4

@@ -12,9 +12,9 @@ import numpy as np
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, LeaveOut, Place, Rename
 from adjust.diagnosis.prediction import Prediction
-from adjust.diagnosis.score import ratio
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import FloatArray, Survey
+from adjust.statistics.score import ratio
 
 _CLEARLY = 3.0
 _MEDIAN = 1.386  # of chi-square with two degrees of freedom

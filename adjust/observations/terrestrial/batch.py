@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -305,7 +304,7 @@ def _blocks(chunk: Chunk, J: FloatArray) -> list[FloatArray]:
     return out
 
 
-def _callback(batch: TerrestrialBatch, c: int) -> Callable[..., Any]:
+def _callback(batch: TerrestrialBatch, c: int) -> Callable[..., FloatArray]:
     def residual(_factor, values, jacobians):  # type: ignore[no-untyped-def]  # GTSAM's protocol, bound untyped
         return batch.residual_of(c, values, jacobians)
 

@@ -6,6 +6,7 @@ axes. Axes that turn by a small w, about the world's axes, change ``F d`` by ``F
 """
 
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 
@@ -64,7 +65,7 @@ def predict(r: Readings, u: Geometry, sign: float, curve: float) -> tuple[FloatA
     offset, scale = u.instrument[r.instrument[distances], 0], 1.0 + u.instrument[r.instrument[distances], 1]
     factor = np.where(r.kind == ANGLE, -1.0, 1.0)
     factor[distances] = scale
-    value, A = _sights(r, u, rows, r.to, 1, TO, factor[rows], sign, curve)
+    value, A = _sights(r, u, rows, _End(r.to, 1, TO), factor[rows], sign, curve)
     if len(level):
         sights, by = value, A
         value, A = np.empty(len(r.kind)), np.zeros((len(r.kind), N_COLUMNS))
@@ -72,7 +73,7 @@ def predict(r: Readings, u: Geometry, sign: float, curve: float) -> tuple[FloatA
         value[level] = _heights(r, u, level, A)
     rows = np.flatnonzero(r.kind == ANGLE)
     if len(rows):
-        more, by = _sights(r, u, rows, r.second, 2, SECOND, np.ones(len(rows)), sign, curve)
+        more, by = _sights(r, u, rows, _End(r.second, 2, SECOND), np.ones(len(rows)), sign, curve)
         value[rows], A[rows] = value[rows] + more, A[rows] + by
     rows = np.flatnonzero(r.kind == DIRECTION)
     value[rows] -= u.orientation[r.orientation[rows]]
@@ -111,14 +112,19 @@ def _heights(r: Readings, u: Geometry, rows: IntArray, A: FloatArray) -> FloatAr
     return np.asarray(h.height[b] - h.height[a] + raised)
 
 
-def _sights(
-    r: Readings, u: Geometry, rows: IntArray, to: IntArray, target: int, to_column: int, factor: FloatArray,
-    sign: float, curve: float,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """``factor`` times the values (m,) of the sights of ``rows`` to the positions ``to``, and derivatives A (m, 22).
+class _End(NamedTuple):
+    """Where sights go: positions (n,) of all readings, the column of their heights, the first one of derivatives."""
 
-    target: column of the target's height.
-    """
+    to: IntArray
+    height: int
+    column: int
+
+
+def _sights(
+    r: Readings, u: Geometry, rows: IntArray, end: _End, factor: FloatArray, sign: float, curve: float
+) -> tuple[FloatArray, FloatArray]:
+    """``factor`` times the values (m,) of the sights of ``rows`` to that end, and derivatives A (m, 22)."""
+    to, target, to_column = end
     a, b, kind, horizon, body = r.at[rows], to[rows], r.kind[rows], u.horizon, r.body[rows]
     on_body, F = np.flatnonzero(body >= 0), horizon.axes[a]
     F[on_body] = u.body_axes[body[on_body]]

@@ -60,7 +60,7 @@ def reading_residuals(batch: TerrestrialBatch, tree: KeyCovariances, values: gts
             redundancy[rows] = found if in_use else 0.0
     observed = batch.layout.arrays.observed
     return ReadingResiduals(
-        observed, observed + batch.residual, batch.residual.copy(), sigma, own * sigma, redundancy, standardized, test,
+        observed, observed + batch.residual, batch.residual.copy(), sigma, redundancy, standardized, test,
         e**2, used,
     )  # fmt: skip
 

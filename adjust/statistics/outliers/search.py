@@ -17,7 +17,7 @@ from gtsam import Pose3, Rot3
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.graph.assembly import StartValues, values_of
 from adjust.model.errors import IndeterminateError, NotConvergedError
-from adjust.model.result import Adjustment, ObservationResidual, ParameterName
+from adjust.model.result import Adjustment, Decision, ObservationResidual, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.precision.precision import Precision, precision_of
 from adjust.statistics.condensed import condensed_system
@@ -26,7 +26,7 @@ from adjust.statistics.outliers.exchange import Exchange, better_set, equal_sets
 from adjust.statistics.outliers.snooping import Snooping, Verdict
 from adjust.statistics.outliers.watched import FOLLOWED, WatchedSnooping, large, watchable, watched
 from adjust.statistics.reliability import observation_name
-from adjust.statistics.result import Alternative, Decision
+from adjust.statistics.result import Alternative
 from adjust.statistics.system import groups_of_others, linear_system
 from adjust.testing.criteria import MANY, limits
 from adjust.testing.distributions import chi2

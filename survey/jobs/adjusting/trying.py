@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from adjust.diagnosis.diagnosis import Diagnosis
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.model.errors import DiagnosedError, SurveyError
 from survey.folder.replacing import changing, replace_parts
@@ -44,7 +45,7 @@ def _candidates(folder: Path) -> list[Hypothesis]:
         diagnosis = adjust_project(read(folder), False).diagnosis
     except DiagnosedError as error:
         diagnosis = error.diagnosis
-    return [] if diagnosis is None else [c.hypothesis for c in diagnosis.candidates]
+    return [c.hypothesis for c in diagnosis.candidates] if isinstance(diagnosis, Diagnosis) else []
 
 
 def carried_out(folder: Path, chosen: Hypothesis) -> str:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
-from gtsam import Pose3, Rot3
+from gtsam import Pose3
 
 from adjust.adjustment import start_values
 from adjust.graph.assembly import StartValues
@@ -21,6 +21,7 @@ from adjust.model.rewriting import Rewriting, Vector
 from adjust.model.survey import FloatArray, LensParameter, PointParameter, PoseParameter, Survey, VectorParameter
 from adjust.model.tables import unit_of
 from adjust.pose_network.from_survey import network_from_survey, network_of_pairs
+from adjust.pose_network.start import carried
 from adjust.start import find_start
 from survey.jobs.adjusting.steps import adjust_project
 from survey.project import Project
@@ -69,21 +70,8 @@ def network_poses(survey: Survey, known: Mapping[ParameterName, Pose3]) -> dict[
     poses = {s: known["world_from_station", s] for s in ids if ("world_from_station", s) in known}
     given = {s.station_id: s.world_from_station for s in survey.stations}
     poses |= {s: given[s].value or Pose3() for s in ids if given[s].treatment != "free"}
-    waiting = sorted((p for p in survey.pairs if p.used), key=lambda p: float(np.trace(p.cov)))
-    while len(poses) < len(ids):
-        usable = [p for p in waiting if (p.a.frame_id in poses) != (p.b.frame_id in poses)]
-        if not usable:
-            return None
-        for pair in usable:
-            a, b = pair.a.frame_id, pair.b.frame_id
-            motion = pair.b_from_a
-            b_from_a = Pose3(motion, np.zeros(3)) if isinstance(motion, Rot3) else motion
-            if a in poses and b not in poses:
-                poses[b] = poses[a].compose(b_from_a.inverse())
-            elif b in poses and a not in poses:
-                poses[a] = poses[b].compose(b_from_a)
-        waiting = [p for p in waiting if p.a.frame_id not in poses or p.b.frame_id not in poses]
-    return {s: poses[s] for s in ids}
+    poses |= carried(poses, (p for p in survey.pairs if p.used))
+    return {s: poses[s] for s in ids} if all(s in poses for s in ids) else None
 
 
 def survey_start(survey: Survey, previous: Previous) -> StartValues | None:

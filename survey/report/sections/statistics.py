@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from markupsafe import Markup
 
-from adjust.model.result import Adjustment, ParameterName
+from adjust.model.result import Adjustment, Component, ParameterName
 from adjust.model.survey import FloatArray
-from adjust.statistics.result import BudgetEntry, Component, Correlation, Influence, RelativePrecision, WeakDirection
+from adjust.statistics.result import BudgetEntry, Correlation, Influence, RelativePrecision, WeakDirection
 from survey.report.charts import heat_map, quantiles
 from survey.report.context import Context
 from survey.report.language import esc, group_name, known, t

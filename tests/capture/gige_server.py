@@ -1,6 +1,6 @@
 """A camera of the simulated laboratory as a GigE Vision camera, in a process of its own.
 
-``python -m capture.simulated.gige_server FOLDER/X`` serves camera X of the laboratory in FOLDER on 127.0.0.1; a client
+``python -m tests.capture.gige_server FOLDER/X`` serves camera X of the laboratory in FOLDER on 127.0.0.1; a client
 reaches it as ``gige:127.0.0.1``. ``GigeServer`` starts and ends such a process.
 """
 
@@ -20,7 +20,7 @@ import numpy as np
 from adjust.model.errors import SurveyError
 from capture.devices.camera import GrayImage, ImageSource
 from capture.simulated.angles import AnglesFile
-from capture.simulated.aravis import AravisCamera
+from tests.capture.aravis import AravisCamera
 
 _READY = "ready"
 _START_S = 60.0  # on a busy machine
@@ -43,7 +43,7 @@ class GigeServer:
         lost_ratio: float = 0.0,
         angles: Path | None = None,
     ) -> None:
-        self._command = [sys.executable, "-m", "capture.simulated.gige_server", str(camera)]
+        self._command = [sys.executable, "-m", "tests.capture.gige_server", str(camera)]
         self._command += ["--interface", interface, "--serial", serial, "--lost-ratio", str(lost_ratio)]
         self._command += ["--angles", str(angles)] if angles is not None else []
         self.process: subprocess.Popen[str] | None = None

@@ -11,12 +11,15 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-from adjust.diagnosis.prediction import Prediction, adjusted_values
+from adjust.frames.lens_states import lenders
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.statistics.normal import DENSE
 from adjust.statistics.system import LinearSystem, linear_system
 from adjust.statistics.weakness import times_covariance
+from adjust.testing.distributions import chi2, fisher
+from adjust.testing.quadratic_forms import pseudo_half
+from adjust.testing.significance import LEVEL, Significance
 
 _SEEN = 1e-7
 """Share of a change's column that no unknown takes over, below which it does not show."""
@@ -36,12 +39,10 @@ class Score:
 def score(g: FloatArray, BB: FloatArray, AB: FloatArray, QAB: FloatArray) -> Score:
     """Of ``g = B'e`` (k,), ``B'B`` (k, k), ``A'B`` (n, k) and ``Q A'B`` (n, k)."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(BB), 1e-300))
-    values, V = np.linalg.eigh(scale[:, None] * (BB - AB.T @ QAB) * scale)
-    kept = values > _SEEN
-    L = scale[:, None] * V[:, kept]
-    along = L.T @ g
-    cov = (L / values[kept]) @ L.T
-    return Score(-cov @ g, cov, float((along**2 / values[kept]).sum()), int(kept.sum()))
+    half, seen = pseudo_half(scale[:, None] * (BB - AB.T @ QAB) * scale, _SEEN)
+    half = scale[:, None] * half
+    cov, along = half @ half.T, half.T @ g
+    return Score(-cov @ g, cov, float(along @ along), int(seen))
 
 
 Part = tuple[IntArray, FloatArray]
@@ -49,7 +50,7 @@ Part = tuple[IntArray, FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
-class Linear:
+class LinearScores:
     """An adjustment as a linear system, for scores."""
 
     result: Adjustment
@@ -87,11 +88,6 @@ class Linear:
         """Of an unknown, or of some of its components; none where it is held."""
         at = self.system.columns.at.get(name, np.zeros(0, dtype=np.int64))
         return at if not components else at[[self.system.columns.components[i] in components for i in at]]
-
-    @cached_property
-    def prediction(self) -> Prediction:
-        """What the adjustment says that its images show."""
-        return Prediction(self.result.survey, adjusted_values(self.result))
 
     @cached_property
     def _by_column(self) -> sparse.csc_matrix:
@@ -186,3 +182,70 @@ def ratio(omega: float, n: float, drop: float) -> float:
 def drift_times(n: int) -> FloatArray:
     """(n,) from -1/2 to 1/2."""
     return np.asarray(np.linspace(-0.5, 0.5, n))
+
+
+@dataclass(frozen=True, eq=False)
+class SharedLens:
+    """What ``camera`` shares with ``lender``: names (k,) with units, by how much its own would differ, cov a priori.
+
+    test: whether they differ, as ``significant``.
+    """
+
+    camera: str
+    lender: str
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    difference: FloatArray
+    cov: FloatArray
+    test: Significance
+
+    def said(self) -> str:
+        """The parameters that differ by more than three sigmas, or all, in words."""
+        sigmas = np.sqrt(np.maximum(np.diag(self.cov), 0.0))
+        clear = np.abs(self.difference) > 3.0 * sigmas
+        return ", ".join(
+            f"{name} {d:+.3g} +- {s:.2g}{'' if unit == '1' else ' ' + unit}" for name, unit, d, s, shown in
+            zip(self.names, self.units, self.difference, sigmas, clear | ~clear.any(), strict=True) if shown
+        )  # fmt: skip
+
+
+def shared_lenses(result: Adjustment, estimated_sigma0: bool) -> tuple[SharedLens, ...]:
+    """Of every camera that shares parameters; F with sigma0 of the adjustment in which they are free, or chi-square.
+
+    The statistic is ``(drop / k) / ((v'Pv - drop) / (r - k))`` where v'Pv falls by ``drop`` (Koch 1999, 4.2.1).
+    """
+    shared = lenders(result.survey)
+    if not shared or result.precision is None:
+        return ()
+    linear, out = LinearScores(result), []
+    level = LEVEL if result.global_test is None else result.global_test.alpha
+    for camera, (lender, parameters) in shared.items():
+        found = result.estimates["lens", camera]
+        names = tuple(x for x in found.components if x in parameters)
+        score = own_score(linear, camera, lender, names)
+        k, left = score.seen, result.redundancy - score.seen
+        if not k or (estimated_sigma0 and left <= 0):
+            continue
+        statistic, freedom, p = _tested(score, result.omega, left if estimated_sigma0 else None)
+        test = Significance("lens_shared", names, statistic, freedom, p, p < level)
+        units = tuple(found.units[found.components.index(x)] for x in names)
+        out.append(SharedLens(camera, lender, names, units, score.theta, score.cov, test))
+    return tuple(out)
+
+
+def _tested(score: Score, omega: float, left: int | None) -> tuple[float, tuple[int, ...], float]:
+    """Statistic, degrees of freedom and p-value; left: redundancy without the tie, None where sigma0 is known."""
+    k = score.seen
+    if left is None:
+        return score.drop, (k,), float(chi2.sf(score.drop, k))
+    statistic = score.drop / k / ((omega - score.drop) / left)
+    return statistic, (k, left), float(fisher.sf(statistic, k, left))
+
+
+def own_score(linear: LinearScores, camera: str, lender: str, parameters: tuple[str, ...]) -> Score:
+    """Of a change of these parameters in the images of one camera alone."""
+    ptr = 2 * linear.result.image_residuals.block_ptr
+    rows = [np.arange(ptr[i], ptr[i + 1]) for i, b in enumerate(linear.result.survey.image_blocks)
+            if b.camera_id == camera]  # fmt: skip
+    columns = linear.columns(("lens", lender), parameters)
+    return linear.of_parts(linear.parts(columns, rows) if len(columns) else [])
