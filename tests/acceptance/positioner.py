@@ -142,8 +142,9 @@ def blockwise_covariance(
     """Covariance of the axes' parameters that holds although neighbouring poses err alike (delete-block jackknife).
 
     The poses come in the order in which they were measured; each of the n_blocks stretches is left out once, by one
-    step of Gauss-Newton from the solution of all, and ``C = (g - 1) / g * sum d d'`` (Quenouille, Tukey). Residuals of a real machine are hardly ever white: what its
-    model leaves out bends, sags and drifts, and the sigmas of least squares are then too small.
+    step of Gauss-Newton from the solution of all, and ``C = (g - 1) / g * sum d d'`` (Quenouille, Tukey). Residuals of
+    a real machine are hardly ever white: what its model leaves out bends, sags and drifts, and the sigmas of least
+    squares are then too small.
     """
     n = len(joints)
     if not 3 <= n_blocks <= n // 2:
