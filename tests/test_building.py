@@ -1,6 +1,5 @@
 """How the native library is built: with a compiler that only writes down what it is asked for."""
 
-import json
 import os
 import shutil
 import subprocess
@@ -14,18 +13,17 @@ import pytest
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
-_COMPILER = """
-import json, os, sys
-words = sys.argv[1:]
-if words == ["--version"]:
-    print("wonders", os.environ.get("VERSION", "1"))
-    sys.exit()
-with open(os.environ["ASKED"], "a") as log:
-    log.write(json.dumps(words) + "\\n")
-if any(os.environ.get("REFUSED", "nothing") in word for word in words):
-    print("vision.cpp:3:1: error: unknown wonder")
-    sys.exit(1)
-open(words[words.index("-o") + 1], "w").write("made" + " checked" * ("-fno-sanitize-recover=all" in words))
+_COMPILER = r"""#!/bin/sh
+[ "$*" = --version ] && { echo "wonders ${VERSION:-1}"; exit; }
+words=$(printf '%s\t' "$@")
+printf '%s\n' "$words" >> "$ASKED"
+case $words in
+    *"${REFUSED:-nothing}"*) echo "vision.cpp:3:1: error: unknown wonder"; exit 1;;
+    *-fno-sanitize-recover=all*) made="made checked";;
+    *) made=made;;
+esac
+while [ "$1" != -o ]; do shift; done
+printf '%s' "$made" > "$2"
 """
 
 
@@ -36,7 +34,8 @@ def place(tmp_path: Path) -> Path:
         shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__", "*.so"))
     for name in ("setup.py", "setup.cfg", "pyproject.toml", "README.md", "LICENSE", "MANIFEST.in"):
         shutil.copy(ROOT / name, tmp_path)
-    (tmp_path / "compiler.py").write_text(_COMPILER, encoding="utf-8")
+    (tmp_path / "compiler").write_text(_COMPILER, encoding="utf-8")
+    (tmp_path / "compiler").chmod(0o755)
     return tmp_path
 
 
@@ -44,10 +43,10 @@ def _run(place: Path, *words: str, **more: str) -> tuple[int, str, list[list[str
     """Exit code, what was printed, and what the compiler was asked for; ``setup.py`` with these words."""
     asked = place / "asked"
     asked.unlink(missing_ok=True)
-    environment = {"CXX": f"{sys.executable} {place / 'compiler.py'}", "ASKED": str(asked)}
+    environment = {"CXX": str(place / "compiler"), "ASKED": str(asked)}
     done = subprocess.run([sys.executable, "setup.py", "-q", *words], cwd=place, env=os.environ | environment | more,
                           capture_output=True, text=True, check=False)  # fmt: skip
-    calls = [json.loads(line) for line in asked.read_text().splitlines()] if asked.exists() else []
+    calls = [line.split("\t")[:-1] for line in asked.read_text().splitlines()] if asked.exists() else []
     return done.returncode, done.stdout + done.stderr, calls
 
 

@@ -6,6 +6,7 @@ each taken forward or inverse; the links that are held at identity are left out.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from types import MappingProxyType
 from typing import TypeVar
 
@@ -119,17 +120,13 @@ class ShiftedSlot:
     slot: int
     nodes: tuple[int, ...]
     times: tuple[float, ...]
-    clocks: tuple[tuple[VectorMap, tuple[float, ...]], ...]
+    clocks: tuple[tuple[VectorMap, FloatArray], ...]
     parts: list[tuple[int, int, int]]
 
-    def time(self, values: gtsam.Values) -> float:
-        """By how much later it is than the epoch."""
-        return float(sum(np.dot(rates, vector.full(values)) for vector, rates in self.clocks))
-
-    @property
+    @cached_property
     def by_clocks(self) -> FloatArray:
         """(c,) derivatives of the time by the free components of all clocks."""
-        return np.concatenate([np.asarray(rates) @ vector.matrix for vector, rates in self.clocks])
+        return np.concatenate([rates @ vector.matrix for vector, rates in self.clocks])
 
 
 @dataclass(eq=False)

@@ -21,7 +21,7 @@ from adjust.model.clocks import CLOCK, EpochTimes, clocks_of, epoch_times
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock, Pair, TableReading
 from adjust.model.result import ParameterName
-from adjust.model.survey import FloatArray, Survey
+from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.spatial.rigid import rigid
 from adjust.spatial.rigid_motions import Motions, exp, right_jacobian, right_jacobian_inverse
 
@@ -114,9 +114,9 @@ class Shifts:
         u, nodes, (_, time) = self.unknowns, tuple(self._around[slot]), self._epoch[slot]
         times = tuple(self._epoch[n][1] - time for n in nodes[1:])
         by = {"offset": 1.0, "drift": time - self.times.middle, "line_time": row}
-        clocks = [(vector, tuple(by[x] for x in vector.names))]
+        clocks = [(vector, np.array([by[x] for x in vector.names]))]
         if clock in self._jitter:
-            clocks.append((self._own_time(clock, nodes[0]), (1.0,)))
+            clocks.append((self._own_time(clock, nodes[0]), np.ones(1)))
         made = self._made[place] = len(u.slot_key)
         u.slot_key.append(None)
         u.slot_pose.append(u.slot_pose[slot])
@@ -154,7 +154,8 @@ def between(poses: Sequence[FloatArray], times: Sequence[float], dt: float) -> F
     w, by_dt = weights(np.array([times]) - times[0], np.array([dt]))
     every = np.array(poses)
     motions = Motions(every[:, :3, :3], every[:, :3, 3])
-    R, t, _ = moved_poses(motions[:1], motions[1:], Interpolated(w, by_dt, np.zeros((1, 0))))
+    only = np.zeros(1, dtype=np.int64)
+    R, t, _ = moved_poses(motions[:1], motions[1:], only, Interpolated(w, by_dt, np.zeros((1, 0))))
     return rigid(R[0], t[0])
 
 
@@ -202,27 +203,32 @@ class Interpolated:
 
 def interpolated(slots: Sequence[ShiftedSlot], values: gtsam.Values) -> Interpolated:
     """Of slots with equally many nodes and free components of their clocks."""
-    w, by_dt = weights(np.array([(0.0, *s.times) for s in slots]), np.array([s.time(values) for s in slots]))
+    full = {clock: clock.full(values) for clock in {clock for s in slots for clock, _ in s.clocks}}
+    late = np.array([sum(rates @ full[clock] for clock, rates in s.clocks) for s in slots])
+    w, by_dt = weights(np.array([(0.0, *s.times) for s in slots]), late)
     return Interpolated(w, by_dt, np.array([s.by_clocks for s in slots]))
 
 
-def moved_poses(own: Motions, others: Motions, at: Interpolated) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """R (s, 3, 3), t (s, 3) between poses of s epochs and others (s (n - 1)) around.
+def moved_poses(
+    own: Motions, others: Motions, epoch: IntArray, at: Interpolated
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """R (s, 3, 3), t (s, 3) between poses of e epochs and others (e (n - 1)) around; each about one epoch, (s,).
 
     Then their derivatives (s, 6, 6 n + c) by all of these and the clocks.
     """
     s, n = at.w.shape
     first = Motions(np.repeat(own.rotation, n - 1, axis=0), np.repeat(_t(own), n - 1, axis=0))
-    L = (first.inverse() @ others).log()
-    xi = np.einsum("sk,ski->si", at.w[:, 1:], L.reshape(s, n - 1, 6))
+    logs = (first.inverse() @ others).log()
+    inverse, back = (x.reshape(-1, n - 1, 6, 6)[epoch] for x in (right_jacobian_inverse(logs), exp(-logs).adjoint()))
+    L = logs.reshape(-1, n - 1, 6)[epoch]
+    xi = np.einsum("sk,ski->si", at.w[:, 1:], L)
     right = right_jacobian(xi)
-    J = right[:, None] @ right_jacobian_inverse(L).reshape(s, n - 1, 6, 6) * at.w[:, 1:, None, None]
-    back = exp(-L).adjoint().reshape(s, n - 1, 6, 6)
+    J = right[:, None] @ inverse * at.w[:, 1:, None, None]
     by_own = exp(-xi).adjoint() - np.einsum("skij,skjl->sil", J, back)
-    speed = (right @ np.einsum("sk,ski->si", at.by_dt[:, 1:], L.reshape(s, n - 1, 6))[..., None])[..., 0]
+    speed = (right @ np.einsum("sk,ski->si", at.by_dt[:, 1:], L)[..., None])[..., 0]
     by_nodes = np.swapaxes(np.concatenate([by_own[:, None], J], axis=1), 1, 2).reshape(s, 6, 6 * n)
     by_clock = speed[:, :, None] * at.by_clock[:, None, :]
-    moved = own @ exp(xi)
+    moved = own[epoch] @ exp(xi)
     return moved.rotation, _t(moved), np.concatenate([by_nodes, by_clock], axis=2)
 
 
@@ -238,9 +244,10 @@ def shift(state: State, values: gtsam.Values, slots: Sequence[ShiftedSlot]) -> N
         if table_id:
             R, t, D = _between_readings(state, values, of, at)
         else:
-            own, others = [s.nodes[0] for s in of], [n for s in of for n in s.nodes[1:]]
+            around = {nodes: k for k, nodes in enumerate(dict.fromkeys(s.nodes for s in of))}
+            own, others = [nodes[0] for nodes in around], [n for nodes in around for n in nodes[1:]]
             first, rest = (Motions(state.slot_R[x], state.slot_t[x]) for x in (own, others))
-            R, t, D = moved_poses(first, rest, at)
+            R, t, D = moved_poses(first, rest, np.array([around[s.nodes] for s in of]), at)
         state.slot_R[i], state.slot_t[i] = R, t
         state.D[state.derived_index[i], :, : D.shape[2]] = D
 
@@ -265,7 +272,7 @@ def _t(motions: Motions) -> FloatArray:
 def reading_residual(slot: ShiftedSlot, unknowns: Unknowns, observed: FloatArray) -> tuple[list[int], Reading]:
     """Keys, and angles (k,) of a table at the time of its clock minus those read, with derivatives by these keys."""
     nodes = [unknowns.table_slots[n].angles_key for n in slot.nodes]
-    clocks = [(clock.key, np.asarray(rates) @ clock.matrix) for clock, rates in slot.clocks if clock.key is not None]
+    clocks = [(clock.key, rates @ clock.matrix) for clock, rates in slot.clocks if clock.key is not None]
 
     def residual(values: gtsam.Values) -> tuple[FloatArray, list[tuple[int, FloatArray]]]:
         at = interpolated([slot], values)

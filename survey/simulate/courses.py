@@ -12,6 +12,9 @@ from adjust.model.clocks import EpochTimes, epoch_times
 from adjust.model.result import ParameterName
 from adjust.model.survey import Camera, Clock, FloatArray, Survey
 
+Late = float | FloatArray
+"""A time after an epoch, or (n,) times, at each of which something is somewhere else."""
+
 
 class Courses:
     """The true courses of a survey, and the true times of its clocks."""
@@ -26,27 +29,28 @@ class Courses:
         """Of all epochs."""
         return epoch_times(self.survey)
 
-    def late(self, name: ParameterName, clock: Clock | None, epoch_id: str, row: float = 0.0) -> float:
+    def late(self, name: ParameterName, clock: Clock | None, epoch_id: str, row: Late = 0.0) -> Late:
         """By how much later than an epoch something with this clock is observed; row: below the middle of the image."""
         if clock is None:
             return 0.0
         values = dict(zip(clock.parameters.names, np.asarray(self.truth[name]).tolist(), strict=True))
         own = self.truth.get((*name, epoch_id), np.zeros(1))
         since = self.times.of[epoch_id] - self.times.middle
-        return float(
+        return (
             values.get("offset", 0.0) + values.get("drift", 0.0) * since + values.get("line_time", 0.0) * row
-            + (0.0 if isinstance(own, Pose3) else own[0])
+            + (0.0 if isinstance(own, Pose3) else float(own[0]))
         )  # fmt: skip
 
-    def pose(self, name: ParameterName, dt: float) -> FloatArray:
-        """(4, 4) of a body, named with an epoch, a time after it."""
+    def pose(self, name: ParameterName, dt: Late) -> FloatArray:
+        """(4, 4) of a body, named with an epoch, a time after it; (n, 4, 4) at n times."""
         self._lay(name)
-        t, out = self.times.of[name[2]] + dt, np.eye(4)
-        out[:3, :3], out[:3, 3] = self._turns[name[:2]](t).as_matrix(), self._places[name[:2]](t)
+        t = self.times.of[name[2]] + dt
+        out = np.tile(np.eye(4), (*np.shape(t), 1, 1))
+        out[..., :3, :3], out[..., :3, 3] = self._turns[name[:2]](t).as_matrix(), self._places[name[:2]](t)
         return out
 
-    def angles(self, name: ParameterName, dt: float) -> FloatArray:
-        """(k,) rad of a table, named with an epoch, a time after it."""
+    def angles(self, name: ParameterName, dt: Late) -> FloatArray:
+        """(k,) rad of a table, named with an epoch, a time after it; (n, k) at n times."""
         self._lay(name)
         return np.asarray(self._places[name[:2]](self.times.of[name[2]] + dt))
 

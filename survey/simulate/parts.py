@@ -106,11 +106,13 @@ def _board_in_table() -> FloatArray:
 def shoot_board_from_table(draft: Draft, camera_id: str, n: int) -> None:
     """``n`` epochs of the table with the whole board in one camera, over its whole frame and on both faces."""
     border, scene, taken = outline(BOARD, _BOARD_BORDER), draft.scene(), 0
+    table_from_board = np.linalg.inv(world_from_room(draft)).astype(np.float64)
+    board_in_table = transform(table_from_board, centre(BOARD)[None])[0]
     for trial in range(_TRIALS):
         if taken == n:
             return
         pixel = pixel_in_cell(taken + trial // 100, draft.rng)
-        angles = _aimed(draft, scene, camera_id, pixel, face=taken % 2)
+        angles = _aimed(draft, scene, camera_id, pixel, board_in_table, face=taken % 2)
         if angles is None:
             continue
         epoch_id = add_table_epoch(draft, "t", angles)
@@ -123,25 +125,22 @@ def shoot_board_from_table(draft: Draft, camera_id: str, n: int) -> None:
     raise ValueError(f"no room for {n} images of the board in camera {camera_id}")
 
 
-def _aimed(draft: Draft, scene: Scene, camera_id: str, pixel: FloatArray, face: int) -> FloatArray | None:
+def _aimed(
+    draft: Draft, scene: Scene, camera_id: str, pixel: FloatArray, board_in_table: FloatArray, face: int
+) -> FloatArray | None:
     """Angles (2,) that bring the board's middle near a pixel; None where the table cannot.
 
     The camera stands off the table's centre and moves as it turns, hence the few rounds.
     """
-    table_from_board = np.linalg.inv(world_from_room(draft)).astype(np.float64)
-    board_in_table = transform(table_from_board, centre(BOARD)[None])[0]
     pose = draft.truth["station_from_camera", camera_id]
     mount_from_camera = pose.matrix() if isinstance(pose, Pose3) else np.eye(4)
     wanted = mount_from_camera[:3, :3] @ ray(draft.truth, camera_id, pixel)
-    place = np.zeros(3)
-    angles = None
-    for _ in range(4):
-        solutions = table_angles(wanted, board_in_table - place)
-        if not solutions:
-            return None
-        angles = solutions[face]
-        place = (scene.table_from_mount("turntable", angles) @ mount_from_camera)[:3, 3]
-    return angles
+    solutions = table_angles(wanted, board_in_table)
+    for _ in range(3):
+        if solutions:
+            place = (scene.table_from_mount("turntable", solutions[face]) @ mount_from_camera)[:3, 3]
+            solutions = table_angles(wanted, board_in_table - place)
+    return solutions[face] if solutions else None
 
 
 def add_table_epoch(draft: Draft, letter: str, angles: FloatArray) -> str:

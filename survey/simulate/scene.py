@@ -17,7 +17,7 @@ from adjust.model.boards import BOARD
 from adjust.model.observations import FrameRef, ImageBlock, PositionRef
 from adjust.model.result import ParameterName
 from adjust.model.survey import BoolArray, Camera, FloatArray, IntArray, Station, Survey, Table, Target
-from survey.simulate.courses import Courses, rolls
+from survey.simulate.courses import Courses, Late, rolls
 
 Truth = dict[ParameterName, Pose3 | FloatArray]
 BROWN = ("fx", "fy", "skew", "u0", "v0", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -46,8 +46,9 @@ def shift_along(axis: str, distance: float) -> FloatArray:
 
 
 def transform(matrix: FloatArray, x: FloatArray) -> FloatArray:
-    """Points (n, 3) m through a (4, 4) rigid motion."""
-    moved: FloatArray = x @ matrix[:3, :3].T + matrix[:3, 3]
+    """Points (n, 3) m through a (4, 4) rigid motion, or each through its own of (n, 4, 4)."""
+    turned = x @ matrix[:3, :3].T if matrix.ndim == 2 else np.einsum("nij,nj->ni", matrix[:, :3, :3], x)
+    moved: FloatArray = turned + matrix[..., :3, 3]
     return moved
 
 
@@ -91,7 +92,10 @@ def _moving(axis: str, number: int, geometry: Mapping[str, float], angle: float)
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A survey and its true values; the methods say what is where and what a camera would see."""
+    """A survey and its true values; the methods say what is where and what a camera would see.
+
+    Where several times after an epoch are asked for, every (4, 4) is (n, 4, 4).
+    """
 
     survey: Survey
     truth: Truth
@@ -109,8 +113,8 @@ class Scene:
         object.__setattr__(self, "_targets", {t.target_id: t for t in survey.targets})
         object.__setattr__(self, "courses", Courses(survey, self.truth))
 
-    def _pose(self, *name: str, late: float = 0.0) -> FloatArray:
-        if late != 0.0 and len(name) == 3:
+    def _pose(self, *name: str, late: Late = 0.0) -> FloatArray:
+        if len(name) == 3 and np.any(late):
             return self.courses.pose(name, late)
         pose = self.truth[name]
         if not isinstance(pose, Pose3):
@@ -127,6 +131,8 @@ class Scene:
 
     def table_from_mount(self, table_id: str, angles: FloatArray) -> FloatArray:
         """(4, 4): outer axis, common perpendicular, inner axis, as ``adjust.model.survey.Table`` writes the chain."""
+        if angles.ndim == 2:
+            return np.array([self.table_from_mount(table_id, a) for a in angles])
         table = self._tables[table_id]
         g = dict(zip(table.geometry.names, self.vector("table_geometry", table_id).tolist(), strict=True))
         if len(table.axes) == 1:
@@ -142,7 +148,7 @@ class Scene:
             @ rotation_about(inner, angles[1] + g["zero_2"])
         )
 
-    def world_from_station(self, station_id: str, epoch_id: str | None = None, late: float = 0.0) -> FloatArray:
+    def world_from_station(self, station_id: str, epoch_id: str | None = None, late: Late = 0.0) -> FloatArray:
         """(4, 4) at an epoch, or a time after it: by the table where it was read then, else the station's own pose."""
         station = self._stations[station_id]
         if station.motion == "fixed":
@@ -158,17 +164,17 @@ class Scene:
             @ self._pose("mount_from_station", station_id)
         )
 
-    def angles(self, table_id: str, epoch_id: str, late: float = 0.0) -> FloatArray:
+    def angles(self, table_id: str, epoch_id: str, late: Late = 0.0) -> FloatArray:
         """(k,) rad of a table at an epoch, or a time after it."""
         name = ("table_angles", table_id, epoch_id)
-        return self.vector(*name) if late == 0.0 else self.courses.angles(name, late)
+        return self.courses.angles(name, late) if np.any(late) else self.vector(*name)
 
-    def world_from_camera(self, camera_id: str, epoch_id: str | None = None, late: float = 0.0) -> FloatArray:
+    def world_from_camera(self, camera_id: str, epoch_id: str | None = None, late: Late = 0.0) -> FloatArray:
         """(4, 4) of a camera at an epoch, or a time after it."""
         station_id = self._cameras[camera_id].station_id
         return self.world_from_station(station_id, epoch_id, late) @ self._pose("station_from_camera", camera_id)
 
-    def world_from_target(self, target_id: str, epoch_id: str | None = None, late: float = 0.0) -> FloatArray:
+    def world_from_target(self, target_id: str, epoch_id: str | None = None, late: Late = 0.0) -> FloatArray:
         """(4, 4) of a target at an epoch, or a time after it."""
         target = self._targets[target_id]
         name: tuple[str, ...] = ("carrier_from_target", target_id)
@@ -178,12 +184,14 @@ class Scene:
         carrier = np.eye(4) if on is None else self.world_from_station(on, epoch_id, late)
         return carrier @ self._pose(*name, late=late)
 
-    def target_points(self, target_id: str, epoch_id: str | None = None, late: float = 0.0) -> FloatArray:
-        """The target's points in the world, (n, 3) m."""
+    def target_points(
+        self, target_id: str, epoch_id: str | None = None, late: Late = 0.0, points: IntArray | slice = slice(None)
+    ) -> FloatArray:
+        """The target's points in the world, (n, 3) m, or some of them."""
         target = self._targets[target_id]
         warp, warmth = ("warp", target_id), self.survey.temperatures.get(str(epoch_id), target.reference_temperature)
         x = _warped(target, self.vector(*warp), warmth) if warp in self.truth else target.x_in_target
-        return transform(self.world_from_target(target_id, epoch_id, late), x)
+        return transform(self.world_from_target(target_id, epoch_id, late), x[points])
 
     def world_points(self) -> FloatArray:
         """All of the survey's points, (n, 3) m, in its order."""
@@ -209,22 +217,20 @@ class Scene:
     def image(self, block: ImageBlock) -> FloatArray:
         """Image coordinates (n, 2) px of what a block shows when its camera truly exposes, row by row."""
         camera, name, epoch = self._cameras[block.camera_id], ("camera_clock", block.camera_id), block.epoch_id
-        uv = self._seen(block, block.point_idx, self.courses.late(name, camera.clock, epoch))
+        uv = self._seen(block, self.courses.late(name, camera.clock, epoch))
         if not rolls(camera):
             return uv
         middle = 0.5 * (camera.image_size[1] - 1)
         for _ in range(4):  # a row is where the point is when it is read
-            for i, point in enumerate(block.point_idx):
-                late = self.courses.late(name, camera.clock, epoch, float(uv[i, 1]) - middle)
-                uv[i] = self._seen(block, np.array([point]), late)[0]
+            uv = self._seen(block, self.courses.late(name, camera.clock, epoch, uv[:, 1] - middle))
         return uv
 
-    def _seen(self, block: ImageBlock, points: IntArray, late: float) -> FloatArray:
-        name, epoch = block.target_id, block.epoch_id
-        x = self.world_points() if name is None else self.target_points(name, epoch, late)
-        return self.project(block.camera_id, epoch, x[points], late)
+    def _seen(self, block: ImageBlock, late: Late) -> FloatArray:
+        name, epoch, points = block.target_id, block.epoch_id, block.point_idx
+        x = self.world_points()[points] if name is None else self.target_points(name, epoch, late, points)
+        return self.project(block.camera_id, epoch, x, late)
 
-    def project(self, camera_id: str, epoch_id: str, x_in_world: FloatArray, late: float = 0.0) -> FloatArray:
+    def project(self, camera_id: str, epoch_id: str, x_in_world: FloatArray, late: Late = 0.0) -> FloatArray:
         """Image coordinates (n, 2) px by OpenCV, NaN where a point is behind the camera or far outside its field."""
         world_from_camera = self.world_from_camera(camera_id, epoch_id, late)
         x = transform(np.linalg.inv(world_from_camera).astype(np.float64), x_in_world)
@@ -258,7 +264,7 @@ class Scene:
             within: BoolArray = np.all((uv >= margin_px) & (uv <= size - 1.0 - margin_px), axis=1)
         return within
 
-    def world_from_frame(self, frame: FrameRef, late: float = 0.0) -> FloatArray:
+    def world_from_frame(self, frame: FrameRef, late: Late = 0.0) -> FloatArray:
         """(4, 4) of any named frame, of stations also a time after their epoch."""
         if frame.kind == "world":
             return np.eye(4)

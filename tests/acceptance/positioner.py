@@ -11,12 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from gtsam import Pose3, Rot3
+from gtsam import GaussianFactorGraph, Pose3, Rot3
 
 from adjust.adjustment import adjust
 from adjust.graph.assembly import values_of
 from adjust.graph.building import GraphBuilder
-from adjust.graph.solver import solve
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, Pair, TableReading
 from adjust.model.result import Adjustment, ObservationResidual
@@ -143,21 +142,25 @@ def blockwise_covariance(
 ) -> BlockCovariance:
     """Covariance of the axes' parameters that holds although neighbouring poses err alike (delete-block jackknife).
 
-    The poses come in the order in which they were measured; each of the n_blocks stretches is left out once, and
-    ``C = (g - 1) / g * sum d d'`` (Quenouille, Tukey). Residuals of a real machine are hardly ever white: what its
-    model leaves out bends, sags and drifts, and the sigmas of least squares are then too small.
+    The poses come in the order in which they were measured; each of the n_blocks stretches is left out once, by one
+    step of Gauss-Newton from the solution of all, and ``C = (g - 1) / g * sum d d'`` (Quenouille, Tukey). Residuals of
+    a real machine are hardly ever white: what its model leaves out bends, sags and drifts, and the sigmas of least
+    squares are then too small.
     """
     n = len(joints)
     if not 3 <= n_blocks <= n // 2:
         raise SurveyError(f"{n_blocks} blocks of {n} poses: give at least three blocks of two poses or more")
     whole = positioner_survey(joints, sensor_from_target, weights)
-    start, values = values_of(adjust(whole)), []
-    for block in np.array_split(np.arange(n), n_blocks):
-        kept = np.setdiff1d(np.arange(n), block)
-        pairs, readings = (tuple(items[i] for i in kept) for items in (whole.pairs, whole.table_readings))
-        graph = GraphBuilder(replace(whole, pairs=pairs, table_readings=readings), {}).build(start)
-        axes = graph.unknowns.by_name["table_geometry", POSITIONER]
-        values.append(solve(graph).values.atVector(axes.key))
+    graph = GraphBuilder(whole, {}).build(values_of(adjust(whole)))
+    axes = graph.unknowns.by_name["table_geometry", POSITIONER].key
+    linear = [(o.ids[0 if o.kind == "pair" else 1], o.factor.linearize(graph.start)) for o in graph.others]
+    values = []
+    for block in np.array_split([pair.pair_id for pair in whole.pairs], n_blocks):
+        kept, left_out = GaussianFactorGraph(), set(block)
+        for epoch, factor in linear:
+            if epoch not in left_out:
+                kept.push_back(factor)
+        values.append(kept.optimize().at(axes))
     d = np.array(values) - np.mean(values, axis=0)
     return BlockCovariance((n_blocks - 1) / n_blocks * d.T @ d, n_blocks)
 

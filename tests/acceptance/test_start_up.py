@@ -49,14 +49,22 @@ def test_a_list_of_runs_loads_nothing_that_adjusts(network):
 
 
 def test_the_times_of_the_stages_are_the_time_that_passed(network, capsys):
-    """No stage is counted twice, and nothing that takes long is counted by none."""
+    """No stage is counted twice, and nothing that takes long is counted by none.
+
+    The best of several shares, because other work on the machine may hold up what lies between the stages.
+    """
     assert main(["adjust", str(network), "--quiet"]) == 0  # loads
-    capsys.readouterr()
-    begin = time.perf_counter()
-    assert main(["adjust", str(network), "--quiet"]) == 0
-    passed = time.perf_counter() - begin
-    told = capsys.readouterr().out.strip().splitlines()[-1]
-    stages = {name: float(s) for name, s in re.findall(r"(\w+) ([\d.]+) s", told)}
-    assert set(stages) >= {"read", "adjust", "statistics", "report"}
-    rounding = 0.005 * len(stages)
-    assert 0.6 * passed - rounding <= sum(stages.values()) <= passed + rounding
+    for _ in range(4):
+        capsys.readouterr()
+        begin = time.perf_counter()
+        assert main(["adjust", str(network), "--quiet"]) == 0
+        passed = time.perf_counter() - begin
+        told = capsys.readouterr().out.strip().splitlines()[-1]
+        stages = {name: float(s) for name, s in re.findall(r"(\w+) ([\d.]+) s", told)}
+        assert set(stages) >= {"read", "adjust", "statistics", "report"}
+        rounding = 0.005 * len(stages)
+        assert sum(stages.values()) <= passed + rounding
+        share = (sum(stages.values()) + rounding) / passed
+        if share >= 0.6:
+            return
+    pytest.fail(f"the stages are {share:.0%} of the time")

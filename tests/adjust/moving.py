@@ -39,19 +39,14 @@ def _times(epochs: Sequence[str]) -> dict[str, float]:
     return {e: STEP * int(e[1:]) for e in epochs}
 
 
-def _with_images(survey: Survey, truth: Truth, sigma_px: float) -> Survey:
-    """The survey with all points of its target in every image."""
+def _with_images(survey: Survey, sigma_px: float) -> Survey:
+    """The survey with all points of its target in every image, still without coordinates."""
     target, epochs = survey.targets[0], [e for e in survey.times if e[0] == "e"]
     n = len(target.x_in_target)
     cov = np.tile(sigma_px**2 * np.eye(2), (n, 1, 1))
-    blank = [
+    return replace(survey, image_blocks=tuple(
         ImageBlock(c.camera_id, e, target.target_id, np.arange(n), np.zeros((n, 2)), cov)
-        for e in epochs for c in survey.cameras
-    ]  # fmt: skip
-    scene = Scene(survey, truth)
-    for block in blank:
-        assert scene.inside(block.camera_id, scene.image(block), 2.0).all(), (block.camera_id, block.epoch_id)
-    return replace(survey, image_blocks=tuple(blank))
+        for e in epochs for c in survey.cameras))  # fmt: skip
 
 
 def board_before_cameras(
@@ -126,5 +121,7 @@ def camera_on_hand(
 
 
 def _resampled(survey: Survey, truth: Truth, sigma_px: float) -> tuple[Survey, Truth]:
-    survey = _with_images(survey, truth, sigma_px)
-    return resample(survey, truth, 1), truth
+    made, scene = resample(_with_images(survey, sigma_px), truth, 1), Scene(survey, truth)
+    for block in made.image_blocks:
+        assert scene.inside(block.camera_id, block.uv, 2.0).all(), (block.camera_id, block.epoch_id)
+    return made, truth

@@ -159,8 +159,7 @@ def test_a_target_that_a_single_image_shows() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(1, 9))
 def test_sound_surveys_have_no_findings_but_the_stereo_pair_that_covers_too_little(seed: int) -> None:
-    for survey in (hall(seed), hall(seed, plane=True), single_camera(seed)[0], head_on_table(seed)[0],
-                   beacons(seed)[0]):  # fmt: skip
+    for survey in (head_on_table(seed)[0], beacons(seed)[0]):
         assert [f for f in look_beforehand(survey).findings if f.level == "problem"] == []
     for survey in (hall(seed), hall(seed, plane=True), single_camera(seed)[0]):
         assert look_beforehand(survey).findings == ()

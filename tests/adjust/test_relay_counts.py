@@ -104,10 +104,10 @@ def test_loops_are_walks():
 
 def test_grid_of_4900_loops_has_its_faces_as_basis_in_seconds():
     top = grid(71, 71)
-    start = time.perf_counter()
+    start = time.process_time()
     basis = loop_basis(top)
     # 0.1 s measured alone
-    assert time.perf_counter() - start < 20.0
+    assert time.process_time() - start < 20.0
     assert basis.minimal
     assert (len(basis), basis.lengths.max()) == (4900, 4)
 

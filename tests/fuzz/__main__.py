@@ -96,7 +96,7 @@ def _inside(name: str, arguments: argparse.Namespace, answer: Connection) -> Non
 
 
 def fuzz(name: str, arguments: argparse.Namespace) -> dict:
-    """All inputs of one reader in this process."""
+    """All inputs of one reader in this process: what was found before, then new ones."""
     reader = READERS[name]
     kept = arguments.findings / name
     kept.mkdir(parents=True, exist_ok=True)
@@ -105,18 +105,17 @@ def fuzz(name: str, arguments: argparse.Namespace) -> dict:
         place = Path(folder).resolve()
         read = reader.prepare(place)
         seeds = reader.seeds()
-        for good in seeds:  # imports what is imported late
-            read(good)
-        called = functions_called(read, seeds) if arguments.called else []
+        called = functions_called(read, seeds)  # and imports what is imported late
         watch = Watch(place, arguments.limit_s)
         limit_memory(_MEMORY)
         if arguments.replay:
             inputs = [p.read_bytes() for p in sorted((arguments.replay / name).glob("*")) if p.is_file()]
         else:
-            mutator = Mutator([*seeds, *_corpus(name)], arguments.seed, reader.is_text, reader.dictionary)
+            corpus = _corpus(name)
+            mutator = Mutator([*seeds, *corpus], arguments.seed, reader.is_text, reader.dictionary)
             end = time.process_time() + arguments.cpu_s
             made = (mutator.next() for _ in range(arguments.count))
-            inputs = itertools.takewhile(lambda _: time.process_time() < end, made)
+            inputs = itertools.chain(corpus, itertools.takewhile(lambda _: time.process_time() < end, made))
         return _loop(inputs, read, watch, kept) | {"called": called}
 
 

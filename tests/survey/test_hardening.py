@@ -86,12 +86,12 @@ def test_a_file_of_petabytes_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "survey.toml"
     with path.open("wb") as stream:
         stream.truncate(2**40)  # takes no room on the disk
-    begin = time.perf_counter()
+    begin = time.process_time()
     with pytest.raises(SurveyError, match="more than the 17 MB that are read"):
         read_toml(path)
     with pytest.raises(SurveyError, match="more than the 4295 MB that are read"):
         read_bytes(path)
-    assert time.perf_counter() - begin < 1.0
+    assert time.process_time() - begin < 1.0
 
 
 @pytest.mark.parametrize(
@@ -107,12 +107,12 @@ def test_a_file_of_petabytes_is_refused(tmp_path: Path) -> None:
 def test_toml_that_would_take_for_ever(tmp_path: Path, text: str, said: str) -> None:
     path = tmp_path / "survey.toml"
     path.write_text(text)
-    begin = time.perf_counter()
+    begin = time.process_time()
     with pytest.raises(SurveyError) as caught:
         read_toml(path)
     assert said in str(caught.value)
     assert len(str(caught.value)) < 500
-    assert time.perf_counter() - begin < 5.0
+    assert time.process_time() - begin < 5.0
 
 
 def test_numbers_too_large_to_be_meant(tmp_path: Path) -> None:

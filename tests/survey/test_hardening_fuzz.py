@@ -1,6 +1,7 @@
 """What fuzzing found once is read again, and some new inputs of every reader; ``python -m tests.fuzz`` does more."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -62,24 +63,28 @@ NO_READERS = {
 """Functions that open or parse something, and why nothing that a stranger has written comes through them."""
 
 
-def _fuzzed(tmp_path: Path, *options: str) -> str:
-    command = [sys.executable, "-m", "tests.fuzz", *options, "--limit-s", "30", "--findings", str(tmp_path / "found")]
+@pytest.fixture(scope="module")
+def fuzzed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, int], set[str]]:
+    """How many inputs every reader stood, and which functions read them; nothing may be found."""
+    place = tmp_path_factory.mktemp("fuzz")
+    command = [sys.executable, "-m", "tests.fuzz", "--count", str(size(4)), "--seed", "11", "--limit-s", "30",
+               "--findings", str(place / "found"), "--called", str(place / "called.json")]  # fmt: skip
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+    assert " 0 findings" in done.stdout
+    inputs = {name: int(n) for name, n in re.findall(r"^(\S+) +(\d+) inputs ", done.stdout, re.MULTILINE)}
+    return inputs, set(json.loads((place / "called.json").read_text()))
 
 
-def test_what_was_found_is_found_no_more(tmp_path):
-    names = ",".join(sorted(p.name for p in CORPUS.iterdir()))
-    assert " 0 findings" in _fuzzed(tmp_path, "--replay", str(CORPUS), "--reader", names)
+def test_what_was_found_is_found_no_more(fuzzed: tuple[dict[str, int], set[str]]) -> None:
+    for folder in CORPUS.iterdir():
+        assert fuzzed[0][folder.name] == len(list(folder.iterdir())) + size(4), folder.name
 
 
-def test_every_reader_is_listed_and_stands_new_inputs(tmp_path):
+def test_every_reader_is_listed_and_stands_new_inputs(fuzzed: tuple[dict[str, int], set[str]]) -> None:
     """Whether a function reads files is seen in its source; whether it is in the list, by running the list."""
-    called = tmp_path / "called.json"
-    out = _fuzzed(tmp_path, "--count", str(size(4)), "--seed", "11", "--jobs", "1", "--called", str(called))
-    assert " 0 findings" in out
-    missing = set(reading_functions()) - set(json.loads(called.read_text()))
+    assert set(fuzzed[0].values()) >= {size(4)}
+    missing = set(reading_functions()) - fuzzed[1]
     unlisted = sorted(missing - set(NO_READERS))
     assert unlisted == [], unlisted
     assert sorted(set(NO_READERS) - missing) == []

@@ -43,11 +43,11 @@ def test_cameras_sizes_and_board_are_read_out_of_the_images(images, tmp_path, ca
 
 
 def test_images_that_lie_in_the_project_already_stay(images, tmp_path):
-    shutil.copytree(images, tmp_path / "lab/images")
+    shutil.copytree(images, tmp_path / "lab/images", ignore=shutil.ignore_patterns("e02*", "e03*"))
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "lab/images").glob("*/*")}
     assert start_project(tmp_path / "lab/images", tmp_path / "lab").board == (9, 6)
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "lab/images").glob("*/*")} == before
-    assert read(tmp_path / "lab").images.keys() == read(images.parent).images.keys()
+    assert read(tmp_path / "lab").images.keys() == {key for key in read(images.parent).images if "e01" in key}
     shutil.copytree(images / "left", tmp_path / "flat/images")
     with pytest.raises(SurveyError, match="in a folder of their camera"):
         start_project(tmp_path / "flat/images", tmp_path / "flat")
@@ -56,12 +56,12 @@ def test_images_that_lie_in_the_project_already_stay(images, tmp_path):
 
 def test_one_folder_is_one_camera_and_a_name_may_be_anything(images, tmp_path):
     place = tmp_path / 'my "camera" 1'
-    shutil.copytree(images / "left", place, ignore=shutil.ignore_patterns("e03*"))
+    shutil.copytree(images / "left", place, ignore=shutil.ignore_patterns("e02*", "e03*"))
     with pytest.raises(SurveyError, match="its name is that of the camera"):
         start_project(place, tmp_path / "no")
     assert not (tmp_path / "no").exists()
     outcome = start_project(place.rename(tmp_path / "camera-1"), tmp_path / "yes")
-    assert list(outcome.cameras.values()) == [(2, (1280, 1024))]
+    assert list(outcome.cameras.values()) == [(1, (1280, 1024))]
     assert outcome.summary()["board"] == [9, 6]
 
 
