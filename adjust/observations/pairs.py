@@ -9,7 +9,7 @@ chi-square with the rank of Q_vv degrees of freedom (Baarda 1968; Koch 1999, sec
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import gtsam
 import numpy as np
@@ -83,16 +83,25 @@ class PairArrays:
 
 
 def pair_arrays(pairs: Sequence[Pair]) -> PairArrays:
-    """Pairs as arrays."""
+    """Pairs as arrays, which are not to be changed: those of the same pairs are made once."""
+    return _arrays(tuple(pairs))
+
+
+@lru_cache(2)  # of a survey as it was given, and as it is solved
+def _arrays(pairs: tuple[Pair, ...]) -> PairArrays:
     cov, size = np.zeros((len(pairs), 6, 6)), np.array([len(p.cov) for p in pairs], dtype=np.int64)
     cov[size == 3, 3:, 3:] = np.diag([np.inf] * 3)
     for k in (3, 6):
         alike = np.flatnonzero(size == k)
         cov[alike, :k, :k] = np.array([pairs[e].cov for e in alike.tolist()]).reshape(-1, k, k)
     measured = [p.b_from_a for p in pairs]
-    R = [m.rotation().matrix() if isinstance(m, Pose3) else m.matrix() for m in measured]
-    t = [m.translation() if isinstance(m, Pose3) else np.full(3, np.nan) for m in measured]
-    return PairArrays(np.array(R).reshape(-1, 3, 3), np.array(t).reshape(-1, 3), cov, np.array([p.used for p in pairs]))
+    M = np.full((len(pairs), 4, 4), np.nan)
+    for e, m in enumerate(measured):
+        if isinstance(m, Pose3):
+            M[e] = m.matrix()
+        else:
+            M[e, :3, :3] = m.matrix()
+    return PairArrays(M[:, :3, :3].copy(), M[:, :3, 3].copy(), cov, np.array([p.used for p in pairs], dtype=np.bool_))
 
 
 def doubtful(pairs: PairArrays) -> BoolArray:
