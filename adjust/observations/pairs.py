@@ -7,7 +7,7 @@ Redundancy numbers and tests as in :mod:`adjust.precision.precision`: v' Q_vv^-1
 chi-square with the rank of Q_vv degrees of freedom (Baarda 1968; Koch 1999, section 4.2).
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 
@@ -133,6 +133,10 @@ def checked_arrays(pairs: Sequence[Pair]) -> PairArrays:
             "direction a sigma"
         )
     return found
+
+
+def _ids(pair: Pair) -> tuple[str, str, str]:
+    return pair.pair_id, pair.a.text, pair.b.text
 
 
 def _said(pair: Pair) -> str:
@@ -282,9 +286,8 @@ class PairBatch:
         out = []
         for e, (row, is_pose) in enumerate(zip(self.rows.tolist(), self.arrays.is_pose.tolist(), strict=True)):
             pair, k = pairs[row], 6 if is_pose else 3
-            ids = pair.pair_id, frame_text(pair.a), frame_text(pair.b)
-            out.append(ObservationFactor(self._exact(e, pair, is_pose), "pair", pair.group, ids, POSE_COMPONENTS[:k],
-                                         POSE_UNITS[:k], logs[e, :k], pair.used))  # fmt: skip
+            out.append(ObservationFactor(self._exact(e, pair, is_pose), "pair", pair.group, _ids(pair),
+                                         POSE_COMPONENTS[:k], POSE_UNITS[:k], logs[e, :k], pair.used))  # fmt: skip
         return out
 
     def _exact(self, e: int, pair: Pair, is_pose: bool) -> gtsam.NonlinearFactor:
@@ -344,13 +347,14 @@ class PairBatch:
     def squares(self, found: Sequence[ObservationResidual]) -> dict[int, float]:
         """Weighted squares of the residuals of these pairs, by their row in ``Survey.pairs``; ``found`` are of all."""
         v, rows = np.zeros((len(self), 6)), self.rows.tolist()
-        for e, row in enumerate(rows):
-            v[e, : len(found[row].residual)] = found[row].residual
+        for k, alike in ((6, self.arrays.is_pose), (3, ~self.arrays.is_pose)):
+            of = self.rows[alike].tolist()
+            v[alike, :k] = np.array([found[row].residual for row in of]).reshape(-1, k)
         white = np.einsum("nij,nj->ni", self.arrays.whitening, v)
         return dict(zip(rows, np.einsum("ni,ni->n", white, white).tolist(), strict=True))
 
-    def residuals(self, stats: PairStatistics, items: Iterable[ObservationFactor]) -> list[ObservationResidual]:
-        """As reports take them."""
+    def residuals(self, stats: PairStatistics, pairs: Sequence[Pair]) -> list[ObservationResidual]:
+        """As reports take them; ``pairs`` are those of the survey."""
         v, cov = stats.residual, self.arrays.cov
         adjusted = (self.arrays.motions @ exp(v)).log()
         sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
@@ -360,14 +364,12 @@ class PairBatch:
             standardized = np.where(seen, v / np.sqrt(np.where(seen, spread, 1.0)), np.nan)
         turned = Motions(self.arrays.rotations @ exp(v[:, :3]).rotation).log()
         adjusted[~self.arrays.is_pose, :3] = turned[~self.arrays.is_pose]
-        out = []
-        for e, item in enumerate(items):
-            k = len(item.components)
-            out.append(ObservationResidual(
-                "pair", item.group, item.ids, item.components, item.units, item.observed, adjusted[e, :k], v[e, :k],
-                sigma[e, :k], stats.redundancy[e, :k], standardized[e, :k], float(stats.test[e]), item.used,
-            ))  # fmt: skip
-        return out
+        said = {k: (POSE_COMPONENTS[:k], POSE_UNITS[:k]) for k in (3, 6)}
+        columns = self.arrays.logs, adjusted, v, sigma, stats.redundancy, standardized
+        rows = zip(self.rows.tolist(), np.where(self.arrays.is_pose, 6, 3).tolist(), *columns, stats.test.tolist(),
+                   strict=True)  # fmt: skip
+        return [ObservationResidual("pair", (p := pairs[row]).group, _ids(p), *said[k], *(x[:k] for x in values), test,
+                                    p.used) for row, k, *values, test in rows]  # fmt: skip
 
 
 def _quadratic(Q: FloatArray, v: FloatArray) -> tuple[FloatArray, IntArray]:
