@@ -366,10 +366,10 @@ class PairBatch:
         adjusted[~self.arrays.is_pose, :3] = turned[~self.arrays.is_pose]
         said = {k: (POSE_COMPONENTS[:k], POSE_UNITS[:k]) for k in (3, 6)}
         columns = self.arrays.logs, adjusted, v, sigma, stats.redundancy, standardized
-        rows = zip(self.rows.tolist(), np.where(self.arrays.is_pose, 6, 3).tolist(), *columns, stats.test.tolist(),
-                   strict=True)  # fmt: skip
-        return [ObservationResidual("pair", (p := pairs[row]).group, _ids(p), *said[k], *(x[:k] for x in values), test,
-                                    p.used) for row, k, *values, test in rows]  # fmt: skip
+        rows = zip((pairs[row] for row in self.rows.tolist()), np.where(self.arrays.is_pose, 6, 3).tolist(), *columns,
+                   stats.test.tolist(), strict=True)  # fmt: skip
+        return [ObservationResidual("pair", p.group, _ids(p), *said[k], l[:k], a[:k], r[:k], s[:k], n[:k], w[:k], test,
+                                    p.used) for p, k, l, a, r, s, n, w, test in rows]  # fmt: skip
 
 
 def _quadratic(Q: FloatArray, v: FloatArray) -> tuple[FloatArray, IntArray]:

@@ -97,7 +97,8 @@ def _real(ids: Sequence[str]) -> tuple[str, ...]:
 
 def _ends(pairs: Sequence[Pair]) -> _Ends:
     """Ids of the pairs, and names of their frames a and b."""
-    name = {id(r): frame_name(r) for p in pairs for r in (p.a, p.b)}  # most are the same object
+    seen = {id(r): r for p in pairs for r in (p.a, p.b)}  # most are the same object
+    name = {k: frame_name(r) for k, r in seen.items()}
     return [(p.pair_id, name[id(p.a)], name[id(p.b)]) for p in pairs]
 
 
