@@ -113,6 +113,11 @@ class AdjustmentGraph:
     pairs: "PairBatch | None" = None
     first_pair: int = 0
 
+    @property
+    def n_others(self) -> int:
+        """How many ``others`` there are; makes none."""
+        return len(self.singles) + (0 if self.pairs is None else len(self.pairs))
+
     @cached_property
     def others(self) -> list[ObservationFactor]:
         """Every observation that is neither an image point nor a reading, in the order of the survey."""

@@ -1,6 +1,7 @@
 """What was observed: values with their covariance and the group they belong to, as frozen values."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -22,6 +23,13 @@ class FrameRef:
     frame_id: str = ""
     epoch_id: str | None = None
 
+    @cached_property
+    def text(self) -> str:
+        """``kind:id@epoch``, as in the tables of the project folder; ``world``. Kept: pairs share their frames."""
+        if self.kind == "world":
+            return "world"
+        return f"{self.kind}:{self.frame_id}" + (f"@{self.epoch_id}" if self.epoch_id else "")
+
 
 @dataclass(frozen=True)
 class PositionRef:
@@ -32,10 +40,8 @@ class PositionRef:
 
 
 def frame_text(ref: FrameRef) -> str:
-    """``kind:id@epoch``, as in the tables of the project folder; ``world``."""
-    if ref.kind == "world":
-        return "world"
-    return f"{ref.kind}:{ref.frame_id}" + (f"@{ref.epoch_id}" if ref.epoch_id else "")
+    """See :attr:`FrameRef.text`."""
+    return ref.text
 
 
 def position_text(ref: PositionRef) -> str:

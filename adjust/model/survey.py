@@ -7,6 +7,7 @@ first pixel is (0, 0). Tangents of poses are GTSAM's: rotation (rad) then transl
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -21,6 +22,7 @@ from adjust.model.observations import (
     CoordinateDifferences,
     Coordinates,
     Distance,
+    FrameRef,
     ImageBlock,
     LaserSpot,
     Level,
@@ -438,11 +440,21 @@ class Survey:
         """How many of them are in use."""
         return sum(o.used for kind in self.others.values() for o in kind)
 
-    @property
+    @cached_property
     def is_pose_network(self) -> bool:
         """Whether it observes nothing but pairs between stations that stay where they are."""
-        if self.cameras or self.image_blocks or any(v for k, v in self.others.items() if k != "pairs"):
+        if not self.pairs or self.cameras or self.image_blocks or any(v for k, v in self.others.items() if k != "pairs"):
             return False
+        return self.pairs_join_fixed_stations
+
+    @cached_property
+    def pairs_join_fixed_stations(self) -> bool:
+        """Whether no pair ends at anything else."""
         fixed = {s.station_id for s in self.stations if s.motion == "fixed"}
-        ends = [ref for p in self.pairs for ref in (p.a, p.b)]
-        return bool(ends) and all(r.kind == "station" and r.frame_id in fixed for r in ends)
+        return all(r.kind == "station" and r.frame_id in fixed for r in self.pair_frames)
+
+    @cached_property
+    def pair_frames(self) -> tuple[FrameRef, ...]:
+        """The frames that the pairs join, each once, in order of appearance."""
+        seen = {id(r): r for p in self.pairs for r in (p.a, p.b)}  # most are the same object: no hash of each
+        return tuple(dict.fromkeys(seen.values()))

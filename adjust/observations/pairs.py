@@ -7,9 +7,9 @@ Redundancy numbers and tests as in :mod:`adjust.precision.precision`: v' Q_vv^-1
 chi-square with the rank of Q_vv degrees of freedom (Baarda 1968; Koch 1999, section 4.2).
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import gtsam
 import numpy as np
@@ -83,16 +83,25 @@ class PairArrays:
 
 
 def pair_arrays(pairs: Sequence[Pair]) -> PairArrays:
-    """Pairs as arrays."""
+    """Pairs as arrays, which are not to be changed: those of the same pairs are made once."""
+    return _arrays(tuple(pairs))
+
+
+@lru_cache(2)  # of a survey as it was given, and as it is solved
+def _arrays(pairs: tuple[Pair, ...]) -> PairArrays:
     cov, size = np.zeros((len(pairs), 6, 6)), np.array([len(p.cov) for p in pairs], dtype=np.int64)
     cov[size == 3, 3:, 3:] = np.diag([np.inf] * 3)
     for k in (3, 6):
         alike = np.flatnonzero(size == k)
         cov[alike, :k, :k] = np.array([pairs[e].cov for e in alike.tolist()]).reshape(-1, k, k)
     measured = [p.b_from_a for p in pairs]
-    R = [m.rotation().matrix() if isinstance(m, Pose3) else m.matrix() for m in measured]
-    t = [m.translation() if isinstance(m, Pose3) else np.full(3, np.nan) for m in measured]
-    return PairArrays(np.array(R).reshape(-1, 3, 3), np.array(t).reshape(-1, 3), cov, np.array([p.used for p in pairs]))
+    M = np.full((len(pairs), 4, 4), np.nan)
+    for e, m in enumerate(measured):
+        if isinstance(m, Pose3):
+            M[e] = m.matrix()
+        else:
+            M[e, :3, :3] = m.matrix()
+    return PairArrays(M[:, :3, :3].copy(), M[:, :3, 3].copy(), cov, np.array([p.used for p in pairs], dtype=np.bool_))
 
 
 def doubtful(pairs: PairArrays) -> BoolArray:
@@ -124,6 +133,10 @@ def checked_arrays(pairs: Sequence[Pair]) -> PairArrays:
             "direction a sigma"
         )
     return found
+
+
+def _ids(pair: Pair) -> tuple[str, str, str]:
+    return pair.pair_id, pair.a.text, pair.b.text
 
 
 def _said(pair: Pair) -> str:
@@ -273,9 +286,8 @@ class PairBatch:
         out = []
         for e, (row, is_pose) in enumerate(zip(self.rows.tolist(), self.arrays.is_pose.tolist(), strict=True)):
             pair, k = pairs[row], 6 if is_pose else 3
-            ids = pair.pair_id, frame_text(pair.a), frame_text(pair.b)
-            out.append(ObservationFactor(self._exact(e, pair, is_pose), "pair", pair.group, ids, POSE_COMPONENTS[:k],
-                                         POSE_UNITS[:k], logs[e, :k], pair.used))  # fmt: skip
+            out.append(ObservationFactor(self._exact(e, pair, is_pose), "pair", pair.group, _ids(pair),
+                                         POSE_COMPONENTS[:k], POSE_UNITS[:k], logs[e, :k], pair.used))  # fmt: skip
         return out
 
     def _exact(self, e: int, pair: Pair, is_pose: bool) -> gtsam.NonlinearFactor:
@@ -335,13 +347,14 @@ class PairBatch:
     def squares(self, found: Sequence[ObservationResidual]) -> dict[int, float]:
         """Weighted squares of the residuals of these pairs, by their row in ``Survey.pairs``; ``found`` are of all."""
         v, rows = np.zeros((len(self), 6)), self.rows.tolist()
-        for e, row in enumerate(rows):
-            v[e, : len(found[row].residual)] = found[row].residual
+        for k, alike in ((6, self.arrays.is_pose), (3, ~self.arrays.is_pose)):
+            of = self.rows[alike].tolist()
+            v[alike, :k] = np.array([found[row].residual for row in of]).reshape(-1, k)
         white = np.einsum("nij,nj->ni", self.arrays.whitening, v)
         return dict(zip(rows, np.einsum("ni,ni->n", white, white).tolist(), strict=True))
 
-    def residuals(self, stats: PairStatistics, items: Iterable[ObservationFactor]) -> list[ObservationResidual]:
-        """As reports take them."""
+    def residuals(self, stats: PairStatistics, pairs: Sequence[Pair]) -> list[ObservationResidual]:
+        """As reports take them; ``pairs`` are those of the survey."""
         v, cov = stats.residual, self.arrays.cov
         adjusted = (self.arrays.motions @ exp(v)).log()
         sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
@@ -351,14 +364,12 @@ class PairBatch:
             standardized = np.where(seen, v / np.sqrt(np.where(seen, spread, 1.0)), np.nan)
         turned = Motions(self.arrays.rotations @ exp(v[:, :3]).rotation).log()
         adjusted[~self.arrays.is_pose, :3] = turned[~self.arrays.is_pose]
-        out = []
-        for e, item in enumerate(items):
-            k = len(item.components)
-            out.append(ObservationResidual(
-                "pair", item.group, item.ids, item.components, item.units, item.observed, adjusted[e, :k], v[e, :k],
-                sigma[e, :k], stats.redundancy[e, :k], standardized[e, :k], float(stats.test[e]), item.used,
-            ))  # fmt: skip
-        return out
+        said = {k: (POSE_COMPONENTS[:k], POSE_UNITS[:k]) for k in (3, 6)}
+        columns = self.arrays.logs, adjusted, v, sigma, stats.redundancy, standardized
+        rows = zip((pairs[row] for row in self.rows.tolist()), np.where(self.arrays.is_pose, 6, 3).tolist(), *columns,
+                   stats.test.tolist(), strict=True)  # fmt: skip
+        return [ObservationResidual("pair", p.group, _ids(p), *said[k], l[:k], a[:k], r[:k], s[:k], n[:k], w[:k], test,
+                                    p.used) for p, k, l, a, r, s, n, w, test in rows]  # fmt: skip
 
 
 def _quadratic(Q: FloatArray, v: FloatArray) -> tuple[FloatArray, IntArray]:

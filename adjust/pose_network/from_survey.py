@@ -26,7 +26,7 @@ def network_of_pairs(survey: Survey) -> PoseNetwork | None:
     beside = any(getattr(survey, kind) for kind in _BESIDE)
     if beside and survey.datum.kind == "inner":  # where a free network lies is not to be seen in its pairs alone
         return None
-    reached = {r.frame_id for p in survey.pairs for r in (p.a, p.b)}
+    reached = {r.frame_id for r in survey.pair_frames}
     lost = [s.station_id for s in survey.stations
             if s.station_id not in reached and s.world_from_station.treatment == "free"]  # fmt: skip
     if lost:
@@ -51,8 +51,7 @@ def _stations_and_pairs(survey: Survey) -> bool:
     there_is = {f.name for f in fields(survey) if isinstance(v := getattr(survey, f.name), tuple) and v}
     if there_is - _FREELY or survey.vertical.tilt.free:
         return False
-    fixed = {s.station_id for s in survey.stations if s.motion == "fixed"}
-    return all(r.kind == "station" and r.frame_id in fixed for p in survey.pairs for r in (p.a, p.b))
+    return survey.pairs_join_fixed_stations
 
 
 def network_from_survey(survey: Survey, any_datum: bool = False) -> PoseNetwork:
@@ -62,14 +61,14 @@ def network_from_survey(survey: Survey, any_datum: bool = False) -> PoseNetwork:
     than fixed stations, IndeterminateError where the survey gives no datum.
     """
     stations = {s.station_id: s for s in survey.stations}
-    for pair in survey.pairs:
-        for ref in (pair.a, pair.b):
+    if not survey.pairs_join_fixed_stations:
+        for pair, ref in ((p, r) for p in survey.pairs for r in (p.a, p.b)):
             if ref.kind != "station" or ref.frame_id not in stations or stations[ref.frame_id].motion != "fixed":
                 raise SurveyError(
                     f"pair {pair.pair_id!r} ends at {ref.kind} {ref.frame_id!r}, which is no fixed station of the "
                     "survey; a pose network joins fixed stations"
                 )
-    ids = list(dict.fromkeys(r.frame_id for p in survey.pairs for r in (p.a, p.b)))
+    ids = list(dict.fromkeys(r.frame_id for r in survey.pair_frames))
     index = {s: i for i, s in enumerate(ids)}
     given = {index[s]: stations[s].world_from_station for s in ids}
     measured = pair_arrays(survey.pairs)

@@ -220,10 +220,11 @@ class Precision(Covariances):
 
     @cached_property
     def single(self) -> list[int]:
-        """Which of the other observations are in no batch, by number."""
-        batch, first = self.graph.pairs, self.graph.first_pair
-        within = set() if batch is None else set((first + batch.rows).tolist())
-        return [i for i in range(len(self.graph.others)) if i not in within]
+        """Which of the other observations are in no batch, by number, in the order of ``AdjustmentGraph.singles``."""
+        batch, alone = self.graph.pairs, np.ones(self.graph.n_others, dtype=np.bool_)
+        if batch is not None:
+            alone[self.graph.first_pair + batch.rows] = False
+        return np.flatnonzero(alone).tolist()
 
     def covs(self, keys: IntArray, dim: int) -> FloatArray:
         """Covariances (n, dim, dim) of many unknowns of the same dimension."""
@@ -311,10 +312,8 @@ def other_residuals(precision: Precision) -> tuple[ObservationResidual, ...]:
     graph, out = precision.graph, dict[int, ObservationResidual]()
     if graph.pairs is not None:
         places = (graph.first_pair + graph.pairs.rows).tolist()
-        found = graph.pairs.residuals(precision.pairs, [graph.others[i] for i in places])
-        out |= dict(zip(places, found, strict=True))
-    for i in precision.single:
-        item = graph.others[i]
+        out |= dict(zip(places, graph.pairs.residuals(precision.pairs, graph.survey.pairs), strict=True))
+    for i, item in zip(precision.single, graph.singles, strict=True):
         e, M, root = precision.influence(item)
         n = len(e)
         Q = np.eye(n) - M if item.used else np.eye(n) + M
@@ -329,7 +328,7 @@ def other_residuals(precision: Precision) -> tuple[ObservationResidual, ...]:
         adjusted = adjusted_motion(item.observed, v) if item.kind == "pair" else np.asarray(item.observed + v)
         out[i] = ObservationResidual(item.kind, item.group, item.ids, item.components, item.units, item.observed,
                                      adjusted, v, sigma, redundancy, standardized, test, item.used)  # fmt: skip
-    return tuple(out[i] for i in range(len(graph.others)))
+    return tuple(out[i] for i in range(graph.n_others))
 
 
 def adjusted_motion(observed: FloatArray, v: FloatArray) -> FloatArray:
@@ -356,13 +355,15 @@ def group_summaries(
     for group, *sums_of_group in zip(names, *_image_sums(graph, images, names), strict=True):
         add(group, *sums_of_group)
     of_pairs = {} if graph.pairs is None else graph.pairs.squares(others[graph.first_pair :])
-    for i, (item, factor) in enumerate(zip(others, graph.others, strict=True)):
+    alone = iter(graph.singles)
+    for i, item in enumerate(others):
+        square = of_pairs.get(i - graph.first_pair)
+        factor = next(alone) if square is None else None
         if item.used:
-            square = of_pairs.get(i - graph.first_pair)
-            if square is None:
+            if factor is not None:
                 e = noise_of(factor).whiten(item.residual)
                 square = float(e @ e)
-            add(item.group, len(item.residual), sum(item.redundancy.tolist()), square)
+            add(item.group, len(item.residual), sum(item.redundancy.tolist()), square or 0.0)
     if readings is not None:
         of_group: dict[str, list[int]] = {}
         for i, reading in enumerate(graph.survey.readings):

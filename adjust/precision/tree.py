@@ -137,13 +137,19 @@ class TreeCovariance:
         return out
 
     def _apart(self, numbers: list[int]) -> FloatArray:
-        """Joint covariance of unknowns of different cliques: columns of the inverse, on their ways to the root only."""
-        rows = np.concatenate([np.arange(self._first[k], self._first[k + 1]) for k in numbers])
-        x = np.zeros((int(self._first[-1]), len(rows)))
-        x[rows, np.arange(len(rows))] = 1.0
-        cliques = self._ancestors(set(self._home[numbers].tolist()))
-        self._solve(cliques, cliques, x)
-        out = x[rows]
+        """Joint covariance of unknowns of different cliques: columns of the inverse, on their ways to the root only.
+
+        Of the last one none: its own covariance is known, and the rest is in the columns of the others.
+        """
+        rows = [np.arange(self._first[k], self._first[k + 1]) for k in numbers]
+        every, asked = np.concatenate(rows), np.concatenate(rows[:-1])
+        x = np.zeros((int(self._first[-1]), len(asked)))
+        x[asked, np.arange(len(asked))] = 1.0
+        home = self._home[numbers].tolist()
+        self._solve(self._ancestors(set(home[:-1])), self._ancestors(set(home)), x)
+        out, n = np.empty((len(every),) * 2), len(asked)
+        out[:, :n], out[:n, n:] = x[every], x[rows[-1]].T
+        out[n:, n:] = self._block(numbers[-1], numbers[-1])
         return np.asarray(0.5 * (out + out.T))
 
     def _ancestors(self, cliques: set[int]) -> IntArray:

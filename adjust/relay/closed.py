@@ -23,7 +23,6 @@ from adjust.model.observations import Closure, FrameRef, Pair
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.survey import FloatArray, PoseParameter, Station, Survey
 from adjust.precision.precision import Precision, adjusted_motion, global_test
-from adjust.relay.conditions import adjust_loops
 from adjust.relay.network import network_from_pairs
 from adjust.relay.result import AdjustedPairs, whitening
 
@@ -212,6 +211,8 @@ def in_condition_form(result: Adjustment) -> Adjustment:
     kinds = {isinstance(p.b_from_a, Rot3) for p in used}
     if len(given) > 1 or len(kinds) != 1:
         return result
+    from adjust.relay.conditions import adjust_loops  # here: what is not solved by conditions goes without
+
     found = adjust_loops(network_from_pairs(used))
     pairs, precision = found.pairs, result.precision
     if not len(found.basis) or not isinstance(precision, Precision):

@@ -7,6 +7,7 @@ A station is here any frame that carries an eye: a camera, a marker block, a who
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import gtsam
 import numpy as np
@@ -41,17 +42,18 @@ def topology(pairs: Iterable[tuple[str, str, str]], stations: Sequence[str] = ()
     Raises SurveyError for an id that comes twice and for a pair of a station with itself.
     """
     rows = list(pairs)
-    for what, ids in (("pair", [row[0] for row in rows]), ("station", list(stations))):
-        twice = [i for i, n in Counter(ids).items() if n > 1]
-        if twice:
-            raise SurveyError(f"{what} {twice[0]!r} is there twice; give every {what} an id of its own")
-    alone = [row for row in rows if row[1] == row[2]]
-    if alone:
-        raise SurveyError(f"pair {alone[0][0]!r} joins {alone[0][1]!r} with itself; correct a or b")
-    index = {station: i for i, station in enumerate(stations)}
-    ends = [index.setdefault(end, len(index)) for row in rows for end in row[1:]]
-    a, b = np.array(ends, dtype=np.int64).reshape(-1, 2).T
-    return Topology(tuple(index), tuple(row[0] for row in rows), a.copy(), b.copy())
+    pair_ids, *ends = zip(*rows, strict=True) if rows else ((), (), ())
+    for what, ids in (("pair", pair_ids), ("station", tuple(stations))):
+        if len(set(ids)) < len(ids):
+            twice = next(i for i, n in Counter(ids).items() if n > 1)
+            raise SurveyError(f"{what} {twice!r} is there twice; give every {what} an id of its own")
+    station_ids = tuple(dict.fromkeys(chain(stations, chain.from_iterable(zip(*ends, strict=True)))))
+    index = {station: i for i, station in enumerate(station_ids)}
+    a, b = (np.array([index[end] for end in of], dtype=np.int64) for of in ends)
+    alone = np.flatnonzero(a == b)
+    if len(alone):
+        raise SurveyError(f"pair {pair_ids[alone[0]]!r} joins {ends[0][alone[0]]!r} with itself; correct a or b")
+    return Topology(station_ids, pair_ids, a, b)
 
 
 def network_from_pairs(pairs: Sequence[Pair], rotations_only: bool = False) -> MeasuredPairs:

@@ -124,7 +124,7 @@ def contributions(adjustment: Adjustment, system: LinearSystem, blocks: IntArray
             sums = np.bincount(number, np.where(images.used, values, 0.0), len(images.block_ptr) - 1)
             out[:k] = (sums / np.maximum(np.bincount(blocks, minlength=len(sums)), 1))[blocks]  # each part its share
     np.add.at(omega, system.row_of, np.where(system.row_of >= k, system.e**2, 0.0))
-    others = adjustment.other_residuals[: len(graph.others)]
+    others = adjustment.other_residuals[: graph.n_others]
     first = k + len(others)
     n[k:first] = [len(o.residual) for o in others]
     r[k:first] = [o.redundancy.sum() for o in others]

@@ -89,14 +89,14 @@ def observation_name(adjustment: Adjustment, row: int) -> tuple[str, tuple[str, 
 def _others(precision: Precision) -> list[_Batch]:
     """All other observations, those with the same number of components together."""
     n_image = sum(len(b.uv) for b in precision.graph.survey.image_blocks)
-    found: dict[int, list[tuple[int, FloatArray, FloatArray, FloatArray, FloatArray]]] = {}
-    for i in precision.single:
-        x = precision.rows(precision.graph.others[i])
-        found.setdefault(len(x.e), []).append((n_image + i, x.e, x.influence, x.W, x.root))
+    found: dict[int, list[tuple[int, FloatArray, FloatArray, FloatArray, FloatArray, bool]]] = {}
+    for i, item in zip(precision.single, precision.graph.singles, strict=True):
+        x = precision.rows(item)
+        found.setdefault(len(x.e), []).append((n_image + i, x.e, x.influence, x.W, x.root, item.used))
     out = []
     for same in found.values():
         rows, e, M, W, back = (np.array([x[i] for x in same]) for i in range(5))
-        used = np.array([precision.graph.others[i - n_image].used for i in rows], dtype=np.bool_)
+        used = np.array([x[5] for x in same], dtype=np.bool_)
         out.append(_batch(rows, whitened(e, M, used), W, back))
     return out + _pairs(precision, n_image)
 
@@ -136,7 +136,7 @@ def _readings(precision: Precision) -> list[_Batch]:
         W[rows] = np.linalg.norm(whitener, axis=0)
         K[rows] = np.einsum("ji,jk,ki->i", whitener, Q, whitener) / W[rows] ** 2
         g[rows] = whitener.T @ (e[rows] if used else Q @ e[rows]) / W[rows]
-    n, first = len(e), sum(len(b.uv) for b in precision.graph.survey.image_blocks) + len(precision.graph.others)
+    n, first = len(e), sum(len(b.uv) for b in precision.graph.survey.image_blocks) + precision.graph.n_others
     x = Whitened(g[:, None], K[:, None, None], K[:, None], np.ones((n, 1, 1)), batch.used)
     return [_batch(first + np.arange(n), x, W[:, None, None], 1.0 / W[:, None, None])]
 

@@ -69,8 +69,7 @@ class Whitened:
 
 def whitened(e: FloatArray, M: FloatArray, used: BoolArray) -> Whitened:
     """From whitened residuals e (n, k) and the whitened covariance M = A Q A' (n, k, k) of what is adjusted."""
-    k = e.shape[1]
-    eye = np.eye(k)
+    k, out = e.shape[1], np.flatnonzero(~used)
     if k == 2:
         values, vectors = eigen2(M)
     else:
@@ -78,8 +77,9 @@ def whitened(e: FloatArray, M: FloatArray, used: BoolArray) -> Whitened:
         values, vectors = values[:, ::-1], vectors[:, :, ::-1]  # ascending in K, which falls with M
     with np.errstate(divide="ignore"):
         of_K = np.where(used[:, None], 1.0 - values, 1.0 / (1.0 + np.maximum(values, 0.0)))
-    K = np.where(used[:, None, None], eye - M, np.einsum("nij,nj,nkj->nik", vectors, of_K, vectors))
-    g = np.where(used[:, None], e, np.einsum("nij,nj->ni", K, e))
+    K, g = np.eye(k) - M, e.copy()
+    K[out] = (vectors[out] * of_K[out, None, :]) @ np.swapaxes(vectors[out], 1, 2)
+    g[out] = np.einsum("nij,nj->ni", K[out], e[out])
     return Whitened(g, K, of_K, vectors, used)
 
 
@@ -104,7 +104,7 @@ class ComponentTests:
 def component_tests(x: Whitened, W: FloatArray) -> ComponentTests:
     """Baarda's w of every component: -(W'g)_i / sqrt((W'KW)_ii), W (n, k, k) the square root information."""
     numerator = np.einsum("nij,ni->nj", W, x.g)
-    information = np.einsum("nij,nik,nkj->nj", W, x.K, W)
+    information = np.einsum("nij,nij->nj", W, x.K @ W)
     own = np.einsum("nij,nij->nj", W, W)
     seen = information > CONTROLLED * own
     w = np.where(seen, -numerator / np.sqrt(np.where(seen, information, 1.0)), np.nan)

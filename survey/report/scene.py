@@ -3,8 +3,9 @@
 Also the view in space, to be turned around on the screen: lines, points and ellipsoids as plain values for the page.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from gtsam import Pose3
@@ -20,7 +21,9 @@ from survey.solution.frames import AdjustedFrames
 from survey.solution.quantities import Scale
 
 _MOST_EPOCHS = 24
-_MOST_POINTS = 500
+_MOST_SPOTS = 500
+"""Points, and stations, that are drawn: all, or an even selection of either."""
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,11 +98,16 @@ def _shown(adjustment: Adjustment) -> list[str]:
     return [epochs[i] for i in np.unique(np.linspace(0, len(epochs) - 1, min(len(epochs), _MOST_EPOCHS)).astype(int))]
 
 
+def _selected(scene: Scene, found: Sequence[T]) -> Sequence[T]:
+    """What is drawn of these; how many are not is counted."""
+    some = found[:: max(1, -(-len(found) // _MOST_SPOTS))]
+    scene.n_left_out += len(found) - len(some)
+    return some
+
+
 def _add_points(scene: Scene, adjustment: Adjustment, scale: Scale) -> None:
     points = [e for name, e in adjustment.estimates.items() if name[0] == "point"]
-    every = max(1, -(-len(points) // _MOST_POINTS))
-    scene.n_left_out = len(points) - len(points[::every])
-    for estimate in points[::every]:
+    for estimate in _selected(scene, points):
         x = np.asarray(estimate.value, dtype=float)
         scene.spots.append(Spot(estimate.name[1], "point", x, scale.factor**2 * estimate.cov))
 
@@ -133,7 +141,7 @@ def _add_stations(scene: Scene, adjustment: Adjustment, scale: Scale) -> None:
     found = [(name, e.value, e.cov) for name, e in adjustment.estimates.items()
              if name[0] == "world_from_station" and isinstance(e.value, Pose3)]  # fmt: skip
     scene.moves += [np.asarray(pose.translation()) for name, pose, _ in found if len(name) > 2]
-    fixed = [(name[1], pose, cov) for name, pose, cov in found if len(name) == 2]
+    fixed = _selected(scene, [(name[1], pose, cov) for name, pose, cov in found if len(name) == 2])
     R = np.array([pose.rotation().matrix() for _, pose, _ in fixed]).reshape(-1, 3, 3)
     covs = R @ np.array([cov[3:, 3:] for *_, cov in fixed]).reshape(-1, 3, 3) @ np.swapaxes(R, 1, 2)
     scene.spots += [Spot(label, "station", np.asarray(pose.translation()), cov)

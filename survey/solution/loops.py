@@ -14,9 +14,10 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model.names import natural_key
-from adjust.model.observations import FrameRef, Pair, frame_text
+from adjust.model.observations import FrameRef, Pair
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, PoseParameter, Survey
+from adjust.observations.pairs import PairArrays, pair_arrays
 from adjust.pose_network.loops import evaluate_loops
 from adjust.pose_network.network import Topology
 from adjust.relay.closed import play
@@ -54,7 +55,7 @@ class PairNetwork:
 
 def frame_name(frame: FrameRef) -> str:
     """As in tables; a station goes without its kind."""
-    return frame_text(frame).removeprefix("station:")
+    return frame.text.removeprefix("station:")
 
 
 def pair_network(survey: Survey) -> PairNetwork:
@@ -64,8 +65,8 @@ def pair_network(survey: Survey) -> PairNetwork:
     poses = [p for p in used if isinstance(p.b_from_a, Pose3)]
     dim, ends = 6 if len(poses) == len(used) and used else 3, _ends(used)
     whole = topology(ends, bare)
-    counts = count(whole, dim)
-    closed = count(_tied(ends, _links(survey, used, ends, 6 if poses else 3), bare), dim)
+    counts, links = count(whole, dim), _links(survey, used, ends, 6 if poses else 3)
+    closed = count(_tied(ends, links, bare), dim) if links else counts
     real = set(whole.station_ids) - {_WORLD}
     conditions, redundancy, shifts = closed.independent_conditions, closed.redundancy, None
     if dim == 3 and poses:
@@ -96,7 +97,9 @@ def _real(ids: Sequence[str]) -> tuple[str, ...]:
 
 def _ends(pairs: Sequence[Pair]) -> _Ends:
     """Ids of the pairs, and names of their frames a and b."""
-    return [(p.pair_id, frame_name(p.a), frame_name(p.b)) for p in pairs]
+    seen = {id(r): r for p in pairs for r in (p.a, p.b)}  # most are the same object
+    name = {k: frame_name(r) for k, r in seen.items()}
+    return [(p.pair_id, name[id(p.a)], name[id(p.b)]) for p in pairs]
 
 
 def _bare_stations(survey: Survey) -> tuple[str, ...]:
@@ -167,44 +170,49 @@ def pair_loops(survey: Survey) -> LoopMisclosures | None:
     pairs = list(survey.pairs)
     if not pairs:
         return None
-    dim = 6 if all(isinstance(p.b_from_a, Pose3) for p in pairs) else 3
-    motions = [p.b_from_a for p in pairs]
-    covs, ends = [np.asarray(p.cov)[:dim, :dim] for p in pairs], _ends(pairs)
-    links = _links(survey, pairs, ends, dim)
-    for link in links:
-        given = link.given
-        motions.append(given.value or Pose3())
+    measured, ends = pair_arrays(survey.pairs), _ends(pairs)
+    dim = 6 if measured.is_pose.all() else 3
+    links, covs = _links(survey, pairs, ends, dim), [measured.cov[:, :dim, :dim]]
+    for given in (link.given for link in links):
         held = given.treatment == "held" or given.prior_cov is None
-        covs.append(np.zeros((dim, dim)) if held else np.asarray(given.prior_cov)[:dim, :dim])
-    network = MeasuredPairs(_tied(ends, links), motion_arrays(motions, dim), np.array(covs))
-    return loop_misclosures(network)
+        covs.append((np.zeros((dim, dim)) if held else np.asarray(given.prior_cov)[:dim, :dim])[None])
+    motions = _with_given(measured, [link.given.value or Pose3() for link in links], dim)
+    return loop_misclosures(MeasuredPairs(_tied(ends, links), motions, np.concatenate(covs)))
+
+
+def _with_given(measured: PairArrays, given: Sequence[Pose3], dim: int) -> Motions:
+    """Measured pairs and then what is known without them; of poses the rotations alone where ``dim`` is 3."""
+    R = np.concatenate([measured.rotations, *(p.rotation().matrix()[None] for p in given)])
+    if dim == 3:
+        return Motions(R)
+    return Motions(R, np.concatenate([measured.translations, *(p.translation()[None] for p in given)]))
 
 
 def loops_after(adjustment: Adjustment, loops: LoopMisclosures) -> FloatArray:
     """Misclosures (L, dim) of the same loops by the adjusted pairs, predicted where not used; a mount keeps its play.
 
-    From the residuals: each pair as measured, moved by its own. Nan where a pair has none.
+    loops: of :func:`pair_loops`, the pairs of the survey first. From the residuals: each pair as measured, moved by its
+    own. Nan where a pair has none.
     """
     basis, survey = loops.basis, adjustment.survey
     top, dim = basis.topology, loops.vector.shape[1]
-    by_id = {p.pair_id: p for p in survey.pairs}
-    found = {o.ids[0]: np.asarray(o.residual) for o in adjustment.other_residuals if o.kind == "pair"}
-    links = {link.link_id: link for link in _links(survey, survey.pairs, _ends(survey.pairs), dim)}
-    motions: list[Pose3 | Rot3] = []
-    moved, lost = np.zeros((top.n_pairs, dim)), np.zeros(top.n_pairs, dtype=np.bool_)
-    for e, pair_id in enumerate(top.pair_ids):
-        pair = by_id.get(pair_id)
-        if pair is None:  # what is given: its adjusted pose, where it is known no better than that
-            estimate = adjustment.estimates.get(links[pair_id].parameter)
+    n, given = len(survey.pairs), list[Pose3]()
+    if top.n_pairs > n:  # what is given: its adjusted pose, where it is known no better than that
+        links = {link.link_id: link for link in _links(survey, survey.pairs, _ends(survey.pairs), dim)}
+        for link in (links[i] for i in top.pair_ids[n:]):
+            estimate = adjustment.estimates.get(link.parameter)
             now = None if estimate is None else estimate.value
-            motions.append(now if isinstance(now, Pose3) else links[pair_id].given.value or Pose3())
-            continue
-        motions.append(pair.b_from_a)
-        v = found.get(pair_id)
-        lost[e] = v is None
-        if v is not None:
-            moved[e] = (v - play(survey.closures, pair, v))[:dim]
-    w = evaluate_loops(basis, motion_arrays(motions, dim).retract(moved))[0]
+            given.append(now if isinstance(now, Pose3) else link.given.value or Pose3())
+    found = {o.ids[0]: o.residual for o in adjustment.other_residuals if o.kind == "pair"}
+    mounts = {closure.pair_ids[-1] for closure in survey.closures}
+    moved, lost = np.zeros((top.n_pairs, dim)), np.zeros(top.n_pairs, dtype=np.bool_)
+    for e, pair in enumerate(survey.pairs):
+        v = found.get(pair.pair_id)
+        if v is None:
+            lost[e] = True
+        else:
+            moved[e] = (v - play(survey.closures, pair, v) if pair.pair_id in mounts else v)[:dim]
+    w = evaluate_loops(basis, _with_given(pair_arrays(survey.pairs), given, dim).retract(moved))[0]
     w[np.logical_or.reduceat(lost[basis.pair_idx], basis.ptr[:-1])] = np.nan
     return w
 

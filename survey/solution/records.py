@@ -4,7 +4,7 @@ Such entries are dictionaries where they are asked for.
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from json.encoder import encode_basestring
@@ -44,6 +44,11 @@ class Records(PlainRecords):
     def __getitem__(self, name: str) -> dict[str, Any]:
         place = self._place[name]
         return self._apart[name] if place is None else _entry(self._forms[place[0]].tree, place[1])
+
+    def keys_of(self, name: str) -> Iterable[str]:
+        """The keys of a record, without making it."""
+        place = self._place[name]
+        return self._apart[name] if place is None else self._forms[place[0]].tree
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._place)
@@ -192,6 +197,11 @@ def _one(value: Any) -> str:
 
 
 _key = lru_cache(encode_basestring)
+
+
+def keys_of(entries: Mapping[str, dict[str, Any]], name: str) -> Iterable[str]:
+    """The keys of an entry."""
+    return entries.keys_of(name) if isinstance(entries, Records) else entries[name]
 
 
 def having(entries: Mapping[str, dict[str, Any]], key: str) -> Mapping[str, dict[str, Any]]:

@@ -8,7 +8,7 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.model.result import Adjustment, Decision, Estimate, ParameterName, VarianceComponents
-from adjust.model.survey import FloatArray, IntArray
+from adjust.model.survey import FloatArray
 from adjust.native.parallel import Beside
 from adjust.precision.precision import precision_of
 from adjust.statistics.budget import uncertainty_budget
@@ -68,8 +68,6 @@ MOST_CORRELATED = 110
 """Components that the picture of correlations shows: what there is once before what there is at every epoch."""
 MOST_BUDGETS = 60
 """Parameters with a budget: cameras, tables and stations first, then points."""
-_FEW_PLACES = 300
-"""Places whose neighbours are found without a tree."""
 MOST_NEIGHBOURS = 150
 
 
@@ -145,16 +143,13 @@ def _budget(
     )  # fmt: skip
 
 
-def _nearest(x: FloatArray, k: int) -> IntArray:
-    """Of each of n places (n, 3) the k nearest ones (n, k), itself first."""
-    if len(x) <= _FEW_PLACES:
-        squares = np.sum((x[:, None] - x) ** 2, axis=2)
-        squares[np.arange(len(x)), np.arange(len(x))] = -1.0
-        return np.argsort(squares, axis=1, kind="stable")[:, :k]
-    from scipy.spatial import cKDTree  # here: it takes longer to load than a small survey to adjust
-
-    return np.asarray(cKDTree(x).query(x, k=k)[1])
-
+def _nearest(x: FloatArray, i: int, k: int) -> list[int]:
+    """The k of all places (n, 3) that are nearest to the i-th, itself first."""
+    squares = np.sum((x - x[i]) ** 2, axis=1)
+    squares[i] = -1.0
+    near = np.flatnonzero(squares <= np.partition(squares, k - 1)[k - 1])
+    found: list[int] = near[np.argsort(squares[near], kind="stable")][:k].tolist()
+    return found
 
 
 def neighbours(adjustment: Adjustment, scale: Scale) -> tuple[RelativePrecision, ...]:
@@ -168,15 +163,19 @@ def neighbours(adjustment: Adjustment, scale: Scale) -> tuple[RelativePrecision,
                 places.append(x)
     if len(names) < 2:
         return ()
-    near = _nearest(np.array(places), min(3, len(names)))
-    pairs = dict.fromkeys((min(i, int(k)), max(i, int(k))) for i, row in enumerate(near) for k in row if int(k) != i)
-    free = ((names[i], names[k]) for i, k in pairs if _is_free(adjustment, names[i]) or _is_free(adjustment, names[k]))
+    x, free, found = np.array(places), [_is_free(adjustment, name) for name in names], dict[tuple[int, int], None]()
+    for i in range(len(x)):
+        near = _nearest(x, i, min(3, len(x)))
+        found |= {(min(i, k), max(i, k)): None for k in near[1:] if free[i] or free[k]}
+        if len(found) >= MOST_NEIGHBOURS:
+            break
+    pairs = [(names[i], names[k]) for i, k in islice(found, MOST_NEIGHBOURS)]
     posterior = scale.sigmas == "a_posteriori"
     f = scale.factor
     return tuple(
         replace(r, cov=f**2 * r.cov, sigma_distance=f * r.sigma_distance,
                 rotation_cov=None if r.rotation_cov is None else f**2 * r.rotation_cov)
-        for r in relative_precision(adjustment, list(islice(free, MOST_NEIGHBOURS)), PROBABILITY, posterior)
+        for r in relative_precision(adjustment, pairs, PROBABILITY, posterior)
         if r.ellipsoid.dimension  # rotations alone say nothing of positions
     )  # fmt: skip
 

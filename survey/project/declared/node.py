@@ -2,7 +2,6 @@
 
 import math
 import re
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,13 +13,14 @@ from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
 from survey.folder.text import LARGEST_NUMBER, choice_hint, decode, id_problem, read_bytes, suggestion, with_digest
 from survey.folder.units import to_si
-from survey.project.declared.toml_text import KeyLines, KeyPath
+from survey.project.declared.toml_text import KeyLines, KeyPath, read_tables
 
 _REQUIRED: Any = object()
 _LARGEST_TOML = 16 * 2**20  # bytes
 _DEEPEST_KEY = 32  # parts between dots; time and memory grow with their square
 _NUMBERS = {int, float}
 _LONGEST_INTEGER = 1000  # bits: all that a double can hold, and less than what cannot be printed
+_MANY_DIGITS = re.compile(r"[0-9A-Fa-f_]{200}")  # no integer of so many bits has fewer, in whatever base
 _KEY_PART = re.compile(r"[ \t]*([A-Za-z0-9_-]+|\"[^\"\n]*\"|'[^'\n]*')[ \t]*")
 
 
@@ -32,9 +32,10 @@ def read_toml(path: Path, instead: str | None = None) -> tuple["Node", str]:
         raise SurveyError(f"{path}:1: the file is empty; it starts with 'format = 1'")
     _check_keys(path, text)
     try:
-        values = tomllib.loads(text)
+        values = read_tables(text)
         root = Node(path, KeyLines(text), (), values)
-        _check_integers(root, values, ())
+        if _MANY_DIGITS.search(text):
+            _check_integers(root, values, ())
     except ValueError as error:  # of tomllib, or of the interpreter for an integer of thousands of digits
         found = re.search(r"at line (\d+)", str(error))
         line = int(found[1]) if found else _line_of_digits(text) or text.count("\n") + 1
@@ -46,6 +47,8 @@ def read_toml(path: Path, instead: str | None = None) -> tuple["Node", str]:
 
 def _check_keys(path: Path, text: str) -> None:
     """Refuse keys of very many parts before anything tries to take them apart."""
+    if all(line.count(".") < _DEEPEST_KEY - 1 for line in text.split("\n")):
+        return
     run = at = 0
     for part in text.split("."):
         run = run + 1 if _KEY_PART.fullmatch(part) else 0

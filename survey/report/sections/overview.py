@@ -216,7 +216,7 @@ def picture(c: Context) -> Markup:
     scene = scene_of(c.adjustment, c.scale)
     drawn, enlarged = pictures(scene, c.scale.ellipsoid)
     n = count(scene.n_left_out)
-    left_out = " " + t("{n} points are left out for clarity.", n=n) if scene.n_left_out else Markup()
+    left_out = " " + t("{n} points and stations are left out for clarity.", n=n) if scene.n_left_out else Markup()
     said = t(
         "95 % confidence ellipsoids of points (red) and stations (green), enlarged {n} times. "
         "Cameras are drawn at the first epoch; thin lines are their axes at others, dash-dotted lines those of tables.",

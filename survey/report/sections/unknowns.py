@@ -1,6 +1,7 @@
 """Sections on what was estimated: cameras, stations, tables, targets, points, instruments and surfaces."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -25,12 +26,13 @@ from survey.report.markup import (
     value_text,
     with_sigma,
 )
-from survey.solution.records import having
+from survey.solution.records import having, keys_of
 
 _MOST_ROWS, _MOST_CAMERAS, _MOST_BLOCKS = 250, 40, 100
 _MANY_EPOCHS = 12
 T = TypeVar("T")
-_Pose = tuple[str, str, str, dict[str, Any]]
+_Pose = tuple[str, str, str, Callable[[], dict[str, Any]]]
+"""A thing, the name of its pose, the epoch, and what gives the entry: few of many are shown."""
 """Thing, name of its pose, epoch or nothing, entry."""
 _POSE_COLUMNS = ("<Pose", "<Epoch", "x [mm]", "y [mm]", "z [mm]", "rx [°]", "ry [°]", "rz [°]", "<Status")
 _POSE_NOTE = (
@@ -97,7 +99,7 @@ def _tests(found: dict[str, Any]) -> Markup:
 
 def _pose_row(pose: _Pose) -> list[str]:
     """A row of the table of poses."""
-    thing_id, name, epoch, entry = pose
+    (thing_id, name, epoch, _), entry = pose, pose[-1]()
     smallest = min((s for s in entry["sigma_translation_mm"] if s), default=None)
     cells = [
         with_sigma(v, s, smallest) for v, s in zip(entry["translation_mm"], entry["sigma_translation_mm"], strict=True)
@@ -109,16 +111,20 @@ def _pose_row(pose: _Pose) -> list[str]:
     return [joined((element("b", thing_id), code(name)), " "), epoch, *cells, status_pill(entry["status"])]
 
 
-def _poses(thing_id: str, entry: dict[str, Any]) -> Iterator[_Pose]:
+def _poses(thing_id: str, entries: Mapping[str, dict[str, Any]]) -> Iterator[_Pose]:
     """All poses of a thing, also those per epoch."""
-    for key, value in entry.items():
+    for key in keys_of(entries, thing_id):
         if key == "epochs":
-            for epoch, poses in value.items():
+            for epoch, poses in entries[thing_id][key].items():
                 for name, pose in poses.items():
                     if "_from_" in name and isinstance(pose, dict):
-                        yield thing_id, name, epoch, pose
+                        yield thing_id, name, epoch, partial(dict, pose)
         elif "_from_" in key:
-            yield thing_id, key, "", value
+            yield thing_id, key, "", partial(_part_of, entries, thing_id, key)
+
+
+def _part_of(entries: Mapping[str, dict[str, Any]], thing_id: str, key: str) -> dict[str, Any]:
+    return dict(entries[thing_id][key])
 
 
 def _limited(columns: Sequence[str], things: Sequence[T], row: Callable[[T], list[str]]) -> Markup:
@@ -243,7 +249,7 @@ def _remarks(lens: dict[str, Any]) -> Markup:
 def stations(c: Context) -> Markup:
     """Poses of stations, of their mounts, of tables and targets."""
     kinds = (c.solution[kind] for kind in ("stations", "tables", "targets"))
-    poses = [pose for entries in kinds for i, e in entries.items() for pose in _poses(i, e)]
+    poses = [pose for entries in kinds for i in entries for pose in _poses(i, entries)]
     by_epoch = [pose for pose in poses if pose[2]]
     many = len(by_epoch) > _MANY_EPOCHS
     body = _limited(_POSE_COLUMNS, [pose for pose in poses if not pose[2]] if many else poses, _pose_row)
