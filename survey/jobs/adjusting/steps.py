@@ -184,7 +184,7 @@ def told(project: Project, given: Survey, adjustment: Adjustment) -> Adjustment:
 
 
 def image_warnings(images: Mapping[tuple[str, str], DetectedImage]) -> tuple[str, ...]:
-    """Boards of a wrong size, once each; images that are wrong as such, by camera; those without targets, or unreadable.
+    """Boards of a wrong size, once each; images that are wrong as such, by camera; those without targets, or not read.
 
     At every adjustment, not only at the first.
     """
