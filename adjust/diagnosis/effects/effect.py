@@ -17,7 +17,7 @@ from adjust.model.survey import FloatArray, Survey
 from adjust.precision.precision import noise_of
 
 ROUNDS = 6
-_SLOW = 0.5  # share of the last drop that the next one is at most, while it is on its way
+_SLOW = 0.5  # share of the last drop, or of the last v'Pv, that the next one is at most, while it is on its way
 _SMALL = 9.0  # a further drop of v'Pv that is not worth another adjustment
 
 
@@ -103,7 +103,7 @@ class Effect:
             if more.drop < _SMALL * new.scale:
                 cov, now = more.cov if more.seen else cov, new
                 break
-            if more.drop > _SLOW * last:
+            if more.drop > _SLOW * last and new.result.omega > _SLOW * now.result.omega:
                 break
             theta, cov, now, last = self.added(theta, more.theta), more.cov, new, more.drop
         self._last.extend(made[-1:])
