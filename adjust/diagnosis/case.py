@@ -35,6 +35,8 @@ _FAR = 25.0
 """Variance factor from which a solution may be another one than that of the observations without their mistake."""
 _WARM, _START, _LOST_ROUNDS = 0.4, 0.4, 3
 """What adjusting from near values costs, and what finding start values does, against a whole adjustment."""
+_TO_TRY = 1.5
+"""Adjustments that a trial may take: from values that turn out to be spoilt, then from its own start."""
 _SOLVE = SolveOptions(max_step=1e-3, max_iterations=40, settled=1e-6)
 """A survey that is right converges soon, and is only compared with others."""
 
@@ -129,13 +131,15 @@ class Case:
         """(id, start values of the survey without its images), where there are any; field_name: target_id, camera_id.
 
         Of the few targets or cameras with the largest misfit, or with most images where nothing is adjusted. Each is
-        started when it is asked for.
+        started when it is asked for, as long as there is time to try what that shows.
         """
         if field_name not in self._without:
             ids = [t for t in dict.fromkeys(getattr(b, field_name) for b in self.survey.image_blocks) if t is not None]
             self._without[field_name] = dict.fromkeys(self._worst(field_name, ids)[: _LEFT_OUT * (len(ids) > 1)], ())
         for owner, known in self._without[field_name].items():
             if not known:
+                if self.budget.left < _TO_TRY:
+                    return
                 known = self._without[field_name][owner] = (self.rough(without(self.survey, field_name, owner)),)
             if known[0] is not None:
                 yield owner, known[0]
@@ -166,7 +170,8 @@ class Case:
             return Linear(self.result) if self.result.redundancy > 0 else None
         try:
             self.budget.spend(1.0)
-            return Linear(adjust(self.survey, None, AdjustOptions(reject_blocks=False, solve=_SOLVE)))
+            solve = _SOLVE if self.result is not None else replace(_SOLVE, max_iterations=SolveOptions().max_iterations)
+            return Linear(adjust(self.survey, None, AdjustOptions(reject_blocks=False, solve=solve)))
         except SurveyError:
             return None
 
