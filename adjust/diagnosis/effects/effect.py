@@ -81,9 +81,7 @@ class Effect:
     def _last(self) -> list[tuple[FloatArray, Survey]]:
         return []
 
-    def _estimated(
-        self, case: Case, linear: Linear, theta: FloatArray
-    ) -> tuple[FloatArray, Adjustment, FloatArray]:
+    def _estimated(self, case: Case, linear: Linear, theta: FloatArray) -> tuple[FloatArray, Adjustment, FloatArray]:
         """Its size, the adjustment at which that was found, and the sigmas (k,).
 
         A size is one of a change of the values there: where these were spoilt, the next one may be worse, and is none.
@@ -143,4 +141,3 @@ def shifted_back(survey: Survey, shifts: Shifts, theta: FloatArray) -> Survey:
         replace(b, uv=b.uv - shifts[i] @ theta) if i in shifts else b for i, b in enumerate(survey.image_blocks)
     )
     return replace(survey, image_blocks=blocks)
-

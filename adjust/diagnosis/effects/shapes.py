@@ -51,8 +51,11 @@ def _of(case: Case, linear: Linear, given: Target, name: str, by: FloatArray, wh
             "edits": (ScaleKey(("targets", target), factor),),
         }  # fmt: skip
 
-    remedy = ("multiply its square or marker size by that" if name == _SCALE else
-              f'let the adjustment find it: warp = {{ free = ["{component}"] }}; or measure it in both directions')
+    remedy = (
+        "multiply its square or marker size by that"
+        if name == _SCALE
+        else f'let the adjustment find it: warp = {{ free = ["{component}"] }}; or measure it in both directions'
+    )
     edits = (SetKey(("targets", target, "warp", "free"), (component,)),) if component and given.warp is None else ()
     hypothesis = Hypothesis(name, "", remedy, Place("target", (target,), "square_mm" if name == _SCALE else "warp"),
                             case.survey, edits, 1.0, 0)  # fmt: skip

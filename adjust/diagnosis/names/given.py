@@ -56,6 +56,7 @@ def _evidence(before: Screen | None, after: Fit | None) -> float:
 
 def with_given(survey: Survey, new: dict[str, FloatArray]) -> Survey:
     """The survey with other given coordinates (3,) m of these points."""
+
     def point(p: Point) -> Point:
         return replace(p, x_in_world=replace(p.x_in_world, value=new[p.point_id])) if p.point_id in new else p
 

@@ -79,9 +79,7 @@ def _hypothesis(survey: Survey, target: str, factor: float, why: str, parameters
 
 def reshaped(survey: Survey, target: str, A: FloatArray) -> Survey:
     """The survey with the points of a target times A (3, 3)."""
-    targets = tuple(
-        replace(t, x_in_target=t.x_in_target @ A.T) if t.target_id == target else t for t in survey.targets
-    )
+    targets = tuple(replace(t, x_in_target=t.x_in_target @ A.T) if t.target_id == target else t for t in survey.targets)
     return replace(survey, targets=targets)
 
 
