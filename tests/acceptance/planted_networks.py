@@ -285,6 +285,8 @@ NETWORK_MISTAKES = (
     Mistake("rows of another set-up", of(SETUP), BOTH, (1.0, 2.0, 3.0), other_setup),
     Mistake("set-up turned", of(SETUP), BOTH, (30.0, 120.0, 600.0), turned),
     Mistake("sigmas of a group", of("reading"), BOTH, (1 / 10, 1 / 4, 4.0), sigmas("reading")),
+    Mistake("sigmas of a group", of("north"), ("poses",), (1 / 6, 4.0, 10.0), sigmas("north"),
+            title="among others"),
     Mistake("odd sigma", anything, BOTH, (1e-2 / 2, 1e-3, 1e-4), odd),
     Mistake("correlated observations", anything, BOTH, (3.0, 6.0, 12.0), correlated),
     Mistake("pairs inverted", anything, ("hand", "base", "poses"), (0.0,), pairs(inverted), title="all"),
@@ -308,6 +310,7 @@ NETWORK_MISTAKES = (
     Mistake("epochs exchanged", of("hand"), ROBOTS, (1.0, 3.0, 8.0), poses_exchanged, title="of a robot"),
     Mistake("the same twice", anything, ("hand", "poses"), (30.0, 100.0, 1000.0), twice),
     Mistake("stations exchanged", of("T3"), ("poses",), (0.2, 0.35, 0.5), stations_exchanged("since")),
-    Mistake("stations exchanged", of("T3"), ("poses",), (1.0, 3.0, 6.0), stations_exchanged("one"), title="in one pair"),
+    Mistake("stations exchanged", of("T3"), ("poses",), (1.0, 3.0, 6.0), stations_exchanged("one"),
+            title="in one pair"),
     Mistake("station moved", of("T4"), ("poses",), (20.0, 60.0, 200.0), station_bumped, title="in a network of poses"),
 )  # fmt: skip

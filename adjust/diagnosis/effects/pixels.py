@@ -86,7 +86,7 @@ def _interlaced(case: Case, linear: Linear, camera: str) -> Effect:
         lambda at: of_shifts(at, {i: first[i] for i in shifts(at.result.survey)}),
         lambda _, theta: shifted_back(case.survey, first, theta),
         lambda theta, sigmas: f"camera {camera}: image points at even rows are shifted against those at odd ones by "
-        f"twice ({theta[0]:+.2f} +- {sigmas[0]:.2f}, {theta[1]:+.2f} +- {sigmas[1]:.2f}) px: half images of two moments",
+        f"twice ({theta[0]:+.2f} +- {sigmas[0]:.2f}, {theta[1]:+.2f} +- {sigmas[1]:.2f}) px: as of two moments",
     )  # fmt: skip
 
 
