@@ -1,6 +1,6 @@
 """The survey that does not fit, with the data from which hypotheses are formed; everything costly is found once."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -14,7 +14,7 @@ from adjust.frames.lens_times import whole_images
 from adjust.graph.assembly import StartValues, values_of
 from adjust.graph.solver import SolveOptions
 from adjust.model.boards import deformed
-from adjust.model.errors import IndeterminateError, SurveyError
+from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import Camera, FloatArray, Survey
 from adjust.spatial.averaging import mean_pose
@@ -35,6 +35,8 @@ _FAR = 25.0
 """Variance factor from which a solution may be another one than that of the observations without their mistake."""
 _WARM, _START, _LOST_ROUNDS = 0.4, 0.4, 3
 """What adjusting from near values costs, and what finding start values does, against a whole adjustment."""
+_TO_TRY = 1.5
+"""Adjustments that a trial may take: from values that turn out to be spoilt, then from its own start."""
 _SOLVE = SolveOptions(max_step=1e-3, max_iterations=40, settled=1e-6)
 """A survey that is right converges soon, and is only compared with others."""
 
@@ -125,20 +127,25 @@ class Case:
         """The lens (n,) of each camera, from its own images alone; a camera without any is not there."""
         return own_lenses(self.survey)
 
-    def without_each(self, field_name: str) -> list[tuple[str, Altered]]:
+    def without_each(self, field_name: str) -> Iterator[tuple[str, Altered]]:
         """(id, start values of the survey without its images), where there are any; field_name: target_id, camera_id.
 
-        Of the few targets or cameras with the largest misfit, or with most images where nothing is adjusted.
+        Of the few targets or cameras with the largest misfit, or with most images where nothing is adjusted. Each is
+        started when it is asked for, as long as there is time to try what that shows.
         """
         if field_name not in self._without:
             ids = [t for t in dict.fromkeys(getattr(b, field_name) for b in self.survey.image_blocks) if t is not None]
-            worst = self._worst(field_name, ids)[:_LEFT_OUT] if len(ids) > 1 else ()
-            started = ((owner, self.rough(without(self.survey, field_name, owner))) for owner in worst)
-            self._without[field_name] = [(owner, values) for owner, values in started if values is not None]
-        return self._without[field_name]
+            self._without[field_name] = dict.fromkeys(self._worst(field_name, ids)[: _LEFT_OUT * (len(ids) > 1)], ())
+        for owner, known in self._without[field_name].items():
+            if not known:
+                if self.budget.left < _TO_TRY:
+                    return
+                known = self._without[field_name][owner] = (self.rough(without(self.survey, field_name, owner)),)
+            if known[0] is not None:
+                yield owner, known[0]
 
     @cached_property
-    def _without(self) -> dict[str, list[tuple[str, Altered]]]:
+    def _without(self) -> dict[str, dict[str, tuple[Altered | None, ...]]]:
         return {}
 
     def _worst(self, field_name: str, ids: list[str]) -> list[str]:
@@ -151,16 +158,20 @@ class Case:
 
     @cached_property
     def linear(self) -> "Linear | None":
-        """The adjustment with all images in use, as a linear system; None where there is none."""
+        """The adjustment with all images in use, as a linear system; None where there is none.
+
+        One that did not converge may have settled: what it still changes is nothing to v'Pv.
+        """
         from adjust.diagnosis.linear import Linear  # here: what fails as a whole needs none
 
-        if self.result is None or not self.result.redundancy > 0:
+        if self.result is None and not isinstance(self.error, NotConvergedError):
             return None
-        if self.is_whole:
-            return Linear(self.result)
+        if self.result is not None and (self.is_whole or not self.result.redundancy > 0):
+            return Linear(self.result) if self.result.redundancy > 0 else None
         try:
             self.budget.spend(1.0)
-            return Linear(adjust(self.survey, None, AdjustOptions(reject_blocks=False, solve=_SOLVE)))
+            solve = _SOLVE if self.result is not None else replace(_SOLVE, max_iterations=SolveOptions().max_iterations)
+            return Linear(adjust(self.survey, None, AdjustOptions(reject_blocks=False, solve=solve)))
         except SurveyError:
             return None
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from adjust.model.errors import DiagnosedError, IndeterminateError, NotConvergedError, SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
+from adjust.testing.criteria import CAUTIOUS
 from survey.project import Project
 
 if TYPE_CHECKING:
@@ -54,6 +55,9 @@ def with_probable_causes(survey: Survey, result: Adjustment, project: Project) -
         diagnosis, _ = _named(_misread(survey, result), project)
         warnings = diagnosis.lines if diagnosis is not None else ()
     lines = tuple(f"probable cause: {c}" for c in warnings)
+    if diagnosis is None and not warnings:
+        diagnosis, _ = _named(_too_cautious(survey, result), project)
+        lines = tuple(f"too good: {c}" for c in diagnosis.lines) if diagnosis is not None else ()
     return replace(result, warnings=(*lines, *result.warnings, *note), diagnosis=diagnosis)
 
 
@@ -71,6 +75,17 @@ def _diagnosis(
     from adjust.diagnosis.diagnosis import diagnose
 
     return diagnose(Case(survey, result, error))
+
+
+def _too_cautious(survey: Survey, result: Adjustment) -> "Diagnosis | None":
+    """Groups whose sigmas are far too large, which no test of what contradicts shows; None where there are none."""
+    if not any(g.factor < CAUTIOUS**2 for g in result.groups):
+        return None
+    from adjust.diagnosis.case import Case  # here: as above
+    from adjust.diagnosis.diagnosis import diagnose
+    from adjust.diagnosis.weights.sigmas import wrong_factors
+
+    return diagnose(Case(survey, result), [wrong_factors])
 
 
 def _misread(survey: Survey, result: Adjustment) -> "Diagnosis | None":
