@@ -198,15 +198,12 @@ def _change(
 def _weights(change: _Change) -> FloatArray:
     """One weight for all positions, one for all rotations: the mean precision of a component if all others are known.
 
-    With points alone they do not matter; metres and radians need them.
+    With points alone, or a datum that both epochs have, they do not matter; metres and radians need them.
     """
-    position = change.component >= 3
-    if position.all() or not position.any():
+    position, G = change.component >= 3, change.G
+    if position.all() or not position.any() or not G.shape[1]:
         return np.ones(len(position))
-    Q, G = change.Q, change.G
-    if G.shape[1]:
-        Q = transformed(change.d, Q, G, np.ones(len(G)))[1]
-    precision = pseudo_precision(Q, G)
+    precision = pseudo_precision(transformed(change.d, change.Q, G, np.ones(len(G)))[1], G)
     return np.asarray(np.where(position, precision[position].mean(), precision[~position].mean()))
 
 

@@ -93,32 +93,45 @@ struct Wedge {
 };
 
 struct Collected {
-    alignas(64) double x[MOST_PIXELS], y[MOST_PIXELS], value[MOST_PIXELS];
+    alignas(64) double x[MOST_PIXELS + 1], y[MOST_PIXELS + 1], value[MOST_PIXELS + 1];
 };
 
-// The pixels of a corner: a disc, and strips along its edges; their number, -1 at the border. shape: radius of the disc,
-// half width of the strips, length of strip 1, length of strip 2, in px.
+// The pixels of a corner: a disc, and strips along its edges; their number, -1 at the border. Those near both edges come
+// first: the others need no integral (``Wedge``). shape: radius of the disc, half width of the strips, length of strip 1,
+// length of strip 2, in px.
 inline int corner_window(In<float, 2> image, int64_t u0, int64_t v0, const double *p, const double *shape, bool crossing, Collected &out) {
+    static thread_local Collected far;
     const double radius = shape[0], width = shape[1], c[2] = {std::cos(p[2]), std::cos(p[3])}, s[2] = {std::sin(p[2]), std::sin(p[3])};
-    const double extent = larger(radius, larger(shape[2], shape[3]) + width);
+    const double extent = larger(radius, larger(shape[2], shape[3]) + width), bent = FAR * std::exp(p[6]);
     if (!(magnitude(extent) < LARGEST_WINDOW)) return -1;
     const int reach = int(std::ceil(extent));
-    int n = 0;
-    for (int j = -reach; j <= reach; ++j)
-        for (int i = -reach; i <= reach; ++i) {
-            const double dx = i - p[0], dy = j - p[1];
-            bool inside = dx * dx + dy * dy <= radius * radius;
-            for (int a = 0; a < 2 && !inside && width > 0.0; ++a) {
-                const double along = c[a] * dx + s[a] * dy, across = c[a] * dy - s[a] * dx;
-                inside = magnitude(across) <= width && (crossing ? -shape[2 + a] : -width) <= along && along <= shape[2 + a];
+    int n_near = 0, n_far = 0;
+    for (int j = -reach; j <= reach; ++j) {
+        const double dy = j - p[1], half = root(larger(radius * radius - dy * dy, 0.0));
+        const bool strips = width > 0.0, disc = magnitude(dy) <= radius;
+        if (!strips && !disc) continue;
+        const int from = strips ? -reach : int(std::ceil(p[0] - half)), to = strips ? reach : int(std::floor(p[0] + half));
+        for (int i = from; i <= to; ++i) {
+            const double dx = i - p[0], across[2] = {c[0] * dy - s[0] * dx, c[1] * dy - s[1] * dx};
+            bool inside = disc && magnitude(dx) <= half;
+            for (int a = 0; a < 2 && !inside; ++a) {
+                const double along = c[a] * dx + s[a] * dy;
+                inside = magnitude(across[a]) <= width && (crossing ? -shape[2 + a] : -width) <= along && along <= shape[2 + a];
             }
             if (!inside) continue;
             const int64_t u = u0 + i, v = v0 + j;
             if (u < 0 || v < 0 || u >= image.n[1] || v >= image.n[0]) return -1;
-            if (n == MOST_PIXELS) return n;
-            out.x[n] = i, out.y[n] = j, out.value[n++] = image(v, u);
+            if (n_near + n_far == MOST_PIXELS) break;
+            // to both lists, of which one goes on
+            const bool near = (magnitude(across[0]) <= bent) & (magnitude(across[1]) <= bent);
+            const float value = image(v, u);
+            out.x[n_near] = i, out.y[n_near] = j, out.value[n_near] = value;
+            far.x[n_far] = i, far.y[n_far] = j, far.value[n_far] = value;
+            n_near += near, n_far += !near;
         }
-    return n;
+    }
+    for (const auto list : {&Collected::x, &Collected::y, &Collected::value}) std::memcpy(out.*list + n_near, far.*list, n_far * sizeof(double));
+    return n_near + n_far;
 }
 
 // Level and step of p by linear regression on the shape of the start, and the normal equations there: those of level zero
@@ -138,49 +151,134 @@ template <class Evaluate> inline void start_levels(double *p, int n, const Evalu
     }
 }
 
+// Linear between nodes x, ascending, with values y; beyond the nodes that of the last.
+inline double interpolated(Vector x, Vector y, double at) {
+    int64_t k = 0;
+    while (k < x.n[0] && x[k] <= at) ++k;
+    if (k == 0 || k == x.n[0]) return y[k == 0 ? 0 : k - 1];
+    return y[k - 1] + (y[k] - y[k - 1]) * (at - x[k - 1]) / (x[k] - x[k - 1]);
+}
+
 enum CornerStatus : int64_t { GOOD, AT_BORDER, TOO_FEW, NO_CONVERGENCE, AWAY };
 
-// Every corner: start (n, 2) px, angles (n, 2) of the two edges, the second clockwise (in the image) of the first, blur
-// (n,) px, shapes (n, 4) of the windows. tolerance: px, where the fit may stop; enough: pixels from which the slopes of
-// the illumination are free. p (n, 9) with absolute u, v; cov (n, 2, 2) of u, v; pixels, rms, status (n,).
+struct FittedCorner {
+    double p[CORNER], cov[4] = {}, rms = 0.0;  // u, v of p absolute where the fit is good
+    int64_t n = -1, n_free = 0;
+    CornerStatus status = AT_BORDER;
+};
+// One corner: start u, v px, angles of the two edges, the second clockwise (in the image) of the first, blur px, shape of
+// the window. tolerance: px, where the fit may stop; enough: pixels from which the slopes of the illumination are free.
+inline FittedCorner fit_corner(In<float, 2> image, const double *start, const double *angles, double blur, const double *shape, bool crossing,
+                               double max_shift, double tolerance, int64_t enough) {
+    static thread_local Collected window;
+    FittedCorner o;
+    if (!lies_on(image, start[0], start[1])) return o;
+    const int64_t u0 = std::lrint(start[0]), v0 = std::lrint(start[1]);
+    const double first[CORNER] = {start[0] - double(u0), start[1] - double(v0), angles[0], angles[1], 0, 0, std::log(blur), 0, 0};
+    std::memcpy(o.p, first, sizeof first);
+    o.n = corner_window(image, u0, v0, o.p, shape, crossing, window), o.n_free = o.n >= enough ? 9 : 7;
+    if (o.n < 20) {
+        o.status = o.n < 0 ? AT_BORDER : TOO_FEW;
+        return o;
+    }
+    const Pixels w{window.x, window.y, window.value, int(o.n)};
+    Normals<CORNER> at;
+    const auto evaluate = [&](const double *q, Normals<CORNER> &out) { add_pixels(w, Wedge(q, crossing), out); };
+    const auto clamp = [](double *p) { p[6] = smaller(larger(p[6], std::log(0.2)), std::log(12.0)); };
+    start_levels(o.p, int(o.n), evaluate, at);
+    o.status = NO_CONVERGENCE;
+    if (!levenberg_marquardt(o.p, int(o.n_free), tolerance, evaluate, clamp, at)) return o;
+    const double variance = at.cost / double(o.n - o.n_free);
+    o.rms = root(variance);
+    if (!place_covariance(at, int(o.n_free), variance, o.cov)) return o;
+    o.p[0] += double(u0), o.p[1] += double(v0);
+    o.status = magnitude(o.p[0] - start[0]) + magnitude(o.p[1] - start[1]) > max_shift ? AWAY : GOOD;
+    return o;
+}
+// Every corner (``fit_corner``): p (n, 9); cov (n, 2, 2) of u, v; pixels, rms, status (n,).
 inline void fit_corners(In<float, 2> image, In<double, 2> start, In<double, 2> angles, Vector blur, In<double, 2> shapes, int64_t crossing,
                         double max_shift, double tolerance, int64_t enough, Out<double, 2> out, Out<double, 3> cov,
                         Out<int64_t, 1> pixels, Out<double, 1> rms, Out<int64_t, 1> status) {
-    static thread_local Collected window;
-    const auto clamp = [](double *p) { p[6] = smaller(larger(p[6], std::log(0.2)), std::log(12.0)); };
     for (int64_t c = 0; c < start.n[0]; ++c) {
-        if (!lies_on(image, start(c, 0), start(c, 1))) {
-            pixels.data[c] = -1, status.data[c] = AT_BORDER;
-            continue;
+        const FittedCorner o = fit_corner(image, &start(c, 0), &angles(c, 0), blur[c], &shapes(c, 0), crossing, max_shift, tolerance, enough);
+        std::memcpy(&out(c, 0), o.p, sizeof o.p), std::memcpy(&cov(c, 0, 0), o.cov, sizeof o.cov);
+        pixels.data[c] = o.n, rms.data[c] = o.rms, status.data[c] = o.status;
+    }
+}
+
+constexpr double ROUGH_PX = 1e-2, FINE_PX = 2e-5;  // where the first and the second fit of a corner may stop
+constexpr double NEAR_PX = 5.0;  // from a crossing, as far as the first fit looks where the edges' blur ends before that
+
+// The window of a corner: it keeps clear of the neighbouring edges, blurred as those are. edges: both, px, to where they
+// end; free: px from them within which there is nothing else, infinite for a whole square.
+inline void window_shape(const double *edges, double free, bool crossing, double blur, double *shape) {
+    const double length[2] = {std::hypot(edges[0], edges[1]), std::hypot(edges[2], edges[3])};
+    const double across = magnitude(edges[0] * edges[3] - edges[1] * edges[2]) / larger(larger(length[0], length[1]), 1e-9);
+    const auto clipped = [](double x, double low, double high) { return smaller(larger(x, low), high); };
+    shape[1] = shape[2] = shape[3] = 0.0;
+    if (crossing && !std::isfinite(free)) {
+        shape[0] = clipped(smaller(0.6 * across, across - 3.0 * blur), 2.6, 11.0);
+        return;
+    }
+    const double limit = smaller(free, across);
+    shape[0] = shape[1] = clipped(smaller(0.75 * limit, limit - 2.5 * blur), 1.5, 8.0);
+    for (int a = 0; a < 2; ++a) shape[2 + a] = clipped(0.6 * length[a], shape[1], crossing ? 14.0 : 20.0);
+}
+// Amplitude at 0 of the straight line fitted over (0, 1) to a unit sine of that many periods.
+inline double at_the_end(double periods) {
+    const double w = 2.0 * M_PI * larger(periods, 1e-4), c = std::cos(w), s = std::sin(w);
+    return std::hypot((6.0 * (1.0 - c) / w - 2.0 * s) / w, (4.0 + 2.0 * c - 6.0 * s / w) / w);
+}
+// What pixels do to sharp edges along their rows and columns, added to cov (2, 2) px^2. A pixel's square is taken for a
+// Gaussian of equal variance. The difference has a harmonic at one period a pixel, which displaces the edge by as much,
+// periodically with its place; an oblique edge averages it over the pixels that it passes. displaced: px, of an edge along
+// the pixels; length: px of the edges in the window, on each side of a crossing.
+inline void add_sampling(double displaced, const double *angles, const double *length, bool crossing, double *cov) {
+    const double c[2] = {std::cos(angles[0]), std::cos(angles[1])}, s[2] = {std::sin(angles[0]), std::sin(angles[1])};
+    const double turn = c[0] * s[1] - s[0] * c[1];
+    double back[2][2] = {{c[1] / turn, -c[0] / turn}, {s[1] / turn, -s[0] / turn}};  // from offsets across both edges
+    if (magnitude(turn) < 1e-3) back[0][0] = back[1][1] = 1.0, back[0][1] = back[1][0] = 0.0;
+    for (int a = 0; a < 2; ++a) {
+        const double periods = length[a] * smaller(magnitude(s[a]), magnitude(c[a])), w = 2.0 * M_PI * periods;
+        const double by = displaced / root(2.0) * (crossing ? (w > 0.0 ? std::sin(w) / w : 1.0) : at_the_end(periods));
+        for (int i = 0; i < 2; ++i)
+            for (int j = 0; j < 2; ++j) cov[2 * i + j] += by * by * back[i][a] * back[j][a];
+    }
+}
+// Corners from start (n, 2) px, good to about 2 px, in two passes: the second one's window is centred and turned to the
+// corner itself. edges (n, 2, 2), free (n,): see ``window_shape``. floor: px, of the covariance. displaced (k,): px by
+// which pixels displace an edge, at most, for blurs (k,) of the lens. uv (n, 2), cov (n, 2, 2), blur of the lens, contrast (n,);
+// good (n,): what is to be trusted; angles (n, 2); bend (n, 2) px^2 by how much an edge's curvature displaces it.
+inline void refine_corners(In<float, 2> image, In<double, 2> start, In<double, 3> edges, Vector free, int64_t crossing, int64_t enough, double floor,
+                           Vector blurs, Vector displaced, Out<double, 2> uv, Out<double, 3> cov, Out<double, 1> blur, Out<double, 1> contrast,
+                           Out<bool, 1> good, Out<double, 2> angles, Out<double, 2> bend) {
+    for (int64_t i = 0; i < start.n[0]; ++i) {
+        const double *edge = &edges(i, 0, 0), *centre = &start(i, 0);
+        double turned[2] = {std::atan2(edge[1], edge[0]), std::atan2(edge[3], edge[2])}, shape[4], close[4] = {}, spread = 1.0;
+        window_shape(edge, free[i], crossing, spread, shape);
+        close[0] = smaller(shape[0], NEAR_PX);
+        const bool strips = shape[1] > 0.0;
+        FittedCorner first = fit_corner(image, centre, turned, spread, strips ? shape : close, crossing, 3.0, ROUGH_PX, enough);
+        if (!strips && (first.status != GOOD || first.p[6] > std::log(NEAR_PX / 3.5)))
+            first = fit_corner(image, centre, turned, spread, shape, crossing, 3.0, ROUGH_PX, enough);
+        if (first.status == GOOD) centre = first.p, turned[0] = first.p[2], turned[1] = first.p[3], spread = std::exp(first.p[6]);
+        window_shape(edge, free[i], crossing, spread, shape);
+        FittedCorner o = fit_corner(image, centre, turned, spread, shape, crossing, 0.5, FINE_PX, enough);
+        const double whole = std::exp(o.p[6]), length[2] = {larger(shape[0], shape[2]), larger(shape[0], shape[3])};
+        contrast.data[i] = magnitude(o.p[5]) * (crossing ? 2.0 : 1.0), blur.data[i] = root(larger(whole * whole - 1.0 / 12.0, 0.0));
+        // noise that comes from few residuals: the covariance of Student's distribution, not its scale's
+        const double redundancy = double(o.n - o.n_free), student = redundancy / larger(redundancy - 2.0, 1.0);
+        for (double &x : o.cov) x *= student;
+        add_sampling(interpolated(blurs, displaced, blur.data[i]), o.p + 2, length, crossing, o.cov);
+        o.cov[0] += floor * floor, o.cov[3] += floor * floor;
+        good.data[i] = o.status == GOOD && first.status == GOOD && o.rms < 0.2 * contrast.data[i] && o.cov[0] + o.cov[3] < 1.0
+                       && whole < larger(0.5 * larger(shape[0], larger(shape[2], shape[3])), 1.0);
+        std::memcpy(&cov(i, 0, 0), o.cov, sizeof o.cov);
+        for (int a = 0; a < 2; ++a) {
+            uv(i, a) = o.p[a], angles(i, a) = o.p[2 + a];
+            // means of the parabola x^2 / 2: over both sides of the corner, and where it begins if there is but one side
+            bend(i, a) = length[a] * length[a] / (crossing ? 6.0 : -12.0);
         }
-        const int64_t u0 = std::lrint(start(c, 0)), v0 = std::lrint(start(c, 1));
-        double p[CORNER] = {start(c, 0) - double(u0), start(c, 1) - double(v0), angles(c, 0), angles(c, 1), 0, 0, std::log(blur[c]), 0, 0};
-        const int n = corner_window(image, u0, v0, p, &shapes(c, 0), crossing, window), n_free = n >= enough ? 9 : 7;
-        pixels.data[c] = n;
-        if (n < 20) {
-            status.data[c] = n < 0 ? AT_BORDER : TOO_FEW;
-            std::memcpy(&out(c, 0), p, sizeof p);
-            continue;
-        }
-        const Pixels w{window.x, window.y, window.value, n};
-        Normals<CORNER> at;
-        const auto evaluate = [&](const double *q, Normals<CORNER> &o) { add_pixels(w, Wedge(q, crossing), o); };
-        start_levels(p, n, evaluate, at);
-        const bool found = levenberg_marquardt(p, n_free, tolerance, evaluate, clamp, at);
-        const double variance = at.cost / (n - n_free);
-        std::memcpy(&out(c, 0), p, sizeof p);
-        if (!found) {
-            status.data[c] = NO_CONVERGENCE;
-            continue;
-        }
-        rms.data[c] = root(variance);
-        if (!place_covariance(at, n_free, variance, &cov(c, 0, 0))) {
-            status.data[c] = NO_CONVERGENCE;
-            continue;
-        }
-        out(c, 0) += double(u0), out(c, 1) += double(v0);
-        const double shift = magnitude(out(c, 0) - start(c, 0)) + magnitude(out(c, 1) - start(c, 1));
-        status.data[c] = shift > max_shift ? AWAY : GOOD;
     }
 }
 

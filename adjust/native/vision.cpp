@@ -1,12 +1,15 @@
-// What Python calls of the fits of corners and spots, and of the renderer.
+// What Python calls of the fits of corners and spots, of boards, and of the renderer.
+#include "boards.h"
 #include "corners.h"
 #include "rendering.h"
 #include "spots.h"
 
 extern "C" __attribute__((visibility("default"))) const Entry *vision() {
     static constexpr Entry table[] = {
-        entry<fit_corners>("fit_corners"), entry<corner_rows>("corner_rows"), entry<fit_spots>("fit_spots"),
+        entry<fit_corners>("fit_corners"), entry<refine_corners>("refine_corners"), entry<corner_rows>("corner_rows"), entry<fit_spots>("fit_spots"),
         entry<spot_profile>("spot_rows_of_profile"), entry<pixel_corner_rays>("pixel_corner_rays"),
-        entry<draw_facets>("draw_facets"), entry<spread_and_sum>("spread_and_sum"), {nullptr, nullptr, nullptr}};
+        entry<draw_facets>("draw_facets"), entry<spread_and_sum>("spread_and_sum"), entry<of_neighbours>("of_neighbours"),
+        entry<first_is_dark>("first_is_dark"), entry<squares_follow>("squares_follow"), entry<may_go_on>("may_go_on"),
+        entry<off_grid>("off_grid"), entry<unbend>("unbend"), {nullptr, nullptr, nullptr}};
     return table;
 }

@@ -1,6 +1,6 @@
 """Fits of corners and spots to the pixels of an image, and the renderer's inner loops, in the core.
 
-The formulas are in ``corners.h``, ``spots.h``, ``fits.h`` and ``rendering.h``. Places are px, the centre of the first
+The formulas are in ``corners.h``, ``boards.h``, ``spots.h``, ``fits.h`` and ``rendering.h``. Places are px, the centre of the first
 pixel is (0, 0).
 """
 
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from adjust.model.survey import FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.library import Function
 
 Gray = npt.NDArray[np.float32]
@@ -26,6 +26,11 @@ _fit_corners = Function(
     "image[*,*] start[n,2] angles[n,2] blur[n] shapes[n,4] crossing max_shift tolerance enough "
     "p[n,9] cov[n,2,2] pixels[n] rms[n] status[n]",
 )
+_refine_corners = Function(
+    "refine_corners",
+    "image[*,*] start[n,2] edges[n,2,2] free[n] crossing enough floor blurs[k] displaced[k] "
+    "uv[n,2] cov[n,2,2] blur[n] contrast[n] good[n] angles[n,2] bend[n,2]",
+)
 _corner_rows = Function("corner_rows", "xy[n,2] p[9] crossing value[n] rows[n,9]")
 _fit_spots = Function(
     "fit_spots",
@@ -40,6 +45,12 @@ _draw_facets = Function(
     "background samples[*,2] weights[4,*] image[*,*] candidates[f]",
 )
 
+_of_neighbours = Function("of_neighbours", "image[*,*] grid[r,c,2] contrast")
+_first_is_dark = Function("first_is_dark", "image[*,*] grid[r,c,2]")
+_squares_follow = Function("squares_follow", "image[*,*] corners[n,2] places[n,2] edges[n,2,2] step follow[n]")
+_may_go_on = Function("may_go_on", "image[*,*] grid[r,c,2] step share")
+_off_grid = Function("off_grid", "grid[r,c,2] off[r,c] work[*]")
+_unbend = Function("unbend", "xy[n,2] keep[n] angles[n,2] bend[n,2] uv[n,2] cov[n,2,2] work[*]")
 _spread_and_sum = Function("spread_and_sum", "first last image[*,*] weights[t] reach n out[*,*] work[*,*]")
 
 
@@ -77,6 +88,77 @@ def fit_corners(
     _fit_corners(np.ascontiguousarray(image), *given, crossing, max_shift, tolerance, ENOUGH_FOR_SLOPES, p, cov,
                  pixels, rms, status)  # fmt: skip
     return p, cov, pixels, rms, status
+
+
+def refine_corners(
+    image: Gray, start: FloatArray, edges: FloatArray, free: FloatArray, crossing: bool, floor: float,
+    blurs: FloatArray, displaced: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray, FloatArray, FloatArray]:  # fmt: skip
+    """Fit two blurred edges to every corner, twice, the second time in a window centred and turned to it.
+
+    start: (n, 2) px, good to about 2 px. edges: (n, 2, 2) px, both, the second clockwise of the first. free: (n,) px
+    from the edges within which there is nothing else, infinite for a whole square. floor: px, added to the covariance.
+    displaced: (k,) px by which pixels displace an edge along them, at most, for ascending blurs (k,) px of the lens.
+    Returns uv (n, 2), covariance (n, 2, 2), blur px of the lens and contrast (n,), which are good (n,), angles (n, 2)
+    rad of the edges, and px^2 (n, 2) by how much an edge of a curvature of 1 / px is displaced along its normal.
+    """
+    n = len(start)
+    found = (np.empty((n, 2)), np.empty((n, 2, 2)), np.empty(n), np.empty(n), np.empty(n, bool), np.empty((n, 2)),
+             np.empty((n, 2)))  # fmt: skip
+    given = (np.ascontiguousarray(a, dtype=np.float64) for a in (start, edges, free))
+    _refine_corners(np.ascontiguousarray(image), *given, crossing, ENOUGH_FOR_SLOPES, floor, blurs, displaced, *found)
+    return found
+
+
+def unbend(
+    uv: FloatArray, cov: FloatArray, xy: FloatArray, keep: BoolArray, angles: FloatArray, bend: FloatArray
+) -> tuple[FloatArray, FloatArray] | None:
+    """Corners uv (n, 2) px of a plane at xy (n, 2), freed from the bending of their edges, and cov (n, 2, 2) with it.
+
+    keep: (n,) to learn from. angles, bend: as :func:`refine_corners` gives them. None where too few tell the bending.
+    """
+    uv, cov, n = uv.copy(), cov.copy(), len(uv)
+    given = (np.ascontiguousarray(a) for a in (xy, keep, angles, bend))
+    return (uv, cov) if _unbend(*given, uv, cov, np.empty(8 * n)) else None
+
+
+def of_neighbours(image: Gray, grid: FloatArray, contrast: float) -> bool:
+    """Whether the colours change across every edge of a grid (rows, columns, 2) px, and in turn.
+
+    They do not where a finder took every second corner of a larger board, or went across it. contrast: median step
+    from dark to bright. One in five places may be hidden or lit from the side.
+    """
+    return bool(_of_neighbours(image, np.ascontiguousarray(grid), contrast))
+
+
+def first_is_dark(image: Gray, grid: FloatArray) -> bool:
+    """Whether the first of the squares between the corners (rows, columns, 2) px is one of the darker ones."""
+    return bool(_first_is_dark(image, np.ascontiguousarray(grid)))
+
+
+def squares_follow(image: Gray, corners: FloatArray, places: FloatArray, edges: FloatArray, step: float) -> BoolArray:
+    """Whether squares beyond places (n, 2) px differ by more than step, the other way than those before the corners.
+
+    corners: (n, 2) px, those that the places continue. edges: (n, 2, 2) px, along the row and back to the corners.
+    """
+    follow = np.empty(len(corners), bool)
+    _squares_follow(image, *(np.ascontiguousarray(a) for a in (corners, places, edges)), step, follow)
+    return follow
+
+
+def may_go_on(image: Gray, grid: FloatArray, step: float, share: float) -> bool:
+    """Whether more than a share of a next row's squares follow a grid (rows, columns, 2) px on any of its four sides.
+
+    By places of a parabola through the last corners: near enough for squares, not for corners. True below 3 x 3.
+    """
+    return bool(_may_go_on(image, np.ascontiguousarray(grid), step, share))
+
+
+def off_grid(grid: FloatArray) -> FloatArray:
+    """Second differences (rows, columns) of a grid (rows, columns, 2) px, the larger of both ways, in squares."""
+    off = np.empty(grid.shape[:2])
+    _off_grid(np.ascontiguousarray(grid), off, np.empty(off.size))
+    return off
 
 
 def corner_rows(xy: FloatArray, p: FloatArray, crossing: bool) -> tuple[FloatArray, FloatArray]:

@@ -87,13 +87,18 @@ class Covariances(ABC):
     def following(self, spreads: Sequence[Mapping[int, FloatArray]], sizes: Sequence[int]) -> FloatArray:
         """Joint covariance of quantities that follow from unknowns: each (n, dim) by key; n of each in ``sizes``."""
         unknowns = [self.unknowns.by_key[key] for key in dict.fromkeys(key for by_key in spreads for key in by_key)]
-        rows, columns = np.cumsum([0, *sizes]), np.cumsum([0, *(u.dim for u in unknowns)])
+        rows, columns = np.cumsum([0, *sizes]).tolist(), np.cumsum([0, *(u.dim for u in unknowns)]).tolist()
         at = {u.key: slice(*columns[i : i + 2]) for i, u in enumerate(unknowns)}
-        J = np.zeros((int(rows[-1]), int(columns[-1])))
-        for first, by_key in zip(rows[:-1].tolist(), spreads, strict=True):
-            for key, part in by_key.items():
-                J[first : first + len(part), at[key]] = part
-        return np.asarray(J @ self.joint([u.name for u in unknowns]) @ J.T) if unknowns else J @ J.T
+
+        def spread(Q: FloatArray) -> FloatArray:
+            """J Q of the quantities' derivatives J, each of which has but a few unknowns."""
+            out = np.zeros((rows[-1], Q.shape[1]))
+            for first, by_key in zip(rows, spreads, strict=False):
+                for key, part in by_key.items():
+                    out[first : first + len(part)] += part @ Q[at[key]]
+            return out
+
+        return spread(spread(self.joint([u.name for u in unknowns])).T) if unknowns else np.zeros((rows[-1],) * 2)
 
 
 class Precision(Covariances):

@@ -12,7 +12,7 @@ from adjust.testing.distributions import chi2, norm
 
 _STEPS = 100
 _DETERMINED = 1e-9
-"""Share of the largest eigenvalue of a correlation matrix that is not rounding; joint ones lose about ten digits."""
+"""Share that is not rounding: of the largest eigenvalue of a correlation matrix, of a variance; joint ones lose digits."""
 _NEAR = 1e-4
 
 
@@ -43,9 +43,11 @@ def pseudo_square(d: FloatArray, Q: FloatArray) -> tuple[float, int, FloatArray]
 
 
 def pseudo_square_beside(d: FloatArray, Q: FloatArray, held: FloatArray) -> tuple[float, int]:
-    """The first two of :func:`pseudo_square`, by Cholesky's method where nothing is open but directions held (n, k).
+    """``d' Q^+ d`` and the rank of Q, by Cholesky's method where nothing is open but directions held (n, k).
 
-    Q held = 0 and held' d = 0: with N that spans these in sigmas, Q^+ is inv(Q + N N') on d.
+    Q held = 0 and held' d = 0: with N that spans these in sigmas, Q^+ is inv(Q + N N') on d. Nothing is taken for
+    rounding there but what the components before one leave of its variance: in a long chain, where all neighbours move
+    together, eigenvalues span far more than that, and the smallest tell of the neighbours. Else :func:`pseudo_square`.
     """
     s, _, factor = _factored(Q, held)
     if factor is None:
@@ -68,9 +70,9 @@ def _factored(Q: FloatArray, held: FloatArray) -> tuple[FloatArray, FloatArray, 
     s = np.sqrt(np.maximum(np.diag(Q), 1e-300))
     N = np.linalg.qr(s[:, None] * held)[0]
     full = Q / np.outer(s, s) + N @ N.T
-    norm_1 = float(np.abs(full).sum(axis=0).max(initial=0.0))
+    least = _DETERMINED * np.diag(full)
     factor, lost = scipy.linalg.lapack.dpotrf(full.T, lower=0, clean=0, overwrite_a=1) if len(Q) else (full, 1)
-    return s, N, None if lost or scipy.linalg.lapack.dpocon(factor, norm_1)[0] < _DETERMINED else factor
+    return s, N, None if lost or (np.diag(factor) ** 2 < least).any() else factor
 
 
 def upper_tail(x: float, weights: FloatArray) -> float:

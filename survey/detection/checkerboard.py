@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray
-from survey.detection.bent_edges import unbent
-from survey.detection.corners import CornerFit, refine_corners
-from survey.detection.extent import grown, is_of_neighbours
+from adjust.native.vision import first_is_dark, of_neighbours, off_grid
+from survey.detection.corners import CornerFit, refine_corners, unbent
+from survey.detection.extent import grown
 from survey.detection.gray import Gray8, Gray32, halved, reduced
 from survey.detection.results import Detection, nothing_found
 from survey.project.targets import Checkerboard
@@ -96,7 +96,7 @@ def _measured(gray: Gray32, gray8: Gray8, rough: FloatArray) -> tuple[Detection,
         notes += ("order is ambiguous: the board looks the same after a turn",)
     blur, contrast = float(np.median(fit.blur_px[keep])), float(np.median(fit.contrast[keep]))
     measured = np.where(keep[:, None], fit.uv, start).reshape(grid.shape)
-    if not is_of_neighbours(gray, measured, contrast):
+    if not of_neighbours(gray, measured, contrast):
         return nothing_found("corners found, but not those of neighbouring squares"), rough
     whole = grown(gray, measured, contrast)
     return Detection(np.flatnonzero(keep), fit.uv[keep], fit.cov[keep], blur, contrast, notes, ambiguous), whole
@@ -125,7 +125,7 @@ def _glimpsed(gray8: Gray8, columns: int, rows: int) -> FloatArray | None:
     """Corners (n, 2) px that the classic finder sees in a small image at once, and that lie as on a board."""
     small, factor = halved(gray8, _SQUARE_PX * max(columns, rows))
     ok, corners = cv2.findChessboardCorners(small, (columns, rows), flags=0)
-    if not ok or _off_grid(np.reshape(corners, (rows, columns, 2))).max() > _REGULAR:
+    if not ok or off_grid(np.reshape(corners, (rows, columns, 2)).astype(float)).max() > _REGULAR:
         return None
     return _enlarged(corners, factor)
 
@@ -148,36 +148,27 @@ def _found_in(coarse: Gray8, pattern: tuple[int, int]) -> tuple[bool, Any]:
 
 def _ordered(gray: Gray32, grid: FloatArray) -> tuple[FloatArray, bool]:
     """The grid (rows, columns, 2) in the order that ``find_checkerboard`` defines, and whether that is ambiguous."""
-    edges = grid_edges(grid).mean((0, 1))
-    if edges[0, 0] * edges[1, 1] - edges[0, 1] * edges[1, 0] < 0.0:
+    along, down = grid[:, -1] - grid[:, 0], grid[-1] - grid[0]
+    if np.linalg.det(np.stack([along.mean(0), down.mean(0)])) < 0.0:
         grid = grid[:, ::-1]
-    turns = [grid, grid[::-1, ::-1]]
-    if grid.shape[0] == grid.shape[1]:
-        quarter = grid.transpose(1, 0, 2)[:, ::-1]
-        turns += [quarter, quarter[::-1, ::-1]]
-    dark = [turn for turn in turns if _first_square_is_dark(gray, turn)] or turns
-    return min(dark, key=lambda turn: float(turn[0, 0].sum())), len(dark) > 1
-
-
-def _first_square_is_dark(gray: Gray32, grid: FloatArray) -> bool:
-    """By the centres of all inner squares, those of the first one's colour against the others."""
-    centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4.0
-    level = _bilinear_patch(gray, centres)
-    row, column = np.indices(level.shape)
-    even = (row + column) % 2 == 0
-    return bool(level[even].mean() < level[~even].mean())
-
-
-def _bilinear_patch(gray: Gray32, uv: FloatArray) -> FloatArray:
-    points = uv.astype(np.float32)
-    return np.asarray(
-        cv2.remap(gray, points[..., 0], points[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    )
+    rows, columns = grid.shape[:2]
+    dark = first_is_dark(gray, grid)
+    turns = [(grid, dark), (grid[::-1, ::-1], dark == ((rows + columns) % 2 == 0))]
+    if rows == columns:  # a quarter turn begins at the other end of a row
+        quarter, begins_dark = grid.transpose(1, 0, 2)[:, ::-1], dark == (rows % 2 == 0)
+        turns += [(quarter, begins_dark), (quarter[::-1, ::-1], begins_dark)]
+    possible = [turn for turn, begins_dark in turns if begins_dark] or [turn for turn, _ in turns]
+    return min(possible, key=lambda turn: float(turn[0, 0].sum())), len(possible) > 1
 
 
 def grid_edges(grid: FloatArray) -> FloatArray:
     """Vectors (rows, columns, 2, 2) px along the row and along the column at each corner of a grid, one square long."""
-    return np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=2)
+    edges = np.empty((*grid.shape, 2)).swapaxes(2, 3)
+    for axis in (0, 1):
+        g, e = grid.swapaxes(0, axis), edges[:, :, 1 - axis].swapaxes(0, axis)
+        e[1:-1] = 0.5 * (g[2:] - g[:-2])
+        e[0], e[-1] = g[1] - g[0], g[-1] - g[-2]
+    return np.ascontiguousarray(edges)
 
 
 def _settle(gray8: Gray8, grid: FloatArray, edges: FloatArray) -> FloatArray:
@@ -195,15 +186,4 @@ def _settle(gray8: Gray8, grid: FloatArray, edges: FloatArray) -> FloatArray:
 
 def _on_grid(fit: CornerFit, shape: tuple[int, int]) -> BoolArray:
     """Which corners lie where their neighbours in the row and the column put them, to a fifth of a square."""
-    return _off_grid(np.where(fit.good[:, None], fit.uv, np.nan).reshape(*shape, 2)).ravel() <= 0.4
-
-
-def _off_grid(grid: FloatArray) -> FloatArray:
-    """Second differences (rows, columns) of a grid (rows, columns, 2) px, the larger of both ways, in squares."""
-    steps = np.linalg.norm(np.diff(grid, axis=1), axis=2)
-    spacing = float(np.median(steps[np.isfinite(steps)])) if np.isfinite(steps).any() else np.inf
-    off = np.zeros(grid.shape[:2])
-    for axis in (0, 1):
-        g, o = np.moveaxis(grid, axis, 0), np.moveaxis(off, axis, 0)
-        o[1:-1] = np.fmax(o[1:-1], np.linalg.norm(g[2:] - 2.0 * g[1:-1] + g[:-2], axis=2) / spacing)
-    return off
+    return off_grid(np.where(fit.good[:, None], fit.uv, np.nan).reshape(*shape, 2)).ravel() <= 0.4

@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 
 from adjust.model.survey import FloatArray, IntArray
-from survey.detection.bent_edges import unbent
-from survey.detection.corners import CornerFit, refine_corners
+from survey.detection.corners import CornerFit, refine_corners, unbent
 from survey.detection.gray import Gray8, Gray32, reduced
 from survey.detection.results import Detection, nothing_found
 from survey.project.dictionaries import charuco_board, marker_dictionary

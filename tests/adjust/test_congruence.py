@@ -199,3 +199,12 @@ def test_the_statistic_by_elimination_is_that_of_the_eigenvectors() -> None:
     assert found == (pytest.approx(pseudo_square(d[:8], Q[:8, :8])[0], rel=1e-8), 5)
     singular = np.outer(root[0], root[0]) + np.outer(root[1], root[1])
     assert pseudo_square_beside(root[0], singular, np.zeros((12, 0)))[1] == 2
+
+
+def test_what_neighbours_of_a_long_chain_know_of_each_other_is_no_rounding() -> None:
+    steps = np.random.default_rng(3).normal(size=700) * np.where(np.arange(700) % 2, 1.0, 1e-3)
+    sigmas = np.where(np.arange(700) % 2, 1.0, 1e-3)
+    Q = np.minimum.outer(c := np.cumsum(sigmas**2), c)  # of a random walk
+    statistic, rank = pseudo_square_beside(np.cumsum(steps), Q, np.zeros((700, 0)))
+    assert rank == 700
+    assert statistic == pytest.approx(((steps / sigmas) ** 2).sum(), rel=1e-6)

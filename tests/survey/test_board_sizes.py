@@ -6,8 +6,9 @@ import pytest
 from gtsam import Pose3, Rot3
 
 from adjust.model.errors import SurveyError
+from adjust.native.vision import of_neighbours
 from survey.detection import detect_image
-from survey.detection.extent import grown, is_of_neighbours
+from survey.detection.extent import grown
 from survey.jobs.adjusting.job import adjust_job, detect_job
 from survey.project.targets import Checkerboard
 from survey.simulate.rendering import BrownCamera, Imaging, PlacedTarget, render
@@ -64,9 +65,9 @@ def test_a_grid_is_continued_to_the_edge_of_its_board_and_not_beyond(turn):
         whole = grown(image, part, 190.0)
         assert whole.shape == grid.shape
         assert np.abs(whole - grid).max() < 0.5
-        assert is_of_neighbours(image, part, 190.0)
-    assert not is_of_neighbours(image, grid[::2], 190.0)
-    assert not is_of_neighbours(image, np.stack([[grid[j + i, 2 * i] for i in range(4)] for j in range(3)]), 190.0)
+        assert of_neighbours(image, part, 190.0)
+    assert not of_neighbours(image, grid[::2], 190.0)
+    assert not of_neighbours(image, np.stack([[grid[j + i, 2 * i] for i in range(4)] for j in range(3)]), 190.0)
 
 
 def test_what_stands_beside_a_board_does_not_make_it_larger():

@@ -7,8 +7,7 @@ from gtsam import Pose3, Rot3
 from scipy.stats import chi2
 
 from survey.detection import SpotOptions, checkerboard, detect_image, detect_spots, markers
-from survey.detection.bent_edges import unbent
-from survey.detection.corners import CornerFit
+from survey.detection.corners import CornerFit, unbent
 from survey.project.targets import Charuco, Checkerboard, MarkerGrid
 from survey.simulate.rendering import Beacons, BrownCamera, Imaging, PlacedTarget, render
 
