@@ -33,7 +33,7 @@ class Courses:
         """By how much later than an epoch something with this clock is observed; row: below the middle of the image."""
         if clock is None:
             return 0.0
-        values = dict(zip(clock.parameters.names, np.asarray(self.truth[name]).tolist(), strict=True))
+        values: dict[str, float] = dict(zip(clock.parameters.names, np.asarray(self.truth[name]).tolist(), strict=True))
         own = self.truth.get((*name, epoch_id), np.zeros(1))
         since = self.times.of[epoch_id] - self.times.middle
         return (

@@ -12,7 +12,7 @@ import numpy as np
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect, of_shifts, shifted_back
 from adjust.diagnosis.hypothesis import ChangeColumns, Hypothesis, Place
-from adjust.diagnosis.score import Linear
+from adjust.diagnosis.linear import Linear
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import FloatArray, Survey
 
