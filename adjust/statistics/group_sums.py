@@ -13,6 +13,7 @@ equations; the covariance of the estimated factors, relative to themselves, is 2
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 import scipy
@@ -24,9 +25,7 @@ from adjust.statistics.system import LinearSystem
 
 _SMALL = 500
 """Unknowns up to which the normal matrices of the groups are full ones."""
-
-
-Matrix = FloatArray | sparse.csr_matrix
+Matrix: TypeAlias = FloatArray | sparse.csr_matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +142,7 @@ def _own_trace(N: Matrix, Q: FloatArray) -> float:
     """tr(Q N) of a symmetric N."""
     if not sparse.issparse(N):
         return float(np.vdot(N, Q))
-    entries = N.tocoo()
+    entries = sparse.coo_matrix(N)
     return float(entries.data @ Q[entries.row, entries.col])
 
 
