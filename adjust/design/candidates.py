@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -27,6 +26,7 @@ from adjust.model.observations import (
     TableReading,
 )
 from adjust.model.result import ParameterName
+from adjust.model.rewriting import Fields
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Point, Survey
 from adjust.statistics.system import Columns
 
@@ -74,7 +74,7 @@ def with_candidates(survey: Survey, candidates: Sequence[Candidate]) -> Survey:
         for b in c.image_blocks:
             moved = np.where(b.point_idx >= n, b.point_idx + shift, b.point_idx) if b.target_id is None else b.point_idx
             blocks.append(replace(b, point_idx=moved))
-    lists: dict[str, Any] = {
+    lists: Fields = {
         name: getattr(survey, name) + tuple(x for c in candidates for x in getattr(c, name))
         for name in _LISTS.values()
     }

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -10,6 +9,7 @@ from adjust.design.prediction import Predictor
 from adjust.graph.assembly import StartValues
 from adjust.model.errors import SurveyError
 from adjust.model.result import ParameterName
+from adjust.model.rewriting import Fields
 from adjust.model.survey import FloatArray, Survey, VectorParameter, VectorPrior
 from adjust.observations.factors import ObservationFactor
 from adjust.precision.precision import noise_of
@@ -18,7 +18,7 @@ Rng = np.random.Generator
 _NO_RESIDUAL_M = 1e-7
 
 
-def exact_readings(p: Predictor) -> dict[str, Any]:
+def exact_readings(p: Predictor) -> Fields:
     """The fields of the survey with the readings and geometric observations that the predictor's values give.
 
     Raises SurveyError for a position that should lie on a line and does not: only its coordinates could mend that.
@@ -93,7 +93,7 @@ def displaced(survey: Survey, start: StartValues, rng: Rng) -> Survey:
     )
 
 
-def disturbed_readings(survey: Survey, sigmas: FloatArray, rng: Rng) -> dict[str, Any]:
+def disturbed_readings(survey: Survey, sigmas: FloatArray, rng: Rng) -> Fields:
     """The fields of the survey with noise on these observations and on the means of their priors.
 
     sigmas: (N,) of the readings. Positions that lie on a line by definition stay there.

@@ -231,7 +231,11 @@ def _search(
     change: _Change, begin: list[int], test: CongruenceTest, pooled: tuple[float, float, float],
     options: CongruenceOptions,
 ) -> tuple[list[CongruenceStep], list[int], CongruenceTest]:  # fmt: skip
-    """Take out the worst until the rest is congruent, and back what then fits."""
+    """Take out the worst until the rest is congruent, and back what then fits.
+
+    No search for gross errors: not single points are judged but what is left, as a whole and by F, and every step is
+    told with the test after it (Niemeier 2008, 13.3).
+    """
     stable, steps = list(begin), list[CongruenceStep]()
     while options.search and not test.passed:
         shares = _shares(change, stable)

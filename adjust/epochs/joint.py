@@ -6,6 +6,7 @@ from typing import Any
 
 from adjust.model.errors import SurveyError
 from adjust.model.observations import PositionRef
+from adjust.model.rewriting import Fields
 from adjust.model.subsets import Item, with_positions
 from adjust.model.survey import Datum, Instrument, Point, Survey
 
@@ -55,13 +56,13 @@ def joint_survey(epochs: Mapping[str, Survey], stable: Collection[str]) -> Surve
     datum = Datum("inner", points=tuple(p for p in points if p in stable)) if inner else first.datum
     whole = Survey(points=tuple(points.values()), datum=datum, vertical=first.vertical, bearings=first.bearings,
                    instruments=tuple(instruments.values()))  # fmt: skip
-    observed: dict[str, Any] = {k: tuple(v) for k, v in parts.items()}
+    observed: Fields = {k: tuple(v) for k, v in parts.items()}
     return replace(whole, **observed)
 
 
 def _renamed(item: Item, epoch: str, stable: Collection[str]) -> Item:
     """An observation or setup of one epoch, with its own ids and points."""
-    changed: dict[str, Any] = {}
+    changed: Fields = {}
     for name in {"setup_id", *_IDS} & set(item.__dataclass_fields__):
         value = getattr(item, name)
         changed[name] = epoch_name(value, epoch) if value or name in _IDS else value

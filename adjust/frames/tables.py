@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.frames.chains import adjoint_of_inverse
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, Survey, Table
 from adjust.model.tables import Harmonic, harmonic
@@ -139,3 +138,13 @@ def _check_axis(table: Table, axis: int, angles: FloatArray, free: Sequence[Harm
             f"deg; its harmonics take more than {most} angles over {np.degrees(wanted):.0f} deg: measure there, or "
             "take them out of harmonics"
         )
+
+
+def adjoint_of_inverse(R: FloatArray, t: FloatArray) -> FloatArray:
+    """Ad(T^-1) (n, 6, 6) of motions T = (R, t), R (n, 3, 3) and t (n, 3)."""
+    out = np.zeros((len(R), 6, 6))
+    out[:, :3, :3] = out[:, 3:, 3:] = np.swapaxes(R, 1, 2)
+    for i in range(3):  # -R' [t]x has the rows t x (column of R)
+        j, k = (i + 1) % 3, (i + 2) % 3
+        out[:, 3:, i] = t[:, j, None] * R[:, k] - t[:, k, None] * R[:, j]
+    return out

@@ -1,8 +1,12 @@
 """How GTSAM eliminates a linear system: by Cholesky, or by QR where that still resolves what Cholesky refuses."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import gtsam
+
+_Found = TypeVar("_Found")
 
 
 @dataclass(frozen=True, eq=False)
@@ -12,16 +16,19 @@ class Elimination:
     ordering: gtsam.Ordering
     use_qr: bool = False
 
-    def solution(self, linear: gtsam.GaussianFactorGraph) -> tuple[gtsam.VectorValues, float] | None:
-        """The solution and by how much it lowers chi-square; None where this method finds the system indeterminate."""
+    def of(self, run: Callable[..., _Found]) -> _Found | None:
+        """What an algorithm of GTSAM's finds in this way; None where it takes the system for indeterminate."""
         try:
-            how = (self.ordering, gtsam.EliminateQR) if self.use_qr else (self.ordering,)
-            delta = linear.optimize(*how)
+            return run(*((self.ordering, gtsam.EliminateQR) if self.use_qr else (self.ordering,)))
         except RuntimeError as error:  # GTSAM's exception for it has no type of its own in Python
             if "ndetermin" not in str(error):
                 raise
             return None
-        return delta, -float(delta.dot(linear.gradientAtZero()))
+
+    def solution(self, linear: gtsam.GaussianFactorGraph) -> tuple[gtsam.VectorValues, float] | None:
+        """The solution and by how much it lowers chi-square; None where this method finds the system indeterminate."""
+        delta = self.of(linear.optimize)
+        return None if delta is None else (delta, -float(delta.dot(linear.gradientAtZero())))
 
     def tree(self, linear: gtsam.GaussianFactorGraph) -> tuple[gtsam.GaussianBayesTree, gtsam.VectorValues] | None:
         """The Bayes tree and its solution; None as above."""

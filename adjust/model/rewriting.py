@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from adjust.model.result import ParameterName
 from adjust.model.survey import (
@@ -18,6 +18,8 @@ from adjust.model.survey import (
 )
 
 Vector = TypeVar("Vector", LensParameter, VectorParameter)
+Fields = dict[str, Any]
+"""Fields of a value by their names, as ``dataclasses.replace`` takes them: of any type, for each field has its own."""
 
 
 class Rewriting:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -17,7 +17,7 @@ Item = TypeVar("Item", bound="DataclassInstance")
 
 def with_positions(item: Item, new: Callable[[PositionRef], PositionRef]) -> Item:
     """An observation with other positions in the place of those that it names."""
-    changed: dict[str, Any] = {}
+    changed: dict[str, PositionRef | tuple[PositionRef, ...]] = {}
     for name in item.__dataclass_fields__:
         value = getattr(item, name)
         if isinstance(value, PositionRef):

@@ -161,20 +161,26 @@ def with_poses(
     _with_poses(run, *bundle, Q, Y, YL, B, np.zeros((len(Q), 8)))
 
 
+class PointCovariances(NamedTuple):
+    """Of reduced points with poses B (K, 3, 6), with lenses BL (pairs, 3, MAX_LENS), their own C (P, 3, 3)."""
+
+    B: FloatArray
+    BL: FloatArray
+    C: FloatArray
+
+
 def with_lenses(
-    bundle: BundleArrays, Vi: FloatArray, Q: FloatArray, Y: FloatArray, YL: FloatArray, B: FloatArray, BL: FloatArray,
-    C: FloatArray,
-) -> None:  # fmt: skip
-    """Covariance BL (pairs, 3, MAX_LENS) of reduced points with lenses, and their own C (P, 3, 3)."""
-    _with_lenses(*bundle, Vi, Q, Y, YL, B, BL, C)
+    bundle: BundleArrays, Vi: FloatArray, Q: FloatArray, Y: FloatArray, YL: FloatArray, out: PointCovariances
+) -> None:
+    """The covariances with lenses and of the points themselves, from those with poses."""
+    _with_lenses(*bundle, Vi, Q, Y, YL, *out)
 
 
 def reduced_influence(
-    run: IntArray, bundle: BundleArrays, A: FloatArray, Q: FloatArray, B: FloatArray, BL: FloatArray, C: FloatArray,
-    influence: FloatArray,
-) -> None:  # fmt: skip
+    run: IntArray, bundle: BundleArrays, A: FloatArray, Q: FloatArray, points: PointCovariances, influence: FloatArray
+) -> None:
     """Whitened A Q A' (K, 3) of observations of reduced points; A: rows whitened as if all were used."""
-    _reduced_influence(run, *bundle, A, Q, B, BL, C, influence)
+    _reduced_influence(run, *bundle, A, Q, *points, influence)
 
 
 def direct_influence(

@@ -149,12 +149,20 @@ class KeyArrays(NamedTuple):
     place: IntArray
 
 
-def fill_chains(
-    slot_R: FloatArray, slot_t: FloatArray, ptr: IntArray, slot: IntArray, inverse: BoolArray, R: FloatArray,
-    t: FloatArray, C: FloatArray,
-) -> None:  # fmt: skip
-    """Poses R (B, 3, 3), t (B, 3) of chains and their derivatives C (links, 6, 6) by every link."""
-    _evaluate_chains(slot_R, slot_t, ptr, slot, inverse, R, t, C)
+def evaluate_chains(
+    slot_R: FloatArray, slot_t: FloatArray, link_ptr: IntArray, link_slot: IntArray, link_inverse: BoolArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Poses R (B, 3, 3), t (B, 3) of all chains, and C (links, 6, 6), the derivative of each pose by each link.
+
+    slot_R (S, 3, 3), slot_t (S, 3): poses by slot. Chain b has the links ``link_ptr[b]:link_ptr[b + 1]``. Tangents are
+    GTSAM's (rotation then translation, perturbation on the right). For ``T = A1 ... An`` a perturbation of a forward
+    link i reaches T through ``Ad((A_{i+1} ... A_n)^-1)``; of an inverted link through ``-Ad((A_i^-1 ... A_n)^-1)``
+    (Sola, Deray, Atchuthan 2018, "A micro Lie theory", section II.G).
+    """
+    n = len(link_ptr) - 1
+    R, t, C = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((len(link_slot), 6, 6))
+    _evaluate_chains(slot_R, slot_t, link_ptr, link_slot, link_inverse, R, t, C)
+    return R, t, C
 
 
 def normal_equations(which: IntArray, at: BlocksAt, H: FloatArray, chi: FloatArray, depth: FloatArray) -> None:
@@ -201,15 +209,22 @@ def local_by_keys(which: IntArray, n_lens: IntArray, keys: ByKeys, G: FloatArray
     _local_by_keys(which, n_lens, *keys.segments, keys.C, keys.D, G)
 
 
+class PointStatistics(NamedTuple):
+    """Residuals (N, 2), influence (N, 3) of all points, lost (B,) of all blocks."""
+
+    residual: FloatArray
+    influence: FloatArray
+    lost: IntArray
+
+
 def all_statistics(
-    which: IntArray, at: BlocksAt, by_keys: ByKeys, keys: KeyArrays, tree: TreeArrays, residual: FloatArray,
-    influence: FloatArray, lost: IntArray,
-) -> None:  # fmt: skip
+    which: IntArray, at: BlocksAt, by_keys: ByKeys, keys: KeyArrays, tree: TreeArrays, out: PointStatistics
+) -> None:
     """Residuals (N, 2) px of the listed blocks and the whitened covariance A Q A' (N, 3: 00, 01, 11) of their points.
 
-    at.W: that of all points, used or not. lost[b] becomes 1 where two keys of a block share no clique of the tree.
+    at.W: that of all points, used or not. out.lost[b] becomes 1 where two keys of a block share no clique of the tree.
     """
     widest = int(by_keys.width.max(initial=0))
     work = np.empty(widest * (widest + 2 * MAX_LOCAL))
     segments, C, D, width = by_keys
-    _all_statistics(which, *at.arrays, *segments, C, D, width, *keys, *tree, residual, influence, lost, work)
+    _all_statistics(which, *at.arrays, *segments, C, D, width, *keys, *tree, *out, work)

@@ -7,6 +7,8 @@ import gtsam
 import numpy as np
 from gtsam import Pose3
 
+from adjust.graph.elimination import Elimination
+
 _STEPS = 6
 _MOST_TOUCHED = 24
 
@@ -174,14 +176,11 @@ class Batch:
 
     def _step(self, ordering: gtsam.Ordering) -> gtsam.VectorValues:
         linear = self.graph.linearize(self.present)
-        if not self.use_qr:
-            try:
-                return linear.optimize(ordering)
-            except RuntimeError as error:
-                if "ndetermin" not in str(error):
-                    raise
-                self.use_qr = True  # GTSAM's Cholesky refuses pivots of weak networks that QR still resolves
-        return linear.optimize(ordering, gtsam.EliminateQR)
+        found = Elimination(ordering, self.use_qr).of(linear.optimize)
+        if found is None:
+            self.use_qr = True  # GTSAM's Cholesky refuses pivots of weak networks that QR still resolves
+            found = linear.optimize(ordering, gtsam.EliminateQR)
+        return found
 
     def estimate(self, key: int) -> Pose3:
         """See :class:`Growth`."""

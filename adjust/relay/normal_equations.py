@@ -14,6 +14,7 @@ import scipy.linalg
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
+from adjust.graph.elimination import Elimination
 from adjust.model.survey import FloatArray, IntArray
 from adjust.observations.factors import Jacobians, custom
 from adjust.precision.tree import TreeCovariance
@@ -150,10 +151,7 @@ def _linear_factor(keys: list[int], blocks: FloatArray, dim: int) -> gtsam.Gauss
 
 
 def _eliminate(graph: gtsam.GaussianFactorGraph) -> gtsam.GaussianBayesTree:
-    try:
-        return graph.eliminateMultifrontal()
-    except RuntimeError as error:
-        if "ndetermin" not in str(error):
-            raise
-        # weak but determined: GTSAM's Cholesky refuses pivots that QR still resolves
-        return graph.eliminateMultifrontal(gtsam.Ordering.ColamdGaussianFactorGraph(graph), gtsam.EliminateQR)
+    order = gtsam.Ordering.ColamdGaussianFactorGraph(graph)
+    found = Elimination(order).of(graph.eliminateMultifrontal)
+    # weak but determined: GTSAM's Cholesky refuses pivots that QR still resolves
+    return graph.eliminateMultifrontal(order, gtsam.EliminateQR) if found is None else found

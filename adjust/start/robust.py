@@ -57,7 +57,8 @@ def screen(graph: AdjustmentGraph, solved: Solved, options: SolveOptions) -> Scr
     if state.failing.any() and not state.tests.cautious.any():
         used = given.copy()
         start = _reweighted(graph, solved, used, options)
-        state = search.settled(search.judged(*tested(solve(graph, options, start=start), used)))
+        state = search.judged(*tested(solve(graph, options, start=start), used))  # the first one goes: it may be large
+        state = search.settled(state)
     return state.solution
 
 

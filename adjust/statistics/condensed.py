@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-from adjust.frames.chains import adjoint_of_inverse
+from adjust.frames.tables import adjoint_of_inverse
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.model.boards import BENT, deformation
 from adjust.model.survey import FloatArray, IntArray

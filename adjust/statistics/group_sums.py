@@ -25,8 +25,6 @@ from adjust.statistics.system import LinearSystem
 
 _SMALL = 500
 """Unknowns up to which the normal matrices of the groups are full ones."""
-
-
 Matrix: TypeAlias = FloatArray | sparse.csr_matrix
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from adjust.model.rewriting import Fields
 from adjust.model.survey import FloatArray, Survey
 
 _WITH_COVARIANCE = (
@@ -23,15 +24,15 @@ def scaled_survey(survey: Survey, factors: Mapping[str, float]) -> Survey:
     def root(group: str) -> float:
         return float(np.sqrt(factors.get(group, 1.0)))
 
-    def with_cov(item: Any) -> Any:
+    def with_cov(item: Any) -> Any:  # of every kind, by the name of its field
         factor = root(item.group) ** 2
         return item if factor == 1.0 else replace(item, cov=factor * item.cov)
 
-    def with_sigma(item: Any) -> Any:
+    def with_sigma(item: Any) -> Any:  # as above
         factor = root(item.group)
         return item if factor == 1.0 else replace(item, sigma=factor * item.sigma)
 
-    changed: dict[str, Any] = {f: tuple(with_cov(x) for x in getattr(survey, f)) for f in _WITH_COVARIANCE}
+    changed: Fields = {f: tuple(with_cov(x) for x in getattr(survey, f)) for f in _WITH_COVARIANCE}
     changed |= {f: tuple(with_sigma(x) for x in getattr(survey, f)) for f in _WITH_SIGMA}
     readings = tuple(
         r if root(r.group) == 1.0 else replace(r, sigma=root(r.group) * r.sigma,

@@ -11,7 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from adjust.adjustment import adjust
-from adjust.statistics.outliers.search import SearchOptions, search_outliers
+from adjust.statistics.outliers.outcome import SearchOptions
+from adjust.statistics.outliers.search import search_outliers
 from adjust.statistics.reliability import observation_name, reliability
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2

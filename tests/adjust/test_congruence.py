@@ -16,7 +16,13 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import Datum, FloatArray, PointParameter, PoseParameter, Station, Survey
 from adjust.precision.s_transformation import transformed
-from adjust.testing.quadratic_forms import pseudo_precision, pseudo_square, pseudo_square_beside
+from adjust.testing.quadratic_forms import (
+    pseudo_half,
+    pseudo_precision,
+    pseudo_square,
+    pseudo_square_beside,
+    pseudo_squares,
+)
 from tests.adjust import helpers as h
 from tests.adjust import statistics_networks as net
 
@@ -208,3 +214,18 @@ def test_what_neighbours_of_a_long_chain_know_of_each_other_is_no_rounding() -> 
     statistic, rank = pseudo_square_beside(np.cumsum(steps), Q, np.zeros((700, 0)))
     assert rank == 700
     assert statistic == pytest.approx(((steps / sigmas) ** 2).sum(), rel=1e-6)
+
+
+def test_directions_that_are_open_have_no_part_in_squares_of_many_at_once():
+    rng = np.random.default_rng(12)
+    A, g = rng.normal(size=(4, 5, 3)), rng.normal(size=(4, 5))
+    M = A @ np.swapaxes(A, 1, 2)
+    M[3] = np.diag([4.0, 1.0, 1e-8, 0.0, 0.25])
+    half, rank = pseudo_half(M, 1e-6)
+    expected = np.linalg.pinv(M, rcond=1e-7, hermitian=True)
+    np.testing.assert_allclose(half @ np.swapaxes(half, 1, 2), expected, rtol=1e-9, atol=1e-9)
+    assert rank.tolist() == [3, 3, 3, 3]
+    assert pseudo_half(M[3], 1e-9)[1] == 4, "what is small is open only below the limit"
+    assert pseudo_half(M[3], 1e-9, 1e-7)[1] == 3, "or below a share of the largest"
+    squares, _ = pseudo_squares(g, M, 1e-6)
+    np.testing.assert_allclose(squares, np.einsum("ni,nij,nj->n", g, expected, g), rtol=1e-9)

@@ -6,7 +6,15 @@ from scipy.stats import chi2
 
 from adjust.model.errors import NotConvergedError
 from adjust.model.survey import BoolArray, FloatArray
-from adjust.testing.gross_errors import Search, State, Verdicts, best_back_first, one_group, worst_first
+from adjust.testing.gross_errors import (
+    Search,
+    State,
+    Verdicts,
+    all_at_once,
+    best_back_first,
+    one_group,
+    worst_first,
+)
 
 ALPHA = 0.01
 
@@ -51,6 +59,16 @@ def test_what_fails_goes_and_what_was_out_by_mistake_comes_back(step) -> None:
     assert last.solution == pytest.approx(lengths[[0, 1, 2, 4, 6, 7]].mean())
     assert ([3], []) in told
     assert any(0 in back for _, back in told)
+
+
+def test_all_that_fail_may_go_at_once_while_all_that_fit_come_back() -> None:
+    search = of_one_length(np.array([0.3, -0.4, 0.1, 12.0, 0.2, -9.0, -0.1, 0.5]))
+    search.step = all_at_once
+    told: list[tuple[list[int], list[int]]] = []
+    search.said = lambda _, out, back: told.append((np.flatnonzero(out).tolist(), np.flatnonzero(back).tolist()))
+    last = search.settled(begun(search, np.arange(8) > 0))
+    assert told == [([3, 5], [0])]
+    assert np.flatnonzero(~last.tests.used).tolist() == [3, 5]
 
 
 def test_where_the_next_step_has_no_solution_the_last_one_stays() -> None:

@@ -16,7 +16,8 @@ from adjust.start.robust import limit
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.outliers import exchange
 from adjust.statistics.outliers.candidates import candidates, without
-from adjust.statistics.outliers.search import SearchOptions, search_outliers
+from adjust.statistics.outliers.outcome import SearchOptions
+from adjust.statistics.outliers.search import search_outliers
 from adjust.statistics.outliers.snooping import Snooping
 from adjust.statistics.reliability import reliability
 from adjust.statistics.system import LinearSystem, linear_system

@@ -465,7 +465,7 @@ def test_following_only_what_fails_finds_what_following_all_does(
     every = screened(sim.network)
     monkeypatch.setattr("adjust.statistics.outliers.watched._LARGE", 0.0)
     made = []
-    monkeypatch.setattr("adjust.statistics.outliers.search.WatchedSnooping",
+    monkeypatch.setattr("adjust.statistics.outliers.round.WatchedSnooping",
                         lambda *a: made.append(WatchedSnooping(*a)) or made[-1])  # fmt: skip
     few = screened(sim.network)
     assert left_out(few) == left_out(every) == set(sim.wrong)

@@ -5,6 +5,7 @@ from gtsam import Pose3, Rot3
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, Pair
 from adjust.pose_network.from_survey import network_from_survey
+from adjust.pose_network.start import carried
 from adjust.relay.session import NetworkSession, SessionOptions
 from tests.adjust.pose_networks import Simulated, simulate, solve_network
 from tests.benchmarks.networks import additions, adjusted, difference, first_stations
@@ -127,3 +128,14 @@ def test_what_cannot_be_added_is_refused_and_changes_nothing(pair_id, a, b, cov,
         session.add([Pair(pair_id, FrameRef("station", a), FrameRef("station", b), Pose3(), cov)])
     assert session.n_stations == before
     assert len(session.finish().survey.stations) == before
+
+
+def test_a_station_is_placed_by_the_best_pair_that_reaches_it() -> None:
+    def pair(name: str, a: str, b: str, x: float, sigma: float) -> Pair:
+        ends = FrameRef("station", a), FrameRef("station", b)
+        return Pair(name, *ends, Pose3(Rot3(), np.array([-x, 0.0, 0.0])), sigma**2 * np.eye(6))
+
+    pairs = [pair("poor", "A", "C", 7.0, 1.0), pair("first", "A", "B", 1.0, 0.1), pair("second", "C", "B", -2.0, 0.2),
+             pair("elsewhere", "X", "Y", 1.0, 0.1)]  # fmt: skip
+    placed = carried({"A": Pose3(Rot3(), np.array([0.0, 5.0, 0.0]))}, pairs)
+    assert {s: p.translation().tolist() for s, p in placed.items()} == {"B": [1.0, 5.0, 0.0], "C": [3.0, 5.0, 0.0]}

@@ -1,26 +1,33 @@
-"""Large pose networks: ``python -m tests.benchmarks.networks [grow NX NY | batch NX NY]``, full size by default.
+"""Large pose networks: ``python -m tests.benchmarks.networks [grow|late|batch NX NY]``, full size by default.
 
-grow: stations added one at a time, time per addition and largest difference to the batch solution. batch: a grid from
-nothing to its minimum with all variances and tests; time, memory, v'Pv within its chi-square band, gradient.
+grow: stations added one at a time, time per addition and largest difference to the batch solution. late: the last ones
+into a solved network, by a session and all at once. batch: a grid from nothing to its minimum with all variances and
+tests; time, memory, v'Pv within its chi-square band, gradient.
 """
 
 import argparse
 import resource
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from gtsam import Pose3, Rot3
 
+from adjust.adjustment import adjust
+from adjust.graph.assembly import StartValues
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 from adjust.pose_network import PoseNetwork
+from adjust.pose_network.start import carried
 from adjust.precision.precision import global_test
 from adjust.relay.session import NetworkSession
 from adjust.spatial.rigid_motions import Motions
 from tests.adjust.pose_networks import Solved, network_jacobians, simulate, solve_network
+
+T = TypeVar("T")
 
 
 def as_pair(network: PoseNetwork, e: int) -> Pair:
@@ -156,18 +163,47 @@ def gradient(solution: Solved) -> float:
     return float((np.abs(g) / np.sqrt(size))[free].max() / np.linalg.norm(e))
 
 
+def late(nx: int, ny: int, n: int = 20) -> str:
+    """The last stations into a solved network: by a session, and by one adjustment from the values before."""
+    network = simulate(nx, ny).network
+    whole, new = network.as_survey, [pair for step in additions(network)[-n:] for pair in step]
+    names, ids = set(network.station_ids[-n:]), {pair.pair_id for pair in new}
+    first = replace(whole, stations=tuple(s for s in whole.stations if s.station_id not in names),
+                    pairs=tuple(p for p in whole.pairs if p.pair_id not in ids))  # fmt: skip
+    before = adjust(first)
+    session, begin = timed(lambda: NetworkSession(before))
+    _, add = timed(lambda: session.add(new))
+    finished, finish = timed(session.finish)
+
+    def at_once() -> Adjustment:
+        poses = adjusted(before) | carried(adjusted(before), new)
+        return adjust(whole, StartValues({}, {("world_from_station", s): p for s, p in poses.items()}, {}))
+
+    solved, once = timed(at_once)
+    assert abs(finished.omega - solved.omega) < 1e-9 * solved.omega
+    parts = f"its tree {begin:.2f}, the addition {add:.3f}, finishing {finish:.2f}"
+    return (f"{n} stations more, seconds of processor time: a session {begin + add + finish:.2f} ({parts}), at once "
+            f"from the last solution {once:.2f}")  # fmt: skip
+
+
+def timed(work: Callable[[], T]) -> tuple[T, float]:
+    """What it gives, and the seconds of processor time that it takes."""
+    begin = time.process_time()
+    return work(), time.process_time() - begin
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", nargs="?", choices=["grow", "batch"])
+    parser.add_argument("what", nargs="?", choices=["grow", "late", "batch"])
     parser.add_argument("size", nargs="*", type=int)
     chosen = parser.parse_args(arguments)
-    runs = [("grow", 5000, 2), ("batch", 10000, 10), ("batch", 25000, 4)]
+    runs = [("grow", 5000, 2), ("late", 5000, 2), ("batch", 10000, 10), ("batch", 25000, 4)]
     if chosen.what:
         runs = [(chosen.what, *chosen.size)]
     for what, nx, ny in runs:
         print(f"{what} {nx} x {ny}", flush=True)
-        print(grow(nx, ny) if what == "grow" else batch(nx, ny), flush=True)
+        print({"grow": grow, "late": late, "batch": batch}[what](nx, ny), flush=True)
 
 
 if __name__ == "__main__":

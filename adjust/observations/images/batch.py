@@ -11,7 +11,6 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 
-from adjust.frames.chains import evaluate_chains
 from adjust.frames.state import State
 from adjust.frames.unknowns import Chain
 from adjust.model.boards import warming_of
@@ -24,10 +23,12 @@ from adjust.native.images import (
     ByKeys,
     KeyArrays,
     PointArrays,
+    PointStatistics,
     all_statistics,
     block_rows,
     condensed_rows,
     errors,
+    evaluate_chains,
     local_by_keys,
     normal_equations,
     serve,
@@ -264,18 +265,18 @@ class ImageBatch:
 
         tree: covariances of the unknowns; without it, A Q A' is zero.
         """
-        residual, influence = np.zeros((self.n_points, 2)), np.zeros((self.n_points, 3))
+        n = self.n_points
+        out = PointStatistics(np.zeros((n, 2)), np.zeros((n, 3)), np.zeros(len(self.blocks), dtype=np.int64))
         number = tree.number if tree is not None else {}
         k = self.of_blocks
         keys = np.array([number.get(key, -1) for key in k.key.tolist()], dtype=np.int64)
-        lost = np.zeros(len(self.blocks), dtype=np.int64)
         run_split(
             all_statistics, self._all, self.at(self.W_all_columns), self.by_keys, KeyArrays(k.ptr, keys, k.place),
-            tree.arrays if tree is not None else TreeArrays.nothing(), residual, influence, lost,
+            tree.arrays if tree is not None else TreeArrays.nothing(), out,
         )  # fmt: skip
-        if lost.any() and tree is not None:
-            raise KeyError(f"unknowns of block {int(np.argmax(lost))} share no clique")
-        return residual, influence
+        if out.lost.any() and tree is not None:
+            raise KeyError(f"unknowns of block {int(np.argmax(out.lost))} share no clique")
+        return out.residual, out.influence
 
 
 def used_points(blocks: Sequence[ImageBlock]) -> BoolArray:

@@ -8,6 +8,7 @@ from scipy import sparse
 
 from adjust.model.survey import FloatArray
 from adjust.native.bundles import (
+    PointCovariances,
     between_poses,
     direct_influence,
     fill_upper,
@@ -111,13 +112,13 @@ class BundleHidden:
         b = self.batch
         Y, YL = np.empty_like(b.W3), np.zeros_like(b.WL)
         point_from_local(b.arrays, b.of_reduced, Y, YL)
-        B, BL, C = np.empty_like(b.W3), np.zeros_like(b.WL), np.zeros((len(b.reduced), 3, 3))
-        run_split(with_poses, b.runs, b.arrays, Q, Y, YL, B)
-        with_lenses(b.arrays, b.Vi, Q, Y, YL, B, BL, C)
+        points = PointCovariances(np.empty_like(b.W3), np.zeros_like(b.WL), np.zeros((len(b.reduced), 3, 3)))
+        run_split(with_poses, b.runs, b.arrays, Q, Y, YL, points.B)
+        with_lenses(b.arrays, b.Vi, Q, Y, YL, points)
         influence = np.zeros((len(b.point), 3))
-        run_split(reduced_influence, b.runs, b.arrays, b.A, Q, B, BL, C, influence)
+        run_split(reduced_influence, b.runs, b.arrays, b.A, Q, points, influence)
         direct_influence(b.n_reduced, len(b.point), b.arrays, b.A, Q, influence)
-        return C, influence
+        return points.C, influence
 
     def transposed(self, rows: Mapping[int, FloatArray], k: int) -> FloatArray:
         """Rows on hidden unknowns, transposed (dim, k) per key, as rows on the interface (n_interface, k)."""

@@ -2,12 +2,12 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.model.observations import ImageBlock, ReadingCovariance
+from adjust.model.rewriting import Fields
 from adjust.model.survey import BoolArray, IntArray, Survey
 
 _FIELD = {
@@ -68,7 +68,7 @@ def without(survey: Survey, found: Candidates, rejected: Iterable[int]) -> Surve
     """The survey with these observations out of use: predicted and tested, and as given for everything else."""
     out = np.zeros(found.n, dtype=np.bool_)
     out[list(rejected)] = True
-    changed: dict[str, Any] = {"image_blocks": _blocks(survey, found, out)}
+    changed: Fields = {"image_blocks": _blocks(survey, found, out)}
     by_field: dict[str, set[int]] = {}
     for row in np.flatnonzero(out[found.n_image :]).tolist():
         field, i = found.place[row + found.n_image]

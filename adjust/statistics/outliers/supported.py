@@ -9,7 +9,7 @@ never dropped: a station that nobody has measured is an error of the survey, not
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from adjust.frames.unknowns import FrameTree, Link, Unknowns
 from adjust.model.errors import listed
 from adjust.model.observations import FrameRef, ImageBlock, PositionRef
 from adjust.model.result import ParameterName
+from adjust.model.rewriting import Fields
 from adjust.model.survey import Survey
 from adjust.observations.geometry.building import carrier_of
 from adjust.statistics.outliers.undetermined_points import without_named_points
@@ -180,7 +181,7 @@ def _without(survey: Survey, needs: _Needs, lost: Needs) -> Survey:
     def left(items: Iterable[Item], of_each: Iterable[Needs]) -> tuple[Item, ...]:
         return tuple(item for item, mine in zip(items, of_each, strict=True) if not mine & lost)
 
-    others: dict[str, Any] = {name: left(survey.others[name], of_each) for name, of_each in needs.others().items()}
+    others: Fields = {name: left(survey.others[name], of_each) for name, of_each in needs.others().items()}
     kept = replace(survey, image_blocks=left(survey.image_blocks, needs.of_blocks), **others)
     points = {name[1] for name in lost if name[0] == "point"}
     kept = without_named_points(kept, points) if points else kept
