@@ -120,6 +120,7 @@ def test_a_reading_whose_decimal_point_slipped(kind: str, factor: float, seed: i
     assert found(wrong)["slipped decimal"].ids == (chosen,)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [10.0, 0.1, 100.0])
 def test_a_distance_and_a_coordinate_whose_decimal_point_slipped(factor: float) -> None:
     good = hall(1)

@@ -102,6 +102,7 @@ def test_whatever_a_body_says_is_answered_in_a_line(mine, body):
             assert "Traceback" not in answer.text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("query", [
     f"worst={MANY}&layout={MANY}&size={MANY}&a={MANY}&b={MANY}&run={MANY}&most={MANY}",
     "worst=-1&layout=nan&size=0&a=x&b=-1&most=-5&distance_m=nan", "distance_m=-inf&size=%00&image=%00/%00&other=%00",
@@ -157,6 +158,7 @@ def test_links_lead_nowhere_outside(mine, tmp_path):
             assert answer.headers["content-type"] == "application/json"
 
 
+@pytest.mark.slow
 def test_a_command_that_writes_at_the_same_time_loses_nothing(mine):
     """While another keeps the folder a decision is refused, told who has it, and can be made again."""
     first = image_of(mine)
