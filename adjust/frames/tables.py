@@ -37,15 +37,22 @@ def table_motions(
         raise SurveyError(f"a table of {len(axes)} axes has readings of {k} angles")
     R, t, D = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), np.zeros((n, 6, k + len(geometry)))
     for step in reversed(_steps(["xyz".index(a) for a in axes], geometry, angles)):
-        column = adjoint_of_inverse(R, t)[:, :, step.axis + (0 if step.turn else 3)]
         for parameter, derivative in step.by:
-            D[:, :, parameter] += derivative[:, None] * column
+            D[:, :, parameter] += derivative[:, None] * _moved(R, t, step)
         if step.turn:
             turned = _turns(step.axis, step.q)
             R, t = turned @ R, (turned @ t[:, :, None])[:, :, 0]
         else:
             t = t + step.q[:, None] * np.eye(3)[step.axis]
     return R, t, D
+
+
+def _moved(R: FloatArray, t: FloatArray, step: _Step) -> FloatArray:
+    """(n, 6): what a step by one before the motions (R, t) moves, a column of Ad(T^-1), tangents on the right."""
+    if not step.turn:
+        return np.concatenate([np.zeros_like(t), R[:, step.axis]], axis=1)
+    j, k = (step.axis + 1) % 3, (step.axis + 2) % 3
+    return np.concatenate([R[:, step.axis], t[:, j, None] * R[:, k] - t[:, k, None] * R[:, j]], axis=1)
 
 
 def _steps(axes: Sequence[int], geometry: Mapping[str, float], angles: FloatArray) -> list[_Step]:

@@ -36,10 +36,8 @@ class Courses:
         values: dict[str, float] = dict(zip(clock.parameters.names, np.asarray(self.truth[name]).tolist(), strict=True))
         own = self.truth.get((*name, epoch_id), np.zeros(1))
         since = self.times.of[epoch_id] - self.times.middle
-        return (
-            values.get("offset", 0.0) + values.get("drift", 0.0) * since + values.get("line_time", 0.0) * row
-            + (0.0 if isinstance(own, Pose3) else float(own[0]))
-        )  # fmt: skip
+        late: Late = values.get("offset", 0.0) + values.get("drift", 0.0) * since + values.get("line_time", 0.0) * row
+        return late + (0.0 if isinstance(own, Pose3) else float(own[0]))
 
     def pose(self, name: ParameterName, dt: Late) -> FloatArray:
         """(4, 4) of a body, named with an epoch, a time after it; (n, 4, 4) at n times."""

@@ -46,6 +46,7 @@ def misses(result: Adjustment, truth: Truth) -> list[float]:
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(SURVEYS))
 def test_derivatives_by_every_unknown(name: str) -> None:
     """Of the whole objective, against differences, away from the minimum.
@@ -83,6 +84,7 @@ def test_clocks_are_found_within_their_sigmas(name: str) -> None:
     assert adjust(without).sigma0 > 1.4 * result.sigma0
 
 
+@pytest.mark.slow
 def test_factors_alone_agree_with_the_batch() -> None:
     """What GTSAM asks of a factor at values of its own is what the batch served."""
     survey, truth = SURVEYS["cameras on a table"]()
@@ -159,6 +161,7 @@ def test_times_that_cannot_be_are_refused() -> None:
         adjust(replace(survey, times=dict.fromkeys(survey.times, 0.0)))
 
 
+@pytest.mark.slow
 def test_sigmas_of_poses_are_true_beside_a_clock() -> None:
     """All poses of the board, the camera's place and its clock together, over repeats."""
     survey, truth = board_before_cameras(12, {"right": clock(offset=0.02)}, {RIGHT: np.array([0.02])})

@@ -78,22 +78,16 @@ def test_block_ids_of_16_bit_begin_anew_at_1(port: None) -> None:
     """Aravis starts at 65400, for this very test."""
     with GigeServer("gradient"), open_camera(GIGE) as camera:
         set_up(camera)
-        camera.set("TriggerMode", "Off")
-        camera.set("AcquisitionFrameRate", 300.0)
-        camera.arm()
-        frames = [camera.fetch(2.0) for _ in range(128)]  # up to 65528
-        camera.disarm()
-        camera.set("TriggerMode", "On")
         cameras = TriggerSet({"X": camera})
         cameras.arm()
-        frames += [cameras.take(2.0).frames["X"] for _ in range(16)]
+        frames = [cameras.take(2.0).frames["X"] for _ in range(144)]
         assert camera.last_block_id == 65535
     ids = [f.block_id for f in frames]
     assert 1 in ids
     assert 65535 in ids
     assert 0 not in ids
-    numbers = [number_in(f.image) for f in frames[128:]]
-    assert numbers == list(range(numbers[0], numbers[0] + 16))
+    numbers = np.array([number_in(f.image) for f in frames])
+    assert (np.diff(numbers) == 1).all()
 
 
 def test_lost_packets_make_incomplete_images(port: None) -> None:

@@ -27,7 +27,7 @@ def test_killed_before_every_fsync(tmp_path):
         plan = write_plan(home, table=False, n=(1, 2), cameras=("X",))
         process = context.Process(target=run_until_fsync, args=(str(plan), number))
         process.start()
-        process.join(30)
+        process.join(120)
         if process.exitcode == 0:
             break
         assert process.exitcode == -signal.SIGKILL

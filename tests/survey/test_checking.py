@@ -92,6 +92,7 @@ def test_a_camera_that_misses_a_corner_is_told_and_where_boards_help_most(tmp_pa
     assert "measure next (where it can be seen): " in outcome.text()
 
 
+@pytest.mark.slow
 def test_spots_without_names_are_not_held_against_the_survey(tmp_path: Path) -> None:
     survey, _ = beacons(1)
     write_project(tmp_path / "named", survey)

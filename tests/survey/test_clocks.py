@@ -88,6 +88,7 @@ def test_times_are_said_once(tmp_path: Path) -> None:
         read(tmp_path)
 
 
+@pytest.mark.slow
 def test_clocks_reach_result_report_and_terminal(tmp_path: Path) -> None:
     write_project(tmp_path, with_rows())
     solution = labsurvey.adjust(tmp_path)
@@ -117,6 +118,7 @@ def test_without_times_clocks_count_intervals(tmp_path: Path) -> None:
     assert entry["offset_intervals"] == pytest.approx(0.1, abs=5.0 * entry["sigma_offset_intervals"])
 
 
+@pytest.mark.slow
 def test_what_was_found_before_is_where_the_next_search_begins(tmp_path: Path) -> None:
     """Clocks, warps and lenses that change: the values of the last solution, not those of survey.toml."""
     survey, _ = board_before_cameras(14, {"right": clock(1e-3, offset=0.03)}, {RIGHT: np.array([0.03])})

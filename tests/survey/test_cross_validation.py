@@ -49,6 +49,7 @@ def test_epochs_of_a_sort_take_turns_and_the_only_one_of_its_sort_is_in_both(tmp
         assert bool(epochs & first & second) == (len(epochs) == 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distance", [np.inf, 2.0])
 def test_differences_are_as_large_as_the_covariances_expect(tmp_path: Path, distance: float) -> None:
     """The statistics of all cameras and repetitions together follow chi-square; so do the shifts, roughly."""
@@ -62,6 +63,7 @@ def test_differences_are_as_large_as_the_covariances_expect(tmp_path: Path, dist
     assert 0.5 < np.sqrt(np.mean([(c.rms_px / c.expected_px) ** 2 for c in found])) < 2.0
 
 
+@pytest.mark.slow
 def test_a_lens_that_changed_is_named(tmp_path: Path) -> None:
     folder = tmp_path / "lab"
     write_lab(folder)

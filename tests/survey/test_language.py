@@ -144,6 +144,7 @@ def _said(node: ast.AST) -> Iterator[str]:
             yield from _said(child)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("language", OTHERS)
 def test_causes_and_remedies_have_their_translation(language: str) -> None:
     said = said_by_diagnosis()

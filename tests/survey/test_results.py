@@ -326,6 +326,7 @@ def test_names_with_commas_and_numbers_that_are_missing(adjustment: Adjustment) 
     assert {r["point_id"] for r in rows if r["target_id"] == "board"} <= set(board.point_ids)
 
 
+@pytest.mark.slow
 def test_numbers_in_full_are_what_python_prints() -> None:
     rng = np.random.default_rng(1)
     bits = rng.integers(0, 2**63 - 1, 20_000, dtype=np.int64).view(np.float64)  # every exponent

@@ -68,6 +68,7 @@ def test_the_gradient_is_that_of_the_square_sum() -> None:
     assert group.at_start > group.where_stopped
 
 
+@pytest.mark.slow
 def test_failure_is_written_beside_what_was_there_and_goes_with_the_next_solution(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -31,6 +31,14 @@ def mine(lab, tmp_path):
     return shutil.copytree(lab[0], tmp_path / "lab")
 
 
+@pytest.fixture(scope="module")
+def served(lab, tmp_path_factory):
+    """A folder and a client of its page, for requests after which both are as before."""
+    folder = shutil.copytree(lab[0], tmp_path_factory.mktemp("served") / "lab")
+    with page(folder) as client:
+        yield folder, client
+
+
 def address_of(way, number="1"):
     path = way.path.replace("{number:int}", number).replace("{camera}/{epoch}", "left/e01")
     return path.replace("{camera}", "left").replace("{part}", "weak").replace("{name}", "none")
@@ -53,9 +61,10 @@ def nothing_written(folder):
     HERE | {"Origin": "http://evil.example"}, HERE | {"Origin": "null"}, HERE | {"Origin": "http://127.0.0.1:8791"},
     HERE | {"Origin": "http://evil.example", "Host": "evil.example"},
 ])  # fmt: skip
-def test_no_address_answers_another_site(mine, headers):
+def test_no_address_answers_another_site(served, headers):
     """Rebound names, foreign and no origins, requests that a form of another page can send; and no token."""
-    with page(mine) as client, nothing_written(mine):
+    mine, client = served
+    with nothing_written(mine):
         for way in ways(mine):
             client.cookies.clear()
             answer = client.request(way.method, address_of(way), headers=headers, json={} if way.changes else None)
@@ -93,13 +102,16 @@ def test_whatever_a_body_says_is_answered_in_a_line(mine, body):
             assert "Traceback" not in answer.text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("query", [
     f"worst={MANY}&layout={MANY}&size={MANY}&a={MANY}&b={MANY}&run={MANY}&most={MANY}",
     "worst=-1&layout=nan&size=0&a=x&b=-1&most=-5&distance_m=nan", "distance_m=-inf&size=%00&image=%00/%00&other=%00",
     "image=../../etc/passwd&other=../x&distance_m=1e999&size=1e9&worst=%D9%A3", "distance_m=" + MANY,
 ])  # fmt: skip
-def test_whatever_an_address_asks_is_answered_in_a_line(mine, query):
-    with page(mine) as client, nothing_written(mine):
+def test_whatever_an_address_asks_is_answered_in_a_line(served, query):
+    mine, client = served
+    client.cookies.clear()
+    with nothing_written(mine):
         for way in (w for w in ways(mine) if w.method == "GET"):
             answer = client.get(f"{address_of(way)}?{query}", headers=HERE)
             assert answer.status_code in (200, 404, 409), way.path
@@ -110,17 +122,18 @@ def test_whatever_an_address_asks_is_answered_in_a_line(mine, query):
                 assert client.get(path, headers=HERE).status_code in (200, 404, 409), path
 
 
-def test_the_policy_allows_nothing_inline_and_the_token_is_in_no_address(mine):
-    with page(mine) as client:
-        for path, headers in (("/", {}), ("/app.js", {}), ("/nope", {}), ("/api/state", HERE), ("/api/nope", HERE)):
-            answer = client.get(path, headers=headers)
-            policy = dict(part.split(" ", 1) for part in answer.headers["content-security-policy"].split("; "))
-            assert policy["default-src"] == "'self'"
-            assert policy["frame-ancestors"] == policy["base-uri"] == policy["form-action"] == "'none'"
-            assert "unsafe" not in answer.headers["content-security-policy"]
-            assert answer.headers["cross-origin-resource-policy"] == "same-origin"
-            assert TOKEN not in answer.text + str(answer.url)
-        assert client.get(f"/api/state?token={TOKEN}&X-Token={TOKEN}").status_code == 403
+def test_the_policy_allows_nothing_inline_and_the_token_is_in_no_address(served):
+    _, client = served
+    client.cookies.clear()
+    for path, headers in (("/", {}), ("/app.js", {}), ("/nope", {}), ("/api/state", HERE), ("/api/nope", HERE)):
+        answer = client.get(path, headers=headers)
+        policy = dict(part.split(" ", 1) for part in answer.headers["content-security-policy"].split("; "))
+        assert policy["default-src"] == "'self'"
+        assert policy["frame-ancestors"] == policy["base-uri"] == policy["form-action"] == "'none'"
+        assert "unsafe" not in answer.headers["content-security-policy"]
+        assert answer.headers["cross-origin-resource-policy"] == "same-origin"
+        assert TOKEN not in answer.text + str(answer.url)
+    assert client.get(f"/api/state?token={TOKEN}&X-Token={TOKEN}").status_code == 403
 
 
 def test_links_lead_nowhere_outside(mine, tmp_path):
@@ -145,6 +158,7 @@ def test_links_lead_nowhere_outside(mine, tmp_path):
             assert answer.headers["content-type"] == "application/json"
 
 
+@pytest.mark.slow
 def test_a_command_that_writes_at_the_same_time_loses_nothing(mine):
     """While another keeps the folder a decision is refused, told who has it, and can be made again."""
     first = image_of(mine)

@@ -127,6 +127,7 @@ def ways(folder):
     return Server(Workbench(folder), TOKEN).ways()
 
 
+@pytest.mark.slow
 def test_reading_only_allows_what_changes_no_file_and_nothing_else(mine, tmp_path):
     """Every address is asked; those that say that they change nothing with what makes them work."""
     other = shutil.copytree(mine, tmp_path / "other")
