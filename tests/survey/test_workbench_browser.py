@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 import capture.web
+from adjust.model.clocks import CLOCKS
 from survey.examples import write_example
 from survey.project import write_project
+from survey.project.project import DEMANDED
 from survey.report.language import catalogue
 from survey.report.modules import WEB as SHARED
 from survey.report.terminal import summary_text
@@ -425,3 +427,11 @@ def test_images_are_detected_and_shown_as_they_come(browser: Any, tmp_path: Path
         page.wait("location.hash.startsWith('#image=')")
         page.context.close()
     assert [text for text in page.complaints if "409" not in text] == []
+
+
+def test_what_a_solution_has_is_said_in_words() -> None:
+    """Every kind of parameter and of clock, and how each is treated."""
+    german, english = (json.loads((SHARED / f"{name}.json").read_text()) for name in ("de", "en"))
+    kinds = {*CLOCKS, *(kind for all_of in DEMANDED.values() for kind in all_of), "lens_drift", "lens_crop", "table_motion", "warp"}
+    assert {f"param {kind}" for kind in kinds} <= set(english) & set(german)
+    assert {"free", "held", "prior", "tied"} <= set(german)

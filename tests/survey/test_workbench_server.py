@@ -17,6 +17,7 @@ from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 from websockets.sync.client import connect
 
+from adjust.model.errors import SurveyError
 from survey.cli import main
 from survey.report.language import message, speaking
 from survey.workbench.live import Listening
@@ -254,6 +255,25 @@ def test_every_view_answers(mine):
             assert answer.json()["version"] == 1
 
 
+def test_others_are_answered_while_the_halves_are_adjusted(mine, monkeypatch):
+    begun, told = threading.Event(), threading.Event()
+
+    def halves(bench, distance):
+        begun.set()
+        assert told.wait(30.0), "nobody else was answered meanwhile"
+        raise SurveyError("there are no two halves")
+
+    monkeypatch.setattr(Workbench, "cross_validate", halves)
+    with page(mine) as client:
+        asked = threading.Thread(target=client.get, args=("/api/halves",), kwargs={"headers": HERE})
+        asked.start()
+        assert begun.wait(30.0)
+        assert post(client, "/api/exclusions", exclude(f"image:{image_of(mine)}", 1)).json()["version"] == 2
+        told.set()
+        asked.join(30.0)
+    assert not asked.is_alive()
+
+
 def test_an_unknown_part_offers_the_nearest(mine):
     with page(mine) as client:
         answer = client.get("/api/statistics/correlation", headers=HERE)
@@ -405,15 +425,16 @@ ENGLISH = re.compile(r"\b(the|is|are|of|and|or|from|with|there|please|no|not|kno
 DATA = {"title", "label", "solution.solution", "capture.state"}
 """What is of the project or of its files, or a code, whatever the language: keys, some below an address only."""
 ASKED = [
-    *(("jobs/compare", {"folder": name}) for name in ("other", "nowhere", "new")), ("jobs/plan", {}), ("jobs/navigate", {}),
-    ("jobs/detect", {}), ("jobs/detct", {}), ("jobs/add", {"folder": "other"}), ("jobs/add", {"folder": "lab"}),
+    *(("jobs/compare", {"folder": name}) for name in ("other", "nowhere", "new")), ("jobs/plan", {}),
+    ("jobs/navigate", {}), ("jobs/detect", {}), ("jobs/detct", {}), ("jobs/add", {"folder": "other"}), ("jobs/add", {"folder": "lab"}),
     ("jobs/init", {"images": "", "folder": ""}), ("jobs/init", {"images": "lab", "folder": "other"}),
     ("jobs/show", {"folder": "nowhere"}), ("jobs/batch", {"folders": ["lab", "nowhere"]}),
     *((way, {"changes": [{"name": name, "excluded": True}], "reason": "blur"})
       for way in ("preview", "exclusions") for name in ("nothing", "camera:right")),
     ("exclusions", {"changes": [{"name": "camera:right", "excluded": True}], "reason": "blur"}),
     ("exclusions", {"changes": [{"name": "camera:right", "excluded": True}]}), ("undo", {"base": 1}), ("undo", {}),
-    ("redo", {}), ("remedy", {"number": 1}), ("save", {}), ("runs/9/restore", {}), ("runs/9/pin", {}), ("runs/x/pin", {}),
+    ("redo", {}), ("remedy", {"number": 1}), ("save", {}), ("runs/9/restore", {}), ("runs/9/pin", {}),
+    ("runs/x/pin", {}),
     *(("definition", asked) for asked in (
         {"parameter": "lens/left/fx", "treatment": "held"}, {"parameter": "lens/nobody/fx", "treatment": "held"},
         {"parameter": "lens/left/fx", "treatment": "loose"}, {"group": "image", "factor": -1},
