@@ -1,12 +1,15 @@
 """Pictures of the page of ``labsurvey open``, by Chromium, of at most 256 colours each.
 
-Run in the project's folder: python -m docs.make_workbench_pictures FOLDER docs/pictures
-FOLDER is a project, such as that of: labsurvey example full-lab FOLDER. The others are made on the way.
+Run in the project's folder: python -m docs.make_workbench_pictures FOLDER docs/pictures [NAME...]
+FOLDER is an adjusted project, such as that of: labsurvey example full-lab FOLDER; labsurvey adjust FOLDER. The others
+are made on the way. NAME: only these pictures of views.
 With --every: every view of FOLDER, and its report, light and dark, on a desk and on a phone, in English and German, to
 be looked at.
 """
 
+import csv
 import itertools
+import json
 import sys
 import tempfile
 import time
@@ -22,6 +25,7 @@ from playwright.sync_api import sync_playwright
 from adjust.model.errors import SurveyError
 from docs.palette import write_palette_png
 from survey.examples import write_example
+from survey.project.captured import quality_path, status_path
 from survey.workbench.guard import new_token
 from survey.workbench.live import Listening
 from survey.workbench.server import Server
@@ -39,19 +43,19 @@ from tests.survey.test_workbench_faults import (
 CHROMIUM = "/usr/bin/chromium"
 DESK, PHONE = (1440, 900), (390, 844)
 SMALL = (1280, 800)
-Act = Callable[[Any], None]
+Act = Callable[[Any, Path], None]
 
 
-def _nothing(_page: Any) -> None:
+def _nothing(_page: Any, _folder: Path) -> None:
     pass
 
 
-def _detect(page: Any) -> None:
+def _detect(page: Any, _folder: Path | None = None) -> None:
     page.get_by_label("Run: Detect").click()
     page.wait_for_timeout(9000)
 
 
-def _without_an_image(page: Any) -> None:
+def _without_an_image(page: Any, _folder: Path) -> None:
     """Something to compare: the image shown is left out."""
     page.keyboard.press("X")
     page.locator("dialog input").fill("motion blur")
@@ -59,36 +63,57 @@ def _without_an_image(page: Any) -> None:
     page.keyboard.press("s")
 
 
-# name: place, colours, what is done before
-OF_FOLDER: dict[str, tuple[str, str, Act]] = {
-    "workbench": ("", "light", _nothing),
-    "workbench-scene": ("point=B07&view=camera,scene", "dark", _nothing),
-    "workbench-flat": ("point=B07&view=plan,south", "light", _nothing),
-    "workbench-halves": ("camera=Z&view=halves,camera", "light", _nothing),
-    "workbench-angles": ("view=angles,correlations", "dark", _nothing),
-    "workbench-compare": ("image=X/hX05&view=compare,history", "light", _without_an_image),
+def _session(page: Any, folder: Path) -> None:
+    """As if a session took the images of the folder just now: where it is, and what was seen."""
+    _detect(page)
+    rows = [(x["epoch_id"], x["camera_id"], float(x["u_px"]), float(x["v_px"])) for x in
+            csv.DictReader((folder / "observations/image_points.csv").open(newline=""))]  # fmt: skip
+    for epoch, camera in dict.fromkeys(row[:2] for row in rows):
+        uv = [list(row[2:]) for row in rows if row[:2] == (epoch, camera)]
+        of = {"camera_id": camera, "epoch_id": epoch, "width": 1280, "height": 1024, "points": {"board": uv}}
+        with quality_path(folder).open("a") as stream:
+            stream.write(json.dumps(of) + "\n")
+    n, (epoch, camera) = len({row[0] for row in rows}), rows[-1][:2]
+    told = {"state": "finished", "done": n, "total": n, "epoch_id": epoch, "images": {camera: "x"}}
+    status_path(folder).write_text(json.dumps(told))
+    page.wait_for_timeout(3000)
+
+
+# name: place, what is done before
+OF_FOLDER: dict[str, tuple[str, Act]] = {
+    "workbench": ("", _nothing),
+    "workbench-scene": ("point=B07&view=camera,scene", _nothing),
+    "workbench-flat": ("point=B07&view=plan,south", _nothing),
+    "workbench-east": ("point=B07&view=east,correlations", _nothing),
+    "workbench-halves": ("camera=Z&view=halves,image", _nothing),
+    "workbench-angles": ("view=angles,settings", _nothing),
+    "workbench-compare": ("image=X/hX05&view=compare,history", _without_an_image),
 }
-OF_EXAMPLES: dict[str, tuple[str, str, str, Act]] = {
-    "workbench-network": ("total-station", "view=settings,network", "dark", _nothing),
-    "workbench-loops": ("relay", "view=loops,scene", "light", _nothing),
-    "workbench-detect": ("one-camera", "view=jobs,image", "light", _detect),
+OF_EXAMPLES: dict[str, tuple[str, str, Act]] = {
+    "workbench-network": ("total-station", "view=network,settings", _nothing),
+    "workbench-loops": ("relay", "view=loops,scene", _nothing),
+    "workbench-detect": ("one-camera", "view=jobs,image", _detect),
+    "workbench-capture": ("one-camera", "view=findings,capture", _session),
 }
 ON_A_PHONE = (("", "left"), ("image=X/hX05", "right"), ("point=B07&view=findings,scene", "right"), ("", "tables"),
               ("obs=image_point:X/hX05/board/r7c2", "inspector"))  # fmt: skip
+TWO_VIEWS, HIGH = ("left", "right"), 400  # px
 
 
-def main(folder: Path, out: Path) -> None:
-    """Write every picture as a PNG."""
+def main(folder: Path, out: Path, *names: str) -> None:
+    """Write every picture as a PNG, or those of the names."""
     with sync_playwright() as playwright, tempfile.TemporaryDirectory() as place:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        mistakes(browser, Path(place), out)
-        for name, (example, *how) in OF_EXAMPLES.items():
-            mine = Path(place) / name / "lab"
-            write_example(example, mine)
-            picture(browser, mine, out / f"{name}.png", *how)
-        phone(browser, folder, out / "workbench-phone.png")
-        for name, how in OF_FOLDER.items():
-            picture(browser, folder, out / f"{name}.png", *how)
+        if not names:
+            mistakes(browser, Path(place), out)
+            phone(browser, folder, out / "workbench-phone.png")
+        for name in names or (*OF_EXAMPLES, *OF_FOLDER):
+            mine = folder
+            if name in OF_EXAMPLES:
+                mine = Path(place) / name / "lab"
+                write_example(OF_EXAMPLES[name][0], mine)
+            what = OF_EXAMPLES[name][1:] if name in OF_EXAMPLES else OF_FOLDER[name]
+            picture(browser, mine, out / f"{name}.png", *what)
         browser.close()
 
 
@@ -144,12 +169,36 @@ def opened(
         context.close()
 
 
-def picture(browser: Any, folder: Path, out: Path, place: str, colours: str, act: Act) -> None:
-    """One picture of a place, after something was done there."""
-    with opened(browser, folder, place, colours) as page:
+def picture(browser: Any, folder: Path, out: Path, place: str, act: Act) -> None:
+    """One picture of a place, after something was done there; and beside it how both views look otherwise."""
+    with opened(browser, folder, place) as page:
         page.wait_for_timeout(1500)
-        act(page)
+        act(page, folder)
         shot(page, out)
+        looks(page, out.with_name(out.name.replace("workbench", "look")))
+
+
+def looks(page: Any, out: Path) -> None:
+    """A page in the dark, and each of its two views on a phone, light and dark, in a row."""
+    page.emulate_media(color_scheme="dark")
+    parts = [_seen(page)]
+    page.set_viewport_size({"width": PHONE[0], "height": PHONE[1]})
+    for region, colours in itertools.product(TWO_VIEWS, ("light", "dark")):
+        page.emulate_media(color_scheme=colours)
+        _tab(page, region)
+        parts.append(_seen(page))
+    small = [cv2.resize(x, (round(HIGH * x.shape[1] / x.shape[0]), HIGH), interpolation=cv2.INTER_AREA) for x in parts]
+    row = np.hstack([cv2.copyMakeBorder(x, 0, 0, 0, 6, cv2.BORDER_CONSTANT, value=(128, 128, 128)) for x in small])
+    write_palette_png(out, cv2.imencode(".png", row[:, :-6])[1].tobytes())
+    print(f"{out}: {out.stat().st_size / 1e3:.0f} kB")
+
+
+def _tab(page: Any, region: str) -> None:
+    page.evaluate(f"document.querySelector('#tabs button:nth-child({1 + _REGIONS.index(region)})').click()")
+
+
+def _seen(page: Any) -> Any:
+    return cv2.imdecode(np.frombuffer(_settled(page).screenshot(), np.uint8), cv2.IMREAD_COLOR)
 
 
 def phone(browser: Any, folder: Path, out: Path) -> None:
@@ -157,8 +206,8 @@ def phone(browser: Any, folder: Path, out: Path) -> None:
     parts = []
     for k, (place, region) in enumerate(ON_A_PHONE):
         with opened(browser, folder, place, ("light", "dark")[k % 2], PHONE) as page:
-            page.evaluate(f"document.querySelector('#tabs button:nth-child({1 + _REGIONS.index(region)})').click()")
-            parts.append(cv2.imdecode(np.frombuffer(_settled(page).screenshot(), np.uint8), cv2.IMREAD_COLOR))
+            _tab(page, region)
+            parts.append(_seen(page))
     write_palette_png(out, cv2.imencode(".png", np.hstack(parts))[1].tobytes())
 
 
@@ -202,9 +251,9 @@ def every(folder: Path, out: Path) -> None:
             page.goto(f"{listening.address}#token={token}")
             _until(page, "document.body.dataset.results !== undefined")
             for region in _REGIONS if size is PHONE else ("left",):
-                page.evaluate(f"document.body.dataset.pane = '{region}'")
+                _tab(page, region)
                 _settled(page).screenshot(path=out / f"{region}-{mark}")
-            page.evaluate("document.body.dataset.pane = 'right'")
+            _tab(page, "right")
             for view in page.locator("#right .chooser option").evaluate_all("(all) => all.map((one) => one.value)"):
                 page.locator("#right .chooser select").select_option(view)
                 _settled(page).screenshot(path=out / f"{view}-{mark}")
@@ -219,4 +268,4 @@ def every(folder: Path, out: Path) -> None:
 
 if __name__ == "__main__":
     given = [text for text in sys.argv[1:] if text != "--every"]
-    (every if "--every" in sys.argv else main)(Path(given[0]), Path(given[1]))
+    (every if "--every" in sys.argv else main)(Path(given[0]), Path(given[1]), *given[2:])

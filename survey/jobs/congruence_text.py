@@ -103,4 +103,5 @@ def _motion(m: Motion) -> dict[str, Any]:
 
 
 def _cell(value: float, width: int, digits: int) -> str:
-    return f"{value:>{width}.{digits}f}" if math.isfinite(value) else f"{'-':>{width}}"
+    # a space of its own: large values must not run together
+    return f" {value:>{width - 1}.{digits}f}" if math.isfinite(value) else f"{'-':>{width}}"

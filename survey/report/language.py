@@ -32,6 +32,9 @@ _SIGNS = tuple(map(chr, TURNING))
 _NUMBER = r"[-+\d.e]+"
 _PLACE = re.compile(r"\{[nw]?\}")
 _PARTS = {"{}": "(.+?)", "{w}": r"(\S+)", "{n}": f"({_NUMBER})"}
+_CELL = re.compile(r"( {2,}|^ ?)(\S+(?: \S+)*)")
+_ALONE = re.compile(r"(?<![^ (])[-+]?\d+\.\d+(?:e[-+]?\d+)?(?![^ ,;)])")
+_WORDS = frozenset(("required", "planned"))
 _current: ContextVar[str] = ContextVar("language", default="en")
 
 
@@ -44,25 +47,41 @@ class Catalogue:
     """A language: its decimal sign, ``texts`` by their English form, ``messages`` as patterns with what they become.
 
     sentences: messages as the catalogue has them, by their English form: ``{}`` for a part, ``{w}`` for a part of one
-    word, ``{n}`` for a number; those with most words of their own first.
+    word, ``{n}`` for a number; those with most words of their own first. cells: words of columns in a text.
     """
 
     decimal: str
     texts: Mapping[str, str]
     sentences: Mapping[str, str]
     messages: tuple[tuple[str, str], ...]
+    cells: Mapping[str, str]
 
 
 @cache
 def catalogue(language: str) -> Catalogue:
     """The catalogue of a language; English needs no texts."""
     if language == "en":
-        return Catalogue(".", {}, {}, ())
+        return Catalogue(".", {}, {}, (), {})
     found = tomllib.loads((_CATALOGUES / f"{language}.toml").read_text(encoding="utf-8"))
     sentences = dict(sorted(found["sentences"].items(), key=lambda item: -len(_PLACE.sub("", item[0]))))
     messages = ((m["pattern"], m["text"]) for m in found["messages"])
     said = ((pattern_of(sentence), _PLACE.sub("{}", text)) for sentence, text in sentences.items())
-    return Catalogue(found["decimal"], found["texts"], sentences, (*said, *messages))
+    return Catalogue(found["decimal"], found["texts"], sentences, (*said, *messages),
+                     found["texts"] | found["cells"])  # fmt: skip
+
+
+@cache
+def _phrases(language: str) -> tuple[tuple[str, str, str], ...]:
+    """Every message with the longest words of its own, which are looked for before its pattern is."""
+    known = catalogue(language)
+    words = [max(_PLACE.split(sentence), key=len) for sentence in known.sentences]
+    words += [""] * (len(known.messages) - len(words))
+    return tuple((w, *one) for w, one in zip(words, known.messages, strict=True))
+
+
+@cache  # not re's own, which holds fewer
+def _compiled(pattern: str) -> re.Pattern[str]:
+    return re.compile(pattern, re.DOTALL)
 
 
 def pattern_of(sentence: str) -> str:
@@ -127,13 +146,39 @@ def message(text: str) -> str:
 
     A part that a pattern has as ``(.+)`` or ``(.+?)`` is a message itself.
     """
-    for pattern, said in catalogue(_current.get()).messages:
-        found = re.fullmatch(pattern, text, re.DOTALL)
-        if found:
+    for words, pattern, said in _phrases(_current.get()):
+        if words in text and (found := _compiled(pattern).fullmatch(text)):
             numeric = re.findall(r"(?<!\\)\(([^()]*)\)", pattern)
             values = zip(found.groups(), numeric, strict=True)
             return said.format(*(_part(x, kind) for x, kind in values))
     return text
+
+
+def text_said(text: str) -> str:
+    """A text of several lines, each a message; what stands in columns, two spaces apart, stays in them."""
+    return text if _current.get() == "en" else "\n".join(map(_line, text.split("\n")))
+
+
+def _line(text: str) -> str:
+    """Words begin where they began, and numbers and headings to the right end where they ended, as far as they can."""
+    mark, line = re.fullmatch(r"( *(?:! )?)(.*)", text).groups()  # type: ignore[union-attr]  # fits everything
+    whole = message(line)
+    if whole != line or not line:
+        return str(mark + whole)
+    out = ""
+    for found in _CELL.finditer(text):
+        first, said = not out.strip(), _cell(found[2])
+        begin = found.start(2) if first else found.end() - len(said)
+        out += " " * max(begin - len(out), 0 if first else 2) + said
+    return out
+
+
+def _cell(text: str) -> str:
+    """A word, or several with numbers among them; what only looks like a number, as a name may, is none."""
+    words = catalogue(_current.get()).cells
+    found = words.get(text) or message(text)
+    return found if found != text else _ALONE.sub(lambda m: localised(m[0]), " ".join(
+        words.get(word, word) if word in _WORDS else word for word in text.split(" ")))  # fmt: skip
 
 
 def _part(text: str, kind: str) -> str:

@@ -17,8 +17,9 @@ from survey.jobs.excluding import FILE, included_rows, new_rows
 from survey.project.declared.editing import with_datum, with_sigma_scale, with_treatment
 from survey.project.exclusions import Exclusion, Name, Row, appended, in_force, read_exclusions
 from survey.project.observed import Observed, union
-from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
+from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER, Project
 from survey.project.reading import leaving_out, read_all
+from survey.report.language import message
 from survey.solution.earlier.changes import Changes
 from survey.workbench.resident import Resident, Watch
 from survey.workbench.situation import CancelledError, ChangedError, Situation, Step, signature_of
@@ -29,11 +30,14 @@ _NONE: Mapping[str, str] = MappingProxyType({})
 class Deciding(Resident):
     """A project folder about which is decided. Every method may be called from any thread.
 
-    read_only: nothing is ever written. watch: called with (iteration, v'Pv) while something is adjusted.
+    folder: or a project that was read, whose folder is meant: what is decided is written there. read_only: nothing is
+    ever written. watch: called with (iteration, v'Pv) while something is adjusted.
     """
 
-    def __init__(self, folder: str | Path, *, read_only: bool = False, watch: Watch | None = None) -> None:
-        super().__init__(folder, read_only=read_only, watch=watch)
+    def __init__(
+        self, folder: str | Path | Project, *, read_only: bool = False, watch: Watch | None = None
+    ) -> None:  # fmt: skip
+        super().__init__(folder.folder if isinstance(folder, Project) else folder, read_only=read_only, watch=watch)
         self.n_unsaved = 0
         self._done: list[Step] = []
         self._undone: list[Step] = []
@@ -67,7 +71,7 @@ class Deciding(Resident):
         kept = {(b.camera_id, b.epoch_id) for b in gone.survey.image_blocks if b.n_used}
         epochs = {e for _, e in images} - {e for _, e in kept}
         return {
-            "names": [str(n) for n in found], "text": hits.text(), "n_image_points": hits.n_image_points,
+            "names": [str(n) for n in found], "text": message(hits.text()), "n_image_points": hits.n_image_points,
             "n_readings": hits.n_readings, "n_spots": hits.n_spots, "n_images": len(hits.images),
             "images_lost": ["/".join(x) for x in sorted(images - kept)], "epochs_lost": sorted(epochs),
         }  # fmt: skip

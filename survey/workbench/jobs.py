@@ -16,6 +16,7 @@ from adjust.model.survey import FloatArray, PoseParameter
 from survey.folder.replacing import changing, replace_parts
 from survey.jobs.adjusting.job import AdjustOutcome, Clock, command_line, kept_run, made, run_info
 from survey.project.project import DEFINITION_FILE, RESULTS
+from survey.report.language import text_said
 from survey.report.scene import scene_values
 from survey.solution.dictionary import RunInfo
 from survey.solution.earlier.runs import remove_empty
@@ -133,7 +134,7 @@ class Jobs(Deciding):
         chosen = [self._other(f) for f in folders] or sorted(
             p.parent for p in self.folder.resolve().parent.glob(f"*/{DEFINITION_FILE}"))  # fmt: skip
         found = run_batch(chosen, BatchOptions(progress=False))
-        rows = [{"folder": str(r.folder), "state": str(r.state), "error": r.error,
+        rows = [{"folder": str(r.folder), "state": str(r.state), "error": text_said(r.error),
                  **{k: r.summary.get(k) for k in ("verdict", "sigma0", "redundancy")}} for r in found]  # fmt: skip
         return Told(summary_table(found), {"folders": [row["folder"] for row in rows],
                                            "states": [row["state"] for row in rows], "rows": rows})  # fmt: skip

@@ -25,6 +25,8 @@ from survey.folder.plain import plain
 from survey.folder.text import suggestion
 from survey.report.language import LANGUAGES, message, speaking
 from survey.report.modules import WEB as SHARED
+from survey.solution.earlier.changes import Changes
+from survey.solution.records import solution_json
 from survey.workbench import pictures
 from survey.workbench.bodies import JOBS, Body, BodyError, distance_of, json_of, whole_of
 from survey.workbench.guard import LONGEST_BODY, Guard, TooLongError
@@ -32,6 +34,7 @@ from survey.workbench.live import Live
 from survey.workbench.pages.beginning import Beginning
 from survey.workbench.session import Workbench
 from survey.workbench.situation import CancelledError, ChangedError
+from survey.workbench.views import in_words
 
 WEB = Path(__file__).parent / "web"
 _KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".json": "application/json",
@@ -186,7 +189,7 @@ class Server:
 
         async def said(request: Request) -> Response:
             if way.changes and self.shown.read_only:
-                return JSONResponse({"error": "the project is open for reading only"}, 403)
+                return JSONResponse({"error": message("the project is open for reading only")}, 403)
             try:
                 return await way.handler(request)
             except SurveyError as error:
@@ -196,7 +199,7 @@ class Server:
             except OSError as error:
                 return JSONResponse({"error": f"{error.filename}: {error.strerror}"}, 409)
             except (BodyError, ClientDisconnect) as error:
-                return JSONResponse({"error": f"not understood: {error}"}, 400)
+                return JSONResponse({"error": message(f"not understood: {error}")}, 400)
             except TooLongError:
                 return JSONResponse({"error": f"more than {LONGEST_BODY} bytes"}, 413)
 
@@ -239,12 +242,13 @@ class Server:
 
     async def _statistics(self, request: Request) -> Response:
         part = request.path_params["part"]
-        return JSONResponse(await self._run("statistics", lambda: self.bench.statistics_part(part)))
+        found = await self._run("statistics", lambda: self.bench.statistics_part(part))
+        return Response(solution_json(found), media_type="application/json")
 
     async def _compare(self, request: Request) -> Response:
         a, b = (whole_of(request, k) for k in "ab")
         found = await self._run("compare", lambda: self.bench.compare(a, b))
-        return JSONResponse(found.as_dict(whole_of(request, "most")))
+        return JSONResponse(_in_words(found, whole_of(request, "most")))
 
     async def _camera(self, request: Request) -> Response:
         camera, distance = request.path_params["camera"], distance_of(request)
@@ -256,9 +260,9 @@ class Server:
         return JSONResponse(await self._run("view", lambda: self.bench.lens_change(camera, run, other, distance)))
 
     async def _halves(self, request: Request) -> Response:
-        distance = distance_of(request)
-        found = await self._run("compare", lambda: self.bench.cross_validate(distance))
-        told = {"version": self.bench.version, "cameras": [c.summary() | c.pixels() for c in found.cameras],
+        distance, bench = distance_of(request), self.bench
+        found = await asyncio.to_thread(bench.cross_validate, distance)  # of values that nobody changes: others go on
+        told = {"version": bench.version, "cameras": [c.summary() | c.pixels() for c in found.cameras],
                 "notes": [message(note) for note in found.notes]}  # fmt: skip
         return JSONResponse(plain(found.summary() | told))
 
@@ -267,7 +271,7 @@ class Server:
         project = self.bench.situation.everything
         size = _size_of(request)
         if key not in project.images:
-            return JSONResponse({"error": "no such image"}, 404)
+            return JSONResponse({"error": message("no such image")}, 404)
         tag = pictures.etag(project.detected.get(key), project.images[key], size)
         kept = {"ETag": tag, "Cache-Control": "private, no-cache"}
         if request.headers.get("if-none-match") == tag:
@@ -343,8 +347,9 @@ class Server:
         return await self._decided(self.bench.reload)
 
     async def _save(self, _request: Request) -> Response:
-        outcome = await self._run("save", self.bench.save)
-        return JSONResponse(outcome.summary())
+        said = (await self._run("save", self.bench.save)).summary()
+        told = {"summary": in_words(said["summary"]), "warnings": [*map(message, said["warnings"])]}
+        return JSONResponse(said | told)
 
     def _job(self, name: str) -> _Handler:
         """A job: what it said, and the state after it."""
@@ -382,7 +387,12 @@ class Server:
 
     def _changed(self) -> dict[str, Any]:
         found = self.bench.changes
-        return {"version": self.bench.version, "changes": None if found is None else found.as_dict(500)}
+        return {"version": self.bench.version, "changes": None if found is None else _in_words(found, 500)}
+
+
+def _in_words(changes: Changes, most: int | None) -> dict[str, Any]:
+    found = changes.as_dict(most)
+    return found | {k: in_words(found[k]) for k in ("before", "after")}
 
 
 def _size_of(request: Request) -> int | None:

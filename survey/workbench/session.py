@@ -1,6 +1,6 @@
 """A project in memory that is adjusted again at every decision: what ``labsurvey open`` serves, and a notebook uses.
 
->>> bench = Workbench("lab")
+>>> bench = Workbench("lab")          # or a project: Workbench(survey.read("lab"))
 >>> bench.adjust()
 >>> bench.exclude("X/hX05", reason="motion blur").largest[:5]
 >>> bench.undo()
@@ -24,7 +24,7 @@ from survey.workbench.pictures import picture
 
 
 class Workbench(Jobs):
-    """A project folder, kept in memory; see the module. Every method may be called from any thread.
+    """A project or its folder, kept in memory; see the module. Every method may be called from any thread.
 
     read_only: nothing is ever written. watch: called with (iteration, v'Pv) while something is adjusted.
     """

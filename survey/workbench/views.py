@@ -45,10 +45,10 @@ def state(bench: Jobs) -> dict[str, Any]:
     return dict(plain({
         "version": bench.version, "folder": str(bench.folder), "title": now.project.title,
         "read_only": bench.read_only, "lock": bench.holder(), "changed_files": bench.changed_files(),
-        "unsaved": bench.n_unsaved, "undo": bench.undoable, "redo": bench.redoable,
+        "unsaved": bench.n_unsaved, "undo": [*map(message, bench.undoable)], "redo": [*map(message, bench.redoable)],
         "solution": None if solved is None else _summary(solved) | {
             "mode": now.mode, "seconds": now.seconds, "sigmas": bench.scale.sigmas},
-        "kept": None if bench.kept is None else _in_words(bench.kept.summary) | {"date": bench.kept.date},
+        "kept": None if bench.kept is None else in_words(bench.kept.summary) | {"date": bench.kept.date},
         "warnings": [message(w) for w in _warnings(bench)],
         "failure": None if bench.failure is None else message(str(bench.failure)),
         "exclusions": [{"name": str(e.name), "what": e.name.what, "id": e.name.id, "reason": e.reason,
@@ -63,10 +63,11 @@ def state(bench: Jobs) -> dict[str, Any]:
 
 
 def _summary(solved: Adjustment) -> dict[str, Any]:
-    return _in_words(snapshot(solved).summary)
+    return in_words(snapshot(solved).summary)
 
 
-def _in_words(summary: Mapping[str, Any]) -> dict[str, Any]:
+def in_words(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """A summary with its reason in the language that is spoken."""
     return {**summary, "reason": message(str(summary["reason"]))}
 
 
@@ -156,7 +157,7 @@ def findings(bench: Jobs) -> dict[str, Any]:
                              "causes": [], "n_failing": 0, "findings": []}  # fmt: skip
     kept = bench.kept
     if solved is not None or kept is not None:
-        known = _of_solution(bench, _in_words(kept.summary) if kept is not None else _summary(bench.adjustment))
+        known = _of_solution(bench, in_words(kept.summary) if kept is not None else _summary(bench.adjustment))
     return dict(plain({"version": bench.version, **known, "remedies": remedies(bench)}))
 
 
@@ -251,7 +252,8 @@ def _of_images(bench: Jobs, failing: list[dict[str, Any]]) -> list[dict[str, Any
 
 def runs(bench: Jobs) -> dict[str, Any]:
     """The runs that were kept, the last first."""
-    return {"version": bench.version, "runs": [r.as_dict() for r in reversed(list_runs(bench.folder))]}
+    found = [r.as_dict() for r in reversed(list_runs(bench.folder))]
+    return {"version": bench.version, "runs": [r | {"summary": in_words(r["summary"])} for r in found]}
 
 
 def scene(bench: Jobs) -> dict[str, Any]:

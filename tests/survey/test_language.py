@@ -24,6 +24,7 @@ from survey.report.language import (
     message,
     speaking,
     t,
+    text_said,
 )
 
 SURVEY, ADJUST = (Path(str(package.__file__)).parent for package in (survey, adjust))
@@ -94,7 +95,7 @@ def test_nothing_stale_remains(language: str) -> None:
     assert set(catalogue(language).texts) - used == set()
     everything = "\n".join(far)
     sentences = catalogue(language).sentences
-    for sentence in sentences:
+    for sentence in [*sentences, *catalogue(language).cells.keys() - catalogue(language).texts.keys()]:
         words = max(re.split(r"\{[nw]?\}|[^A-Za-z' ]", sentence), key=len).split()
         assert all(word in everything for word in words), sentence
     for pattern, _ in catalogue(language).messages[len(sentences) :]:
@@ -195,3 +196,22 @@ def test_causes_are_said_in_the_language_part_by_part() -> None:
             "motion = \"epoch\" unter [targets.board] in survey.toml eintragen (erklärt 97 % der Widersprüche, "
             "sigma0 wird 1.02; survey.toml:14; --try 1)"
         )
+
+
+def test_a_text_of_several_lines_is_said_with_its_columns() -> None:
+    said = """a -> b: nothing to see
+  ! no set of stable points was found; what is shown as motion depends on the datum
+
+  group              observations  redundancy  smallest  median
+  image                      4648      4497.3     0.093   0.980
+  mine                          1         0.7     0.716   0.716
+    station_from_camera.X.rx               72 arcsec required   83.8 arcsec planned   NOT MET"""
+    with speaking("de"):
+        assert text_said(said) == """a -> b: nothing to see
+  ! keine Gruppe stabiler Punkte wurde gefunden; was als Bewegung gezeigt wird, hängt vom Datum ab
+
+  Gruppe            Beobachtungen   Redundanz  kleinste  Median
+  Bild                       4648      4497,3     0,093   0,980
+  mine                          1         0,7     0,716   0,716
+    station_from_camera.X.rx              72 arcsec gefordert   83,8 arcsec geplant  NICHT ERFÜLLT"""
+    assert text_said(said) == said

@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 import capture.web
+from adjust.model.clocks import CLOCKS
 from survey.examples import write_example
 from survey.project import write_project
+from survey.project.project import DEMANDED
 from survey.report.language import catalogue
 from survey.report.modules import WEB as SHARED
 from survey.report.terminal import summary_text
@@ -32,6 +34,18 @@ WRONG = ("tX05", "X", "board", "c40")  # an image point that is moved by 4 px
 NAME = "X/tX05/board/c40"
 VIEWS = ("scene", "plan", "south", "east", "camera", "compare", "history", "angles", "loops", "correlations",
          "settings", "network", "jobs", "capture")  # fmt: skip
+# before and after of every parameter with the widest numbers: by how much its table is wider than its place
+WIDE = """(async () => { const { changesText } = await import("/compare.js"), { bench } = await import("/bench.js");
+    const box = document.querySelector("#left .page"), kept = [...box.childNodes], out = [];
+    for (const [size, sigmas] of [[1.2e-4, -1234.5], [123456.789, 0.01], [3.3e-12, 123456.7]]) {
+        const before = { verdict: "passed", sigma0: 1.01, redundancy: 12345, n_suspects: 10 };
+        const components = bench.parameters.slice(0, 300).map(({ name, sigma_unit }) => ({
+            name, before: 1.001 * size, after: size, difference: -size, unit: sigma_unit, sigmas, ratio: 12.3 }));
+        box.replaceChildren(changesText({ before, after: { ...before, verdict: "failed" }, components }));
+        out.push(...[...box.querySelectorAll(".t")].map((t) => t.scrollWidth - t.clientWidth));
+    }
+    box.replaceChildren(...kept);
+    return out; })()"""
 ROWS = "Number(document.querySelector('#tables [role=grid]').getAttribute('aria-rowcount'))"
 
 
@@ -226,18 +240,24 @@ def test_readable_on_desk_and_phone(browser: Any, address: str, scheme: str, wid
     assert page.complaints == []
 
 
-def test_no_table_of_a_view_is_cut(page: Page) -> None:
+@pytest.mark.parametrize("width", [1280, 390])
+def test_no_table_of_a_view_is_cut(browser: Any, address: str, width: int) -> None:
     """In German too, whose words are longer."""
+    page = Page(browser, address, width)
     p = page.page
     page.wait("document.body.dataset.results !== undefined")
+    p.evaluate("document.body.dataset.pane = 'left'")
     for language in ("en", "de"):
         for view in ("findings", *VIEWS):
             p.locator("#left .chooser select").select_option(view)
             page.wait("document.querySelector('#left [aria-busy=true]') === null")
             cut = "[...document.querySelectorAll('#left .t')].map((t) => t.scrollWidth - t.clientWidth)"
             assert max([0, *p.evaluate(cut)]) <= 1, (language, view)
+        assert max(p.evaluate(WIDE)) <= 1, language
         p.keyboard.press("g")
         page.wait(f"document.documentElement.lang === '{'de' if language == 'en' else 'en'}'")
+    page.context.close()
+    assert page.complaints == []
 
 
 def test_a_choice_stays_when_values_arrive(page: Page) -> None:
@@ -407,3 +427,11 @@ def test_images_are_detected_and_shown_as_they_come(browser: Any, tmp_path: Path
         page.wait("location.hash.startsWith('#image=')")
         page.context.close()
     assert [text for text in page.complaints if "409" not in text] == []
+
+
+def test_what_a_solution_has_is_said_in_words() -> None:
+    """Every kind of parameter and of clock, and how each is treated."""
+    german, english = (json.loads((SHARED / f"{name}.json").read_text()) for name in ("de", "en"))
+    kinds = {*CLOCKS, *(kind for all_of in DEMANDED.values() for kind in all_of), "lens_drift", "lens_crop", "table_motion", "warp"}
+    assert {f"param {kind}" for kind in kinds} <= set(english) & set(german)
+    assert {"free", "held", "prior", "tied"} <= set(german)

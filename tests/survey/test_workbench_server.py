@@ -17,12 +17,14 @@ from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 from websockets.sync.client import connect
 
+from adjust.model.errors import SurveyError
 from survey.cli import main
 from survey.report.language import message, speaking
 from survey.workbench.live import Listening
 from survey.workbench.pages.beginning import Beginning
 from survey.workbench.server import WEB, Server
 from survey.workbench.session import Workbench
+from survey.workbench.views import PARTS
 from tests.survey.test_workbench import exclusions, wrong_point
 
 TOKEN = "secret-token-of-this-test"
@@ -244,14 +246,33 @@ def test_the_command_line_and_two_pages_lose_nothing_of_each_other(mine):
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("path", ["readings", "parameters", "scene", "findings", "runs", "statistics/correlations",
-                                  "statistics/reliability", "changes", "camera/left?distance_m=3", "loops",
-                                  "table_residuals"])  # fmt: skip
-def test_every_view_answers(mine, path):
+def test_every_view_answers(mine):
+    views = ("readings", "parameters", "scene", "findings", "runs", "changes", "camera/left?distance_m=3", "loops",
+             "table_residuals", "network", "halves", *(f"statistics/{part}" for part in PARTS))  # fmt: skip
     with page(mine) as client:
-        answer = client.get(f"/api/{path}", headers=HERE)
-        assert answer.status_code == 200, answer.text
-        assert answer.json()["version"] == 1
+        for path in views:
+            answer = client.get(f"/api/{path}", headers=HERE)
+            assert answer.status_code == 200, (path, answer.text)
+            assert answer.json()["version"] == 1
+
+
+def test_others_are_answered_while_the_halves_are_adjusted(mine, monkeypatch):
+    begun, told = threading.Event(), threading.Event()
+
+    def halves(bench, distance):
+        begun.set()
+        assert told.wait(30.0), "nobody else was answered meanwhile"
+        raise SurveyError("there are no two halves")
+
+    monkeypatch.setattr(Workbench, "cross_validate", halves)
+    with page(mine) as client:
+        asked = threading.Thread(target=client.get, args=("/api/halves",), kwargs={"headers": HERE})
+        asked.start()
+        assert begun.wait(30.0)
+        assert post(client, "/api/exclusions", exclude(f"image:{image_of(mine)}", 1)).json()["version"] == 2
+        told.set()
+        asked.join(30.0)
+    assert not asked.is_alive()
 
 
 def test_an_unknown_part_offers_the_nearest(mine):
@@ -399,6 +420,64 @@ def test_messages_are_in_the_language_that_is_asked_for(mine):
     assert german == f"{mine}: nichts kann rückgängig gemacht werden"
     with speaking("de"):
         assert reason == message(said) != said
+
+
+ENGLISH = re.compile(r"\b(the|is|are|of|and|or|from|with|there|please|no|not|known|found|expected)\b")
+DATA = {"title", "label", "solution.solution", "capture.state"}
+"""What is of the project or of its files, or a code, whatever the language: keys, some below an address only."""
+ASKED = [
+    *(("jobs/compare", {"folder": name}) for name in ("other", "nowhere", "new")), ("jobs/plan", {}),
+    ("jobs/navigate", {}), ("jobs/detect", {}), ("jobs/detct", {}), ("jobs/add", {"folder": "other"}), ("jobs/add", {"folder": "lab"}),
+    ("jobs/init", {"images": "", "folder": ""}), ("jobs/init", {"images": "lab", "folder": "other"}),
+    ("jobs/show", {"folder": "nowhere"}), ("jobs/batch", {"folders": ["lab", "nowhere"]}),
+    *((way, {"changes": [{"name": name, "excluded": True}], "reason": "blur"})
+      for way in ("preview", "exclusions") for name in ("nothing", "camera:right")),
+    ("exclusions", {"changes": [{"name": "camera:right", "excluded": True}], "reason": "blur"}),
+    ("exclusions", {"changes": [{"name": "camera:right", "excluded": True}]}), ("undo", {"base": 1}), ("undo", {}),
+    ("redo", {}), ("remedy", {"number": 1}), ("save", {}), ("runs/9/restore", {}), ("runs/9/pin", {}),
+    ("runs/x/pin", {}),
+    *(("definition", asked) for asked in (
+        {"parameter": "lens/left/fx", "treatment": "held"}, {"parameter": "lens/nobody/fx", "treatment": "held"},
+        {"parameter": "lens/left/fx", "treatment": "loose"}, {"group": "image", "factor": -1},
+        {"group": "image", "factor": 1.2}, {"group": "imag", "factor": 2}, {"datum": "other"},
+        {"datum": "inner", "points": ["nobody"]})),
+]  # fmt: skip
+
+
+def texts_in(value, place=""):
+    """Texts of an answer that are not data, line by line."""
+    if isinstance(value, str):
+        yield from ((place, line) for line in value.splitlines())
+    elif isinstance(value, dict):
+        yield from (found for key, x in value.items() if not {key, f"{place}.{key}"} & DATA
+                    for found in texts_in(x, place))  # fmt: skip
+    elif isinstance(value, list):
+        yield from (found for x in value for found in texts_in(x, place))
+
+
+@pytest.mark.slow
+def test_whatever_is_asked_in_german_nothing_is_said_in_english(mine):
+    shutil.copytree(mine, mine.parent / "other")
+    (mine.parent / "new").mkdir()
+    shutil.copy(mine / "survey.toml", mine.parent / "new")
+    german, answers = HERE | {"X-Language": "de"}, []
+    with page(mine) as client:
+        for way in ways(mine):
+            if way.method == "GET":
+                path = way.path.replace("{camera}/{epoch}", image_of(mine)).replace("{camera}", "left")
+                for part in PARTS if "{part}" in path else ("",):
+                    for question in ("", "?distance_m=x", "?run=9&a=9", "?other=nobody"):
+                        one = path.replace("{part}", part) + question
+                        answers.append((one, client.get(one, headers=german)))
+        answers += [(path, client.post(f"/api/{path}", json=asked, headers=german)) for path, asked in ASKED]
+    with page(mine, read_only=True) as client:
+        answers.append(("undo", client.post("/api/undo", json={}, headers=german)))
+    assert {answer.status_code for _, answer in answers} == {200, 403, 404, 409}
+    said = [(path, *found) for path, answer in answers if answer.headers["content-type"] == "application/json"
+            for found in texts_in(answer.json(), path.split("?")[0].split("/")[-1])]  # fmt: skip
+    assert len(said) > 1000
+    english = [one for one in said if ENGLISH.search(re.sub(r"'[^']*'|--?\w+|\S*[/_]\S*", "", one[-1]))]
+    assert "\n".join(map(str, english)) == ""
 
 
 def test_remedies_jobs_and_the_network_are_asked_for_as_the_page_does(mine):

@@ -160,8 +160,9 @@ def parts(c: Context) -> Markup:
     tested, out = s.consistency, Markup()
     if tested is not None and tested.parts:
         rows = [
-            (f"{t(_KINDS[x.kind])} {x.name}", count(x.n), fixed(x.redundancy, 1), fixed(x.factor, 3),
-             general(x.p, 2), pill("bad", t("does not fit")) if x.fails else pill("good", t("fits")))
+            (f"{t(_KINDS[x.kind])} {group_name(x.name) if x.kind == 'group' else x.name}", count(x.n),
+             fixed(x.redundancy, 1), fixed(x.factor, 3), general(x.p, 2),
+             pill("bad", t("does not fit")) if x.fails else pill("good", t("fits")))
             for x in tested.parts[:_MOST_PARTS]
         ]  # fmt: skip
         classes = ["suspect" if x.fails else "" for x in tested.parts[:_MOST_PARTS]]

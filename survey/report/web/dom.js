@@ -31,8 +31,8 @@ export function button(text, act, key = "", extra = {}) {
   return make("button", { type: "button", onclick: act, "aria-keyshortcuts": key || null, title: key ? `${text} (${key})` : null, ...extra }, text);
 }
 
-/** A link to a place of the page; its text may go on in the next line behind a slash. @param {string} hash @param {string} text */
-export const link = (hash, text, extra = {}) => make("a", { href: hash, ...extra }, ...text.split(/(?<=\/)/).flatMap((part, k) => (k ? [make("wbr"), part] : part)));
+/** A link to a place of the page; its text may go on in the next line behind a slash or a low line. @param {string} hash @param {string} text */
+export const link = (hash, text, extra = {}) => make("a", { href: hash, ...extra }, ...text.split(/(?<=[/_])/).flatMap((part, k) => (k ? [make("wbr"), part] : part)));
 
 /**
  * A small table: head of texts, rows of texts or elements; columns in `right` hold numbers.

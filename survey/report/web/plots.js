@@ -1,7 +1,7 @@
 // Plots of one camera over its image, and of series: small pictures drawn from values, with their scale beside them.
 
 import { rowAt } from "./columns.js";
-import { colour, make, surface } from "./dom.js";
+import { colour, make, roundBelow, surface } from "./dom.js";
 import { count, significant, t } from "./words.js";
 
 /** From dark to bright, also for those who see no red or green (after viridis, eight stops). */
@@ -113,6 +113,13 @@ export function residualField(points, camera, size) {
   };
 }
 
+/** Round numbers within bounds, about five of them. @param {number} low @param {number} high */
+function rounds(low, high) {
+  if (!(high > low)) return [low];
+  const step = roundBelow((high - low) / 4), first = Math.ceil(low / step - 1e-9);
+  return Array.from({ length: Math.floor(high / step + 1e-9) - first + 1 }, (_, k) => (first + k) * step);
+}
+
 /**
  * Values over a quantity, one series each; a click goes to the place of a value.
  * @param {string} label @param {{name: string, x: number[], y: number[], anchors?: [string, string][]}[]} series
@@ -126,14 +133,15 @@ export function scatter(label, series, how) {
     const left = 52, bottom = 30, to = (x, y) => [left + ((x - x0) / Math.max(1e-300, x1 - x0)) * (width - left - 16), 8 + (0.5 - y / (2 * top)) * (height - bottom - 8)];
     context.font = "11px system-ui, sans-serif";
     context.lineWidth = 1;
-    for (const y of [-1, -0.5, 0, 0.5, 1]) {
-      const [, v] = to(x0, (y * top) / 1.08);
+    for (const y of rounds(-top, top)) {
+      const [, v] = to(x0, y);
       context.strokeStyle = colour(y ? "rule" : "edge");
       context.beginPath(); context.moveTo(left, v); context.lineTo(width - 12, v); context.stroke();
       context.fillStyle = colour("quiet");
-      context.fillText(significant((y * top) / 1.08, 2), 2, v + 4);
+      context.fillText(significant(y, 2), 2, v + 4);
     }
-    for (const share of [0, 0.5, 1]) { const [u] = to(x0 + share * (x1 - x0), 0); context.textAlign = share ? (share === 1 ? "right" : "center") : "left"; context.fillText(significant(x0 + share * (x1 - x0), 3), u, height - 16); }
+    context.textAlign = "center";
+    for (const x of rounds(x0, x1)) context.fillText(significant(x, 3), to(x, 0)[0], height - 16);
     context.textAlign = "left";
     context.fillText(`${how.x}  →      ↑ ${how.y}`, left, height - 3);
     if (how.band) for (const y of [-how.band, how.band]) { const [, v] = to(x0, y); context.strokeStyle = colour("bad"); context.setLineDash([5, 4]); context.beginPath(); context.moveTo(left, v); context.lineTo(width - 12, v); context.stroke(); context.setLineDash([]); }

@@ -39,7 +39,7 @@ export function significant(value, digits = 4) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   if (value === 0) return "0";
   const decimals = digits - 1 - Math.floor(Math.log10(Math.abs(value)));
-  if (decimals > 9) return value.toExponential(digits - 1).replaceAll("-", "−");
+  if (decimals > 9) { const [size, power] = value.toExponential(digits - 1).split("e"); return `${number(Number(size), digits - 1)}e${power.replace("-", "−")}`; }
   return number(value, Math.max(0, decimals));
 }
 

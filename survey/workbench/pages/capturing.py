@@ -13,6 +13,7 @@ from adjust.model.survey import FloatArray
 from survey.folder.locking import SESSION_LOCK, holder_of
 from survey.project.captured import Coverage, Qualities, is_id, points_of, session_status
 from survey.project.project import IMAGES_FOLDER
+from survey.report.language import message
 from survey.workbench.pictures import is_plain, picture
 
 if TYPE_CHECKING:
@@ -56,7 +57,8 @@ class FolderView:
         told = session_status(self._folder)
         running = holder_of(self._folder / SESSION_LOCK)
         if running is None and told.get("state") in ("running", "paused"):
-            told |= {"state": "broken off", "message": "the session's process has ended; start it again to go on"}
+            ended = message("the session's process has ended; start it again to go on")
+            told |= {"state": "broken off", "message": ended}
         with self._reading:
             self._qualities.read()
             cameras = self._cameras or list(dict.fromkeys([*told.get("images", ()), *self._qualities.coverage]))

@@ -59,8 +59,17 @@ const page = {
 };
 const KEYS = keysOf(page);
 
-/** New values, then every view with them: observations and what is wrong first. @param {any} answer see `load` */
-async function renew(answer, anew = false) {
+let last = Promise.resolve();
+
+/** One after the other: what was asked for first must not be shown over what came of something newer. @param {any} answer see `load` */
+function renew(answer, anew = false) {
+  const next = last.then(() => shown(answer, anew));
+  last = next.catch(() => {});
+  return next;
+}
+
+/** New values, then every view with them: observations and what is wrong first. */
+async function shown(answer, anew) {
   const fresh = await load(answer, anew);
   if (bench.beginning) { drawBeginning(bench.beginning, actions); return; }
   drawAll(fresh);

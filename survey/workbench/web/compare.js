@@ -1,6 +1,7 @@
 // Before and after of every parameter, the runs that were kept, and any two of them compared.
 
-import { button, fill, link, make, plainTable } from "./dom.js";
+import { Asked } from "./asked.js";
+import { button, link, make, plainTable } from "./dom.js";
 import { count, number, significant, t, time } from "./words.js";
 import { anchor, current, go } from "./store.js";
 import { get, post } from "./source.js";
@@ -30,26 +31,16 @@ export function changedShortly(changes) {
   return first ? ` sigma0 ${number(changes.before.sigma0, 4)} → ${number(changes.after.sigma0, 4)}; ${t("largest change")} ${first.name} ${number(first.sigmas, 2)} σ` : "";
 }
 
-export class CompareView {
-  /** @param {any} bench */
-  constructor(bench) {
-    this.bench = bench;
-    this.element = make("div", { class: "view page", tabindex: 0 });
-    this.follow();
-  }
+export class CompareView extends Asked {
+  question() { return `${current().run}/${current().against}`; }
 
-  async follow() {
+  async parts() {
     const { run, against } = current(), { state } = this.bench;
-    const key = `${run}/${against}/${state.version}`;
-    if (key === this.key) return;
-    this.key = key;
-    try {
-      const { runs } = await get("runs"), asked = new URLSearchParams(Object.entries({ a: against, b: run }).filter(([, number]) => number));
-      const changes = against ? await get(`compare?${asked}`) : state.changes;
-      const title = !against ? t("Before and after the last change") : run ? t("Run {a} → run {b}", { a: against, b: run }) : t("Run {a} → now", { a: against });
-      const nothing = make("p", { class: "quiet" }, t("Nothing has been changed yet. Leave something out (x), or choose a run."));
-      if (this.key === key) fill(this.element, runs.length ? this.chooser(runs, run, against) : null, changes ? [make("h2", {}, title), changesText(changes)] : nothing);
-    } catch (error) { fill(this.element, make("p", { class: "warn" }, error.message)); }
+    const { runs } = await get("runs"), asked = new URLSearchParams(Object.entries({ a: against, b: run }).filter(([, number]) => number));
+    const changes = against ? await get(`compare?${asked}`) : state.changes;
+    const title = !against ? t("Before and after the last change") : run ? t("Run {a} → run {b}", { a: against, b: run }) : t("Run {a} → now", { a: against });
+    const nothing = make("p", { class: "quiet" }, t("Nothing has been changed yet. Leave something out (x), or choose a run."));
+    return [runs.length ? this.chooser(runs, run, against) : null, changes ? [make("h2", {}, title), changesText(changes)] : nothing];
   }
 
   /** Which run is before, and which after: none is what the page shows now. */
@@ -59,30 +50,20 @@ export class CompareView {
   }
 }
 
-export class HistoryView {
-  /** @param {any} bench @param {any} actions */
-  constructor(bench, actions) {
-    this.bench = bench;
-    this.actions = actions;
-    this.element = make("div", { class: "view page", tabindex: 0 });
-    this.follow();
-  }
+export class HistoryView extends Asked {
+  question() { return `${this.bench.state.unsaved}/${current().run}`; }
 
-  async follow() {
-    const key = `${this.bench.state.version}/${this.bench.state.unsaved}/${current().run}`;
-    if (key === this.key) return;
-    this.key = key;
-    let runs = [];
-    try { runs = (await get("runs")).runs; } catch (error) { fill(this.element, make("p", { class: "warn" }, error.message)); return; }
+  async parts() {
+    const { runs } = await get("runs");
     const { state } = this.bench, chosen = current();
     const pick = (name, run) => make("input", { type: "radio", name, "aria-label": `${t(name)} ${run}`, checked: String(chosen[name === "before" ? "against" : "run"]) === String(run), onchange: () => go(name === "before" ? { against: String(run) } : { run: String(run) }, true) });
     const acts = (run) => (state.read_only ? null : make("span", { class: "actions" }, button(run.pinned ? "★" : "☆", () => this.act("pin", run), "", { "aria-label": `${run.pinned ? t("not kept for ever") : t("keep for ever")}: ${run.number}` }), " ", button(t("restore"), () => this.act("restore", run), "", { "aria-label": `${t("restore")}: ${run.number}` })));
     const rows = runs.map((run) => [pick("before", run.number), pick("after", run.number), link(`#run=${run.number}`, String(run.number)), t(`verdict ${run.summary.verdict}`), number(run.summary.sigma0, 4),
       make("div", { class: "wide" }, time(run.time), " ", make("span", { class: "quiet" }, [`${t("redundancy")} ${count(run.summary.redundancy)}`, run.author, run.command].filter(Boolean).join(" · ")), acts(run))]);
     const steps = (title, labels) => labels?.length ? make("div", {}, make("h3", {}, title), make("ol", {}, ...labels.map((label) => make("li", {}, label)))) : null;
-    fill(this.element, make("h2", {}, t("History")), steps(t("Can be undone"), state.undo), steps(t("Can be done again"), state.redo), make("h3", {}, t("Runs")),
+    return [make("h2", {}, t("History")), steps(t("Can be undone"), state.undo), steps(t("Can be done again"), state.redo), make("h3", {}, t("Runs")),
       rows.length ? plainTable(t("Runs"), [t("before"), t("after"), t("run"), t("verdict"), "sigma0", t("time, who, command")], rows, [4]) : make("p", { class: "quiet" }, t("No runs are kept yet; Save writes one.")),
-      rows.length > 1 ? button(t("Compare"), () => this.compare(), "d", { class: "primary" }) : null);
+      rows.length > 1 ? button(t("Compare"), () => this.compare(), "d", { class: "primary" }) : null];
   }
 
   compare() {
@@ -93,7 +74,6 @@ export class HistoryView {
 
   async act(what, run) {
     try { await this.actions.done(await post(`runs/${run.number}/${what}`, { base: this.bench.state.version, pinned: !run.pinned })); } catch (error) { tell(error.message, "warn"); }
-    this.key = "";
-    this.follow();
+    await this.again();
   }
 }

@@ -7,6 +7,14 @@ import { pointId, pointName, rowOf, rowsOfImage, rowsOfPoint, rowsWhere } from "
 
 const WHY = ["in use", "used = false in its table", "excluded by people", "left out by this adjustment"];
 const MOST = 40;
+/** What survey.toml can hold and free in one line; of what is there for every epoch, only a person can. */
+const HOLDABLE = /^((lens|table_geometry)\/[^/]+(\/[^/]+)?|(point|(station|carrier)_from_\w+|(world|mount)_from_(station|table))\/[^/]+)$/;
+
+/** What a parameter is of, in words where there are some. @param {string} id */
+function owns(id) {
+  const [kind, owner] = id.split("/"), said = known(`param ${kind}`);
+  return said.startsWith("param ") ? null : `${said} ${owner}`;
+}
 
 /** Names under which the chosen things are left out. @returns {string[]} */
 export function chosenNames() {
@@ -88,12 +96,12 @@ const ABOUT = {
     const rows = rowsOfImage(bench.points, id), [camera, epoch] = id.split("/");
     return [sums(bench.points, rows), facts([[t("camera"), link(anchor("camera", camera), camera)], [t("kind epoch"), link(anchor("epoch", epoch), epoch)]])];
   },
-  camera: (bench, id) => [sums(bench.points, rowsWhere(bench.points, (b) => b.camera === id)), ...parameters(bench, `lens/${id}`, `station_from_camera/${id}`)],
+  camera: (bench, id) => [sums(bench.points, rowsWhere(bench.points, (b) => b.camera === id)), ...parameters(bench, `lens/${id}`, `lens_crop/${id}`, `camera_clock/${id}`, `station_from_camera/${id}`, `lens_drift/${id}`)],
   epoch: (bench, id) => [sums(bench.points, rowsWhere(bench.points, (b) => b.epoch === id)), ...imagesOf(bench, (b) => b.epoch === id), ...parametersOfEpoch(bench, id)],
   target: (bench, id) => [sums(bench.points, rowsWhere(bench.points, (b) => b.target === id)), ...parameters(bench, `carrier_from_target/${id}`, `warp/${id}`, `target_points/${id}`)],
   point: (bench, id) => [...parameters(bench, `point/${id}`), ...seenBy(bench.points, rowsOfPoint(bench.points, null, id))],
-  table: (bench, id) => parameters(bench, `world_from_table/${id}`, `table_geometry/${id}`),
-  station: (bench, id) => parameters(bench, `world_from_station/${id}`, `mount_from_station/${id}`),
+  table: (bench, id) => parameters(bench, `world_from_table/${id}`, `table_geometry/${id}`, `table_motion/${id}`, `table_clock/${id}`),
+  station: (bench, id) => parameters(bench, `mount_from_station/${id}`, `pose_clock/${id}`, `world_from_station/${id}`),
   reading(bench, id) {
     const rows = bench.readings.filter((row) => row.id === id);
     if (!rows.length) return [make("p", { class: "warn" }, t("There is no such observation in this solution."))];
@@ -105,8 +113,8 @@ const ABOUT = {
     if (!row) return parameters(bench, id);
     // a component of a lens or turntable by itself, poses and points as a whole, those of single epochs in survey.toml
     const single = /^(lens|table_geometry)\//.test(id), name = single ? id : row.owner, to = row.treatment === "free" ? "held" : "free";
-    const acts = bench.state.read_only || (!single && name.split("/").length !== 2) ? [] : [button(t(`make ${to}`), () => actions.setting({ parameter: name, treatment: to }))];
-    return [facts([[t("value"), measure(row.value, row.unit, 9)], [t("sigma"), measure(row.sigma, row.sigma_unit, 3)], [t("treatment"), row.treatment && known(row.treatment)]]), make("div", { class: "actions" }, ...acts)];
+    const acts = bench.state.read_only || !HOLDABLE.test(name) ? [] : [button(t(`make ${to}`), () => actions.setting({ parameter: name, treatment: to }))];
+    return [facts([[t("what"), owns(id)], [t("value"), measure(row.value, row.unit, 9)], [t("sigma"), measure(row.sigma, row.sigma_unit, 3)], [t("treatment"), row.treatment && known(row.treatment)]]), make("div", { class: "actions" }, ...acts)];
   },
   group(bench, id, actions) {
     const group = (bench.findings.groups ?? []).find((g) => g.id === id);

@@ -1,37 +1,11 @@
 // One camera, and what hangs together: residuals of the table over its angles, loops, correlations.
 
+import { Asked } from "./asked.js";
 import { link, make, plainTable } from "./dom.js";
 import { count, number, significant, t } from "./words.js";
 import { anchor, current, names, select } from "./store.js";
 import { get } from "./source.js";
 import { gridOf, heat, residualField, scatter } from "./plots.js";
-
-/** A view whose content is fetched once for each solution and question. */
-class Asked {
-  /** @param {any} bench */
-  constructor(bench) {
-    this.bench = bench;
-    this.element = make("div", { class: "view page", tabindex: 0 });
-    this.follow();
-  }
-
-  question() { return ""; }
-
-  async follow() {
-    const key = `${this.bench.state.version}/${this.question()}`;
-    if (key === this.key) return;
-    this.key = key;
-    this.element.setAttribute("aria-busy", "true");
-    if (!this.element.childElementCount) this.element.replaceChildren(make("p", { class: "quiet" }, t("computing …")));
-    try {
-      const parts = await this.parts();
-      if (this.key === key) this.element.replaceChildren(...parts);
-    } catch (error) {
-      this.element.replaceChildren(make("p", { class: "warn" }, error.message));
-    }
-    this.element.removeAttribute("aria-busy");
-  }
-}
 
 /** The camera that the selection means, one of those that there are. @param {string[]} cameras @returns {string|undefined} */
 function chosenCamera(cameras) {
@@ -59,20 +33,24 @@ export class CameraView extends Asked {
     const runs = (await get("runs")).runs, choices = [...runs.map((run) => [{ run: run.number }, `${t("run")} ${run.number}`]), ...Object.keys(this.bench.sizes).filter((id) => id !== camera && this.bench.sizes[id].join() === size.join()).map((id) => [{ other: id }, `${t("camera")} ${id}`])];
     const others = make("select", { "aria-label": t("difference to"), onchange: () => { this.against = choices[others.selectedIndex - 1]?.[0]; this.follow(); } },
       make("option", {}, "–"), ...choices.map(([what, text]) => make("option", { selected: JSON.stringify(what) === JSON.stringify(this.against) }, text)));
-    const said = make("p", { class: "warn" });
+    this.said = make("p", { class: "warn" });
+    this.plots = plots;
+    return [make("div", { class: "bar" }, choose, make("label", {}, t("distance, m"), " ", distance), make("label", {}, t("difference to"), " ", others)), plots, this.said];
+  }
+
+  async more() {
+    const { plots, said } = this, camera = this.camera(), size = this.bench.sizes[camera], path = `camera/${encodeURIComponent(camera)}`;
     const asked = this.distance ? `distance_m=${encodeURIComponent(this.distance)}` : "";
-    const refused = (error) => { said.textContent = error.message; };
-    get(`camera/${encodeURIComponent(camera)}?${asked}`).then((found) => {
-      const { distortion: d, uncertainty: s } = found, body = s.station ?? s.camera;
-      const away = d.uv.map((uv, k) => [uv[0] - d.without[k][0], uv[1] - d.without[k][1]]);
+    try {
+      const { distortion: d, uncertainty: s } = await get(`${path}?${asked}`), body = s.station ?? s.camera;
+      const away = d.uv.map((uv, k) => [uv[0] - d.without[k][0], uv[1] - d.without[k][1]]), covered = (values) => gridOf(size, s.uv, values.map((x, k) => (s.covered[k] ? x : null)));
       plots.append(heat(t("Distortion: what the lens moves"), gridOf(size, d.uv, away.map((x) => Math.hypot(...x)), away)),
-        heat(s.station ? t("Uncertainty of projection (one sigma), camera on its station") : t("Uncertainty of projection (one sigma), camera by itself"), gridOf(size, s.uv, body.map((x, k) => (s.covered[k] ? x : null)))));
-      if (s.station) plots.append(heat(t("Uncertainty of projection (one sigma), camera by itself"), gridOf(size, s.uv, s.camera.map((x, k) => (s.covered[k] ? x : null)))));
-    }).catch(refused);
-    if (this.against) get(`camera/${encodeURIComponent(camera)}/difference?${new URLSearchParams(this.against)}&${asked}`).then((found) => {
+        heat(s.station ? t("Uncertainty of projection (one sigma), camera on its station") : t("Uncertainty of projection (one sigma), camera by itself"), covered(body)));
+      if (s.station) plots.append(heat(t("Uncertainty of projection (one sigma), camera by itself"), covered(s.camera)));
+      if (!this.against) return;
+      const found = await get(`${path}/difference?${new URLSearchParams(this.against)}&${asked}`);
       plots.append(heat(`${t("Difference of two lens results, implied rotation fitted")}: ${significant(found.rotation_deg, 2)}°, ${significant(found.translation_mm, 2)} mm`, gridOf(size, found.uv, found.shift.map((x) => Math.hypot(...x)), found.shift)));
-    }).catch(refused);
-    return [make("div", { class: "bar" }, choose, make("label", {}, t("distance, m"), " ", distance), make("label", {}, t("difference to"), " ", others)), plots, said];
+    } catch (error) { said.textContent = error.message; }
   }
 }
 
@@ -83,8 +61,9 @@ export class HalvesView extends Asked {
   async follow() { await super.follow(); this.plot(); }
 
   async parts() {
-    this.found = await get(`halves?${this.distance ? `distance_m=${encodeURIComponent(this.distance)}` : ""}`);
-    const { cameras, epochs, sigma0, notes } = this.found;
+    const { key } = this, found = await get(`halves?${this.distance ? `distance_m=${encodeURIComponent(this.distance)}` : ""}`), { cameras, epochs, sigma0, notes } = found;
+    if (this.key !== key) return [];
+    this.found = found;
     this.plots = make("div", { class: "figures" });
     this.plotted = "";
     const rows = cameras.map((c) => [link(anchor("camera", c.camera), c.camera), number(c.rms_px, 4), number(c.expected_px, 4), number(c.ratio, 2), make("span", { class: c.p_value < 0.01 ? "bad" : "" }, `${c.p_value < 0.01 ? "■ " : ""}${significant(c.p_value, 2)}`), `${c.largest} ${number(c.largest_in_sigmas, 1)} σ`]);

@@ -77,7 +77,7 @@ export class Tables {
       n: data.n, id: (i) => `image_point:${pointId(data, i)}`, state: (i) => (data.used[i] ? (data.w[i] > data.limit ? "suspect" : "") : "out"),
       columns: [{ key: "camera", title: t("camera"), ...coded("camera") }, { key: "epoch", title: t("kind epoch"), ...coded("epoch") }, { key: "target", title: t("target"), ...coded("target") },
         { key: "point", title: t("point"), names: all, code: (i) => of[data.block[i]][data.point[i]], wide: 5 },
-        { key: "residual", title: t("residual, px"), values: residual, digits: 3, size: true }, { key: "w", title: "w", values: data.w, digits: 2, size: true },
+        { key: "residual", title: t("residual, px"), values: residual, digits: 3, size: true, wide: 6.4 }, { key: "w", title: "w", values: data.w, digits: 2, size: true },
         ...(data.redundancy ? [{ key: "r", title: "r", values: data.redundancy, digits: 3 }] : []), { key: "used", title: t("used"), values: data.used, digits: 0, wide: 3.6, text: (i) => (data.used[i] ? "✓" : "✕") }],
       kind: "obs", sort: "w",
     };
