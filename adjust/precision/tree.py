@@ -95,7 +95,9 @@ class TreeCovariance:
         out = np.empty((self._dims[a], self._dims[b]))
         if fill_block(self.arrays, a, b, out):
             return out
-        return self._across[a, b] if (a, b) in self._across else self._across[b, a].T if (b, a) in self._across else None
+        if (b, a) in self._across:
+            return self._across[b, a].T
+        return self._across.get((a, b))
 
     def bring_together(self, pairs: Iterable[tuple[int, int]]) -> None:
         """Find what :meth:`joint` of these pairs of keys takes, of those in different cliques, many columns at once."""

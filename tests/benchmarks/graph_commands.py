@@ -1,9 +1,9 @@
 """Pose graphs from file to report beside the plain solve: ``python -m tests.benchmarks.graph_commands FILE.g2o ...``.
 
 The command: reading, start values, solution, covariances, tests, results and report, with and without the search for
-wrong pairs. The plain solves, all from the start that ours finds, with the graph built and nothing else: our own, GTSAM's
-Gauss-Newton and its Levenberg-Marquardt. Processor time of one thread, the least of all rounds, in turn. Times as long:
-each command over our plain solve, and over GTSAM's Gauss-Newton.
+wrong pairs. The plain solves, all from the start that ours finds, with the graph built and nothing else: our own,
+GTSAM's Gauss-Newton and its Levenberg-Marquardt. Processor time of one thread, the least of all rounds, in turn. Times
+as long: each command over our plain solve, and over GTSAM's Gauss-Newton.
 """
 
 import argparse

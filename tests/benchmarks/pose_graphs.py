@@ -74,7 +74,7 @@ def ours(case: PoseGraph) -> Competitor:
 
 
 def torus_g2o(n_pairs: int, seed: int = 0) -> str:
-    """A closed grid on a torus as a g2o file: half as many stations as pairs, each measured to two; 10 mrad and 5 cm."""
+    """A closed grid on a torus as a g2o file: half as many stations as pairs, sigmas of 10 mrad and 5 cm."""
     k = round(np.sqrt(n_pairs / 2.0))
     u, v = (2.0 * np.pi * x.ravel() / k for x in np.mgrid[:k, :k])
     out = np.stack([np.cos(u) * np.cos(v), np.sin(u) * np.cos(v), np.sin(v)], axis=1)
@@ -87,7 +87,8 @@ def torus_g2o(n_pairs: int, seed: int = 0) -> str:
     lines = []
     for axis in (0, 1):
         a, b = number.ravel(), np.roll(number, -1, axis).ravel()
-        turn = Rotation.from_matrix(np.swapaxes(R[a], 1, 2) @ R[b]) * Rotation.from_rotvec(rng.normal(0, 0.01, (len(a), 3)))
+        noise = Rotation.from_rotvec(rng.normal(0.0, 0.01, (len(a), 3)))
+        turn = Rotation.from_matrix(np.swapaxes(R[a], 1, 2) @ R[b]) * noise
         shift = np.einsum("nji,nj->ni", R[a], t[b] - t[a]) + rng.normal(0.0, 0.05, (len(a), 3))
         rows = np.hstack([shift, turn.as_quat()]).tolist()
         lines += [f"EDGE_SE3:QUAT {i} {j} {' '.join(map(repr, row))} {information}" for i, j, row in zip(

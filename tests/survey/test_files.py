@@ -5,7 +5,7 @@ import dataclasses
 import math
 import time
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -380,16 +380,17 @@ def test_plain_documents_are_read_as_by_tomllib() -> None:
         for at in rng.integers(0, len(text), rng.integers(0, 3)).tolist():
             text[at : at + int(rng.integers(0, 2))] = [signs[int(rng.integers(len(signs)))]]
         document = "".join(text)
-        try:
-            expected = repr(tomllib.loads(document))
-            n_valid += 1
-        except tomllib.TOMLDecodeError as error:
-            with pytest.raises(tomllib.TOMLDecodeError) as raised:
-                read_tables(document)
-            assert str(raised.value) == str(error)
-        else:
-            assert repr(read_tables(document)) == expected, document
+        expected, found = _read_or_refused(tomllib.loads, document), _read_or_refused(read_tables, document)
+        assert found == expected, document
+        n_valid += expected.startswith("{")
     assert n_valid > 1000
+
+
+def _read_or_refused(read: Callable[[str], dict], document: str) -> str:
+    try:
+        return repr(read(document))
+    except tomllib.TOMLDecodeError as error:
+        return str(error)
 
 
 @pytest.mark.parametrize(
