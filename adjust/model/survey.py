@@ -443,8 +443,8 @@ class Survey:
     @cached_property
     def is_pose_network(self) -> bool:
         """Whether it observes nothing but pairs between stations that stay where they are."""
-        others = any(v for k, v in self.others.items() if k != "pairs")
-        if not self.pairs or self.cameras or self.image_blocks or others:
+        others = (v for k, v in self.others.items() if k != "pairs")
+        if not self.pairs or self.cameras or self.image_blocks or any(others):
             return False
         return self.pairs_join_fixed_stations
 

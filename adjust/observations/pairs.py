@@ -368,8 +368,8 @@ class PairBatch:
         columns = self.arrays.logs, adjusted, v, sigma, stats.redundancy, standardized
         rows = zip((pairs[row] for row in self.rows.tolist()), np.where(self.arrays.is_pose, 6, 3).tolist(), *columns,
                    stats.test.tolist(), strict=True)  # fmt: skip
-        return [ObservationResidual("pair", p.group, _ids(p), *said[k], obs[:k], a[:k], r[:k], s[:k], n[:k], w[:k],
-                                    test, p.used) for p, k, obs, a, r, s, n, w, test in rows]  # fmt: skip
+        return [ObservationResidual("pair", p.group, _ids(p), *said[k], o[:k], a[:k], r[:k], s[:k], n[:k], w[:k], test,
+                                    p.used) for p, k, o, a, r, s, n, w, test in rows]  # fmt: skip
 
 
 def _quadratic(Q: FloatArray, v: FloatArray) -> tuple[FloatArray, IntArray]:

@@ -5,7 +5,7 @@ Q_vv P. For an image point both components are tested together: v' Q_vv^-1 v, ch
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -79,6 +79,9 @@ class Covariances(ABC):
 
         Raises KeyError for a name that is not an unknown.
         """
+
+    def bring_together(self, pairs: Iterable[tuple[ParameterName, ParameterName]]) -> None:  # noqa: B027  # may do nothing
+        """Prepare :meth:`joint` of these pairs of unknowns, where that is cheaper for all at once."""
 
     def whole(self, names: Sequence[ParameterName], sizes: Sequence[int]) -> FloatArray:
         """The same of all components, so many of each of these parameters; zero where one is held."""
@@ -190,6 +193,12 @@ class Precision(Covariances):
         if seen:
             L[place.index(seen), at.index(seen)] = 1.0
         return _in_datum(self.transformation, keys, L @ Q @ L.T + scatter)
+
+    def bring_together(self, pairs: Iterable[tuple[ParameterName, ParameterName]]) -> None:
+        """See :class:`Covariances`."""
+        by_name = self.graph.unknowns.by_name
+        keys = ((by_name[a].key, by_name[b].key) for a, b in pairs)
+        self.tree.bring_together((a, b) for a, b in keys if a not in self.hidden and b not in self.hidden)
 
     def rows(self, item: ObservationFactor) -> ObservationRows:
         """An observation that is neither image point nor reading, linearised at the solution: built once, and kept."""

@@ -5,7 +5,7 @@ subset of Takahashi, Fagan and Chen 1973; Golub and Plemmons 1980 for geodetic n
 lie together in one clique, so all redundancy numbers follow from it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 
 import gtsam
@@ -38,6 +38,8 @@ class TreeCovariance:
         self.arrays = TreeArrays(self._home, self._key_ptr, self._keys, self._dims, self._front, self._width, self._at,
                                  np.empty_like(self._data))  # fmt: skip
         """What the compiled look-up of two keys' covariance needs."""
+        self._across: dict[tuple[int, int], FloatArray] = {}
+        """Blocks of keys in different cliques that were asked for together, by number."""
         covariance_rows(self.arrays, self._n_front, self._data)
 
     def _take(self, tree: PoseTree) -> None:
@@ -91,7 +93,33 @@ class TreeCovariance:
 
     def _block(self, a: int, b: int) -> FloatArray | None:
         out = np.empty((self._dims[a], self._dims[b]))
-        return out if fill_block(self.arrays, a, b, out) else None
+        if fill_block(self.arrays, a, b, out):
+            return out
+        if (b, a) in self._across:
+            return self._across[b, a].T
+        return self._across.get((a, b))
+
+    def bring_together(self, pairs: Iterable[tuple[int, int]]) -> None:
+        """Find what :meth:`joint` of these pairs of keys takes, of those in different cliques, many columns at once."""
+        apart: dict[int, list[int]] = {}
+        for a, b in ((self.number[i], self.number[j]) for i, j in pairs):
+            if self._block(a, b) is None:
+                apart.setdefault(a, []).append(b)
+        left = sorted(apart, key=lambda a: int(self._home[a]))  # neighbours in the tree side by side
+        while left:
+            n = max(1, int(np.searchsorted(np.cumsum(self._dims[left]), _COLUMNS, side="right")))
+            some, left = left[:n], left[n:]
+            columns = np.concatenate([np.arange(self._first[a], self._first[a + 1]) for a in some])
+            x = np.zeros((int(self._first[-1]), len(columns)))
+            x[columns, np.arange(len(columns))] = 1.0
+            others = [b for a in some for b in apart[a]]
+            up, down = (self._ancestors(set(self._home[of].tolist())) for of in (some, some + others))
+            self._solve(up, down, x)
+            first = 0
+            for a in some:
+                own = slice(first, first := first + int(self._dims[a]))
+                for b in apart[a]:
+                    self._across[a, b] = x[self._first[b] : self._first[b + 1], own].T.copy()
 
     def marginal(self, key: int) -> FloatArray:
         """Covariance (dim, dim) of one unknown."""
@@ -123,7 +151,7 @@ class TreeCovariance:
         deepest = numbers[int(np.argmax(self._home[numbers]))]
         c = int(self._home[deepest])
         inside = set(self._keys[self._key_ptr[c] : self._key_ptr[c + 1]].tolist())
-        if not inside.issuperset(numbers):
+        if not inside.issuperset(numbers) and not self._across:
             return self._apart(numbers)
         at = np.concatenate([[0], np.cumsum(self._dims[numbers])])
         out = np.empty((at[-1], at[-1]))

@@ -51,7 +51,10 @@ def relative_precision(
     Raises SurveyError for a name that is no position.
     """
     places = _Places(adjustment)
-    return tuple(_relative(adjustment, places.place(a), places.place(b), level, scaled) for a, b in pairs)
+    found = [(places.place(a), places.place(b)) for a, b in pairs]
+    unknowns = (tuple(dict.fromkeys([*a.by, *b.by])) for a, b in found)
+    adjustment.precision.bring_together((names[0], names[1]) for names in unknowns if len(names) == 2)
+    return tuple(_relative(adjustment, a, b, level, scaled) for a, b in found)
 
 
 @dataclass(frozen=True, eq=False)

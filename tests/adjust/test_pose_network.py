@@ -181,6 +181,20 @@ def test_inner_datum_is_the_pseudo_inverse_and_relative_precision_does_not_depen
         assert one == pytest.approx(other, rel=1e-6, abs=1e-9)
 
 
+def test_covariances_that_are_brought_together_are_those_of_the_whole_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
+    tree = solve_network(simulate(15, 4, extra=3).network).precision.tree
+    keys, rng = list(tree.places()), np.random.default_rng(0)
+    pairs = [(keys[i], keys[j]) for i, j in rng.integers(0, len(keys), (60, 2)).tolist() if i != j]
+    each = [tree.joint(pair) for pair in pairs]
+    tree.bring_together(pairs)
+    monkeypatch.setattr(tree, "_apart", None)  # no way of its own is left to take
+    whole = tree.full()
+    for pair, alone in zip(pairs, each, strict=True):
+        rows = np.concatenate([np.arange(len(whole))[tree.places()[key]] for key in pair])
+        for found in (alone, tree.joint(pair), tree.joint(pair[::-1])[np.ix_(*[np.roll(np.arange(12), 6)] * 2)]):
+            np.testing.assert_allclose(found, whole[np.ix_(rows, rows)], rtol=1e-9, atol=1e-12 * np.abs(whole).max())
+
+
 def test_covariance_equals_the_scatter_of_repeated_networks() -> None:
     total, n = 0.0, 0
     for seed in range(40):

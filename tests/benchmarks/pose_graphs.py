@@ -8,6 +8,7 @@ from time import perf_counter
 import gtsam
 import numpy as np
 from gtsam import BetweenFactorPose3, Pose3, PriorFactorPose3, Rot3
+from scipy.spatial.transform import Rotation
 
 from adjust.model.survey import FloatArray, IntArray
 from adjust.pose_network import PoseNetwork, pose_network
@@ -70,6 +71,35 @@ def ours(case: PoseGraph) -> Competitor:
                        f"{solution.iterations} steps", numbers)  # fmt: skip
 
     return run
+
+
+def torus_g2o(n_pairs: int, seed: int = 0) -> str:
+    """A closed grid on a torus as a g2o file: half as many stations as pairs, sigmas of 10 mrad and 5 cm."""
+    k = round(np.sqrt(n_pairs / 2.0))
+    u, v = (2.0 * np.pi * x.ravel() / k for x in np.mgrid[:k, :k])
+    out = np.stack([np.cos(u) * np.cos(v), np.sin(u) * np.cos(v), np.sin(v)], axis=1)
+    along = np.stack([-np.sin(u), np.cos(u), np.zeros_like(u)], axis=1)
+    R = np.stack([along, np.cross(out, along), out], axis=2)
+    ring = np.stack([np.cos(u), np.sin(u), np.zeros_like(u)], axis=1)
+    t, number = k * (0.5 * ring + 0.2 * out), np.arange(k * k).reshape(k, k)
+    rng, tangent = np.random.default_rng(seed), np.repeat((0.01, 0.05), 3)
+    information = " ".join(f"{1.0 / tangent[i - 3] ** 2 if i == j else 0:g}" for i in range(6) for j in range(i, 6))
+    lines = []
+    for axis in (0, 1):
+        a, b = number.ravel(), np.roll(number, -1, axis).ravel()
+        noise = Rotation.from_rotvec(rng.normal(0.0, 0.01, (len(a), 3)))
+        turn = Rotation.from_matrix(np.swapaxes(R[a], 1, 2) @ R[b]) * noise
+        shift = np.einsum("nji,nj->ni", R[a], t[b] - t[a]) + rng.normal(0.0, 0.05, (len(a), 3))
+        rows = np.hstack([shift, turn.as_quat()]).tolist()
+        lines += [f"EDGE_SE3:QUAT {i} {j} {' '.join(map(repr, row))} {information}" for i, j, row in zip(
+            a.tolist(), b.tolist(), rows, strict=True)]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def plain_solve(case: PoseGraph) -> Callable[[], object]:
+    """The same least squares alone, its graph built from what a network is."""
+    start = case.start[:, :3, :3], case.start[:, :3, 3]
+    return lambda: solve_network(_network(case), start)
 
 
 def gtsam_solve(case: PoseGraph, gauss_newton: bool, marginals: bool) -> Competitor:

@@ -5,7 +5,7 @@ import dataclasses
 import math
 import time
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from adjust.model.survey import (
 from adjust.model.survey import Point as WorldPoint
 from survey import project as files
 from survey.folder.units import from_si, to_si
-from survey.project.declared.toml_text import key_lines
+from survey.project.declared.toml_text import key_lines, read_tables
 from survey.project.tables import files as table_reading
 from survey.project.tables import reading as tables
 from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList
@@ -356,6 +356,51 @@ def test_atomic_write(tmp_path: Path) -> None:
     with pytest.raises(OSError):  # noqa: PT011  the kind of OSError differs between systems
         files.atomic_write(path.with_name("folder"), b"")
     assert sorted(p.name for p in path.parent.iterdir()) == ["file.txt", "folder"]
+
+
+_PLAIN = """\
+format = 1
+title = "a b = c: [d]"
+
+[stations.0]
+motion = "fixed"
+world_from_station = { treatment = "held", translation_mm = [0.0, -1e-5, 3], rotation_quaternion_wxyz = [1.0, 0, 0, 0] }
+
+[stations.head]
+flag = true
+"""
+
+
+def test_plain_documents_are_read_as_by_tomllib() -> None:
+    """Line by line or not, right or wrong: the same values and the same complaints."""
+    rng, signs = np.random.default_rng(0), list("[]{}=\"',.:# \n\\+-01eE_aln\t")
+    n_valid = 0
+    for _ in range(6000):
+        text = list(_PLAIN)
+        for at in rng.integers(0, len(text), rng.integers(0, 3)).tolist():
+            text[at : at + int(rng.integers(0, 2))] = [signs[int(rng.integers(len(signs)))]]
+        document = "".join(text)
+        expected, found = _read_or_refused(tomllib.loads, document), _read_or_refused(read_tables, document)
+        assert found == expected, document
+        n_valid += expected.startswith("{")
+    assert n_valid > 1000
+
+
+def _read_or_refused(read: Callable[[str], dict], document: str) -> str:
+    try:
+        return repr(read(document))
+    except tomllib.TOMLDecodeError as error:
+        return str(error)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["[a]\nb = 1\n[a]\n", "[a]\nb = 1\nb = 2\n", "a = 1\n[a]\n", "[a.b]\n[a]\nb = 1\n", "a = { b = 1, b = 2 }\n",
+     "a = { b = 1 }\n[a.c]\n", "a = NaN\n", "a = null\n", 'a = { "b": 1 }\n', "a = [1,\n", "a = 01\n"],
+)  # fmt: skip
+def test_what_is_no_toml_is_refused(text: str) -> None:
+    with pytest.raises(tomllib.TOMLDecodeError):
+        read_tables(text)
 
 
 def test_lines_of_toml_keys() -> None:

@@ -299,6 +299,16 @@ def test_scene_turns_station_covariances_into_the_world(adjustment: Adjustment) 
     assert pictures(Scene(), 2.8) == ((), 1.0)
 
 
+def test_many_stations_are_drawn_in_an_even_selection(adjustment: Adjustment) -> None:
+    relay = adjustment.estimates["world_from_station", "relay"]
+    many = {("world_from_station", f"s{i}"): replace(relay, name=("world_from_station", f"s{i}")) for i in range(1200)}
+    scene = scene_of(replace(adjustment, estimates={**adjustment.estimates, **many}), scale_of(adjustment, "a_priori"))
+    drawn = [int(s.label[1:]) for s in scene.spots if s.kind == "station" and s.label[1:].isdigit()]
+    assert set(np.diff(drawn)) == {3}
+    assert scene.n_left_out + sum(s.kind == "station" for s in scene.spots) >= 1200
+    assert len(drawn) <= 500
+
+
 def camera(uv: np.ndarray, residuals: np.ndarray, standardized: np.ndarray | None = None) -> CameraResiduals:
     n = len(uv)
     w = np.zeros((n, 2)) if standardized is None else standardized

@@ -61,8 +61,8 @@ def read_stations(root: Node, table_ids: tuple[str, ...], timed: bool) -> tuple[
             if not node.has("table"):
                 raise node.error('motion = "table" needs the id of the table; add table = "..."', "table")
             table_id = node.reference("table", table_ids, "table")
-        for key in ("table", "mount_from_station"):
-            if motion != "table" and node.has(key):
+        for key in ("table", "mount_from_station") if motion != "table" else ():
+            if key in node.values:
                 raise node.error(f'only a station with motion = "table" has {key!r}; remove it', key)
         stations.append(
             Station(

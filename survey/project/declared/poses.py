@@ -68,11 +68,12 @@ def read_pose(node: Node) -> PoseParameter:
         if held:
             raise node.error("components are held but the pose has no value; give rotation and translation", "held")
         return PoseParameter()
-    vague = np.isinf(np.diagonal(cov)) if cov is not None else np.full(6, treatment == "held")
-    if rotation is None and not vague[:3].all():
-        raise node.error("the rotation is missing; add rotation_quaternion_wxyz or rotation_euler_xyz_deg")
-    if translation is None and not vague[3:].all():
-        raise node.error("translation_mm is missing; add it")
+    if rotation is None or translation is None:
+        vague = np.isinf(np.diagonal(cov)) if cov is not None else np.full(6, treatment == "held")
+        if rotation is None and not vague[:3].all():
+            raise node.error("the rotation is missing; add rotation_quaternion_wxyz or rotation_euler_xyz_deg")
+        if translation is None and not vague[3:].all():
+            raise node.error("translation_mm is missing; add it")
     value = Pose3(rotation or Rot3(), np.zeros(3) if translation is None else translation)
     return PoseParameter(value, treatment, cov, held)
 
@@ -115,7 +116,9 @@ def _coordinates(node: Node, dimensions: int, held: tuple[str, ...]) -> FloatArr
 
 
 def _held(node: Node, treatment: Treatment, components: tuple[str, ...]) -> tuple[str, ...]:
-    held = node.references("held", components, "component", ())
+    if "held" not in node.values:
+        return ()
+    held = node.references("held", components, "component")
     if held and treatment == "held":
         raise node.error('treatment = "held" holds everything; remove one of the two', "held")
     if len(held) == len(components):
@@ -124,7 +127,9 @@ def _held(node: Node, treatment: Treatment, components: tuple[str, ...]) -> tupl
 
 
 def _treatment(node: Node) -> Treatment:
-    name = node.choice("treatment", TREATMENTS, "free")
+    if "treatment" not in node.values:
+        return "free"
+    name = node.choice("treatment", TREATMENTS)
     return next(treatment for treatment in TREATMENTS if treatment == name)
 
 
@@ -139,12 +144,13 @@ def _translation(node: Node) -> FloatArray | None:
 
 
 def _rotation(node: Node) -> Rot3 | None:
-    if all(node.has(key) for key in _ROTATIONS):
+    given = [key for key in _ROTATIONS if key in node.values]
+    if len(given) > 1:
         raise node.error("the rotation is given twice; keep the quaternion or the Euler angles", _ROTATIONS[1])
-    if node.has("rotation_euler_xyz_deg"):
-        return rotation_from_euler(to_si(node.numbers("rotation_euler_xyz_deg", (3,)), "deg"))
-    if not node.has("rotation_quaternion_wxyz"):
+    if not given:
         return None
+    if given == ["rotation_euler_xyz_deg"]:
+        return rotation_from_euler(to_si(node.numbers("rotation_euler_xyz_deg", (3,)), "deg"))
     wxyz = node.numbers("rotation_quaternion_wxyz", (4,))
     rotation = rotation_from_quaternion(wxyz)
     if rotation is None:

@@ -187,7 +187,7 @@ def _camera(camera_id: str, entry: dict[str, Any], residuals: charts.CameraResid
     shown += _clock(entry)
     makers = (charts.vector_field, charts.mean_field, charts.histogram)
     drawn = [make(residuals) for make in makers] if len(residuals.uv) else []
-    rows = [row[:1] + row[2:] for row in map(_pose_row, _poses(camera_id, entry))]
+    rows = [row[:1] + row[2:] for row in map(_pose_row, _poses(camera_id, {camera_id: entry}))]
     poses = table(_POSE_COLUMNS[:1] + _POSE_COLUMNS[2:], rows) if rows else ""
     return part("camera", camera_id, facts, shown, drawn, poses, of="report.html")
 
