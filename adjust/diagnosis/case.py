@@ -28,26 +28,38 @@ if TYPE_CHECKING:
 
 CAP = 50.0
 """The most that one component of an observation counts: what is left out, or cannot be predicted, counts so."""
-MOST = 10.0
-"""Adjustments that a diagnosis may take."""
+MOST = 7.5
+"""Adjustments that scores, starts and trials of a diagnosis may take; other evidence takes one or two more."""
 _LEFT_OUT = 4
 _FAR = 25.0
 """Variance factor from which a solution may be another one than that of the observations without their mistake."""
-_WARM, _START, _LOST_ROUNDS = 0.4, 0.4, 3
-"""What adjusting from near values costs, and what finding start values does, against a whole adjustment."""
-_SOLVE = SolveOptions(max_step=1e-3, max_iterations=40, settled=1e-6)
-"""A survey that is right converges soon, and is only compared with others."""
+_SCORES, _START, _REST, _STEP, _LOST_ROUNDS = 1.5, 0.5, 0.4, 0.07, 3
+"""What all scores, start values, a graph built and judged, and a step of its solution cost, in adjustments."""
+_NEAR = AdjustOptions(reject_blocks=False, solve=SolveOptions(max_step=1e-3, max_iterations=20, settled=1e-4))
+_OWN = replace(_NEAR, solve=replace(_NEAR.solve, max_iterations=8))
+"""From near values and from own start values: a survey that is right converges soon, and is only compared."""
+_HOPELESS = 8
+"""Steps after which a trial from near values leaves less than the survey as it stands does, or leads nowhere."""
 
 
 @dataclass
 class Budget:
-    """What a diagnosis may still adjust, in adjustments of its survey; a part of it counts as its share of images."""
+    """What a diagnosis may still adjust, in adjustments of its survey; a part of it counts as its share of images.
+
+    kept: of that for later.
+    """
 
     left: float = MOST
+    kept: float = 0.0
+
+    @property
+    def lasts(self) -> bool:
+        """Whether something is left for now."""
+        return self.left > self.kept
 
     def spend(self, share: float) -> None:
-        """SurveyError where nothing is left."""
-        if self.left <= 0.0:
+        """SurveyError where nothing is."""
+        if not self.lasts:
             raise SurveyError("the time of the diagnosis is spent")
         self.left -= share
 
@@ -72,8 +84,28 @@ class Case:
     def run(self, survey: Survey) -> Adjustment:
         """A survey like this one, or a part of it, adjusted from its own start. SurveyError where that fails."""
         blocks = len(survey.image_blocks), len(self.survey.image_blocks)
-        self.budget.spend(blocks[0] / blocks[1] if blocks[0] and blocks[1] else 1.0)
-        return adjust(survey, None, AdjustOptions(solve=_SOLVE))
+        share = blocks[0] / blocks[1] if blocks[0] and blocks[1] else 1.0
+        if blocks[0] or survey.pairs:
+            return self._adjusted(survey, None, _OWN, (_START + _REST) * share, _STEP * share)
+        return self._adjusted(survey, start_values(find_start(survey)), _OWN, _START + _REST)
+
+    def _near(self, survey: Survey, result: Adjustment, most: float = np.inf) -> Adjustment:
+        """From the values of another adjustment. most: v'Pv that it has to come below."""
+        rest = _REST if survey.image_blocks else _START + _REST
+        return self._adjusted(survey, completed(survey, values_of(result, survey)), _NEAR, rest, most=most)
+
+    def _adjusted(
+        self, survey: Survey, start: StartValues | None, options: AdjustOptions, first: float, step: float = _STEP,
+        most: float = np.inf,
+    ) -> Adjustment:  # fmt: skip
+        """Paid for as it goes: before it begins, and at every step. It ends where nothing is left."""
+        def went(iteration: int, omega: float) -> None:
+            self.budget.spend(step)
+            if iteration >= _HOPELESS and omega > most:
+                raise SurveyError("it leads away")
+
+        self.budget.spend(first)
+        return adjust(survey, start, options, went)
 
     def warm(self, survey: Survey) -> Adjustment:
         """A survey that is much like this one, with all images, adjusted from the values of this one.
@@ -84,9 +116,7 @@ class Case:
             return self._last[0][1]
         if self.linear is None:
             raise SurveyError("there are no values to begin with")
-        start = completed(survey, values_of(self.linear.result, survey))
-        self.budget.spend(_WARM)
-        result = adjust(survey, start, AdjustOptions(reject_blocks=False, solve=_SOLVE))
+        result = self._near(survey, self.linear.result, self.linear.result.omega)
         self._last[:] = [(survey, result)]
         return result
 
@@ -104,7 +134,7 @@ class Case:
         """Start values of a survey: closed forms and robust means of what agrees; None where these find none."""
         for _ in range(_LOST_ROUNDS):
             try:
-                self.budget.spend(_START)
+                self.budget.spend(_START if survey.image_blocks else 0.1)
                 return started_values(start_values(find_start(survey)))
             except IndeterminateError as error:
                 lost = {n.removeprefix("point ") for n in error.parameters}
@@ -156,11 +186,10 @@ class Case:
 
         if self.result is None or not self.result.redundancy > 0:
             return None
-        if self.is_whole:
-            return Linear(self.result)
         try:
-            self.budget.spend(1.0)
-            return Linear(adjust(self.survey, None, AdjustOptions(reject_blocks=False, solve=_SOLVE)))
+            result = self.result if self.is_whole else self._near(self.survey, self.result)
+            self.budget.spend(_SCORES)
+            return Linear(result)
         except SurveyError:
             return None
 

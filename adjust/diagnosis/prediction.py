@@ -20,8 +20,8 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import Camera, Clock, FloatArray, Survey, Target
-from adjust.observations.clocks import between, nearest
 from adjust.native.lenses import FISHEYE
+from adjust.observations.clocks import between, nearest
 from adjust.spatial.rigid import inverse, rigid, transform
 
 Altered = Mapping[ParameterName, Pose3 | FloatArray]
@@ -82,7 +82,7 @@ class Prediction:
         return None if found is None else np.asarray(found[2] @ found[1][:3, :3] @ change[block.point_idx])
 
     def _by_place(self, block: ImageBlock) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """Its points (n, 3) m on their target, ``camera_from_target`` and (n, 2, 3) px/m by their places in the camera."""
+        """Its points (n, 3) m on their target, ``camera_from_target``, (n, 2, 3) px/m by places in the camera."""
         if block.place not in self._places:
             pose, x, lens = self.pose(block, {}), self._points(block, {}), self._lens(block, {})
             camera, found = self._cameras[block.camera_id], None

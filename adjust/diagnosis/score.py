@@ -157,7 +157,7 @@ class Linear:
     def _by_part(self, parts: Sequence[Part]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """B'e (p, k), B'B (p, k, k), and of the u unknowns that have a part in it A'B and Q A'B (p, u, k)."""
         rows, B = (np.concatenate(x) for x in zip(*parts, strict=True))
-        (n, k), lengths = B.shape, [len(r) for r, _ in parts]
+        k, lengths = B.shape[1], [len(r) for r, _ in parts]
         first, of_part = np.cumsum([0, *lengths]), np.repeat(np.arange(len(parts)), lengths)
         at = np.repeat(rows, k), (k * of_part[:, None] + np.arange(k)).ravel()
         apart = sparse.csr_matrix((B.ravel(), at), (len(self.e), k * len(parts)))

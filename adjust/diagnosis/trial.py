@@ -1,5 +1,6 @@
 """One hypothesis, tried: its survey adjusted, and what is left unexplained."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -56,30 +57,42 @@ class Trial:
     hypothesis: Hypothesis
     misfit: Misfit
     result: Adjustment | None
+    survey: Survey | None = None
+
+    def explains(self, share: float, base: Misfit) -> bool:
+        """Whether it takes away this share of the misfit beyond noise, with all observations."""
+        left = self.misfit.cost - self.misfit.redundancy
+        return self.result is not None and self.misfit.unused == 0 and left <= (1.0 - share) * base.excess
 
 
-def tried(hypothesis: Hypothesis, case: Case, base: Misfit) -> Trial:
-    """The survey of a hypothesis adjusted from the values of its case, and where that leads nowhere from its own start.
-
-    So it is, too, where these values may be spoilt by what the case does not explain. base: what that is.
-    """
+def tried(hypothesis: Hypothesis, case: Case) -> Trial:
+    """The survey of a hypothesis adjusted from the values of its case, where there are none from its own start."""
     survey = hypothesis.changed()
     if survey is None:
         return Trial(hypothesis, misfit_of(None, case.survey), None)
+    return _adjusted(hypothesis, survey, case, case.run if case.linear is None else case.warm)
+
+
+def tried_afresh(trial: Trial, case: Case, base: Misfit) -> Trial | None:
+    """The same from its own start, where the values of the case led away or may be spoilt by what it does not explain.
+
+    None where that is no better, and of what is scored at these values. base: what the case leaves unexplained.
+    """
+    near = case.is_near and trial.misfit.omega < base.omega
+    if trial.survey is None or case.linear is None or near or trial.hypothesis.scored:
+        return None
+    again = _adjusted(trial.hypothesis, trial.survey, case, case.run)
+    return again if again.misfit.omega < trial.misfit.omega else None
+
+
+def _adjusted(hypothesis: Hypothesis, survey: Survey, case: Case, run: Callable[[Survey], Adjustment]) -> Trial:
+    try:
+        result = run(survey)
+    except (SurveyError, RuntimeError):  # the latter from GTSAM, where a hypothesis fits nothing at all
+        result = None
+    misfit = misfit_of(result, survey)
     dropped = max(0, misfit_of(None, case.survey).count - misfit_of(None, survey).count)
-    best = Trial(hypothesis, replace(misfit_of(None, survey), dropped=dropped), None)
-    for run in (case.warm, case.run):
-        try:
-            result = run(survey)
-        except (SurveyError, RuntimeError):  # the latter from GTSAM, where a hypothesis fits nothing at all
-            continue
-        misfit = replace(misfit_of(result, survey), dropped=dropped)
-        if best.result is None or misfit.omega < best.misfit.omega:
-            best = Trial(hypothesis, misfit, result)
-        led = case.is_near or misfit.is_noise()
-        if led and best.misfit.unused == 0 and misfit.omega < base.omega:
-            break
-    return best
+    return Trial(hypothesis, replace(misfit, dropped=dropped), result, survey)
 
 
 def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:

@@ -30,6 +30,8 @@ _CLEARLY = 3.0
 _MOST, _SINGLE = 6, 8
 _FAR = 1000.0
 """Square over sigma of a single reading from which it is no matter how much larger it is."""
+_SHARE = 0.2
+"""Of the readings that miss: among so many one alone explains the less."""
 _FEW, _ROUGH = 0.1, 4.0
 _LARGE_START = 2500
 """Readings up to which start values are found anew for every hypothesis that concerns all of a kind."""
@@ -60,12 +62,13 @@ def _slips(survey: Survey, before: Screen | None, values: FloatArray) -> list[_F
     ways = [(i, slip) for i in worst.tolist() for slip in slips(survey.readings[i].kind, values[i])]
     after = before.alternatives([np.array([i]) for i, _ in ways], observed=np.array([w.factor * values[i]
                                                                                       for i, w in ways]))  # fmt: skip
-    out = []
+    out, others = [], max(1.0, _SHARE * float(before.missed.sum()))
     for (i, slip), now in zip(ways, after, strict=True):
         evidence = min(float(before.readings[i]) / before.scale, _FAR) / (float(now[0]) / before.scale + 5.0)
         if evidence > _CLEARLY:  # of it alone: among all others one bounded misfit is soon lost
             name = survey.readings[i].reading_id
-            out.append((evidence, Scope(np.array([i]), f"reading {name}", Place("reading", (name,), "value")), slip))
+            scope = Scope(np.array([i]), f"reading {name}", Place("reading", (name,), "value"))
+            out.append((evidence / others, scope, slip))
     return out
 
 
