@@ -28,13 +28,15 @@ if TYPE_CHECKING:
 
 CAP = 50.0
 """The most that one component of an observation counts: what is left out, or cannot be predicted, counts so."""
-MOST = 7.5
+MOST = 7.0
 """Adjustments that scores, starts and trials of a diagnosis may take; other evidence takes one or two more."""
 _LEFT_OUT = 4
 _FAR = 25.0
 """Variance factor from which a solution may be another one than that of the observations without their mistake."""
 _SCORES, _START, _REST, _STEP, _LOST_ROUNDS = 1.5, 0.5, 0.4, 0.07, 3
 """What all scores, start values, a graph built and judged, and a step of its solution cost, in adjustments."""
+_CLOCKS = 2.5
+"""How many times more that costs with clocks: what moves is predicted between epochs."""
 _NEAR = AdjustOptions(reject_blocks=False, solve=SolveOptions(max_step=1e-3, max_iterations=20, settled=1e-4))
 _OWN = replace(_NEAR, solve=replace(_NEAR.solve, max_iterations=8))
 """From near values and from own start values: a survey that is right converges soon, and is only compared."""
@@ -46,11 +48,12 @@ _HOPELESS = 8
 class Budget:
     """What a diagnosis may still adjust, in adjustments of its survey; a part of it counts as its share of images.
 
-    kept: of that for later.
+    kept: of that for later. refused: whether something was.
     """
 
     left: float = MOST
     kept: float = 0.0
+    refused: bool = False
 
     @property
     def lasts(self) -> bool:
@@ -60,6 +63,7 @@ class Budget:
     def spend(self, share: float) -> None:
         """SurveyError where nothing is."""
         if not self.lasts:
+            self.refused = True
             raise SurveyError("the time of the diagnosis is spent")
         self.left -= share
 
@@ -89,21 +93,26 @@ class Case:
             return self._adjusted(survey, None, _OWN, (_START + _REST) * share, _STEP * share)
         return self._adjusted(survey, start_values(find_start(survey)), _OWN, _START + _REST)
 
-    def _near(self, survey: Survey, result: Adjustment, most: float = np.inf) -> Adjustment:
+    def _near(
+        self, survey: Survey, result: Adjustment, most: float = np.inf, options: AdjustOptions = _NEAR
+    ) -> Adjustment:
         """From the values of another adjustment. most: v'Pv that it has to come below."""
         rest = _REST if survey.image_blocks else _START + _REST
-        return self._adjusted(survey, completed(survey, values_of(result, survey)), _NEAR, rest, most=most)
+        return self._adjusted(survey, completed(survey, values_of(result, survey)), options, rest, most=most)
 
     def _adjusted(
         self, survey: Survey, start: StartValues | None, options: AdjustOptions, first: float, step: float = _STEP,
         most: float = np.inf,
     ) -> Adjustment:  # fmt: skip
-        """Paid for as it goes: before it begins, and at every step. It ends where nothing is left."""
+        """Paid for as it goes: it begins where something is left, and every step costs."""
         def went(iteration: int, omega: float) -> None:
-            self.budget.spend(step)
+            self.budget.left -= step
             if iteration >= _HOPELESS and omega > most:
                 raise SurveyError("it leads away")
 
+        clocks = [o.clock for of in (survey.cameras, survey.tables, survey.stations) for o in of]
+        if any(clock is not None for clock in clocks):
+            first, step = _CLOCKS * first, _CLOCKS * step
         self.budget.spend(first)
         return adjust(survey, start, options, went)
 
@@ -187,7 +196,7 @@ class Case:
         if self.result is None or not self.result.redundancy > 0:
             return None
         try:
-            result = self.result if self.is_whole else self._near(self.survey, self.result)
+            result = self.result if self.is_whole else self._near(self.survey, self.result, options=_OWN)
             self.budget.spend(_SCORES)
             return Linear(result)
         except SurveyError:
@@ -287,6 +296,16 @@ def single_views(survey: Survey, lenses: Mapping[str, FloatArray]) -> Views:
     seen = {i: points[str(blocks[i].target_id)][blocks[i].point_idx[blocks[i].mask]] for i in rays}
     sights = joined([(i, x, rays[i], focal[blocks[i].camera_id]) for i, x in seen.items() if len(x) >= 3])
     return make_views(sights)[0]
+
+
+def squares_alone(survey: Survey, lenses: Mapping[str, FloatArray]) -> FloatArray:
+    """(b,) sums of squares over sigmas of each block at its own best pose; zero where it has none."""
+    out = np.zeros(len(survey.image_blocks))
+    for view in single_views(survey, lenses):
+        block = survey.image_blocks[view.block_idx]
+        variance = float(np.mean(np.trace(block.cov, axis1=1, axis2=2))) / 2.0
+        out[view.block_idx] = len(view.x) * float(view.error_px[0]) ** 2 / variance
+    return out
 
 
 def completed(survey: Survey, start: StartValues) -> StartValues:

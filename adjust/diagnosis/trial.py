@@ -14,6 +14,8 @@ from adjust.model.survey import FloatArray, Survey
 
 _NOISE = 5.0
 """Sigmas of v'Pv up to which what is left is noise."""
+_LAST = 0.7
+"""Adjustments that finding the size of a change leaves for the one that shows what it explains."""
 _FACTORS = 2.0 ** np.arange(24.0)
 
 
@@ -50,14 +52,24 @@ class Misfit:
         return max(0.0, self.omega - self.redundancy)
 
 
+    def times_less_than(self, other: "Misfit") -> float:
+        """How many times less than another one it exceeds noise; noise itself is some of it."""
+        noise = float(np.sqrt(2.0 * max(self.redundancy, 1)))
+        return (other.excess + noise) / (self.excess + noise)
+
+
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """A hypothesis, with the misfit of its survey and the adjustment that showed it (None: it led to no solution)."""
+    """A hypothesis, with the misfit of its survey and the adjustment that showed it (None: it led to no solution).
+
+    untimely: there was no time to find out.
+    """
 
     hypothesis: Hypothesis
     misfit: Misfit
     result: Adjustment | None
     survey: Survey | None = None
+    untimely: bool = False
 
     def explains(self, share: float, base: Misfit) -> bool:
         """Whether it takes away this share of the misfit beyond noise, with all observations."""
@@ -67,9 +79,13 @@ class Trial:
 
 def tried(hypothesis: Hypothesis, case: Case) -> Trial:
     """The survey of a hypothesis adjusted from the values of its case, where there are none from its own start."""
+    case.budget.refused = False
+    case.budget.kept += _LAST
     survey = hypothesis.changed()
+    case.budget.kept -= _LAST
     if survey is None:
-        return Trial(hypothesis, misfit_of(None, case.survey), None)
+        return Trial(hypothesis, misfit_of(None, case.survey), None, None, case.budget.refused)
+    case.budget.refused = False
     return _adjusted(hypothesis, survey, case, case.run if case.linear is None else case.warm)
 
 
@@ -90,9 +106,9 @@ def _adjusted(hypothesis: Hypothesis, survey: Survey, case: Case, run: Callable[
         result = run(survey)
     except (SurveyError, RuntimeError):  # the latter from GTSAM, where a hypothesis fits nothing at all
         result = None
-    misfit = misfit_of(result, survey)
     dropped = max(0, misfit_of(None, case.survey).count - misfit_of(None, survey).count)
-    return Trial(hypothesis, replace(misfit, dropped=dropped), result, survey)
+    misfit = replace(misfit_of(result, survey), dropped=dropped)
+    return Trial(hypothesis, misfit, result, survey, result is None and case.budget.refused)
 
 
 def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:

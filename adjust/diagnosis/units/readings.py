@@ -30,8 +30,6 @@ _CLEARLY = 3.0
 _MOST, _SINGLE = 6, 8
 _FAR = 1000.0
 """Square over sigma of a single reading from which it is no matter how much larger it is."""
-_SHARE = 0.2
-"""Of the readings that miss: among so many one alone explains the less."""
 _FEW, _ROUGH = 0.1, 4.0
 _LARGE_START = 2500
 """Readings up to which start values are found anew for every hypothesis that concerns all of a kind."""
@@ -62,7 +60,7 @@ def _slips(survey: Survey, before: Screen | None, values: FloatArray) -> list[_F
     ways = [(i, slip) for i in worst.tolist() for slip in slips(survey.readings[i].kind, values[i])]
     after = before.alternatives([np.array([i]) for i, _ in ways], observed=np.array([w.factor * values[i]
                                                                                       for i, w in ways]))  # fmt: skip
-    out, others = [], max(1.0, _SHARE * float(before.missed.sum()))
+    out, others = [], max(1.0, float(before.missed.sum()))  # among so many that miss one alone explains the less
     for (i, slip), now in zip(ways, after, strict=True):
         evidence = min(float(before.readings[i]) / before.scale, _FAR) / (float(now[0]) / before.scale + 5.0)
         if evidence > _CLEARLY:  # of it alone: among all others one bounded misfit is soon lost
