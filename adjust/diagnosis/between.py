@@ -118,10 +118,16 @@ def _scaled(both: Common, found: Congruence) -> Iterator[_Trial]:
     after = moved(both.after, np.array([0.0, 0, 0, 0, 0, 0, np.log(ratio)]))
     unit = next((said for said, r in LENGTH_RATIOS.items() if abs(ratio / r - 1.0) < _EXACT), None)
     epoch = found.epochs[1]
-    cause = f"all lengths of {epoch} {unit}" if unit else \
-        f"all lengths of {epoch} are {1e6 * (1.0 / ratio - 1.0):+.1f} ppm longer than those of {found.epochs[0]}"
-    change = f"correct the unit in {epoch}" if unit else (
-        "compare what gives the scale in both: board or scale bar, its temperature, the distance meter")
+    cause = (
+        f"all lengths of {epoch} {unit}"
+        if unit
+        else f"all lengths of {epoch} are {1e6 * (1.0 / ratio - 1.0):+.1f} ppm longer than those of {found.epochs[0]}"
+    )
+    change = (
+        f"correct the unit in {epoch}"
+        if unit
+        else ("compare what gives the scale in both: board or scale bar, its temperature, the distance meter")
+    )
     yield _Trial("unit of lengths" if unit else "scale", cause, change, (), after,
                  _with(both.directions, _SCALE), 1 if unit else 2)  # fmt: skip
 

@@ -1,6 +1,6 @@
 """The survey that does not fit, with the data from which hypotheses are formed; everything costly is found once."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -14,7 +14,7 @@ from adjust.frames.lens_times import whole_images
 from adjust.graph.assembly import StartValues, values_of
 from adjust.graph.solver import SolveOptions
 from adjust.model.boards import deformed
-from adjust.model.errors import IndeterminateError, SurveyError
+from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import Camera, FloatArray, Survey
 from adjust.spatial.averaging import mean_pose
@@ -164,20 +164,25 @@ class Case:
         """The lens (n,) of each camera, from its own images alone; a camera without any is not there."""
         return own_lenses(self.survey)
 
-    def without_each(self, field_name: str) -> list[tuple[str, Altered]]:
+    def without_each(self, field_name: str) -> Iterator[tuple[str, Altered]]:
         """(id, start values of the survey without its images), where there are any; field_name: target_id, camera_id.
 
-        Of the few targets or cameras with the largest misfit, or with most images where nothing is adjusted.
+        Of the few targets or cameras with the largest misfit, or with most images where nothing is adjusted. Each is
+        started when it is asked for, as long as there is time to try what that shows.
         """
         if field_name not in self._without:
             ids = [t for t in dict.fromkeys(getattr(b, field_name) for b in self.survey.image_blocks) if t is not None]
-            worst = self._worst(field_name, ids)[:_LEFT_OUT] if len(ids) > 1 else ()
-            started = ((owner, self.rough(without(self.survey, field_name, owner))) for owner in worst)
-            self._without[field_name] = [(owner, values) for owner, values in started if values is not None]
-        return self._without[field_name]
+            self._without[field_name] = dict.fromkeys(self._worst(field_name, ids)[: _LEFT_OUT * (len(ids) > 1)], ())
+        for owner, known in self._without[field_name].items():
+            if not known:
+                if not self.budget.lasts:
+                    return
+                known = self._without[field_name][owner] = (self.rough(without(self.survey, field_name, owner)),)
+            if known[0] is not None:
+                yield owner, known[0]
 
     @cached_property
-    def _without(self) -> dict[str, list[tuple[str, Altered]]]:
+    def _without(self) -> dict[str, dict[str, tuple[Altered | None, ...]]]:
         return {}
 
     def _worst(self, field_name: str, ids: list[str]) -> list[str]:
@@ -190,13 +195,22 @@ class Case:
 
     @cached_property
     def linear(self) -> "Linear | None":
-        """The adjustment with all images in use, as a linear system; None where there is none."""
+        """The adjustment with all images in use, as a linear system; None where there is none.
+
+        One that did not converge may have settled: what it still changes is nothing to v'Pv.
+        """
         from adjust.diagnosis.score import Linear  # here: what fails as a whole needs none
 
-        if self.result is None or not self.result.redundancy > 0:
+        if self.result is None and not isinstance(self.error, NotConvergedError):
+            return None
+        if self.result is not None and not self.result.redundancy > 0:
             return None
         try:
-            result = self.result if self.is_whole else self._near(self.survey, self.result, options=_OWN)
+            result = self.result
+            if result is None:
+                result = self._adjusted(self.survey, None, _NEAR, _START + _REST)
+            elif not self.is_whole:
+                result = self._near(self.survey, result, options=_OWN)
             self.budget.spend(_SCORES)
             return Linear(result)
         except SurveyError:

@@ -187,6 +187,7 @@ def _beacons(
 
 def _forgotten(epoch: NavigationEpoch, pose: EpochPose) -> NavigationEpoch:
     """Without the names of spots that were refused."""
+
     def spots(s: Spots, labels: Sequence[str | None]) -> Spots:
         known = s.beacon_ids and tuple(n if label == n else None for n, label in zip(s.beacon_ids, labels, strict=True))
         return replace(s, beacon_ids=known or None)

@@ -20,6 +20,7 @@ from adjust.model.observations import ImageBlock
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write
 from survey.jobs.adjusting.board_sizes import wrong_sizes
+from survey.jobs.adjusting.image_defects import defect_warnings, defects
 from survey.project import Definition, SpotBlock, read_definition
 from survey.project.detected import (
     DETECTED_FILE,
@@ -50,6 +51,7 @@ class DetectOutcome:
     """What detection did: one report per image that was looked at, the files written, and what people should know.
 
     n_same: images that are as they were, whose rows stay. notes: on rows of people, on images that are gone.
+    defects: images that are wrong as such.
     """
 
     folder: Path
@@ -58,6 +60,7 @@ class DetectOutcome:
     n_same: int = 0
     notes: tuple[str, ...] = ()
     wrong_sizes: Mapping[str, str] = field(default_factory=dict)
+    defects: tuple[str, ...] = ()
 
     @property
     def messages(self) -> tuple[str, ...]:
@@ -66,9 +69,9 @@ class DetectOutcome:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """Boards of a wrong size; then the images in which nothing was found for another reason, or not readable."""
+        """Boards of a wrong size; images that are wrong as such; those without targets, or not readable."""
         lines = (m for m, r in zip(self.messages, self.reports, strict=True) if r.status != "found" and self._news(r))
-        return (*self.wrong_sizes.values(), *lines)
+        return (*self.wrong_sizes.values(), *self.defects, *lines)
 
     def _news(self, report: "ImageReport") -> bool:
         missed = _missed(report)
@@ -86,7 +89,7 @@ class DetectOutcome:
             "image_points": sum(len(d) for r in self.reports for d in r.detections.values()),
             "spots": sum(len(r.spots) for r in self.reports if r.spots is not None),
             "notes": list(self.notes),
-            "warnings": list(self.wrong_sizes.values()),
+            "warnings": [*self.wrong_sizes.values(), *self.defects],
             "written": [str(p) for p in self.paths],
         }
 
@@ -178,14 +181,15 @@ def detect_in(
     reports = detect_images(tasks, jobs, progress, place / PICTURES if pictures else None, told)
     blocks, spots = _blocks(state.definition, reports)
     kept = {*state.points.images, *state.spots.images} - set(wanted) - dropped
-    wrong = wrong_sizes(folder, state.definition, reports)
+    wrong, bad = wrong_sizes(folder, state.definition, reports), defects(reports)
     if not blocks and not spots and not kept:
         if wrong:
             raise SurveyError("\n".join(wrong.values()))
-        lines = "\n".join(f"  {r.path}: {r.message}" for r in reports[:10])
+        each = (*defect_warnings(bad), *(f"{r.path}: {r.message}" for r in reports[:10]))
+        lines = "\n".join(f"  {line}" for line in each)
         raise SurveyError(f"{folder}: no target and no spot was found in {len(reports)} images:\n{lines}")
     names = _write(folder, place, state, wanted, dropped, blocks, spots)
-    now = _known_now(state, files, reports, _without_folder(folder, wrong))
+    now = _known_now(state, files, reports, _without_folder(folder, wrong), bad)
     known = {key: entry for key, entry in now.items() if key not in dropped}
     atomic_write(place / OBSERVATIONS_FOLDER / DETECTED_FILE, detected_text(known))
     replace_parts(folder, gone=[name.with_suffix(".parquet").as_posix() for name in names])
@@ -193,7 +197,8 @@ def detect_in(
     if gone:
         state.notes.append(f"gone, their points are used as before: {named(gone)}")
     same = len([key for key in state.definition.images if key not in files])
-    return DetectOutcome(folder, tuple(reports), tuple(folder / n for n in names), same, tuple(state.notes), wrong)
+    paths, said = tuple(folder / n for n in names), defect_warnings(bad)
+    return DetectOutcome(folder, tuple(reports), paths, same, tuple(state.notes), wrong, said)
 
 
 def _file_name(key: ImageKey, state: _State) -> str:
@@ -307,7 +312,7 @@ def author_name(said: Iterable[tuple[str, str]] = ()) -> str:
 
 def _known_now(
     state: _State, files: Mapping[ImageKey, DetectedImage], reports: "Sequence[ImageReport]",
-    wrong_sizes: Mapping[str, str],
+    wrong_sizes: Mapping[str, str], defects: Mapping[ImageKey, str],
 ) -> dict[ImageKey, DetectedImage]:  # fmt: skip
     """What is known of all images from now on; of images that are gone while their points are used, too."""
     known = {key: entry for key, entry in state.known.items() if key in state.news.gone}
@@ -319,6 +324,7 @@ def _known_now(
             rows=state.rows_digest(key), n_image_points=sum(map(len, report.detections.values())),
             n_spots=0 if report.spots is None else len(report.spots),
             wrong_size=next((text for t, text in wrong_sizes.items() if t in _missed(report)), ""),
+            defect=defects.get(key, ""),
         )  # fmt: skip
     return known | _given(state, known)
 
@@ -368,5 +374,3 @@ def _blocks(definition: Definition, reports: "Sequence[ImageReport]") -> tuple[l
             names = tuple(f"s{i + 1}" for i in range(len(report.spots)))
             spots.append(SpotBlock(report.camera_id, report.epoch_id, names, report.spots.uv, report.spots.cov))
     return blocks, spots
-
-

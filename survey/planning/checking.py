@@ -8,9 +8,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from adjust.diagnosis.beforehand import Beforehand, coverage, look_beforehand
+from adjust.diagnosis.beforehand import Beforehand, Finding, coverage, look_beforehand
 from adjust.model.errors import SurveyError
 from adjust.model.survey import Survey
+from survey.jobs.adjusting.image_defects import defective
 from survey.jobs.navigating.task import with_known_points
 from survey.project import Project, read
 
@@ -86,6 +87,9 @@ def check_job(folder: Path) -> CheckOutcome:
     if project.spots:
         left = tuple(f for f in found.findings if (f.kind, f.level) != ("no redundancy", "weak"))
         found = replace(found, findings=left)
+    bad = tuple(Finding("problem", d.kind, tuple("/".join(key) for key in d.images), d.found, d.remedy)
+                for d in defective({k: e.defect for k, e in project.detected.items()}))  # fmt: skip
+    found = replace(found, findings=bad + found.findings)
     best, said = _next_best(project, found)
     return CheckOutcome(project, found, best, notes + said)
 

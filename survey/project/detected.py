@@ -28,7 +28,7 @@ class DetectedImage:
     seen_ns: when the hash was made. looked_for: hash of the targets and spots that it was searched for. status:
     ``given`` where its points were there before any detection. rows: hash of its rows as detection wrote them, so that
     an edit shows; "" for given ones. wrong_size: that a board in it is of another size than declared, and what to
-    change.
+    change. defect: what is wrong with it as an image.
     """
 
     file: str
@@ -43,6 +43,7 @@ class DetectedImage:
     n_image_points: int = 0
     n_spots: int = 0
     wrong_size: str = ""
+    defect: str = ""
 
 
 def read_detected(folder: Path) -> dict[ImageKey, DetectedImage]:
@@ -56,7 +57,7 @@ def read_detected(folder: Path) -> dict[ImageKey, DetectedImage]:
         out = {}
         for name, entry in found["images"].items():
             camera, epoch = name.split("/")
-            entry = {"wrong_size": ""} | entry
+            entry = {"wrong_size": "", "defect": ""} | entry
             if set(entry) != set(kinds) or not all(type(entry[k]) is kind for k, kind in kinds.items()):
                 raise ValueError(f"{name} has other entries")
             out[camera, epoch] = DetectedImage(**entry)

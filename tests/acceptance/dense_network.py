@@ -207,8 +207,7 @@ def dense_adjust(survey: Survey, start: dict[str, FloatArray], steps: int = 30, 
     variances = cov.diagonal()
     sigma = np.sqrt(np.clip(np.diagonal(Q), 0.0, None))
     sigmas = {
-        p: np.array([sigma[model.columns[p, i]] if (p, i) in model.columns else 0.0 for i in range(3)])
-        for p in model.x
+        p: np.array([sigma[model.columns[p, i]] if (p, i) in model.columns else 0.0 for i in range(3)]) for p in model.x
     }
     adjusted_sigmas = np.sqrt(np.clip(adjusted_cov, 0.0, None))
     return DenseResult(

@@ -131,9 +131,7 @@ def bent(survey: Survey, _: Truth, size: float) -> Survey:
     name = board_of(survey)
     return replace(
         survey,
-        targets=tuple(
-            replace(t, x_in_target=sag(t.x_in_target)) if t.target_id == name else t for t in survey.targets
-        ),
+        targets=tuple(replace(t, x_in_target=sag(t.x_in_target)) if t.target_id == name else t for t in survey.targets),
     )
 
 
@@ -215,9 +213,14 @@ def drifting(survey: Survey, _: Truth, size: float) -> Survey:
 
 def origin(of_what: Callable[[Survey, ImageBlock], bool]) -> Plant:
     """Pixels are counted from the corner of the first one, in some images; ``size`` px."""
-    return lambda survey, _, size: in_images(
-        survey, lambda b: of_what(survey, b), lambda b: replace(b, uv=b.uv + size)
-    )
+    return lambda survey, _, size: in_images(survey, lambda b: of_what(survey, b), lambda b: replace(b, uv=b.uv + size))
+
+
+def interlaced(survey: Survey, _: Truth, size: float) -> Survey:
+    """Points of the camera that lie on odd rows are taken from a half image of another moment, ``size`` px away."""
+    camera, by = camera_of(survey), size * np.array([0.5, 0.1])
+    return in_images(survey, lambda b: b.camera_id == camera,
+                     lambda b: replace(b, uv=b.uv + np.cos(np.pi * b.uv[:, 1])[:, None] * by))  # fmt: skip
 
 
 def of_points(_: Survey, block: ImageBlock) -> bool:
@@ -433,6 +436,7 @@ IMAGE_MISTAKES = (
     Mistake("images copied", camera_of, ("stereo", "rig"), (0.1, 0.3, 0.6), copied),
     Mistake("pixel origin", of("points"), ("beacons", "lab"), (0.5, -0.5), origin(of_points), ("board",),
             title="of a second detector"),
+    Mistake("interlaced", camera_of, ("stereo", "rig"), (0.1, 0.4, 2.0), interlaced),
     Mistake("focus touched", camera_of, ("stereo", "head"), (0.004, 0.01, 0.03), zoomed),
     Mistake("lens drifts", camera_of, ("stereo", "head"), (1.0, 3.0, 10.0), drifting),
     Mistake("camera moved", camera_of, ("stereo", "head"), (2.0, 6.0, 20.0), moved(second_camera, 0.5),

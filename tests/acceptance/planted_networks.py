@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.model.observations import PositionRef, Reading
+from adjust.model.observations import FrameRef, PositionRef, Reading
 from adjust.model.survey import FloatArray, Survey
 from adjust.statistics.scaling import scaled_survey
 from survey.simulate.scene import Truth
@@ -215,6 +215,23 @@ def twice(survey: Survey, _: Truth, size: float) -> Survey:
     return replace(survey, pairs=(*survey.pairs, replace(p, pair_id=f"{p.pair_id}b", b_from_a=other)))
 
 
+def stations_exchanged(group: str) -> Plant:
+    """Stations T3 and T6 are called by each other's names in the last pairs with either, a share of them."""
+    other = {"T3": "T6", "T6": "T3"}
+
+    def end(ref: FrameRef) -> FrameRef:
+        return replace(ref, frame_id=other.get(ref.frame_id, ref.frame_id))
+
+    def plant(survey: Survey, _: Truth, size: float) -> Survey:
+        mine = [i for i, p in enumerate(survey.pairs) if {p.a.frame_id, p.b.frame_id} & {*other}]
+        once = [i for i in mine if {survey.pairs[i].a.frame_id, survey.pairs[i].b.frame_id} != {*other}]
+        last = {once[int(size)]} if group == "one" else set(mine[round((1.0 - size) * len(mine)) :])
+        return replace(survey, pairs=tuple(
+            replace(p, a=end(p.a), b=end(p.b)) if i in last else p for i, p in enumerate(survey.pairs)))  # fmt: skip
+
+    return plant
+
+
 def station_bumped(survey: Survey, _: Truth, size: float) -> Survey:
     """Station T4 was knocked by ``size`` mm after half of the pairs that have it."""
     mine = [i for i, p in enumerate(survey.pairs) if "T4" in (p.a.frame_id, p.b.frame_id)]
@@ -268,6 +285,8 @@ NETWORK_MISTAKES = (
     Mistake("rows of another set-up", of(SETUP), BOTH, (1.0, 2.0, 3.0), other_setup),
     Mistake("set-up turned", of(SETUP), BOTH, (30.0, 120.0, 600.0), turned),
     Mistake("sigmas of a group", of("reading"), BOTH, (1 / 10, 1 / 4, 4.0), sigmas("reading")),
+    Mistake("sigmas of a group", of("north"), ("poses",), (1 / 6, 4.0, 10.0), sigmas("north"),
+            title="among others"),
     Mistake("odd sigma", anything, BOTH, (1e-2 / 2, 1e-3, 1e-4), odd),
     Mistake("correlated observations", anything, BOTH, (3.0, 6.0, 12.0), correlated),
     Mistake("pairs inverted", anything, ("hand", "base", "poses"), (0.0,), pairs(inverted), title="all"),
@@ -290,5 +309,8 @@ NETWORK_MISTAKES = (
     Mistake("epochs shifted", of("hand"), ROBOTS, (1.0, 2.0, -1.0), shifted_poses, title="of a robot"),
     Mistake("epochs exchanged", of("hand"), ROBOTS, (1.0, 3.0, 8.0), poses_exchanged, title="of a robot"),
     Mistake("the same twice", anything, ("hand", "poses"), (30.0, 100.0, 1000.0), twice),
+    Mistake("stations exchanged", of("T3"), ("poses",), (0.2, 0.35, 0.5), stations_exchanged("since")),
+    Mistake("stations exchanged", of("T3"), ("poses",), (1.0, 3.0, 6.0), stations_exchanged("one"),
+            title="in one pair"),
     Mistake("station moved", of("T4"), ("poses",), (20.0, 60.0, 200.0), station_bumped, title="in a network of poses"),
 )  # fmt: skip

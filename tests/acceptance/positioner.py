@@ -161,9 +161,7 @@ def blockwise_covariance(
     return BlockCovariance((n_blocks - 1) / n_blocks * d.T @ d, n_blocks)
 
 
-def axis_tests(
-    result: Adjustment, alpha: float = 0.01, blocks: BlockCovariance | None = None
-) -> tuple[AxisTest, ...]:
+def axis_tests(result: Adjustment, alpha: float = 0.01, blocks: BlockCovariance | None = None) -> tuple[AxisTest, ...]:
     """Test the deviation from a right angle, the distance of the axes, and both together against zero.
 
     ``x' inv(C) x / k`` is F distributed with k and ``redundancy`` degrees of freedom where the sigmas come from the

@@ -128,6 +128,8 @@ def _of_tie(result: Adjustment, remedy: Remedy, truth: Truth) -> tuple[FloatArra
     at = [MODELS["brown"].names.index(x) for x in found.names]
     true = (np.asarray(truth[remedy.of]) - np.asarray(truth["lens", found.lender]))[at]
     return found.difference - true, found.cov, found.test
+
+
 def creeping(name: str, sigmas: dict[str, float], begins: tuple[str, ...]) -> Remedy:
     """A stereo rig whose second lens takes a step of these sigmas (px) at given epochs."""
     steps = np.array(list(sigmas.values()))

@@ -209,8 +209,18 @@ def test_caliper_and_total_station_alone_do_not_give_the_world(lab) -> None:
 def test_covers_over_re_solved_noise(lab) -> None:
     """d' inv(C) d of table, beacons, tripods, head and instrument over fresh noise; omega as its redundancy."""
     survey, truth = lab
-    names = [TABLE, ("mount_from_station", "head"), ("station_from_camera", "X"), ("point", "B01"), ("point", "B05"),
-             ("point", "T1"), ("orientation", "T2a"), ("instrument", "TS"), ("vertical",), ("beam", "laser")]
+    names = [
+        TABLE,
+        ("mount_from_station", "head"),
+        ("station_from_camera", "X"),
+        ("point", "B01"),
+        ("point", "B05"),
+        ("point", "T1"),
+        ("orientation", "T2a"),
+        ("instrument", "TS"),
+        ("vertical",),
+        ("beam", "laser"),
+    ]
     ideal = adjusted(survey, truth)
     free = [n for n in names if n in ideal.precision.graph.unknowns.by_name]
     Q = ideal.precision.joint(free)

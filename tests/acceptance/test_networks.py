@@ -84,8 +84,10 @@ def test_gama_covariance_is_that_of_the_dense_adjustment(case):
 
 def test_gama_statistics_of_every_observation(case):
     survey, rows = case.network.survey, core_rows(case.network.survey, case.result)
-    assert len(rows.sigma) == len(case.published.rows) == len(survey.readings) + 3 * sum(
-        len(d.to) for d in survey.coordinate_differences
+    assert (
+        len(rows.sigma)
+        == len(case.published.rows)
+        == len(survey.readings) + 3 * sum(len(d.to) for d in survey.coordinate_differences)
     )
     printed = printed_statistics(case)
     one = gama_statistics(case, case.one.sigma, case.one.residuals, case.one.decorrelated, case.one.sigma0)

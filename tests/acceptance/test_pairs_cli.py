@@ -119,8 +119,9 @@ def _with_block(station, seed, sigma_px, turned=None):
     survey, rng = station.survey(seed, sigma_px), np.random.default_rng(seed + 1000)
     block = rigid(Rot3.Ypr(0.4, -0.3, 0.2).matrix(), np.array([0.05, -0.1, 0.3]))
     wall = rigid(np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, -1.0]]), np.array([0.1, 0.0, 2.2]))
-    names, K = tuple(f"m{i}" for i in range(len(station.x_in_target))), np.array(
-        [[LENS[0], 0, LENS[3]], [0, LENS[1], LENS[4]], [0, 0, 1.0]]
+    names, K = (
+        tuple(f"m{i}" for i in range(len(station.x_in_target))),
+        np.array([[LENS[0], 0, LENS[3]], [0, LENS[1], LENS[4]], [0, 0, 1.0]]),
     )
     x, blocks = 0.6 * station.x_in_target, []
     for i, head in enumerate(station.room_from_station):

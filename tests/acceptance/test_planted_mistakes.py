@@ -40,6 +40,8 @@ SEARCHED = (  # names that closed forms find, and small mistakes among much nois
     ("target height", "hall", 0.1), ("gear ratio", "head", 1e-3), ("clock offset", "hand", 0.05),
     ("left-handed frames", "hand", 0.0), ("images turned", "head", 0.2), ("pairs inverted", "poses", 7.0),
     ("order of quaternions", "poses", 12.0), ("the same twice", "poses", 100.0), ("sigmas of a group", "hall", 0.1),
+    ("stations exchanged", "poses", 0.35), ("stations exchanged", "poses", 3.0), ("interlaced", "rig", 0.1),
+    ("clock drift", "rig", 0.8), ("station moved", "tripods", 20.0), ("sigmas of a group", "poses", 10.0),
     ("correlated observations", "hall", 12.0), ("motion forgotten", "relay", 11.0), ("pairs inverted", "poses", 0.0),
 )  # fmt: skip
 
@@ -65,6 +67,15 @@ def test_size_that_makes_it_worse_is_taken_back() -> None:
     """Found at values that the mistake has spoilt, it is no size at those that it has led to."""
     mistake = next(m for m in MISTAKES if m.name == "focus touched")
     assert outcome_of(mistake, "stereo", 0.03, 90210)["outcome"] == "first"
+
+
+@pytest.mark.parametrize(("name", "kind", "size"), [
+    ("given points exchanged", "plane", 0.0), ("points exchanged", "plane", 0.0), ("target moved", "head", 40.0),
+])  # fmt: skip
+def test_where_the_start_is_lost_the_change_still_shows(name: str, kind: str, size: float) -> None:
+    """Every sight misses; one column alone was exchanged; images that the start leaves out."""
+    mistake = next(m for m in reversed(MISTAKES) if m.name == name and kind in m.kinds and size in m.sizes)
+    assert outcome_of(mistake, kind, size, 61740)["outcome"] == "first"
 
 
 def test_part_that_can_be_adjusted_is_no_explanation() -> None:

@@ -14,6 +14,7 @@ from adjust.model.survey import LensDrift, Survey, VectorParameter, VectorPrior
 from survey.cli import main
 from survey.jobs.adjusting.job import adjust_job
 from survey.jobs.adjusting.warm_start import WARM, survey_start, warm_adjustment
+from survey.jobs.converting import convert_job
 from survey.project import read, write_project
 from survey.report.page import report_html
 from survey.report.terminal import summary_text
@@ -160,3 +161,11 @@ def test_free_running_cameras_are_named_and_remedied(tmp_path: Path) -> None:
     assert abs(late["offset_intervals"] + 0.116 * 6.0) < 2.0 * late["sigma_offset_intervals"]
     assert late["significance"]["clock_offset"]["significant"]
     assert after["cameras"]["cam1"]["rms_residual_px"] < 0.15
+
+
+@pytest.mark.parametrize("format", ["kalibr", "tum", "opencv"])
+def test_exports_say_that_they_hold_no_clock(tmp_path: Path, format: str) -> None:
+    write_project(tmp_path / "lab", MADE["robot"]())
+    assert main(["adjust", str(tmp_path / "lab"), "--quiet"]) in (0, 3)
+    said = convert_job(tmp_path / "lab", tmp_path / "out", format=format).left_out
+    assert "the poses of station hand: its clock (offset, drift) is not written: poses are those at the epochs" in said

@@ -14,7 +14,9 @@ from adjust.model.survey import CROP, ImageCrop, LensDrift, Survey, VectorParame
 from adjust.navigation import Beacons, head_and_beacons
 from survey.interop.cameras.lens_maps import mapped_lens
 from survey.jobs.navigating.lenses import lenses_taken, with_images_left
+from survey.jobs.navigating.task import require_one_time
 from survey.simulate import Truth, resample, stereo
+from tests.adjust.moving import clock
 
 NAVIGATED = ["e07", "e08"]
 GIVEN = ImageCrop(VectorParameter(CROP, np.array([0.5, 40.0, 20.0])), (500, 420))
@@ -92,3 +94,17 @@ def test_an_export_says_which_lens_it_holds() -> None:
                        for c in survey.cameras)  # fmt: skip
     assert left_one.note is None
     assert right.note == "camera right: its lens is written as it is of the first block of epochs and of whole images"
+
+
+def test_epochs_that_were_seen_at_several_times_are_refused() -> None:
+    """One camera that is late has its pose when it exposed; two would need two poses, and rows many."""
+    survey, _ = stereo(3, n_pairs=4)
+    assert require_one_time(survey, "bar") == ()
+    left, right = survey.cameras
+    late, rows = (replace(right, clock=clock(**{name: 0.01})) for name in ("offset", "line_time"))
+    with pytest.raises(SurveyError, match=r"cameras\.right a clock.*one pose an epoch"):
+        require_one_time(replace(survey, cameras=(left, late)), "bar")
+    with pytest.raises(SurveyError, match="seen at different times"):
+        require_one_time(replace(survey, cameras=(rows,)), "bar")
+    (note,) = require_one_time(replace(survey, cameras=(late,)), "bar")
+    assert "poses are those when it exposed" in note

@@ -17,7 +17,7 @@ from adjust.model.survey import FloatArray, Survey
 from adjust.precision.precision import noise_of
 
 ROUNDS = 6
-_SLOW = 0.5  # share of the last drop that the next one is at most, while it is on its way
+_SLOW = 0.5  # share of the last drop, or of the last v'Pv, that the next one is at most, while it is on its way
 _SMALL = 9.0  # a further drop of v'Pv that is not worth another adjustment
 
 
@@ -83,9 +83,7 @@ class Effect:
     def _last(self) -> list[tuple[FloatArray, Survey]]:
         return []
 
-    def _estimated(
-        self, case: Case, linear: Linear, theta: FloatArray
-    ) -> tuple[FloatArray, Adjustment, FloatArray]:
+    def _estimated(self, case: Case, linear: Linear, theta: FloatArray) -> tuple[FloatArray, Adjustment, FloatArray]:
         """Its size, the adjustment at which that was found, and the sigmas (k,).
 
         A size is one of a change of the values there: where these were spoilt, the next one may be worse, and is none.
@@ -106,7 +104,7 @@ class Effect:
             if more.drop < _SMALL * new.scale:
                 cov, now = more.cov if more.seen else cov, new
                 break
-            if more.drop > _SLOW * last:
+            if more.drop > _SLOW * last and new.result.omega > _SLOW * now.result.omega:
                 break
             theta, cov, now, last = self.added(theta, more.theta), more.cov, new, more.drop
         self._last.extend(made[-1:])
@@ -146,4 +144,3 @@ def shifted_back(survey: Survey, shifts: Shifts, theta: FloatArray) -> Survey:
         replace(b, uv=b.uv - shifts[i] @ theta) if i in shifts else b for i, b in enumerate(survey.image_blocks)
     )
     return replace(survey, image_blocks=blocks)
-

@@ -1,6 +1,7 @@
 """Image points that are all shifted alike: the centre of the first pixel at (1/2, 1/2), another region of the sensor.
 
 Shows where something else than the lens tells the principal point: a lens that is held, or one of several detectors.
+Interlaced images show other moments in even and in odd rows: points of a few pixels alternate with their row.
 """
 
 from collections.abc import Iterator, Mapping
@@ -11,6 +12,7 @@ import numpy as np
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect, of_shifts, shifted_back
 from adjust.diagnosis.hypothesis import ChangeColumns, Hypothesis, Place
+from adjust.diagnosis.score import Linear
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import FloatArray, Survey
 
@@ -28,6 +30,8 @@ def pixels(case: Case) -> Iterator[Effect]:
         owners = list(dict.fromkeys(getattr(b, field) for b in blocks))
         for owner in owners if kind == "camera" or len(owners) > 1 else ():
             yield _of(case, kind, field, owner)
+    for camera in dict.fromkeys(b.camera_id for b in blocks):
+        yield _interlaced(case, linear, camera)
 
 
 def _of(case: Case, kind: str, field: str, owner: str | None) -> Effect:
@@ -62,6 +66,27 @@ def _of(case: Case, kind: str, field: str, owner: str | None) -> Effect:
         hypothesis, of_shifts(linear, shifts(linear.result.survey)),
         lambda at: of_shifts(at, shifts(at.result.survey)),
         lambda _, theta: shifted_back(case.survey, shifts(case.survey), theta), said, known=known,
+    )  # fmt: skip
+
+
+def _interlaced(case: Case, linear: Linear, camera: str) -> Effect:
+    """A shift that has another sign in the next row: its cosine, as of a point that one row shows most of."""
+
+    def shifts(survey: Survey) -> dict[int, FloatArray]:
+        return {i: np.cos(np.pi * b.uv[:, 1])[:, None, None] * np.eye(2) for i, b in enumerate(survey.image_blocks)
+                if b.camera_id == camera}  # fmt: skip
+
+    hypothesis = Hypothesis(
+        "interlaced", "", "take every second row of its images, read apart, or whole images, and detect them again",
+        Place("camera", (camera,)), case.survey, (), 1.0, 1,
+    )  # fmt: skip
+    first = shifts(case.survey)
+    return Effect(
+        hypothesis, of_shifts(linear, shifts(linear.result.survey)),
+        lambda at: of_shifts(at, {i: first[i] for i in shifts(at.result.survey)}),
+        lambda _, theta: shifted_back(case.survey, first, theta),
+        lambda theta, sigmas: f"camera {camera}: image points at even rows are shifted against those at odd ones by "
+        f"twice ({theta[0]:+.2f} +- {sigmas[0]:.2f}, {theta[1]:+.2f} +- {sigmas[1]:.2f}) px: as of two moments",
     )  # fmt: skip
 
 

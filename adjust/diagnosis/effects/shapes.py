@@ -13,6 +13,8 @@ from adjust.diagnosis.targets.size import reshaped, well_known
 from adjust.model.survey import FloatArray, Survey, Target
 
 _SCALE = "target scaled"
+_FAR = 0.3
+"""Share by which no change of values is small any more: closed forms tell such a size."""
 _SHAPES: tuple[tuple[str, FloatArray, str, str], ...] = (
     ("target stretched", np.diag([1.0, 0.0, 0.0]),
      "its columns stand {:.6g} times as far from each other against its rows as they should", "scale_x"),
@@ -29,7 +31,8 @@ def shapes(case: Case) -> Iterator[Effect]:
     if linear is not None:
         for target in case.survey.targets:
             if len(target.point_ids) >= 3:
-                yield from (_of(case, linear, target, *shape) for shape in _SHAPES)
+                every = (_of(case, linear, target, *shape) for shape in _SHAPES)
+                yield from (e for e in every if not (np.abs(e.first.theta) > _FAR).any())
 
 
 def _of(case: Case, linear: Linear, given: Target, name: str, by: FloatArray, what: str, component: str) -> Effect:
@@ -48,8 +51,11 @@ def _of(case: Case, linear: Linear, given: Target, name: str, by: FloatArray, wh
             "edits": (ScaleKey(("targets", target), factor),),
         }  # fmt: skip
 
-    remedy = ("multiply its square or marker size by that" if name == _SCALE else
-              f'let the adjustment find it: warp = {{ free = ["{component}"] }}; or measure it in both directions')
+    remedy = (
+        "multiply its square or marker size by that"
+        if name == _SCALE
+        else f'let the adjustment find it: warp = {{ free = ["{component}"] }}; or measure it in both directions'
+    )
     edits = (SetKey(("targets", target, "warp", "free"), (component,)),) if component and given.warp is None else ()
     hypothesis = Hypothesis(name, "", remedy, Place("target", (target,), "square_mm" if name == _SCALE else "warp"),
                             case.survey, edits, 1.0, 0)  # fmt: skip

@@ -280,8 +280,12 @@ def _edits(survey: Survey, course: _Course, later: Sequence[str]) -> tuple[Edit,
     if course.kind == "reading":
         return ()
     thing, chosen = course.name[1], set(later)
-    owner = {"station_from_camera": "camera_id", "lens": "camera_id", "carrier_from_target": "target_id",
-             "target_body": "target_id"}
+    owner = {
+        "station_from_camera": "camera_id",
+        "lens": "camera_id",
+        "carrier_from_target": "target_id",
+        "target_body": "target_id",
+    }
     field = owner.get(course.name[0])
     rows = [b for b in survey.image_blocks if b.epoch_id in chosen and (not field or getattr(b, field) == thing)]
     if course.name[0] in ("carrier_from_target", "target_body"):
@@ -348,9 +352,7 @@ def _concerns(block: ImageBlock, course: _Course) -> bool:
     return course.name[0] not in ("carrier_from_target", "target_body") or block.target_id == course.name[1]
 
 
-def _mended_pairs(
-    survey: Survey, course: _Course, weights: Mapping[str, float], theta: FloatArray
-) -> dict[int, Pair]:
+def _mended_pairs(survey: Survey, course: _Course, weights: Mapping[str, float], theta: FloatArray) -> dict[int, Pair]:
     """``a_late = a exp(theta)``: measured was ``b_from_a exp(theta)``, or ``exp(-theta) a_from_b``."""
     out = {}
     for i, pair in enumerate(survey.pairs):

@@ -185,9 +185,13 @@ def _far(difference: FloatArray, cov: FloatArray) -> bool:
 
 def _without_one(survey: Survey, field: str, row: int) -> Hypothesis:
     o = getattr(survey, field)[row]
-    what, place = (f"pair {o.pair_id}", Place("pair", (o.pair_id,))) if field == "pairs" else (
-        f"the reading of table {o.table_id} at epoch {o.epoch_id}",
-        Place("table", (o.table_id,), "axis1_deg", (o.epoch_id,)),
+    what, place = (
+        (f"pair {o.pair_id}", Place("pair", (o.pair_id,)))
+        if field == "pairs"
+        else (
+            f"the reading of table {o.table_id} at epoch {o.epoch_id}",
+            Place("table", (o.table_id,), "axis1_deg", (o.epoch_id,)),
+        )
     )
     edits = (LeaveOut((f"pairs:{o.pair_id}",)),) if field == "pairs" else ()
     kept: dict[str, Any] = {field: tuple(x for i, x in enumerate(getattr(survey, field)) if i != row)}

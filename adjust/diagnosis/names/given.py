@@ -18,6 +18,8 @@ _CLEARLY = 2.0
 _MOST, _TRIALS = 4, 80
 _SLIPS = (10.0, 0.1, 100.0, 0.01, 1000.0, 0.001)
 _LARGE = 2500
+_SPOILT = 1e6
+"""Variance factor of a start at which the typical reading misses by so much that no single one stands out."""
 
 
 def wrong_given(case: Case) -> Iterator[Hypothesis]:
@@ -27,8 +29,9 @@ def wrong_given(case: Case) -> Iterator[Hypothesis]:
     if not given or not survey.readings or not case.few("wrong given coordinates", len(survey.readings), _LARGE):
         return
     before = at_best(case)
+    lost = before is None or before.scale > _SPOILT
     some = [h for h in (*_exchanges(survey, given), *_slips(survey, given))
-            if before is None or _misses(survey, before, h.place.ids)]  # fmt: skip
+            if before is None or lost or _misses(survey, before, h.place.ids)]  # fmt: skip
     tried = [*_axes(survey, given), *some][:_TRIALS]  # the former concern all: where these are wrong all miss evenly
     changed = [h.survey for h in tried if isinstance(h.survey, Survey)]
     fits = map(screen, changed) if before is None else before.afresh(changed)
@@ -53,6 +56,7 @@ def _evidence(before: Screen | None, after: Fit | None) -> float:
 
 def with_given(survey: Survey, new: dict[str, FloatArray]) -> Survey:
     """The survey with other given coordinates (3,) m of these points."""
+
     def point(p: Point) -> Point:
         return replace(p, x_in_world=replace(p.x_in_world, value=new[p.point_id])) if p.point_id in new else p
 

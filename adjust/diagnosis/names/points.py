@@ -19,6 +19,7 @@ from adjust.observations.terrestrial.building import reading_refs
 _CLEARLY = 3.0
 _SUSPECTS, _MOST = 6, 4
 _LARGE = 2500
+_ENDS = ("to_id", "second_id")
 
 
 def exchanged_points(case: Case) -> Iterator[Hypothesis]:
@@ -36,8 +37,7 @@ def exchanged_points(case: Case) -> Iterator[Hypothesis]:
     found = [(before.drop(rows, squares), rows, *pair) for rows, squares, pair in zip(sets, after, pairs, strict=True)]
     for evidence, rows, setup_id, a, b in sorted(found, key=lambda f: -f[0])[:_MOST]:
         if evidence > _CLEARLY:
-            changed = exchanged(survey, rows, a, b)
-            yield replace(_hypothesis(changed, setup_id, a, b, evidence), looked_at=len(pairs))
+            yield from (replace(h, looked_at=len(pairs)) for h in _hypotheses(survey, rows, setup_id, a, b, evidence))
 
 
 def ends_exchanged(before: Screen, sets: Sequence[IntArray], names: Sequence[tuple[str, str]]) -> dict[str, IntArray]:
@@ -72,8 +72,8 @@ def _of_points(survey: Survey, setup_id: str | None, names: tuple[str, str]) -> 
     )  # fmt: skip
 
 
-def exchanged(survey: Survey, rows: IntArray, a: str, b: str) -> Survey:
-    """The survey with the targets a and b of these readings called by each other's names."""
+def exchanged(survey: Survey, rows: IntArray, a: str, b: str, columns: Sequence[str] = _ENDS) -> Survey:
+    """The survey with the targets a and b of these readings called by each other's names, in these columns."""
     other, chosen = {a: b, b: a}, set(rows.tolist())
 
     def named(ref: PositionRef) -> PositionRef:
@@ -81,19 +81,25 @@ def exchanged(survey: Survey, rows: IntArray, a: str, b: str) -> Survey:
         return PositionRef(other[str(ref.point_id)]) if known else ref
 
     def renamed(r: Reading) -> Reading:
-        return replace(r, to=named(r.to), second=None if r.second is None else named(r.second))
+        second = r.second if r.second is None or "second_id" not in columns else named(r.second)
+        return replace(r, to=named(r.to), second=second)
 
     readings = tuple(renamed(r) if i in chosen else r for i, r in enumerate(survey.readings))
     return replace(survey, readings=tuple(r if r.at != r.to else survey.readings[i] for i, r in enumerate(readings)))
 
 
-def _hypothesis(changed: Survey, setup_id: str | None, a: str, b: str, evidence: float) -> Hypothesis:
+def _hypotheses(
+    survey: Survey, rows: IntArray, setup_id: str | None, a: str, b: str, evidence: float
+) -> Iterator[Hypothesis]:
+    """In all columns where they stand, and in the first alone where the other one has them too."""
     where = "everywhere" if setup_id is None else f"in set-up {setup_id}"
     at = {} if setup_id is None else {"setup_id": (setup_id,)}
-    mine = (r for r in changed.readings if r.second is not None and setup_id in (None, r.setup_id))
-    second = ("second_id",) if any(r.second is not None and r.second.point_id in (a, b) for r in mine) else ()
-    return Hypothesis(
-        "points exchanged", f"points {a} and {b} are called by each other's names {where}",
-        "exchange them in to_id of terrestrial.csv", Place("point", (a, b), "to_id"), changed,
-        tuple(Rename("terrestrial", c, {a: b, b: a}, at) for c in ("to_id", *second)), evidence,
-    )  # fmt: skip
+    seconds = (survey.readings[i].second for i in rows.tolist())
+    both = any(r is not None and r.point_id in (a, b) for r in seconds)
+    for columns in (_ENDS, _ENDS[:1]) if both else (_ENDS[:1],):
+        yield Hypothesis(
+            "points exchanged", f"points {a} and {b} are called by each other's names {where}",
+            f"exchange them in {' and '.join(columns)} of terrestrial.csv", Place("point", (a, b), "to_id"),
+            exchanged(survey, rows, a, b, columns),
+            tuple(Rename("terrestrial", c, {a: b, b: a}, at) for c in columns), evidence,
+        )  # fmt: skip

@@ -116,9 +116,7 @@ def _splits(views: TableViews, outer: int) -> list[IntArray]:
     return [p for p in out if (p == second).any() and (p[mine] == outer).any()]
 
 
-def _reassigned(
-    views: TableViews, place: IntArray, fit: TableFit, moved: int, second: int
-) -> IntArray | None:
+def _reassigned(views: TableViews, place: IntArray, fit: TableFit, moved: int, second: int) -> IntArray | None:
     """Every epoch of the moved thing at the place that suits its views better."""
     mine = views.outer == moved
     squares = [_squares(views, np.where(mine, p, place), fit)[1] for p in (moved, second)]

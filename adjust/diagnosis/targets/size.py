@@ -31,6 +31,8 @@ KNOWN = (  # factor from what is said to what is meant, and how that comes about
     (np.sqrt(0.5), "the side was meant, or A3 was reduced to A4"),
 )
 _CLEAR = 5.0  # sigmas
+_PLAIN = 1e4
+"""Evidence after which no other target is looked at: each costs start values of the survey without it."""
 _NEAR = 0.003
 
 
@@ -42,6 +44,8 @@ def wrong_sizes(case: Case) -> Iterator[Hypothesis]:
         found = _ratio(case, values, owner)
         if found is not None and abs(found[0] - 1.0) > _CLEAR * found[1] and found[0] > 0.0:
             yield from _hypotheses(case.survey, owner, *found)
+            if ((found[0] - 1.0) / found[1]) ** 2 > _PLAIN:
+                return
 
 
 def _hypotheses(survey: Survey, target: str, ratio: float, sigma: float) -> Iterator[Hypothesis]:
@@ -75,9 +79,7 @@ def _hypothesis(survey: Survey, target: str, factor: float, why: str, parameters
 
 def reshaped(survey: Survey, target: str, A: FloatArray) -> Survey:
     """The survey with the points of a target times A (3, 3)."""
-    targets = tuple(
-        replace(t, x_in_target=t.x_in_target @ A.T) if t.target_id == target else t for t in survey.targets
-    )
+    targets = tuple(replace(t, x_in_target=t.x_in_target @ A.T) if t.target_id == target else t for t in survey.targets)
     return replace(survey, targets=targets)
 
 

@@ -116,6 +116,7 @@ def apart(survey: Survey, cameras: tuple[str, ...]) -> tuple[Survey | None, int]
 
 def _with_own_lenses(survey: Survey, case: Case, cameras: tuple[str, ...]) -> Survey:
     """Each of these cameras with the lens that its own images give: alone, its focal length and poses wander."""
+
     def own(c: Camera) -> Camera:
         known = c.camera_id in cameras and c.camera_id in case.lenses
         return replace(c, lens=replace(c.lens, values=case.lenses[c.camera_id], free=(), prior=None)) if known else c

@@ -111,8 +111,14 @@ def _constants(survey: Survey, before: Screen) -> Iterator[_Constant]:
                             "change target_height of its rows in terrestrial.csv")  # fmt: skip
     rows = np.flatnonzero(lengths)
     if len(rows) >= 3:
-        yield _Constant("prism constant", "the reflector's constant of all distances", Place("instrument", (), ""),
-                        rows, np.ones(len(rows)), "give an instrument's distance_offset, or change all distances")
+        yield _Constant(
+            "prism constant",
+            "the reflector's constant of all distances",
+            Place("instrument", (), ""),
+            rows,
+            np.ones(len(rows)),
+            "give an instrument's distance_offset, or change all distances",
+        )
 
 
 def _evidence(before: Screen, constant: _Constant) -> tuple[float, float]:

@@ -43,10 +43,13 @@ def wrong_factors(case: Case) -> Iterator[Hypothesis]:
             continue
         factor = float(group.factor)
         k = float(np.sqrt(factor))
+        least, most = (np.sqrt(group.omega / float(chi2.ppf(p, group.redundancy))) for p in (0.975, 0.025))
+        bounds = (least, most) if k > 1 else (1.0 / most, 1.0 / least)
+        between = f"{bounds[0]:.2g} to {bounds[1]:.2g} at 95 %"
         yield Hypothesis(
             "sigmas of a group", f"the sigmas of group {group.group} are {k if k > 1 else 1 / k:.2g} times too "
-            f"{'small' if k > 1 else 'large'}: its residuals are evenly {'larger' if k > 1 else 'smaller'} than they "
-            "say",
+            f"{'small' if k > 1 else 'large'} ({between}): its residuals are evenly {'larger' if k > 1 else 'smaller'} "
+            "than they say",
             f"multiply them by {k:.3g}: {group.group} = {k:.3g} below [sigmas.scale] in survey.toml, or give the "
             "sigmas that the instrument has", Place("group", (group.group,), "sigmas.scale"),
             scaled_survey(case.survey, {group.group: factor}), (ScaleKey(("sigmas", "scale", group.group), k),),

@@ -398,7 +398,9 @@ class BundleBatch:
         U[rank:] = 0.0
         perm = pivots - 1
         y = np.zeros(n)
-        y[:rank] = scipy.linalg.lapack.dtrtrs(np.asfortranarray(U[:rank, :rank]), z[perm][:rank], lower=0, trans=1)[0]
+        if rank:  # LAPACK's solver refuses, on stderr, where there is nothing to solve
+            R = np.asfortranarray(U[:rank, :rank])
+            y[:rank] = scipy.linalg.lapack.dtrtrs(R, z[perm][:rank], lower=0, trans=1)[0]
         self.r = np.zeros(n + 1)
         self.r[:n] = y
         self.r[n] = np.sqrt(max(0.0, rest - float(y @ y)))

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from adjust.model.clocks import clock_text, clocks_of
 from adjust.model.errors import SurveyError
 from survey.folder.whole import whole_folder
 from survey.interop.cameras.colmap import read_colmap, write_colmap
@@ -70,7 +71,19 @@ AMBIGUOUS: Mapping[str, tuple[str, ...]] = {
 def write_cameras(
     values: CameraValues, target: Path, format: str, station: str | None
 ) -> tuple[dict[str, int], tuple[str, ...]]:
-    """Write a survey in a camera format at ``target``, which must be new; counts and notes for people."""
+    """Write a survey in a camera format at ``target``, which must be new; counts and notes for people.
+
+    None of them holds a clock of its own for every camera.
+    """
+    counts, notes = _written(values, target, format, station)
+    clocks = (f"{clock_text(name)}: its clock ({', '.join(clock.parameters.names) or 'jitter'}) is not written: poses "
+              "are those at the epochs" for name, clock in clocks_of(values.survey))  # fmt: skip
+    return counts, (*notes, *clocks)
+
+
+def _written(
+    values: CameraValues, target: Path, format: str, station: str | None
+) -> tuple[dict[str, int], tuple[str, ...]]:
     if format in COLMAP:
         with whole_folder(target) as place:
             return write_colmap(values, place, text=format == "colmap-text")

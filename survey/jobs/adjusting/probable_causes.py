@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from adjust.model.errors import DiagnosedError, IndeterminateError, NotConvergedError, SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
+from adjust.testing.criteria import CAUTIOUS
 from survey.project import Project
 
 if TYPE_CHECKING:
@@ -16,6 +17,10 @@ if TYPE_CHECKING:
 
 _LARGE = 1.15
 """sigma0 from which a mistake is looked for by trial; below, sigmas that are a little small explain as much."""
+
+
+NOT_LOOKED_FOR = ("two mistakes at once", "bodies that bend or never rest", "refraction")
+"""Told where nothing is named; the documentation says more."""
 
 
 def explained(survey: Survey, error: SurveyError, project: Project) -> SurveyError:
@@ -54,6 +59,9 @@ def with_probable_causes(survey: Survey, result: Adjustment, project: Project) -
         diagnosis, _ = _named(_misread(survey, result), project)
         warnings = diagnosis.lines if diagnosis is not None else ()
     lines = tuple(f"probable cause: {c}" for c in warnings)
+    if diagnosis is None and not warnings:
+        diagnosis, _ = _named(_too_cautious(survey, result), project)
+        lines = tuple(f"too good: {c}" for c in diagnosis.lines) if diagnosis is not None else ()
     return replace(result, warnings=(*lines, *result.warnings, *note), diagnosis=diagnosis)
 
 
@@ -73,6 +81,17 @@ def _diagnosis(
     return diagnose(Case(survey, result, error))
 
 
+def _too_cautious(survey: Survey, result: Adjustment) -> "Diagnosis | None":
+    """Groups whose sigmas are far too large, which no test of what contradicts shows; None where there are none."""
+    if not any(g.factor < CAUTIOUS**2 for g in result.groups):
+        return None
+    from adjust.diagnosis.case import Case  # here: as above
+    from adjust.diagnosis.diagnosis import diagnose
+    from adjust.diagnosis.weights.sigmas import wrong_factors
+
+    return diagnose(Case(survey, result), [wrong_factors])
+
+
 def _misread(survey: Survey, result: Adjustment) -> "Diagnosis | None":
     """What was left out by the search for gross errors, and fits as it was meant; None where nothing does."""
     left_out = survey.n_others_used - result.survey.n_others_used
@@ -90,7 +109,10 @@ def _misread(survey: Survey, result: Adjustment) -> "Diagnosis | None":
 def _named(found: "Diagnosis | None", project: Project) -> "tuple[Diagnosis | None, tuple[str, ...]]":
     """The diagnosis with the lines of its project, where it names anything; else what it was not able to look for."""
     if found is None or not found.candidates:
-        return None, (f"causes of what contradicts: {found.note}",) if found is not None and found.note else ()
+        if found is None:
+            return None, ()
+        note = "; ".join(t for t in (found.note, f"never looked for: {', '.join(NOT_LOOKED_FOR)}") if t)
+        return None, (f"causes of what contradicts: nothing that was tried explains it; {note}",)
     from survey.jobs.adjusting.places import located  # here: as above
 
     return located(found, project), ()

@@ -16,6 +16,7 @@ from adjust.model.survey import Survey
 from adjust.statistics.outliers.supported import lost_notes, supported
 from adjust.statistics.outliers.undetermined_points import without_lost_points
 from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
+from survey.jobs.adjusting.image_defects import defect_warnings
 from survey.jobs.adjusting.probable_causes import explained, with_probable_causes
 from survey.jobs.adjusting.symmetric_boards import consistent_turns
 from survey.jobs.identify import identify_spots, without_points
@@ -183,12 +184,13 @@ def told(project: Project, given: Survey, adjustment: Adjustment) -> Adjustment:
 
 
 def image_warnings(images: Mapping[tuple[str, str], DetectedImage]) -> tuple[str, ...]:
-    """Boards of a wrong size, once each; images in which nothing was found for another reason, or not readable.
+    """Boards of a wrong size, once each; images that are wrong as such, by camera; those without targets, or not read.
 
     At every adjustment, not only at the first.
     """
     sizes = dict.fromkeys(entry.wrong_size for entry in images.values() if entry.wrong_size)
-    return tuple(f"detection: {text}" for text in sizes) + tuple(
+    wrong = defect_warnings({key: entry.defect for key, entry in images.items()})
+    return tuple(f"detection: {text}" for text in (*sizes, *wrong)) + tuple(
         f"detection: {entry.file}: {entry.status}{': ' + entry.message if entry.message else ''}"
         for entry in images.values()
         if entry.status == "failed" or (entry.status == "nothing" and not entry.wrong_size)

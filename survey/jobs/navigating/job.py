@@ -29,6 +29,7 @@ from survey.jobs.navigating.task import (
     chosen_times,
     observed_epoch,
     others_to_navigate,
+    require_one_time,
 )
 from survey.project import Project, read
 from survey.report.results import RESULTS
@@ -69,8 +70,16 @@ class NavigateOutcome:
             "calibration_sigma0": self.calibration.sigma0,
             "sigmas": self.sigmas,
             "diagnosis": [
-                {"name": c.name, "cause": c.cause, "change": c.change, "kind": c.kind, "ids": list(c.ids),
-                 "explained": c.explained, "statistic": c.statistic, "critical": c.critical}
+                {
+                    "name": c.name,
+                    "cause": c.cause,
+                    "change": c.change,
+                    "kind": c.kind,
+                    "ids": list(c.ids),
+                    "explained": c.explained,
+                    "statistic": c.statistic,
+                    "critical": c.critical,
+                }
                 for c in self.causes
             ],
             "notes": list(self.notes),
@@ -138,6 +147,7 @@ def _navigated(folder: Path, request: NavigateRequest, there: Path, place: Path,
     station = request.station or chosen_station(project)
     epochs = chosen_epochs(project, station, request)
     times = chosen_times(epochs, request)
+    late = require_one_time(project.survey, station)
     calibration = _calibrate(project, station, epochs, there / CALIBRATION, place / CALIBRATION)
     calibrated = time.perf_counter()
     named = set(calibration.beacons.beacon_ids)
@@ -155,7 +165,7 @@ def _navigated(folder: Path, request: NavigateRequest, there: Path, place: Path,
     if project.options.sigmas == "a_posteriori" and calibration.sigma0 is not None:
         sigmas, trajectory = "a_posteriori", _scaled(trajectory, calibration.sigma0)
     seconds = {"calibrate": calibrated - begin, "navigate": time.perf_counter() - calibrated}
-    notes = _notes(project, calibration)
+    notes = (*_notes(project, calibration), *late)
     sizes = {c.camera_id: c.image_size for c in project.survey.cameras}
     causes = causes_of_trajectory(calibration.head, calibration.beacons, observed, trajectory, options, sizes)
     outcome = NavigateOutcome(folder, station, calibration, trajectory, notes, seconds, sigmas=sigmas, causes=causes)

@@ -115,6 +115,28 @@ def chosen_times(epochs: Sequence[str], request: NavigateRequest) -> list[float]
     return times
 
 
+def require_one_time(survey: Survey, station_id: str) -> tuple[str, ...]:
+    """Notes on clocks, for people: all that an epoch of a station is navigated from counts as seen at one time.
+
+    Raises SurveyError where clocks say that it is not.
+    """
+    cameras = [c for c in survey.cameras if c.station_id == station_id]
+    carried = next(s for s in survey.stations if s.station_id == station_id).table_id
+    owners = {f"cameras.{c.camera_id}": c.clock for c in cameras}
+    owners |= {f"tables.{t.table_id}": t.clock for t in survey.tables if t.table_id == carried}
+    clocked = {name: clock for name, clock in owners.items() if clock is not None}
+    if not clocked:
+        return ()
+    names = ", ".join(clocked)
+    if len(owners) > 1 or any("line_time" in clock.parameters.names for clock in clocked.values()):
+        raise SurveyError(
+            f"station {station_id!r}: survey.toml gives {names} a clock, so that what its epochs show was seen at "
+            "different times; navigation takes one pose an epoch: let it stand still at the epochs to navigate, and "
+            "calibrate with a folder that has no such clock, or trigger the cameras together"
+        )
+    return (f"{names} has a clock: poses are those when it exposed, not when its epoch was",)
+
+
 def calibrating(project: Project, station: str, epochs: Sequence[str]) -> Survey:
     """The survey that the navigated epochs have no part in, so that no spot is used twice."""
     survey, out = project.survey, set(epochs)
