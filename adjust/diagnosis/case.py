@@ -28,28 +28,42 @@ if TYPE_CHECKING:
 
 CAP = 50.0
 """The most that one component of an observation counts: what is left out, or cannot be predicted, counts so."""
-MOST = 10.0
-"""Adjustments that a diagnosis may take."""
+MOST = 7.0
+"""Adjustments that scores, starts and trials of a diagnosis may take; other evidence takes one or two more."""
 _LEFT_OUT = 4
 _FAR = 25.0
 """Variance factor from which a solution may be another one than that of the observations without their mistake."""
-_WARM, _START, _LOST_ROUNDS = 0.4, 0.4, 3
-"""What adjusting from near values costs, and what finding start values does, against a whole adjustment."""
-_TO_TRY = 1.5
-"""Adjustments that a trial may take: from values that turn out to be spoilt, then from its own start."""
-_SOLVE = SolveOptions(max_step=1e-3, max_iterations=40, settled=1e-6)
-"""A survey that is right converges soon, and is only compared with others."""
+_SCORES, _START, _REST, _STEP, _LOST_ROUNDS = 1.5, 0.5, 0.4, 0.07, 3
+"""What all scores, start values, a graph built and judged, and a step of its solution cost, in adjustments."""
+_CLOCKS = 2.5
+"""How many times more that costs with clocks: what moves is predicted between epochs."""
+_NEAR = AdjustOptions(reject_blocks=False, solve=SolveOptions(max_step=1e-3, max_iterations=20, settled=1e-4))
+_OWN = replace(_NEAR, solve=replace(_NEAR.solve, max_iterations=8))
+"""From near values and from own start values: a survey that is right converges soon, and is only compared."""
+_HOPELESS = 8
+"""Steps after which a trial from near values leaves less than the survey as it stands does, or leads nowhere."""
 
 
 @dataclass
 class Budget:
-    """What a diagnosis may still adjust, in adjustments of its survey; a part of it counts as its share of images."""
+    """What a diagnosis may still adjust, in adjustments of its survey; a part of it counts as its share of images.
+
+    kept: of that for later. refused: whether something was.
+    """
 
     left: float = MOST
+    kept: float = 0.0
+    refused: bool = False
+
+    @property
+    def lasts(self) -> bool:
+        """Whether something is left for now."""
+        return self.left > self.kept
 
     def spend(self, share: float) -> None:
-        """SurveyError where nothing is left."""
-        if self.left <= 0.0:
+        """SurveyError where nothing is."""
+        if not self.lasts:
+            self.refused = True
             raise SurveyError("the time of the diagnosis is spent")
         self.left -= share
 
@@ -74,8 +88,33 @@ class Case:
     def run(self, survey: Survey) -> Adjustment:
         """A survey like this one, or a part of it, adjusted from its own start. SurveyError where that fails."""
         blocks = len(survey.image_blocks), len(self.survey.image_blocks)
-        self.budget.spend(blocks[0] / blocks[1] if blocks[0] and blocks[1] else 1.0)
-        return adjust(survey, None, AdjustOptions(solve=_SOLVE))
+        share = blocks[0] / blocks[1] if blocks[0] and blocks[1] else 1.0
+        if blocks[0] or survey.pairs:
+            return self._adjusted(survey, None, _OWN, (_START + _REST) * share, _STEP * share)
+        return self._adjusted(survey, start_values(find_start(survey)), _OWN, _START + _REST)
+
+    def _near(
+        self, survey: Survey, result: Adjustment, most: float = np.inf, options: AdjustOptions = _NEAR
+    ) -> Adjustment:
+        """From the values of another adjustment. most: v'Pv that it has to come below."""
+        rest = _REST if survey.image_blocks else _START + _REST
+        return self._adjusted(survey, completed(survey, values_of(result, survey)), options, rest, most=most)
+
+    def _adjusted(
+        self, survey: Survey, start: StartValues | None, options: AdjustOptions, first: float, step: float = _STEP,
+        most: float = np.inf,
+    ) -> Adjustment:  # fmt: skip
+        """Paid for as it goes: it begins where something is left, and every step costs."""
+        def went(iteration: int, omega: float) -> None:
+            self.budget.left -= step
+            if iteration >= _HOPELESS and omega > most:
+                raise SurveyError("it leads away")
+
+        clocks = [o.clock for of in (survey.cameras, survey.tables, survey.stations) for o in of]
+        if any(clock is not None for clock in clocks):
+            first, step = _CLOCKS * first, _CLOCKS * step
+        self.budget.spend(first)
+        return adjust(survey, start, options, went)
 
     def warm(self, survey: Survey) -> Adjustment:
         """A survey that is much like this one, with all images, adjusted from the values of this one.
@@ -86,9 +125,7 @@ class Case:
             return self._last[0][1]
         if self.linear is None:
             raise SurveyError("there are no values to begin with")
-        start = completed(survey, values_of(self.linear.result, survey))
-        self.budget.spend(_WARM)
-        result = adjust(survey, start, AdjustOptions(reject_blocks=False, solve=_SOLVE))
+        result = self._near(survey, self.linear.result, self.linear.result.omega)
         self._last[:] = [(survey, result)]
         return result
 
@@ -106,7 +143,7 @@ class Case:
         """Start values of a survey: closed forms and robust means of what agrees; None where these find none."""
         for _ in range(_LOST_ROUNDS):
             try:
-                self.budget.spend(_START)
+                self.budget.spend(_START if survey.image_blocks else 0.1)
                 return started_values(start_values(find_start(survey)))
             except IndeterminateError as error:
                 lost = {n.removeprefix("point ") for n in error.parameters}
@@ -138,7 +175,7 @@ class Case:
             self._without[field_name] = dict.fromkeys(self._worst(field_name, ids)[: _LEFT_OUT * (len(ids) > 1)], ())
         for owner, known in self._without[field_name].items():
             if not known:
-                if self.budget.left < _TO_TRY:
+                if not self.budget.lasts:
                     return
                 known = self._without[field_name][owner] = (self.rough(without(self.survey, field_name, owner)),)
             if known[0] is not None:
@@ -166,12 +203,16 @@ class Case:
 
         if self.result is None and not isinstance(self.error, NotConvergedError):
             return None
-        if self.result is not None and (self.is_whole or not self.result.redundancy > 0):
-            return Linear(self.result) if self.result.redundancy > 0 else None
+        if self.result is not None and not self.result.redundancy > 0:
+            return None
         try:
-            self.budget.spend(1.0)
-            solve = _SOLVE if self.result is not None else replace(_SOLVE, max_iterations=SolveOptions().max_iterations)
-            return Linear(adjust(self.survey, None, AdjustOptions(reject_blocks=False, solve=solve)))
+            result = self.result
+            if result is None:
+                result = self._adjusted(self.survey, None, _NEAR, _START + _REST)
+            elif not self.is_whole:
+                result = self._near(self.survey, result, options=_OWN)
+            self.budget.spend(_SCORES)
+            return Linear(result)
         except SurveyError:
             return None
 
@@ -269,6 +310,16 @@ def single_views(survey: Survey, lenses: Mapping[str, FloatArray]) -> Views:
     seen = {i: points[str(blocks[i].target_id)][blocks[i].point_idx[blocks[i].mask]] for i in rays}
     sights = joined([(i, x, rays[i], focal[blocks[i].camera_id]) for i, x in seen.items() if len(x) >= 3])
     return make_views(sights)[0]
+
+
+def squares_alone(survey: Survey, lenses: Mapping[str, FloatArray]) -> FloatArray:
+    """(b,) sums of squares over sigmas of each block at its own best pose; zero where it has none."""
+    out = np.zeros(len(survey.image_blocks))
+    for view in single_views(survey, lenses):
+        block = survey.image_blocks[view.block_idx]
+        variance = float(np.mean(np.trace(block.cov, axis1=1, axis2=2))) / 2.0
+        out[view.block_idx] = len(view.x) * float(view.error_px[0]) ** 2 / variance
+    return out
 
 
 def completed(survey: Survey, start: StartValues) -> StartValues:

@@ -1,27 +1,28 @@
 """The way of a diagnosis: hypotheses from cheap evidence, the likeliest tried, those that explain the misfit ranked."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.ranking import Candidate, ranked
-from adjust.diagnosis.trial import Misfit, Trial, misfit_of, tried
+from adjust.diagnosis.search import Search
+from adjust.diagnosis.trial import Misfit, misfit_of
 from adjust.model.errors import SurveyError
 
 _SHOWN = 3
-_FAINT = 0.2
-_KEPT = 4.0  # adjustments for the second families
+_KEPT, _ONE = 1.25, 1.0  # adjustments for each of the later families, and for a trial of what they find
 
 FAMILIES: tuple[tuple[str, ...], ...] = (
     ("effects", "images", "names", "units", "time", "weights"),
-    ("targets", "bodies"),
+    ("targets",),
+    ("bodies",),
 )
 """Rooms of this one, each with ``hypotheses(case) -> Iterable[Hypothesis]``: what cheap evidence makes worth a try.
 
-The second ones adjust to find theirs: they are asked where what the first ones found does not explain everything.
+The later ones adjust to find theirs: they are asked where what the first ones found does not explain everything.
 """
 
 Family = Callable[[Case], Iterable[Hypothesis]]
@@ -75,50 +76,17 @@ def diagnose(case: Case, families: Sequence[Family] | None = None) -> Diagnosis:
     families: those of ``FAMILIES`` where None. As many are tried as the budget of the case allows. Nothing is repaired,
     nothing is written.
     """
-    base = misfit_of(case.result, case.survey)
-    trials: list[Trial] = []
-    names: list[str] = []
-    queue: list[Hypothesis] = []
+    search = Search(case, misfit_of(case.result, case.survey))
     looked_at = 0
     stages = _all_families() if families is None else [families]
-    for stage, rooms in enumerate(stages, start=1):
-        reserve = _KEPT * (stage < len(stages))
-        formed = [h for family in rooms for h in _formed(family, case)]
+    for later, rooms in zip(reversed(range(len(stages))), stages, strict=True):
+        kept = _KEPT * later * bool(case.survey.image_blocks)
+        case.budget.kept = kept + _ONE
+        formed = [] if search.done() else [h for family in rooms for h in _formed(family, case)]
         looked_at += sum(h.looked_at for h in formed)
-        queue = _in_turn(queue + formed)
-        while queue and case.budget.left > (0.0 if _done(trials, 0.0) else reserve):
-            first = queue.pop(0)
-            names.append(first.name)
-            trial = tried(first, case, base)
-            more = list(first.follow(trial.result)) if first.follow is not None and trial.result is not None else []
-            same = [replace(trial, hypothesis=h) for h in more if h.survey is first.survey]
-            trials += same or [trial]
-            queue = [h for h in more if h.survey is not first.survey] + queue
-            queue = [h for h in queue if not _done(trials, h.evidence)]
-        if _done(trials, 0.0):
-            break
-    untried = dict.fromkeys(h.name for h in queue if h.name not in names)
-    found = ranked(base, trials, looked_at)
-    return Diagnosis(found, tuple(dict.fromkeys(names)), base, tuple(untried), tuple(case.passed_over))
-
-
-def _done(trials: Sequence[Trial], following: float) -> bool:
-    """Whether one explains everything down to the noise, and what follows has much less evidence."""
-    return any(
-        t.result is not None and t.misfit.unused + t.misfit.dropped == 0
-        and t.misfit.is_noise() and following < _FAINT * t.hypothesis.evidence
-        for t in trials
-    )  # fmt: skip
-
-
-def _in_turn(formed: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """The most evident first; of every kind one before the second of any: their evidence is not of one measure."""
-    before: dict[str, int] = {}
-    turns = []
-    for h in sorted(formed, key=lambda h: -h.evidence):
-        turns.append((before.setdefault(h.name, 0), h))
-        before[h.name] += 1
-    return [h for _, h in sorted(turns, key=lambda item: item[0])]
+        search.over(formed, 0.0 if search.done() else kept)
+    found = ranked(search.base, search.told, looked_at)
+    return Diagnosis(found, tuple(dict.fromkeys(search.names)), search.base, search.untried, tuple(case.passed_over))
 
 
 def _all_families() -> list[list[Family]]:

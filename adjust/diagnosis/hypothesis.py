@@ -105,7 +105,8 @@ class Hypothesis:
     looked_at: how many such hypotheses were compared with each other, for the family-wise level. follow: what the
     adjustment tells more exactly, in place of this one: the same survey under its right name, or another one to be
     tried. penalty: what the change adds to minus twice the log likelihood beside v'Pv, where it changes variances: the
-    sum of the logarithms of their factors.
+    sum of the logarithms of their factors. scored: the evidence is how many times less the misfit beyond noise becomes
+    by the score at the solution.
     """
 
     name: str
@@ -119,6 +120,7 @@ class Hypothesis:
     looked_at: int = 1
     follow: Callable[[Adjustment], Sequence["Hypothesis"]] | None = None
     penalty: float = 0.0
+    scored: bool = False
 
     def changed(self) -> Survey | None:
         """The survey to be tried; None where the change turns out not to be possible."""

@@ -12,20 +12,21 @@ from adjust.frames.runs import MOVING
 from adjust.frames.tables import table_motions
 from adjust.frames.unknowns import FrameTree, Unknowns
 from adjust.graph.assembly import StartValues
-from adjust.lenses.models import MODELS, camera_constants, project
+from adjust.lenses.compared import motion_derivatives
+from adjust.lenses.models import MODELS, camera_constants, lens_derivatives, project
 from adjust.model.boards import deformed, warming_of
 from adjust.model.clocks import epoch_times
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import Camera, Clock, FloatArray, Survey, Target
+from adjust.native.lenses import FISHEYE
 from adjust.observations.clocks import between, nearest
-from adjust.spatial.rigid import inverse, rigid
+from adjust.spatial.rigid import inverse, rigid, transform
 
 Altered = Mapping[ParameterName, Pose3 | FloatArray]
 Links = tuple[tuple[ParameterName, bool], ...]
 """A chain: of every link its name, and whether it is inverted."""
-_DELTA = 1e-5
 
 
 def adjusted_values(result: Adjustment) -> Altered:
@@ -64,28 +65,37 @@ class Prediction:
         return None if uv is None else np.einsum("ni,nij,nj->n", uv - block.uv, np.linalg.inv(block.cov), uv - block.uv)
 
     def by_motion(self, block: ImageBlock, body: ParameterName) -> FloatArray | None:
-        """(n, 2, 6) px by a small motion of a body whose pose is held, as in :meth:`uv`; by central differences."""
-        pose, x = self.pose(block, {}), self._points(block, {})
-        if pose is None or x is None:
+        """(n, 2, 6) px by a small motion of a body whose pose is held, as in :meth:`uv`."""
+        found = self._by_place(block)
+        if found is None:
             return None
-        moved = np.array([self._moved_body(block, pose, {body: step}) for step in _STEPS])
-        return self._differences(block, np.einsum("kij,nj->kni", moved[:, :3, :3], x) + moved[:, None, :3, 3])
+        x, pose, by_x = found
+        if body[0] == "target_body":
+            return motion_derivatives(by_x @ pose[:3, :3], x)
+        own = self.link(("station_from_camera", block.camera_id))
+        own = np.eye(4) if own is None else own
+        return -motion_derivatives(by_x @ own[:3, :3].T, transform(own @ pose, x))
 
     def by_shape(self, block: ImageBlock, change: FloatArray) -> FloatArray | None:
-        """(n, 2, k) px by a change (P, 3, k) of all points of its target, in the target's axes; as above."""
-        pose, x = self.pose(block, {}), self._points(block, {})
-        if pose is None or x is None:
-            return None
-        by = np.moveaxis(change[block.point_idx], 2, 0)[:, None] * (_DELTA * np.array([1.0, -1.0])[:, None, None])
-        return self._differences(block, (x + by.reshape(-1, *x.shape)) @ pose[:3, :3].T + pose[:3, 3])
+        """(n, 2, k) px by a change (P, 3, k) of all points of its target, in the target's axes."""
+        found = self._by_place(block)
+        return None if found is None else np.asarray(found[2] @ found[1][:3, :3] @ change[block.point_idx])
 
-    def _differences(self, block: ImageBlock, x_in_camera: FloatArray) -> FloatArray | None:
-        """(n, 2, k) px by k changes, of points (2 k, n, 3) after a step of each there and back."""
-        uv = self._project(block, x_in_camera.reshape(-1, 3), {})
-        if uv is None:
-            return None
-        both = uv.reshape(len(x_in_camera) // 2, 2, -1, 2)
-        return np.asarray(np.moveaxis((both[:, 0] - both[:, 1]) / (2.0 * _DELTA), 0, -1))
+    def _by_place(self, block: ImageBlock) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """Its points (n, 3) m on their target, ``camera_from_target``, (n, 2, 3) px/m by places in the camera."""
+        if block.place not in self._places:
+            pose, x, lens = self.pose(block, {}), self._points(block, {}), self._lens(block, {})
+            camera, found = self._cameras[block.camera_id], None
+            if pose is not None and x is not None and lens is not None:
+                model, q = MODELS[camera.lens.model], np.ascontiguousarray(transform(pose, x))
+                if model.kind == FISHEYE or not (q[:, 2] <= 0.0).any():
+                    found = x, pose, lens_derivatives(model, lens, camera_constants(camera), q, block.uv)[2]
+            self._places[block.place] = found
+        return self._places[block.place]
+
+    @cached_property
+    def _places(self) -> dict[tuple[str, str, str | None, str], tuple[FloatArray, FloatArray, FloatArray] | None]:
+        return {}
 
     def pose(self, block: ImageBlock, altered: Altered) -> FloatArray | None:
         """(4, 4) ``camera_from_target`` of a block."""
@@ -256,5 +266,3 @@ class Prediction:
         found = [self._value(("point", self.survey.points[int(i)].point_id), altered) for i in block.point_idx]
         return np.array([np.full(3, np.nan) if x is None else x for x in found])
 
-
-_STEPS = tuple(Pose3.Expmap(s * _DELTA * np.eye(6)[k]) for k in range(6) for s in (1.0, -1.0))

@@ -1,5 +1,6 @@
 """One hypothesis, tried: its survey adjusted, and what is left unexplained."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +13,8 @@ from adjust.model.survey import FloatArray, Survey
 
 _NOISE = 5.0
 """Sigmas of v'Pv up to which what is left is noise."""
+_LAST = 0.7
+"""Adjustments that finding the size of a change leaves for the one that shows what it explains."""
 _FACTORS = 2.0 ** np.arange(24.0)
 
 
@@ -48,37 +51,63 @@ class Misfit:
         return max(0.0, self.omega - self.redundancy)
 
 
+    def times_less_than(self, other: "Misfit") -> float:
+        """How many times less than another one it exceeds noise; noise itself is some of it."""
+        noise = float(np.sqrt(2.0 * max(self.redundancy, 1)))
+        return (other.excess + noise) / (self.excess + noise)
+
+
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """A hypothesis, with the misfit of its survey and the adjustment that showed it (None: it led to no solution)."""
+    """A hypothesis, with the misfit of its survey and the adjustment that showed it (None: it led to no solution).
+
+    untimely: there was no time to find out.
+    """
 
     hypothesis: Hypothesis
     misfit: Misfit
     result: Adjustment | None
+    survey: Survey | None = None
+    untimely: bool = False
+
+    def explains(self, share: float, base: Misfit) -> bool:
+        """Whether it takes away this share of the misfit beyond noise, with all observations."""
+        left = self.misfit.cost - self.misfit.redundancy
+        return self.result is not None and self.misfit.unused == 0 and left <= (1.0 - share) * base.excess
 
 
-def tried(hypothesis: Hypothesis, case: Case, base: Misfit) -> Trial:
-    """The survey of a hypothesis adjusted from the values of its case, and where that leads nowhere from its own start.
-
-    So it is, too, where these values may be spoilt by what the case does not explain. base: what that is.
-    """
+def tried(hypothesis: Hypothesis, case: Case) -> Trial:
+    """The survey of a hypothesis adjusted from the values of its case, where there are none from its own start."""
+    case.budget.refused = False
+    case.budget.kept += _LAST
     survey = hypothesis.changed()
+    case.budget.kept -= _LAST
     if survey is None:
-        return Trial(hypothesis, misfit_of(None, case.survey), None)
+        return Trial(hypothesis, misfit_of(None, case.survey), None, None, case.budget.refused)
+    case.budget.refused = False
+    return _adjusted(hypothesis, survey, case, case.run if case.linear is None else case.warm)
+
+
+def tried_afresh(trial: Trial, case: Case, base: Misfit) -> Trial | None:
+    """The same from its own start, where the values of the case led away or may be spoilt by what it does not explain.
+
+    None where that is no better, and of what is scored at these values. base: what the case leaves unexplained.
+    """
+    near = case.is_near and trial.misfit.omega < base.omega
+    if trial.survey is None or case.linear is None or near or trial.hypothesis.scored:
+        return None
+    again = _adjusted(trial.hypothesis, trial.survey, case, case.run)
+    return again if again.misfit.omega < trial.misfit.omega else None
+
+
+def _adjusted(hypothesis: Hypothesis, survey: Survey, case: Case, run: Callable[[Survey], Adjustment]) -> Trial:
+    try:
+        result = run(survey)
+    except (SurveyError, RuntimeError):  # the latter from GTSAM, where a hypothesis fits nothing at all
+        result = None
     dropped = max(0, misfit_of(None, case.survey).count - misfit_of(None, survey).count)
-    best = Trial(hypothesis, replace(misfit_of(None, survey), dropped=dropped), None)
-    for run in (case.warm, case.run):
-        try:
-            result = run(survey)
-        except (SurveyError, RuntimeError):  # the latter from GTSAM, where a hypothesis fits nothing at all
-            continue
-        misfit = replace(misfit_of(result, survey), dropped=dropped)
-        if best.result is None or misfit.omega < best.misfit.omega:
-            best = Trial(hypothesis, misfit, result)
-        led = case.is_near or misfit.is_noise()
-        if led and best.misfit.unused == 0 and misfit.omega < base.omega:
-            break
-    return best
+    misfit = replace(misfit_of(result, survey), dropped=dropped)
+    return Trial(hypothesis, misfit, result, survey, result is None and case.budget.refused)
 
 
 def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:

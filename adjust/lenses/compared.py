@@ -137,7 +137,7 @@ def _shift(
     moved = np.asarray(motion.transformFrom(np.ascontiguousarray(points.T))).T
     here = project(optics.model, optics.values, optics.constants, moved)
     _, by_point = _derivatives(optics, moved, here)
-    return here - uv, _by_motion(by_point @ motion.rotation().matrix(), points)[:, :, :dim]
+    return here - uv, motion_derivatives(by_point @ motion.rotation().matrix(), points)[:, :, :dim]
 
 
 def _derivatives(optics: Optics, points: FloatArray, uv: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -156,7 +156,7 @@ def _derivatives(optics: Optics, points: FloatArray, uv: FloatArray) -> tuple[Fl
     return np.asarray(-np.linalg.solve(by_uv, by_lens)), np.asarray(-np.linalg.solve(by_uv, by_point))
 
 
-def _by_motion(by_point: FloatArray, points: FloatArray) -> FloatArray:
+def motion_derivatives(by_point: FloatArray, points: FloatArray) -> FloatArray:
     """From the derivative by a point to that by a motion Exp(tangent) of it: rotation, then translation."""
     x, y, z = points.T
     zero = np.zeros_like(x)
@@ -181,12 +181,12 @@ def projection_covariance(
     dim = 3 if np.isinf(distance) else 6
     if len(cov) == n + 6:
         # station_from_camera * Exp(t): a point of the station moves by Exp(-t) in the camera
-        by_mount = -_by_motion(by_point, points)
+        by_mount = -motion_derivatives(by_point, points)
         by_mount[:, :, dim:] = 0.0
         rows = np.concatenate([by_lens, by_mount], axis=2)
         return np.asarray(rows @ cov @ rows.swapaxes(1, 2))
     part = np.ones(len(uv), dtype=np.bool_) if fitted is None else fitted
-    by_motion = _by_motion(by_point, points)[:, :, :dim]
+    by_motion = motion_derivatives(by_point, points)[:, :, :dim]
     gain = np.linalg.lstsq(by_motion[part].reshape(-1, dim), by_lens[part].reshape(-1, n), rcond=None)[0]
     rows = by_lens - by_motion @ gain
     return np.asarray(rows @ cov @ rows.swapaxes(1, 2))

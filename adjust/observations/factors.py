@@ -75,7 +75,8 @@ class ChainPose:
     def __call__(self, values: gtsam.Values) -> tuple[Pose3, Jacobians]:
         """Pose and Jacobians (6, dim)."""
         c = self.chains
-        self.state.load(values, [int(s) for s in c.slot], lenses=False)
+        if not self.state.served:
+            self.state.load(values, [int(s) for s in c.slot], lenses=False)
         c.evaluate(self.state)
         jacobians: Jacobians = []
         for i, slot in enumerate(c.slot):

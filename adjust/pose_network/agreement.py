@@ -6,6 +6,7 @@ covariances of its pairs; the pairs of a loop that closes agree. What that sorts
 """
 
 from collections import defaultdict
+from collections.abc import Sequence
 from itertools import count
 
 import numpy as np
@@ -35,7 +36,7 @@ def agreeing(network: PoseNetwork, family_alpha: float = 0.001, factor: float = 
     all but one there, which take turns: a wrong pair may leave open the loops of all others at its end. So on until no
     more agree.
     """
-    loops = _short_loops(network, network.used, network.used)
+    loops = pair_loops(network)
     fine = network.used.copy()
     fine[loops.pair_idx] = False
     if not len(loops):
@@ -53,12 +54,27 @@ def agreeing(network: PoseNetwork, family_alpha: float = 0.001, factor: float = 
             return fine
 
 
-def loop_tests(network: PoseNetwork) -> FloatArray:
-    """Of each pair (E,) in use the misclosure of a short loop through it, chi-square over its degrees of freedom."""
-    loops, out = _short_loops(network, network.used, network.used), np.full(network.n_pairs, np.nan)
-    if len(loops):
-        test, freedom = _tests(network, loops)
-        out[loops.pair_idx[loops.ptr[:-1]]] = test / freedom
+def pair_loops(network: PoseNetwork) -> Loops:
+    """A short loop through each pair in use, where there is one."""
+    return _short_loops(network, network.used, network.used)
+
+
+def loop_tests(network: PoseNetwork, loops: Loops, motions: Sequence[Motions]) -> FloatArray:
+    """(n, E) misclosures of each pair's loop with each of n sets of motions, chi-square over its freedom; nan without.
+
+    loops: of :func:`pair_loops`.
+    """
+    n, size = len(motions), network.n_pairs
+    out = np.full((n, size), np.nan)
+    if n and len(loops):
+        set_of = np.repeat(np.arange(n), len(loops.pair_idx))
+        ptr = np.concatenate([[0], np.cumsum(np.tile(loops.lengths, n))])
+        pair_idx, (sense, start) = np.tile(loops.pair_idx, n), (np.tile(x, n) for x in (loops.sense, loops.start_idx))
+        every = Loops(ptr, pair_idx + size * set_of, sense, start)
+        each = zip(*((m.rotation, m.translation) for m in motions), strict=True)
+        joined = Motions(*(np.concatenate(x) for x in each))
+        test, freedom = _tested(every, joined, np.tile(network.cov, (n, 1, 1)), np.tile(network.sizes, n), network.dim)
+        out[:, loops.pair_idx[loops.ptr[:-1]]] = (test / freedom).reshape(n, -1)
     return out
 
 
@@ -95,9 +111,15 @@ def _short_loops(network: PoseNetwork, pairs: BoolArray, through: BoolArray) -> 
 
 def _tests(network: PoseNetwork, loops: Loops) -> tuple[FloatArray, IntArray]:
     """Of the misclosures (L,), chi-square with so many degrees of freedom (L,): 3 with a pair that is a rotation."""
-    d = network.dim
-    w, C = misclosures(loops, _measured(network), np.nan_to_num(network.cov[:, :d, :d], posinf=0.0))
-    test, freedom = np.zeros(len(loops)), np.minimum.reduceat(network.sizes[loops.pair_idx], loops.ptr[:-1])
+    return _tested(loops, network.arrays.motions, network.cov, network.sizes, network.dim)
+
+
+def _tested(
+    loops: Loops, motions: Motions, cov: FloatArray, sizes: IntArray, d: int
+) -> tuple[FloatArray, IntArray]:  # fmt: skip
+    motions = motions if d == 6 else Motions(motions.rotation)
+    w, C = misclosures(loops, motions, np.nan_to_num(cov[:, :d, :d], posinf=0.0))
+    test, freedom = np.zeros(len(loops)), np.minimum.reduceat(sizes[loops.pair_idx], loops.ptr[:-1])
     for k in np.unique(freedom).tolist():
         of = np.flatnonzero(freedom == k)
         test[of] = np.einsum("li,li->l", w[of, :k], np.linalg.solve(C[of, :k, :k], w[of, :k, None])[..., 0])

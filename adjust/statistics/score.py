@@ -145,24 +145,23 @@ class LinearScores:
             return Score(np.zeros(0), np.zeros((0, 0)), 0.0, 0)
         rows, B = (np.concatenate(x) for x in zip(*parts, strict=True))
         B = B * (self._used[rows] * np.repeat(weights, [len(r) for r, _ in parts]))[:, None]
-        A = self.A[rows]
-        near = np.unique(A.indices)
-        AB = np.asarray(A[:, near].T @ B)
-        return score(B.T @ self.e[rows], B.T @ B, AB, self._times_covariance(near, AB))
+        whole = np.zeros((len(self.e), B.shape[1]))
+        whole[rows] = B
+        near, AB = _not_zero(self.A.T @ whole)
+        return score(whole.T @ self.e, B.T @ B, AB, self._times_covariance(near, AB))
 
     def _by_part(self, parts: Sequence[Part]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """B'e (p, k), B'B (p, k, k), and of the u unknowns that have a part in it A'B and Q A'B (p, u, k)."""
         rows, B = (np.concatenate(x) for x in zip(*parts, strict=True))
-        first, (n, k) = np.cumsum([0, *(len(r) for r, _ in parts)]), B.shape
-        columns = k * np.repeat(np.arange(len(parts)), np.diff(first))[:, None] + np.arange(k)
-        apart = sparse.csr_matrix((B.ravel(), columns.ravel(), np.arange(0, n * k + 1, k)), (n, k * len(parts)))
-        A = self.A[rows]
-        near = np.unique(A.indices)
-        AB = (A[:, near].T @ apart).toarray()
+        k, lengths = B.shape[1], [len(r) for r, _ in parts]
+        first, of_part = np.cumsum([0, *lengths]), np.repeat(np.arange(len(parts)), lengths)
+        at = np.repeat(rows, k), (k * of_part[:, None] + np.arange(k)).ravel()
+        apart = sparse.csr_matrix((B.ravel(), at), (len(self.e), k * len(parts)))
+        near, AB = _not_zero((self.A.T @ apart).toarray())
         QAB = self._times_covariance(near, AB)
         g, BB = (np.add.reduceat(x, first[:-1]) for x in (B * self.e[rows, None], B[:, :, None] * B[:, None, :]))
-        of_part = len(near), len(parts), k
-        return g, BB, AB.reshape(of_part).transpose(1, 0, 2), QAB.reshape(of_part).transpose(1, 0, 2)
+        shape = len(near), len(parts), k
+        return g, BB, AB.reshape(shape).transpose(1, 0, 2), QAB.reshape(shape).transpose(1, 0, 2)
 
     def _times_covariance(self, near: IntArray, right: FloatArray) -> FloatArray:
         """Rows of the covariance matrix of all unknowns times what is zero elsewhere than in these rows, (u, c)."""
@@ -171,6 +170,12 @@ class LinearScores:
         whole = np.zeros((len(self.system.columns), right.shape[1]))
         whole[near] = right
         return times_covariance(self.system, whole)[near]
+
+
+def _not_zero(AB: FloatArray) -> tuple[IntArray, FloatArray]:
+    """The rows that are not zero throughout, and these."""
+    near = np.flatnonzero(AB.any(axis=1))
+    return near, np.asarray(AB[near])
 
 
 def ratio(omega: float, n: float, drop: float) -> float:

@@ -9,10 +9,12 @@ from adjust.adjustment import adjust
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.names import hypotheses as names
 from adjust.diagnosis.names.epochs import exchanged_cameras, misplaced_epochs
+from adjust.diagnosis.names.stations import exchanged_stations
 from adjust.diagnosis.units import hypotheses as units
 from adjust.model.survey import Survey
 from survey.project import read
 from survey.simulate import stereo
+from tests.acceptance.planted_surveys import poses
 from tests.adjust.planted import diagnosed, hall
 from tests.data import data_folder
 
@@ -110,3 +112,35 @@ def test_a_robots_poses_shifted_by_one(shift: int) -> None:
     assert first.name == "epochs shifted"
     assert "throughout" in first.cause
     assert ("early" if shift > 0 else "late") in first.cause
+
+
+# -- measured poses --------------------------------------------------------------------------------------------------
+
+
+def renamed(survey: Survey, rows: set[int], a: str, b: str) -> Survey:
+    """Stations a and b called by each other's names in some pairs."""
+    other = {a: b, b: a}
+    return replace(survey, pairs=tuple(
+        replace(p, a=replace(p.a, frame_id=other.get(p.a.frame_id, p.a.frame_id)),
+                b=replace(p.b, frame_id=other.get(p.b.frame_id, p.b.frame_id))) if i in rows else p
+        for i, p in enumerate(survey.pairs)))  # fmt: skip
+
+
+@pytest.mark.parametrize("rotations", [False, True])
+@pytest.mark.parametrize("which", [slice(6, None), slice(2, 3)])
+def test_stations_under_each_others_names_in_pairs(rotations: bool, which: slice) -> None:
+    good = poses(4)[0]
+    if rotations:
+        good = replace(good, pairs=tuple(
+            replace(p, b_from_a=p.b_from_a.rotation(), cov=p.cov[:3, :3]) for p in good.pairs))  # fmt: skip
+    mine = [i for i, p in enumerate(good.pairs) if len({p.a.frame_id, p.b.frame_id} & {"T3", "T6"}) == 1]
+    wrong = set(mine[which])
+    first = next(exchanged_stations(Case(renamed(good, wrong, "T3", "T6"))))
+    assert set(first.place.ids) == {"T3", "T6"}
+    assert [(p.a, p.b) for p in first.changed().pairs] == [(p.a, p.b) for p in good.pairs]
+    assert all(set(e.where["pair_id"]) == {good.pairs[i].pair_id for i in wrong} for e in first.edits)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_stations_under_their_own_names_are_not_blamed(seed: int) -> None:
+    assert list(exchanged_stations(Case(poses(seed)[0]))) == []

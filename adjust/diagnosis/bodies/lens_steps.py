@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 
 from adjust.diagnosis.bodies.series import Step
-from adjust.diagnosis.case import Case, own_lenses, single_views
+from adjust.diagnosis.case import Case, own_lenses, single_views, squares_alone
 from adjust.diagnosis.table.views import single_camera_survey
 from adjust.diagnosis.trial import misfit_of
 from adjust.model.errors import SurveyError
-from adjust.model.survey import Survey
+from adjust.model.survey import FloatArray, Survey
 from adjust.testing.distributions import chi2
 
 _LEAST = 3  # images on either side
@@ -31,13 +31,11 @@ def lens_steps(case: Case) -> Iterator[Step]:
         whole = _misfit(case, alone)
         if whole < _limit(alone):
             continue
-        best = _cut(case, alone)
-        costs = {k: _both(case, alone, k) for k in range(best - _NEAR, best + _NEAR + 1) if _LEAST <= k <= n - _LEAST}
-        best = min(costs, key=lambda k: costs[k], default=0)
+        best, cost = _split(case, alone, _cut(case, alone))
         mine = [i for i, b in enumerate(case.survey.image_blocks)
                 if b.camera_id == camera.camera_id and b.target_id is not None]  # fmt: skip
-        if costs and whole - costs[best] > 0.5 * (whole - _limit(alone)):
-            yield Step(("station_from_camera", camera.camera_id), mine[best], whole - costs[best], n - 2 * _LEAST + 1)
+        if whole - cost > 0.5 * (whole - _limit(alone)):
+            yield Step(("station_from_camera", camera.camera_id), mine[best], whole - cost, n - 2 * _LEAST + 1)
 
 
 def _cut(case: Case, alone: Survey) -> int:
@@ -59,9 +57,28 @@ def _cut(case: Case, alone: Survey) -> int:
     return int(np.argmin(costs))
 
 
-def _both(case: Case, alone: Survey, cut: int) -> float:
-    parts = (alone.image_blocks[:cut], alone.image_blocks[cut:])
-    return sum(_misfit(case, replace(alone, image_blocks=part)) for part in parts)
+def _split(case: Case, alone: Survey, cut: int) -> tuple[int, float]:
+    """Before which image the other lens begins, near to a cut, and what is left; infinite where there are none.
+
+    The images next to the cut belong to the lens that fits them better, of those that the images beyond them give.
+    """
+    n, camera = len(alone.image_blocks), alone.cameras[0].camera_id
+    near = range(max(_LEAST, cut - _NEAR), min(n - _LEAST, cut + _NEAR))
+    if not _LEAST <= cut <= n - _LEAST:
+        return 0, np.inf
+    middle = replace(alone, image_blocks=tuple(alone.image_blocks[i] for i in near))
+    left, squares = 0.0, list[FloatArray]()
+    for part in (alone.image_blocks[: near.start], alone.image_blocks[near.stop :]):
+        try:
+            some = replace(alone, image_blocks=part)
+            result = case.run(some)
+        except SurveyError:
+            return 0, np.inf
+        left += misfit_of(result, some).omega
+        squares.append(squares_alone(middle, {camera: np.asarray(result.estimates["lens", camera].value)}))
+    first, last = squares
+    costs = np.concatenate([[0.0], np.cumsum(first)]) + np.concatenate([np.cumsum(last[::-1])[::-1], [0.0]])
+    return near.start + int(np.argmin(costs)), left + float(costs.min())
 
 
 def _misfit(case: Case, survey: Survey) -> float:

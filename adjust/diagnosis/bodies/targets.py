@@ -32,8 +32,9 @@ def moved_target(survey: Survey, step: Step, epochs: tuple[str, ...]) -> Hypothe
     )  # fmt: skip
 
     def told(result: Adjustment) -> Sequence[Hypothesis]:
-        before, after = (result.estimates[("carrier_from_target", name)].value for name in (target, new))
-        if not isinstance(before, Pose3) or not isinstance(after, Pose3):
+        found = (result.estimates.get(("carrier_from_target", name)) for name in (target, new))
+        before, after = (None if e is None else e.value for e in found)
+        if not isinstance(before, Pose3) or not isinstance(after, Pose3):  # its images were left out
             return ()
         return (replace(hypothesis, cause=f"{hypothesis.cause} {motion_text(before.between(after))}"),)
 

@@ -53,6 +53,8 @@ class Effect:
 
         def made() -> Survey | None:
             at, (theta, result, sigmas) = self, self._estimated(case, linear, self.first.theta)
+            if not self._last:
+                return None
             fits = misfit_of(result, result.survey).is_noise()
             nearer = None if fits else self.nearer(result, theta)
             found_there = None if nearer is None else nearer._estimated(case, linear, theta)
@@ -70,7 +72,7 @@ class Effect:
         sigmas = np.sqrt(np.maximum(np.diag(self.first.cov), 0.0))
         hypothesis = replace(self.hypothesis, survey=made, cause=self.said(self.first.theta, sigmas),
                              parameters=self.hypothesis.parameters + self.first.seen, looked_at=looked_at,
-                             evidence=linear.ratio(self.first.drop))  # fmt: skip
+                             evidence=linear.ratio(self.first.drop), scored=True)  # fmt: skip
         return replace(hypothesis, follow=told) if self.model is None else self.model(hypothesis)
 
     def made(self, result: Adjustment, theta: FloatArray) -> Survey:
@@ -94,9 +96,10 @@ class Effect:
                 new = Linear(case.warm(survey))
                 more = self.score(new)
             except SurveyError:
+                theta = made[-1][0] if made else theta
                 break
-            if made and new.result.omega > now.result.omega:
-                theta = made[-1][0]
+            if new.result.omega > min(now.result.omega, linear.result.omega):
+                theta = made[-1][0] if made else theta
                 break
             made.append((theta, survey))
             if more.drop < _SMALL * new.scale:

@@ -5,10 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from adjust.diagnosis.case import Case, single_views
+from adjust.diagnosis.case import Case, squares_alone
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.images.maps import TURNED, mapped, turned
-from adjust.model.survey import FloatArray, Survey
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
 
@@ -25,20 +24,10 @@ def turned_alone(case: Case) -> Iterator[Hypothesis]:
         mine = [b for b in case.survey.image_blocks if b.camera_id == camera and b.target_id is not None]
         alone = replace(case.survey, image_blocks=tuple(mine))
         epochs = list(dict.fromkeys(b.epoch_id for b in mine))
-        back = _squares(mapped(alone, camera, set(epochs), TURNED[_HALF]), lenses)
-        gain = _squares(alone, lenses) - back
+        back = squares_alone(mapped(alone, camera, set(epochs), TURNED[_HALF]), lenses)
+        gain = squares_alone(alone, lenses) - back
         since = np.array([gain[[b.epoch_id in set(epochs[k:]) for b in mine]].sum() for k in range(1, len(epochs))])
         if len(since) and since.max() > float(chi2.isf(sidak(_ALPHA, len(since)), 1)):
             later = tuple(epochs[int(np.argmax(since)) + 1 :])
             ratio = 1.0 + float(since.max() / max(back[-len(later) :].sum(), 1.0))
             yield turned(case.survey, camera, later, TURNED[_HALF], ratio, len(since))
-
-
-def _squares(survey: Survey, lenses: dict[str, FloatArray]) -> FloatArray:
-    """(b,) sums of squares over sigmas of each block at its own best pose; zero where it has none."""
-    out = np.zeros(len(survey.image_blocks))
-    for view in single_views(survey, lenses):
-        block = survey.image_blocks[view.block_idx]
-        variance = float(np.mean(np.trace(block.cov, axis1=1, axis2=2))) / 2.0
-        out[view.block_idx] = len(view.x) * float(view.error_px[0]) ** 2 / variance
-    return out

@@ -11,7 +11,7 @@ import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Edit, Hypothesis, Place, SetKey
-from adjust.diagnosis.screen import Fit, Screen, improvement, screen
+from adjust.diagnosis.screen import Fit, Screen, at_best, improvement, screen
 from adjust.model.survey import FloatArray, Point, Survey
 
 _CLEARLY = 2.0
@@ -28,7 +28,7 @@ def wrong_given(case: Case) -> Iterator[Hypothesis]:
     given = [p.point_id for p in survey.points if p.x_in_world.treatment != "free" and p.x_in_world.value is not None]
     if not given or not survey.readings or not case.few("wrong given coordinates", len(survey.readings), _LARGE):
         return
-    before = screen(survey)
+    before = at_best(case)
     lost = before is None or before.scale > _SPOILT
     some = [h for h in (*_exchanges(survey, given), *_slips(survey, given))
             if before is None or lost or _misses(survey, before, h.place.ids)]  # fmt: skip

@@ -5,7 +5,7 @@ and shifts of both sides must be those of one rigid body. Inverting both sides o
 (eye-in-hand taken for eye-to-hand): only the lengths of the result tell.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,10 +19,13 @@ from adjust.diagnosis.sequences import Link, fitted, links, typical, with_pairs
 from adjust.diagnosis.units.conventions import Scope, shrinking
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, IntArray, Survey
+from adjust.spatial.rigid_motions import Motions
 from adjust.spatial.rotation_forms import euler_from_matrix, matrix_from_euler
 
 Motion = Pose3 | Rot3
 _CLEARLY = 3.0
+_SURE = 20.0
+"""Evidence that hardly leaves more than noise: what is tried at the robust start is bounded."""
 _MOST, _SINGLE = 5, 8
 _MISSED = 25.0
 """Mean square over sigmas at the start that the typical one of several pairs that are misread has at least."""
@@ -146,11 +149,16 @@ def misread_pairs(case: Case) -> Iterator[Hypothesis]:
     found, looked_at = list[tuple[float, Scope, Convention]](), 0
     meant = [(c, {i: m for i, p in enumerate(survey.pairs) if (m := c.mend(p.b_from_a)) is not None})
              for c in CONVENTIONS]  # fmt: skip
+    last = ""
     for scope in _scopes(survey, judge.worst):
-        for convention, motions in meant:
-            if all(i in motions for i in scope.rows.tolist()):
-                looked_at += 1
-                found.append((judge.evidence({i: motions[i] for i in scope.rows.tolist()}), scope, convention))
+        if scope.place.kind != last and any(evidence > _SURE for evidence, *_ in found):
+            break  # what is wrong with many is not looked for in a few of them
+        last = scope.place.kind
+        rows = scope.rows.tolist()
+        ways = [(c, {i: motions[i] for i in rows}) for c, motions in meant if all(i in motions for i in rows)]
+        looked_at += len(ways)
+        judged = judge.evidence([new for _, new in ways]) if ways else []
+        found += [(e, scope, c) for e, (c, _) in zip(judged, ways, strict=True)]
     found.sort(key=lambda f: (-f[0], -len(f[1].rows)))
     for evidence, scope, convention in found[:_MOST]:
         changed = mended(survey, scope.rows, convention) if evidence > _CLEARLY else None
@@ -207,10 +215,10 @@ def _scopes(survey: Survey, worst: IntArray) -> Iterator[Scope]:
 
 @dataclass(frozen=True, eq=False)
 class _Judge:
-    """worst: pairs that fit least, first. evidence: of other motions of some pairs, how many times less these miss."""
+    """worst: pairs that fit least, first. evidence: of other motions of some pairs, how much less these miss."""
 
     worst: IntArray
-    evidence: Callable[[Mapping[int, Motion]], float]
+    evidence: Callable[[Sequence[Mapping[int, Motion]]], list[float]]
 
 
 def _by_hands(survey: Survey, hands: list[Link]) -> _Judge:
@@ -233,7 +241,7 @@ def _by_hands(survey: Survey, hands: list[Link]) -> _Judge:
         some = np.isin(rows, list(new))
         return typical(base[some]) / typical(misses(new)[some]) if some.any() else 0.0
 
-    return _Judge(rows[np.argsort(-base, kind="stable")], evidence)
+    return _Judge(rows[np.argsort(-base, kind="stable")], lambda sets: [evidence(new) for new in sets])
 
 
 def _second(survey: Survey, link: Link, new: Mapping[int, Motion]) -> FloatArray:
@@ -256,26 +264,27 @@ def _by_start(case: Case) -> _Judge | None:
     before = at_best(case)
     if before is None:
         return None
-    squares, loops = _of_pairs(before, survey), _loops(survey)
+    squares, loops = _of_pairs(before, survey), _loop_tests(survey)
     worst = np.argsort(-squares, kind="stable")
     ends = np.array([[p.a.frame_id, p.b.frame_id] for p in survey.pairs])
     ends = np.unique(ends, return_inverse=True)[1].reshape(-1, 2)
     degree = np.bincount(ends.ravel())
+    opened = float(np.minimum(loops([{}]), CAP).sum())
 
-    def evidence(new: Mapping[int, Motion]) -> float:
-        rows = np.array(list(new))
+    def evidence(sets: Sequence[Mapping[int, Motion]]) -> list[float]:
+        rows = np.array(list(sets[0]))
         if len(rows) > 1 and np.median(squares[rows]) < _MISSED:
-            return 0.0
-        if (2 * np.bincount(ends[rows].ravel(), minlength=len(degree)) > degree).any():  # what told the pose of an end
-            changed = _with(survey, new)
-            open_still = np.median(_loops(changed)[rows]) > max(1.0, 0.5 * np.median(loops[rows]))
-            after = None if open_still else screen(changed)
-            if after is None:
-                return 0.0
-            now, rows = _of_pairs(after, survey), np.arange(len(squares))
-        else:
-            now = squares.copy()
-            now[rows] = _read_as(before, new)
+            return [0.0] * len(sets)
+        if not (2 * np.bincount(ends[rows].ravel(), minlength=len(degree)) > degree).any():
+            return [gain(rows, _read_as(before, new)) for new in sets]
+        # what told the pose of an end
+        still = np.minimum(loops(sets), CAP).sum(axis=1) > max(2.0 * len(squares), 0.5 * opened)
+        after = (None if x else screen(_with(survey, new)) for x, new in zip(still, sets, strict=True))
+        return [0.0 if x is None else gain(np.arange(len(squares)), _of_pairs(x, survey)) for x in after]
+
+    def gain(rows: IntArray, after: FloatArray) -> float:
+        now = squares.copy()
+        now[rows] = after
         scale = max(1.0, min(float(np.median(now)), float(np.median(squares))) / 2.0)
         old, left = (np.minimum(s[rows] / scale, CAP).sum() for s in (squares, now))
         return float(old / (left + 0.1 * len(rows)))
@@ -283,14 +292,25 @@ def _by_start(case: Case) -> _Judge | None:
     return _Judge(worst, evidence)
 
 
-def _loops(survey: Survey) -> FloatArray:
-    """(p,) squares over sigmas by which a short loop through each pair stays open; 1 where there is none."""
+def _loop_tests(survey: Survey) -> Callable[[Sequence[Mapping[int, Motion]]], FloatArray]:
+    """By n sets of other motions of some pairs (n, p) squares over sigmas of a loop through each, 1 without one."""
     if not survey.is_pose_network:
-        return np.ones(len(survey.pairs))
-    from adjust.pose_network.agreement import loop_tests  # here: a survey without pairs starts without it
+        return lambda sets: np.ones((len(sets), len(survey.pairs)))
+    from adjust.pose_network.agreement import loop_tests, pair_loops  # here: a survey without pairs starts without it
     from adjust.pose_network.from_survey import network_from_survey
 
-    return np.nan_to_num(loop_tests(network_from_survey(survey, any_datum=True)), nan=1.0)
+    network = network_from_survey(survey, any_datum=True)
+    loops, read = pair_loops(network), network.arrays.motions
+
+    def meant(new: Mapping[int, Motion]) -> Motions:
+        R, t = read.rotation.copy(), np.array(read.translation)
+        for i, motion in new.items():
+            R[i] = _matrix(motion)
+            if isinstance(motion, Pose3):
+                t[i] = motion.translation()
+        return Motions(R, t)
+
+    return lambda sets: np.nan_to_num(loop_tests(network, loops, [meant(new) for new in sets]), nan=1.0)
 
 
 def _read_as(found: Screen, new: Mapping[int, Motion]) -> FloatArray:

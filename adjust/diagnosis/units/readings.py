@@ -60,12 +60,13 @@ def _slips(survey: Survey, before: Screen | None, values: FloatArray) -> list[_F
     ways = [(i, slip) for i in worst.tolist() for slip in slips(survey.readings[i].kind, values[i])]
     after = before.alternatives([np.array([i]) for i, _ in ways], observed=np.array([w.factor * values[i]
                                                                                       for i, w in ways]))  # fmt: skip
-    out = []
+    out, others = [], max(1.0, float(before.missed.sum()))  # among so many that miss one alone explains the less
     for (i, slip), now in zip(ways, after, strict=True):
         evidence = min(float(before.readings[i]) / before.scale, _FAR) / (float(now[0]) / before.scale + 5.0)
         if evidence > _CLEARLY:  # of it alone: among all others one bounded misfit is soon lost
             name = survey.readings[i].reading_id
-            out.append((evidence, Scope(np.array([i]), f"reading {name}", Place("reading", (name,), "value")), slip))
+            scope = Scope(np.array([i]), f"reading {name}", Place("reading", (name,), "value"))
+            out.append((evidence / others, scope, slip))
     return out
 
 

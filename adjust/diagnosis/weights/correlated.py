@@ -4,14 +4,16 @@ One variance component beside their own (Searle, Casella, McCulloch 1992, balanc
 the means of such sets exceed what independent residuals make by ``n s^2``.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
+from adjust.diagnosis.trial import misfit_of
 from adjust.model.observations import ReadingCovariance
+from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.testing.distributions import chi2
 
@@ -19,7 +21,7 @@ _Common = tuple[str, list[IntArray], float]
 """A kind of readings, its sets, and the error that each set has in common over their own sigma."""
 _ALPHA = 1e-6
 _FEWEST, _SETS = 3, 3
-_TRIED = (1.0, 3.0, 10.0)
+_TRIED = (3.0, 1.0, 10.0)
 _LAST = 1.5
 """Evidence: as for sigmas, larger variances fit anything, so what else there is to try is tried first."""
 
@@ -42,8 +44,20 @@ def correlated_readings(case: Case) -> Iterator[Hypothesis]:
             n = float(np.mean([len(s) for s in sets]))
             found.append((kind, sets, float(np.sqrt(max(between / len(sets) - 1.0, 0.0) / n))))
     for some in ([found] if len(found) > 1 else []) + [[one] for one in found]:
-        for factor in _TRIED:  # what the unknowns take over of a common error does not show in residuals
-            yield _hypothesis(survey, some, factor)
+        # what the unknowns take over of a common error does not show in residuals
+        first, *others = (_hypothesis(survey, some, factor) for factor in _TRIED)
+        yield replace(first, follow=_others_if_half(case, first, others))
+
+
+def _others_if_half(
+    case: Case, first: Hypothesis, others: list[Hypothesis]
+) -> Callable[[Adjustment], list[Hypothesis]]:
+    """Other sizes of a common error, where the first takes away half of the misfit."""
+    def told(result: Adjustment) -> list[Hypothesis]:
+        half = misfit_of(result, case.survey).excess < 0.5 * misfit_of(case.result, case.survey).excess
+        return [first, *others] if half else [first]
+
+    return told
 
 
 def _sets(survey: Survey, kind: str) -> list[IntArray]:

@@ -19,6 +19,10 @@ _LARGE = 1.15
 """sigma0 from which a mistake is looked for by trial; below, sigmas that are a little small explain as much."""
 
 
+NOT_LOOKED_FOR = ("two mistakes at once", "bodies that bend or never rest", "refraction")
+"""Told where nothing is named; the documentation says more."""
+
+
 def explained(survey: Survey, error: SurveyError, project: Project) -> SurveyError:
     """What an adjustment of the ``survey`` of a project raised, with the probable causes in front, if any."""
     apart, contradictions = separate_epochs(survey), _probable_causes(survey)
@@ -105,7 +109,10 @@ def _misread(survey: Survey, result: Adjustment) -> "Diagnosis | None":
 def _named(found: "Diagnosis | None", project: Project) -> "tuple[Diagnosis | None, tuple[str, ...]]":
     """The diagnosis with the lines of its project, where it names anything; else what it was not able to look for."""
     if found is None or not found.candidates:
-        return None, (f"causes of what contradicts: {found.note}",) if found is not None and found.note else ()
+        if found is None:
+            return None, ()
+        note = "; ".join(t for t in (found.note, f"never looked for: {', '.join(NOT_LOOKED_FOR)}") if t)
+        return None, (f"causes of what contradicts: nothing that was tried explains it; {note}",)
     from survey.jobs.adjusting.places import located  # here: as above
 
     return located(found, project), ()

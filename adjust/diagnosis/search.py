@@ -1,0 +1,114 @@
+"""Which hypotheses are tried, in which order, and when there is no need for more."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import Hypothesis
+from adjust.diagnosis.trial import Misfit, Trial, tried, tried_afresh
+
+_FAINT, _FAINT_TO_NOISE = 0.2, 0.7
+"""Evidence over that of a trial that leaves little, or nothing but noise, below which nothing else is tried."""
+_MOST_OF_IT, _ENOUGH = 0.95, 0.5
+"""Shares of the misfit beyond noise: what ends a search, and what a cause takes away at least."""
+_CLEAR = 3.0
+"""Evidence of a hypothesis that is tried from its own start as well before the next one is tried at all."""
+_AFRESH = 2
+
+
+@dataclass
+class Search:
+    """base: what the case leaves unexplained. names: of all kinds that were tried. queue: what is still to be tried."""
+
+    case: Case
+    base: Misfit
+    trials: list[Trial] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
+    queue: list[Hypothesis] = field(default_factory=list)
+
+    def over(self, formed: Iterable[Hypothesis], kept: float) -> None:
+        """Try these and what is left, the likeliest first, as long as the budget lasts. kept: of it for later ones.
+
+        First from the values of the case; of what no values are near to, afresh. What there was no time for waits.
+        """
+        self.queue, waiting, astray = _in_turn([*self.queue, *formed]), list[Hypothesis](), list[Trial]()
+        self.case.budget.kept = kept
+        while self.queue and self.case.budget.lasts:
+            trial = tried(self.queue.pop(0), self.case)
+            clear = trial.hypothesis.evidence > _CLEAR and not trial.explains(_ENOUGH, self.base)
+            if trial.untimely:
+                waiting.append(trial.hypothesis)
+                continue
+            if clear or trial.misfit.omega >= self.base.omega:
+                trial = tried_afresh(trial, self.case, self.base) or trial
+            else:
+                astray.append(trial)
+            self.names.append(trial.hypothesis.name)
+            self._note(trial)
+        for trial in sorted(astray, key=lambda t: -t.hypothesis.evidence)[:_AFRESH]:
+            again = None if self.explained(_ENOUGH) else tried_afresh(trial, self.case, self.base)
+            if again is not None:
+                self._note(again)
+        self.queue += [h for h in waiting if not self._beaten(h)]
+
+    def explained(self, share: float) -> bool:
+        """Whether one takes away this share of the misfit beyond noise."""
+        return any(t.explains(share, self.base) for t in self.trials)
+
+    def done(self, following: float = 0.0) -> bool:
+        """Whether one explains nearly everything with all observations, and what follows has much less evidence."""
+        best = (t for t in self.trials if t.explains(_MOST_OF_IT, self.base))
+        return any(t.misfit.dropped == 0 and following < _faint(t) for t in best)
+
+    @property
+    def untried(self) -> tuple[str, ...]:
+        """Names of what evidence speaks for, but the time did not suffice for."""
+        return tuple(dict.fromkeys(h.name for h in self.queue if h.name not in self.names))
+
+    @property
+    def told(self) -> list[Trial]:
+        """The trials to be ranked: larger variances explain anything, so what waits with more evidence goes first."""
+        most = max((h.evidence for h in self.queue), default=0.0)
+        return [t for t in self.trials if not (t.hypothesis.penalty and t.hypothesis.evidence < min(most, _CLEAR))]
+
+    def _note(self, trial: Trial) -> None:
+        """With what it tells more exactly, in its place or to be tried next."""
+        first = trial.hypothesis
+        more = list(first.follow(trial.result)) if first.follow is not None and trial.result is not None else []
+        same = [replace(trial, hypothesis=h) for h in more if h.survey is first.survey]
+        self.trials += same or [trial]
+        if trial.explains(_MOST_OF_IT, self.base):
+            self.queue = [h for h in self.queue if (h.name, h.place.ids) != (first.name, first.place.ids)]
+        self.queue = [h for h in (*more, *self.queue) if h.survey is not first.survey and not self._beaten(h)]
+        if self.explained(_ENOUGH):
+            self.case.budget.kept = 0.0
+
+    def _beaten(self, h: Hypothesis) -> bool:
+        """Whether what was tried leaves too little for a hypothesis; of scores, also where it drops observations."""
+        best = [t for t in self.trials if t.explains(_MOST_OF_IT, self.base)] if h.scored else []
+        scores = [max(_faint(t), _FAINT * t.misfit.times_less_than(self.base)) for t in best if t.hypothesis.scored]
+        return bool(best and _hopeless(h)) or h.evidence < max(scores, default=0.0) or self.done(h.evidence)
+
+
+def _faint(trial: Trial) -> float:
+    """Evidence that is not worth a trial beside it."""
+    return trial.hypothesis.evidence * (_FAINT_TO_NOISE if trial.misfit.is_noise() else _FAINT)
+
+
+def _hopeless(h: Hypothesis) -> bool:
+    """Whether it leaves most of the misfit by its score, and could not be named."""
+    return h.scored and h.evidence < 1.0 / (1.0 - _ENOUGH)
+
+
+def _in_turn(formed: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """The most evident first; of every kind one before the second of any: their evidence is not of one measure.
+
+    Last what by its score leaves most of the misfit, and could not be named.
+    """
+    before: dict[tuple[str, str], int] = {}
+    turns = []
+    for h in sorted(formed, key=lambda h: -h.evidence):
+        kind = h.name, h.place.kind
+        turns.append((_hopeless(h), before.setdefault(kind, 0), h))
+        before[kind] += 1
+    return [h for *_, h in sorted(turns, key=lambda item: item[:2])]
