@@ -96,8 +96,6 @@ def joined(items: Sequence[tuple[int, FloatArray, FloatArray, float]]) -> Sights
                   np.array(focal, dtype=np.float64))  # fmt: skip
 
 
-
-
 def block_text(block: ImageBlock) -> str:
     """The block as people know it."""
     seen = f"target {block.target_id!r}" if block.target_id else "world points"
@@ -152,9 +150,9 @@ def rays_of_images(
 
 
 @lru_cache(maxsize=256)
-def _sample(n: int) -> IntArray:
-    """Positions of at most ``_ENOUGH`` of n points, without the pattern of a grid, the same at every call."""
-    return np.arange(n) if n <= _ENOUGH else np.sort(np.random.default_rng(n).permutation(n)[:_ENOUGH])
+def few_of(n: int, most: int = _ENOUGH) -> IntArray:
+    """Positions of at most so many of n points, without the pattern of a grid, the same at every call."""
+    return np.arange(n) if n <= most else np.sort(np.random.default_rng(n).permutation(n)[:most])
 
 
 def make_views(
@@ -168,7 +166,7 @@ def make_views(
     if not len(sights):
         return Views(sights, np.zeros((0, 4, 4)), np.zeros(0), np.zeros(1, dtype=np.int64)), {}
     x, rays, ptr, focal = sights.x, sights.rays, sights.ptr, sights.focal_px
-    few = [_sample(n) for n in np.diff(ptr).tolist()]
+    few = [few_of(n) for n in np.diff(ptr).tolist()]
     few_ptr = ends_of([len(r) for r in few])
     rows = np.concatenate(few) + np.repeat(ptr[:-1], np.diff(few_ptr))
     part = x[rows], rays[rows], few_ptr
@@ -207,9 +205,7 @@ def _likeliest(focal: FloatArray, error: FloatArray, in_front: BoolArray, of: In
     return np.asarray(order[first | (in_front & (error <= limit))])
 
 
-def untrustworthy(
-    views: Views, survey: Survey, refused: Collection[int] = ()
-) -> tuple[dict[int, str], list[str]]:
+def untrustworthy(views: Views, survey: Survey, refused: Collection[int] = ()) -> tuple[dict[int, str], list[str]]:
     """Reasons against blocks that no pose explains, and notes on blocks with single gross points; not of those refused.
 
     The limit of a camera is ten times the median error of its blocks, but at least 3 px.

@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from survey.commands.common import (
+    begin_adjusting,
     is_set,
     not_negative,
     positive,
-    postpone,
     print_json,
     require_project,
     say,
@@ -84,7 +84,7 @@ def _adjust(arguments: argparse.Namespace) -> int:
 
 
 def _adjust_one(folder: Path, arguments: argparse.Namespace) -> int:
-    postpone()
+    begin_adjusting()
     require_project(folder, arguments.out)
     from survey.jobs.adjusting.job import adjust_job
     from survey.report.results import ReportOptions

@@ -20,6 +20,7 @@ from survey.folder.messages import message, shown
 
 DONE, FAILED, USAGE, TEST_FAILED, INTERRUPTED = 0, 1, 2, 3, 130
 _OBJECTS = 250_000  # new ones before Python looks for cycles: loading modules makes many and no cycles
+_MALLOC = {-3: 2**30, -1: 2**30, -2: 2**26}  # bytes: M_MMAP_THRESHOLD, M_TRIM_THRESHOLD, M_TOP_PAD of malloc.h
 _OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)  # writing does not say which file
 
 
@@ -72,8 +73,18 @@ def run_as_program(main: Callable[[], int]) -> NoReturn:
     sys.exit(code)
 
 
-def postpone() -> None:
-    """Modules that load when their contents are first looked at: SciPy imports all of NumPy and needs little of it."""
+def begin_adjusting() -> None:
+    """Before a command that adjusts and ends: less to load, and memory that was freed is used again.
+
+    Modules that load when their contents are first looked at: SciPy imports all of NumPy and needs little of it. Large
+    arrays come and go by the hundred; given back every time, the system clears as many pages as the command has points.
+    """
+    import ctypes  # here: --help starts without it
+
+    os.environ.setdefault("NUMPY_MADVISE_HUGEPAGE", "0")  # pages of 2 MB are sought, and cleared whole, at every array
+    if sys.platform == "linux" and (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:  # of glibc
+        for option, value in _MALLOC.items():
+            mallopt(option, value)
     for name in ("numpy.f2py", "numpy.testing"):
         spec = None if name in sys.modules else importlib.util.find_spec(name)
         if spec is not None and spec.loader is not None:

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from survey.commands.common import DONE, is_set, print_json, require_project, say, show, tested
+from survey.commands.common import DONE, begin_adjusting, is_set, print_json, require_project, say, show, tested
 from survey.commands.excluding import NAMES
 from survey.commands.parser import project_folder
 
@@ -84,6 +84,7 @@ def declare_trackers(commands: Any, shaped: dict[str, Any]) -> None:
 
 
 def _add(arguments: argparse.Namespace) -> int:
+    begin_adjusting()
     require_project(arguments.folder, arguments.out)
     from survey.jobs.network import add_job
 

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from survey.commands.common import DONE, TEST_FAILED, is_set, print_json, require_project, say, tested
+from survey.commands.common import DONE, TEST_FAILED, begin_adjusting, is_set, print_json, require_project, say, tested
 from survey.commands.parser import project_folder
 
 
@@ -28,6 +28,7 @@ def declare_report(commands: Any, shaped: dict[str, Any]) -> None:
 
 
 def _report(arguments: argparse.Namespace) -> int:
+    begin_adjusting()
     require_project(arguments.folder, arguments.out)
     from survey.jobs.adjusting.job import adjust_job, command_line
     from survey.report.results import ReportOptions

@@ -1,5 +1,6 @@
 """What a small network loads: the clock is for benchmarks, the list of modules does not depend on the machine."""
 
+import platform
 import re
 import subprocess
 import sys
@@ -68,3 +69,23 @@ def test_the_times_of_the_stages_are_the_time_that_passed(network, capsys):
         if share >= 0.6:
             return
     pytest.fail(f"the stages are {share:.0%} of the time")
+
+
+FREED = """
+import resource
+from survey.commands.common import begin_adjusting
+begin_adjusting()
+import numpy as np
+for i in range(20):
+    if i == 2:
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    np.ones(2**22)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other allocators decide for themselves")
+def test_memory_that_was_freed_is_used_again():
+    """Else every array of 32 MB is 8192 pages that the system clears once more."""
+    run = subprocess.run([sys.executable, "-c", FREED], capture_output=True, text=True, timeout=60, check=True)
+    assert int(run.stdout) < 8192
