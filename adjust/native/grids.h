@@ -176,7 +176,7 @@ inline bool find_grid(Bytes image, Out<uint8_t, 2> response, Out<double, 3> grid
     static thread_local Candidates found;
     const int rows = int(grid.n[0]), columns = int(grid.n[1]);
     found.n = 0;
-    if (image.n[0] <= 2 * RADIUS || image.n[1] < 2 * RADIUS + LANES || !candidates(image, response, 0.15, found)) return false;
+    if (image.n[0] <= 2 * RADIUS || image.n[1] < 2 * RADIUS + 32 || !candidates(image, response, 0.15, found)) return false;
     for (int tried = 0; tried < 8; ++tried) {
         int seed = -1;
         for (int i = 0; i < found.n; ++i)
