@@ -318,11 +318,15 @@ class Adjustment:
     diagnosis: Explanation | None = None
 
     @cached_property
+    def single_residuals(self) -> Sequence[ObservationResidual]:
+        """``other_residuals`` without the readings, of which none is made for that."""
+        n_readings = 0 if self.reading_residuals is None else len(self.reading_residuals.used)
+        return self.other_residuals[: len(self.other_residuals) - n_readings]
+
+    @cached_property
     def other_arrays(self) -> OtherArrays:
         """``other_residuals`` as arrays; of readings none is made for that."""
-        readings = self.reading_residuals
-        n = len(self.other_residuals) - (0 if readings is None else len(readings.used))
-        first = self.other_residuals[:n]
+        readings, first = self.reading_residuals, self.single_residuals
         parts = [
             (np.array([len(o.components) for o in first], dtype=np.int64),
              np.array([o.used for o in first], dtype=np.bool_), np.array([o.test for o in first]),

@@ -1,6 +1,7 @@
 // What Python calls of the fits of corners and spots, of boards, and of the renderer.
 #include "boards.h"
 #include "corners.h"
+#include "grids.h"
 #include "rendering.h"
 #include "spots.h"
 
@@ -10,6 +11,6 @@ extern "C" __attribute__((visibility("default"))) const Entry *vision() {
         entry<spot_profile>("spot_rows_of_profile"), entry<pixel_corner_rays>("pixel_corner_rays"),
         entry<draw_facets>("draw_facets"), entry<spread_and_sum>("spread_and_sum"), entry<of_neighbours>("of_neighbours"),
         entry<first_is_dark>("first_is_dark"), entry<squares_follow>("squares_follow"), entry<may_go_on>("may_go_on"),
-        entry<off_grid>("off_grid"), entry<unbend>("unbend"), {nullptr, nullptr, nullptr}};
+        entry<off_grid>("off_grid"), entry<unbend>("unbend"), entry<find_grid>("find_grid"), {nullptr, nullptr, nullptr}};
     return table;
 }

@@ -1,7 +1,7 @@
 """Fits of corners and spots to the pixels of an image, and the renderer's inner loops, in the core.
 
-The formulas are in ``corners.h``, ``boards.h``, ``spots.h``, ``fits.h`` and ``rendering.h``. Places are px, the
-centre of the first pixel is (0, 0).
+The formulas are in ``corners.h``, ``grids.h``, ``boards.h``, ``spots.h``, ``fits.h`` and ``rendering.h``. Places are px,
+the centre of the first pixel is (0, 0).
 """
 
 from typing import Any, NamedTuple
@@ -50,6 +50,7 @@ _first_is_dark = Function("first_is_dark", "image[*,*] grid[r,c,2]")
 _squares_follow = Function("squares_follow", "image[*,*] corners[n,2] places[n,2] edges[n,2,2] step follow[n]")
 _may_go_on = Function("may_go_on", "image[*,*] grid[r,c,2] step share")
 _off_grid = Function("off_grid", "grid[r,c,2] off[r,c] work[*]")
+_find_grid = Function("find_grid", "image[h,w] response[h,w] grid[r,c,2]")
 _unbend = Function("unbend", "xy[n,2] keep[n] angles[n,2] bend[n,2] uv[n,2] cov[n,2,2] work[*]")
 _spread_and_sum = Function("spread_and_sum", "first last image[*,*] weights[t] reach n out[*,*] work[*,*]")
 
@@ -120,6 +121,16 @@ def unbend(
     uv, cov, n = uv.copy(), cov.copy(), len(uv)
     given = (np.ascontiguousarray(a) for a in (xy, keep, angles, bend))
     return (uv, cov) if _unbend(*given, uv, cov, np.empty(8 * n)) else None
+
+
+def find_grid(image: npt.NDArray[np.uint8], columns: int, rows: int) -> FloatArray | None:
+    """Corners (rows, columns, 2) px, to about half a pixel, of the checkerboard that is whole in a small image.
+
+    None where there is none, or one with more corners. Squares of less than some ten pixels are not seen.
+    """
+    grid = np.empty((rows, columns, 2))
+    image = np.ascontiguousarray(image)
+    return grid if _find_grid(image, np.empty_like(image), grid) else None
 
 
 def of_neighbours(image: Gray, grid: FloatArray, contrast: float) -> bool:

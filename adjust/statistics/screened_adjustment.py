@@ -243,7 +243,7 @@ def component_notes(components: VarianceComponents) -> tuple[str, ...]:
 
 def uncontrolled_pairs(result: Adjustment) -> tuple[str, ...]:
     """Warning of pairs in use that nothing checks."""
-    ids = [o.ids[0] for o in result.other_residuals
+    ids = [o.ids[0] for o in result.single_residuals
            if o.kind == "pair" and o.used and float(o.redundancy.max()) < _CONTROLLED]  # fmt: skip
     if not ids:
         return ()

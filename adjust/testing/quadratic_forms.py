@@ -12,7 +12,7 @@ from adjust.testing.distributions import chi2, norm
 
 _STEPS = 100
 _DETERMINED = 1e-9
-"""Share above rounding: of the largest eigenvalue of a correlation matrix, of a variance; joint ones lose digits."""
+"""Share that is not rounding: of a correlation matrix's largest eigenvalue, of a variance; joint ones lose digits."""
 _NEAR = 1e-4
 
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray
-from adjust.native.vision import first_is_dark, of_neighbours, off_grid
+from adjust.native.vision import find_grid, first_is_dark, of_neighbours, off_grid
 from survey.detection.corners import CornerFit, refine_corners, unbent
 from survey.detection.extent import grown
 from survey.detection.gray import Gray8, Gray32, halved, reduced
@@ -15,6 +15,7 @@ from survey.project.targets import Checkerboard
 
 _SQUARE_PX = 32  # longer side of the image in which the board is looked for first, for each of its corners at least
 _REGULAR = 0.25  # squares by which what is found there may bend from one to the next: more is a corner beside its place
+_NEAR = 2.0  # times by which an image may be reduced for its corners to be near enough in the full one
 _COARSE_PX = 900  # that of the image in which it is then looked for by all finders
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _MAX_DECOYS = 3
@@ -32,7 +33,7 @@ def find_checkerboard(gray: Gray32, gray8: Gray8, target: Checkerboard) -> Detec
         found = _find(gray8, target.columns, target.rows)
         if found is None:
             break
-        detection, whole = _measured(gray, gray8, found.reshape(target.rows, target.columns, 2))
+        detection, whole = _measured(gray, found)
         if len(detection) and whole.size == found.size:
             return detection
         # a larger or a ChArUco board or a picture of a board can look like the one that is wanted: cover it
@@ -59,7 +60,7 @@ def other_board(gray: Gray32, gray8: Gray8, target: Checkerboard) -> tuple[int, 
         for columns, rows in sizes:
             found = finder(gray8, columns, rows)
             if found is not None:
-                detection, whole = _measured(gray, gray8, found.reshape(rows, columns, 2))
+                detection, whole = _measured(gray, found)
                 if len(detection):
                     return _size(whole)
     return None
@@ -70,14 +71,14 @@ def _size(grid: FloatArray) -> tuple[int, int]:
     return int(grid.shape[1]), int(grid.shape[0])
 
 
-def _measured(gray: Gray32, gray8: Gray8, rough: FloatArray) -> tuple[Detection, FloatArray]:
+def _measured(gray: Gray32, rough: FloatArray) -> tuple[Detection, FloatArray]:
     """The detection from corners (rows, columns, 2) px of a finder, and with all rows and columns that continue them.
 
     Empty where they are no corners of a board.
     """
     grid, ambiguous = _ordered(gray, rough)
     edges = grid_edges(grid)
-    start = _settle(gray8, grid, edges)
+    start = grid.reshape(-1, 2)
     fit = refine_corners(gray, start, edges.reshape(-1, 2, 2))
     needed = max(6, fit.good.size // 2)
     keep = fit.good & _on_grid(fit, grid.shape[:2]) if fit.good.sum() >= needed else fit.good
@@ -103,7 +104,7 @@ def _measured(gray: Gray32, gray8: Gray8, rough: FloatArray) -> tuple[Detection,
 
 
 def _find(gray8: Gray8, columns: int, rows: int) -> FloatArray | None:
-    """Corners (n, 2) px to about a pixel: classic and sector finder on reduced images, then the full one.
+    """Corners (rows, columns, 2) px to about a pixel: what is seen at once, or by finders that look longer.
 
     The classic finder first binarises by the histogram, which is enough for most boards and fast in a small image. On
     an image without a board its other thresholds follow the noise for half a second, unless a look at the squares
@@ -111,27 +112,28 @@ def _find(gray8: Gray8, columns: int, rows: int) -> FloatArray | None:
     """
     if (found := _glimpsed(gray8, columns, rows)) is not None:
         return found
-    pattern = (columns, rows)
     small, factor = reduced(gray8, _COARSE_PX)
-    ok, corners = _found_in(small, pattern)
-    if ok:
-        return _enlarged(corners, factor)
-    if small is not gray8:
-        ok, corners = cv2.findChessboardCorners(gray8, pattern, flags=_CLASSIC | cv2.CALIB_CB_FAST_CHECK)
-    return np.reshape(corners, (-1, 2)).astype(float) if ok else None
+    ok, corners = _found_in(small, (columns, rows))
+    if not ok and small is not gray8:
+        factor = np.ones(2)
+        ok, corners = cv2.findChessboardCorners(gray8, (columns, rows), flags=_CLASSIC | cv2.CALIB_CB_FAST_CHECK)
+    return _enlarged(gray8, np.reshape(corners, (rows, columns, 2)).astype(float), factor) if ok else None
 
 
 def _glimpsed(gray8: Gray8, columns: int, rows: int) -> FloatArray | None:
-    """Corners (n, 2) px that the classic finder sees in a small image at once, and that lie as on a board."""
+    """Corners (rows, columns, 2) px that are seen in a small image at once, and lie as on a board."""
     small, factor = halved(gray8, _SQUARE_PX * max(columns, rows))
-    ok, corners = cv2.findChessboardCorners(small, (columns, rows), flags=0)
-    if not ok or off_grid(np.reshape(corners, (rows, columns, 2)).astype(float)).max() > _REGULAR:
-        return None
-    return _enlarged(corners, factor)
+    grid = find_grid(small, columns, rows)
+    if grid is None:
+        ok, corners = cv2.findChessboardCorners(small, (columns, rows), flags=0)
+        grid = np.reshape(corners, (rows, columns, 2)).astype(float) if ok else None
+    return None if grid is None or off_grid(grid).max() > _REGULAR else _enlarged(gray8, grid, factor)
 
 
-def _enlarged(corners: Any, factor: FloatArray) -> FloatArray:
-    return np.asarray((np.reshape(corners, (-1, 2)).astype(float) + 0.5) * factor - 0.5)
+def _enlarged(gray8: Gray8, grid: FloatArray, factor: FloatArray) -> FloatArray:
+    """A grid (rows, columns, 2) px of a reduced image in the full one; good to a pixel or two there."""
+    grid = (grid + 0.5) * factor - 0.5
+    return grid if factor.max() <= _NEAR else _settled(gray8, grid)
 
 
 def _found_in(coarse: Gray8, pattern: tuple[int, int]) -> tuple[bool, Any]:
@@ -171,17 +173,17 @@ def grid_edges(grid: FloatArray) -> FloatArray:
     return np.ascontiguousarray(edges)
 
 
-def _settle(gray8: Gray8, grid: FloatArray, edges: FloatArray) -> FloatArray:
-    """Corners (n, 2) moved to the saddle of the grey values nearby, where that is no further than the window."""
-    start = grid.reshape(-1, 2)
+def _settled(gray8: Gray8, grid: FloatArray) -> FloatArray:
+    """The grid (rows, columns, 2) moved to the saddles of the grey values nearby, where they are within the window."""
+    edges = grid_edges(grid)
     area = np.abs(edges[..., 0, 0] * edges[..., 1, 1] - edges[..., 0, 1] * edges[..., 1, 0])
     across = float(np.min(area / np.linalg.norm(edges, axis=3).max(2)))
     half = int(np.clip(0.4 * across, 2, 9))
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
-    points = np.ascontiguousarray(start, np.float32).reshape(-1, 1, 2)
-    moved = cv2.cornerSubPix(gray8, points.copy(), (half, half), (-1, -1), criteria).reshape(-1, 2).astype(float)
-    near = np.linalg.norm(moved - start, axis=1) <= half
-    return np.where(near[:, None], moved, start)
+    points = grid.astype(np.float32).reshape(-1, 1, 2)
+    moved = cv2.cornerSubPix(gray8, points, (half, half), (-1, -1), criteria).reshape(grid.shape).astype(float)
+    near = np.linalg.norm(moved - grid, axis=2) <= half
+    return np.where(near[..., None], moved, grid)
 
 
 def _on_grid(fit: CornerFit, shape: tuple[int, int]) -> BoolArray:

@@ -34,6 +34,7 @@ from adjust.relay.loops import loop_basis
 from adjust.relay.network import topology
 from adjust.start import find_start
 from survey.detection import SpotOptions, detect_image, detect_spots
+from survey.detection.extent import grown
 from survey.project.targets import Checkerboard
 from survey.simulate import head_on_table
 from survey.simulate.rendering import Beacons, BrownCamera, PlacedTarget, render
@@ -178,7 +179,13 @@ def _pictures() -> None:
     turn = Rot3.Rx(0.3) * Rot3.Ry(0.25) * Rot3.Rz(0.2)
     centre = board.points()[1].mean(0)
     view = PlacedTarget(board, Pose3(turn, np.array([0.005, -0.003, 0.35]) - turn.matrix() @ centre))
-    assert len(detect_image(render(camera, [view], seed=1), board)) == 40
+    image = render(camera, [view], seed=1)
+    found = detect_image(image, board)
+    assert len(found) == 40
+    gray, grid = image.astype(np.float32), found.uv.reshape(5, 8, 2)
+    assert grown(gray, grid[1:-1, 1:-1], found.contrast).shape == grid.shape
+    one, disc = np.ones(len(found)), [6.0, 0.0, 0.0, 0.0]
+    vision.fit_corners(gray, found.uv, one[:, None] * [0.1, 1.6], one, one[:, None] * disc, True, 2.0, 1e-4)
     lights = np.stack(np.meshgrid(np.linspace(-0.2, 0.2, 4), np.linspace(-0.15, 0.15, 3), [1.0]), -1).reshape(-1, 3)
     assert len(detect_spots(render(camera, beacons=Beacons(lights, 0.006, 200.0, "disc"), seed=1), SpotOptions())) == 12
     xy = np.random.default_rng(1).uniform(-4.0, 4.0, (50, 2))

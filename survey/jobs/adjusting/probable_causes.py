@@ -95,7 +95,7 @@ def _too_cautious(survey: Survey, result: Adjustment) -> "Diagnosis | None":
 def _misread(survey: Survey, result: Adjustment) -> "Diagnosis | None":
     """What was left out by the search for gross errors, and fits as it was meant; None where nothing does."""
     left_out = survey.n_others_used - result.survey.n_others_used
-    if left_out <= 0 and all(o.used for o in result.other_residuals):
+    if left_out <= 0 and result.other_arrays.used.all():
         return None
     from adjust.diagnosis.diagnosis import Diagnosis  # here: as above
     from adjust.diagnosis.trial import misfit_of

@@ -6,7 +6,7 @@ import numpy as np
 from markupsafe import Markup
 
 from adjust.model.result import Adjustment, Component, ParameterName
-from adjust.model.survey import FloatArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.statistics.result import BudgetEntry, Correlation, Influence, RelativePrecision, WeakDirection
 from survey.report.charts import heat_map, quantiles
 from survey.report.context import Context
@@ -220,12 +220,21 @@ def normality(c: Context) -> Markup:
 
 def standardized_by_group(adjustment: Adjustment) -> dict[str, FloatArray]:
     """Standardized residuals of every group's used observations in ascending order; none that is no number."""
-    found, groups = adjustment.image_residuals, [b.group for b in adjustment.survey.image_blocks]
-    at = {name: i for i, name in enumerate(dict.fromkeys(groups))}
-    row_group = np.repeat(np.array([at[name] for name in groups], dtype=np.int64), np.diff(found.block_ptr))
-    out = {name: [found.standardized[found.used & (row_group == i)].ravel()] for name, i in at.items()}
-    for o in adjustment.other_residuals:
+    found, readings = adjustment.image_residuals, adjustment.reading_residuals
+    out: dict[str, list[FloatArray]] = {}
+
+    def add(groups: Sequence[str], sizes: IntArray | int, used: BoolArray, standardized: FloatArray) -> None:
+        at = {name: i for i, name in enumerate(dict.fromkeys(groups))}
+        number = np.repeat(np.array([at[name] for name in groups], dtype=np.int64), sizes)
+        for name, i in at.items():
+            if (mine := used & (number == i)).any():
+                out.setdefault(name, []).append(standardized[mine].ravel())
+
+    add([b.group for b in adjustment.survey.image_blocks], np.diff(found.block_ptr), found.used, found.standardized)
+    for o in adjustment.single_residuals:
         if o.used:
             out.setdefault(o.group, []).append(o.standardized)
+    if readings is not None:
+        add([r.group for r in adjustment.survey.readings], 1, readings.used, readings.standardized)
     joint = {name: np.concatenate(parts) for name, parts in out.items()}
     return {name: np.sort(w[np.isfinite(w)]) for name, w in joint.items()}
