@@ -1,7 +1,7 @@
 """What an adjustment gives back. Every estimated quantity is one ``Estimate`` under its ``ParameterName``."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, Protocol
@@ -278,6 +278,10 @@ class JointCovariances(Protocol):
 
     def following(self, spreads: Sequence[Mapping[int, FloatArray]], sizes: Sequence[int]) -> FloatArray:
         """Of quantities that follow from unknowns: each (n, dim) by key; n of each in ``sizes``."""
+        ...
+
+    def bring_together(self, pairs: Iterable[tuple[ParameterName, ParameterName]]) -> None:
+        """Work out the covariances of many pairs of unknowns at once, before they are asked for one by one."""
         ...
 
 

@@ -1,7 +1,7 @@
 """Fits of corners and spots to the pixels of an image, and the renderer's inner loops, in the core.
 
-The formulas are in ``corners.h``, ``grids.h``, ``boards.h``, ``spots.h``, ``fits.h`` and ``rendering.h``. Places are px,
-the centre of the first pixel is (0, 0).
+The formulas are in ``corners.h``, ``grids.h``, ``boards.h``, ``spots.h``, ``fits.h`` and ``rendering.h``. Places are
+px, the centre of the first pixel is (0, 0).
 """
 
 from typing import Any, NamedTuple
