@@ -150,7 +150,7 @@ def _solver(scaled: sparse.csc_matrix) -> Solver:
     if n <= FEW:  # its inverse: SciPy's linear algebra takes longer to load
         inverse = np.linalg.inv(scaled.toarray())
         return lambda b: inverse @ b, float(n**2), lambda: inverse
-    if n <= DENSE:
+    if n <= DENSE or scaled.nnz > n**2 // 4:  # as the rows of a free datum over all points fill it
         factor = scipy.linalg.cho_factor(scaled.toarray())
         return lambda b: np.asarray(scipy.linalg.cho_solve(factor, b)), float(n**2), lambda: _inverse(*factor)
     from scipy.sparse.linalg import splu  # here: as above
