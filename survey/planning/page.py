@@ -27,6 +27,7 @@ from survey.report.markup import (
     sigma_text,
     table,
 )
+from survey.report.language import speaking
 from survey.report.picture import draw, perspective, pictures
 from survey.report.scene import Scene, Spot, scene_of
 from survey.solution.quantities import scale_of
@@ -42,13 +43,14 @@ def html_page(title: str, heading: str, sections: list[Markup]) -> str:
 
 
 def plan_page(o: PlanningOutcome) -> str:
-    """The page of a plan."""
+    """The page of a plan, in English whatever is spoken around it."""
     title = o.title or o.folder.resolve().name
-    parts = [
-        _summary(o), _picture(o), _seen(o), _sigmas(o), _weak(o), _selection(o), _tolerances(o), _trials(o),
-        _navigation(o.navigation) if o.navigation is not None else Markup(),
-    ]  # fmt: skip
-    return html_page(f"{title} – plan", "Plan: expected precision before measuring", [p for p in parts if p])
+    with speaking("en"):
+        parts = [
+            _summary(o), _picture(o), _seen(o), _sigmas(o), _weak(o), _selection(o), _tolerances(o), _trials(o),
+            _navigation(o.navigation) if o.navigation is not None else Markup(),
+        ]  # fmt: skip
+        return html_page(f"{title} – plan", "Plan: expected precision before measuring", [p for p in parts if p])
 
 
 def _summary(o: PlanningOutcome) -> Markup:
