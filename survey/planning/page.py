@@ -9,7 +9,7 @@ from survey.planning.navigation import NavigationOutcome
 from survey.planning.summary import PlanningOutcome, meets, people, pose_sigmas, tolerance_values
 from survey.report import drawing as d
 from survey.report.charts import Series, bars, chart, seen_map
-from survey.report.language import esc
+from survey.report.language import esc, speaking
 from survey.report.markup import (
     count,
     definition,
@@ -27,7 +27,6 @@ from survey.report.markup import (
     sigma_text,
     table,
 )
-from survey.report.language import speaking
 from survey.report.picture import draw, perspective, pictures
 from survey.report.scene import Scene, Spot, scene_of
 from survey.solution.quantities import scale_of
