@@ -68,6 +68,7 @@ def _session(page: Any, folder: Path) -> None:
     _detect(page)
     rows = [(x["epoch_id"], x["camera_id"], float(x["u_px"]), float(x["v_px"])) for x in
             csv.DictReader((folder / "observations/image_points.csv").open(newline=""))]  # fmt: skip
+    quality_path(folder).parent.mkdir(exist_ok=True)
     for epoch, camera in dict.fromkeys(row[:2] for row in rows):
         uv = [list(row[2:]) for row in rows if row[:2] == (epoch, camera)]
         of = {"camera_id": camera, "epoch_id": epoch, "width": 1280, "height": 1024, "points": {"board": uv}}
@@ -93,7 +94,7 @@ OF_EXAMPLES: dict[str, tuple[str, str, Act]] = {
     "workbench-network": ("total-station", "view=network,settings", _nothing),
     "workbench-loops": ("relay", "view=loops,scene", _nothing),
     "workbench-detect": ("one-camera", "view=jobs,image", _detect),
-    "workbench-capture": ("one-camera", "view=findings,capture", _session),
+    "workbench-capture": ("one-camera", "view=jobs,capture", _session),
 }
 ON_A_PHONE = (("", "left"), ("image=X/hX05", "right"), ("point=B07&view=findings,scene", "right"), ("", "tables"),
               ("obs=image_point:X/hX05/board/r7c2", "inspector"))  # fmt: skip

@@ -10,7 +10,7 @@ from survey.planning.navigation import NavigationOutcome
 from survey.planning.summary import PlanningOutcome, meets, people, pose_sigmas, tolerance_values
 from survey.report import drawing as d
 from survey.report.charts import Series, bars, chart, seen_map
-from survey.report.language import esc
+from survey.report.language import esc, speaking
 from survey.report.markup import (
     count,
     definition,
@@ -43,13 +43,14 @@ def html_page(title: str, heading: str, sections: list[Markup]) -> str:
 
 
 def plan_page(o: PlanningOutcome) -> str:
-    """The page of a plan."""
+    """The page of a plan, in English whatever is spoken around it."""
     title = o.title or o.folder.resolve().name
-    parts = [
-        _summary(o), _picture(o), _seen(o), _sigmas(o), _weak(o), _selection(o), _tolerances(o), _trials(o),
-        _navigation(o.navigation) if o.navigation is not None else Markup(),
-    ]  # fmt: skip
-    return html_page(f"{title} – plan", "Plan: expected precision before measuring", [p for p in parts if p])
+    with speaking("en"):
+        parts = [
+            _summary(o), _picture(o), _seen(o), _sigmas(o), _weak(o), _selection(o), _tolerances(o), _trials(o),
+            _navigation(o.navigation) if o.navigation is not None else Markup(),
+        ]  # fmt: skip
+        return html_page(f"{title} – plan", "Plan: expected precision before measuring", [p for p in parts if p])
 
 
 def _summary(o: PlanningOutcome) -> Markup:

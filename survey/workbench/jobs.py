@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gtsam import Pose3
@@ -13,6 +13,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, PoseParameter
+from survey.folder.plain import plain
 from survey.folder.replacing import changing, replace_parts
 from survey.jobs.adjusting.job import AdjustOutcome, Clock, command_line, kept_run, made, run_info
 from survey.project.project import DEFINITION_FILE, RESULTS
@@ -27,6 +28,7 @@ from survey.workbench.pages.beginning import Drawn, Told
 from survey.workbench.places import Places
 
 if TYPE_CHECKING:  # detection brings in OpenCV, planning much else
+    from adjust.navigation.model import Beacons
     from survey.detection import ImageReport
     from survey.jobs.cross_validation import CrossValidation
     from survey.planning.job import PlanRequest
@@ -88,7 +90,8 @@ class Jobs(Deciding):
         poses = [(e, e.world_from_station) for e in outcome.trajectory.epochs]
         path = [(e.epoch_id, np.asarray(pose.translation()), _in_world(pose, e.cov), str(e.status))
                 for e, pose in poses if pose is not None]  # fmt: skip
-        return Told(outcome.text(), outcome.summary(), Drawn(path=path))
+        alone = None if self.situation.adjustment is not None else _beacons(outcome.calibration.beacons)
+        return Told(outcome.text(), outcome.summary(), Drawn(path=path, scene=alone))
 
     def add(self, new: str | Path) -> Told:
         """Let the network grow by the stations or observations of another folder, and adjust again.
@@ -144,6 +147,15 @@ def _positions(adjustment: Adjustment) -> dict[str, FloatArray]:
     """Adjusted points and stations (3,) m by name."""
     found = {n: e.value for n, e in adjustment.estimates.items() if n[0] in ("point", "world_from_station")}
     return {"/".join(n): np.asarray(v.translation() if isinstance(v, Pose3) else v) for n, v in found.items()}
+
+
+def _beacons(known: "Beacons") -> dict[str, Any]:
+    """What a path is drawn beside where there is no solution; as :func:`survey.report.scene.scene_values`."""
+    places = range(len(known.beacon_ids))
+    spots = [{"id": known.beacon_ids[i], "kind": "point", "x": known.x_in_world[i],
+              "cov": known.cov[3 * i : 3 * i + 3, 3 * i : 3 * i + 3].ravel()} for i in places]  # fmt: skip
+    return dict(plain({"ellipsoid": 1.0, "images": {}, "cameras": {}, "spots": spots, "outlines": [], "clouds": [],
+                       "tables": [], "moves": [], "n_left_out": 0}))  # fmt: skip
 
 
 def _in_world(pose: Pose3, cov: FloatArray) -> FloatArray:

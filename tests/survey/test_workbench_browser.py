@@ -432,7 +432,7 @@ def test_images_are_detected_and_shown_as_they_come(browser: Any, tmp_path: Path
 def test_what_a_solution_has_is_said_in_words() -> None:
     """Every kind of parameter and of clock, and how each is treated."""
     german, english = (json.loads((SHARED / f"{name}.json").read_text()) for name in ("de", "en"))
-    kinds = {kind for all_of in DEMANDED.values() for kind in all_of}
-    kinds |= {*CLOCKS, "lens_drift", "lens_crop", "table_motion", "warp"}
+    of_demands = (kind for kinds in DEMANDED.values() for kind in kinds)
+    kinds = {*CLOCKS, *of_demands, "lens_drift", "lens_crop", "table_motion", "warp"}
     assert {f"param {kind}" for kind in kinds} <= set(english) & set(german)
     assert {"free", "held", "prior", "tied"} <= set(german)

@@ -10,6 +10,7 @@ from survey.examples import write_example
 from survey.jobs.adjusting.steps import adjust_project
 from survey.planning.job import PlanRequest
 from survey.project import read, write_project
+from survey.report.language import speaking
 from survey.simulate import Scene, beacons
 from survey.workbench.session import Workbench
 from tests.survey.planning_lab import write_lab
@@ -69,7 +70,11 @@ def test_a_plan_draws_what_it_chose_where_it_would_be(tmp_path):
     folder = tmp_path / "lab"
     write_lab(folder)
     bench = Workbench(folder)
-    told = bench.plan(PlanRequest(add=2))
+    with speaking("de"):  # a page of another language than that of plan.html
+        told = bench.plan(PlanRequest(add=2))
+        said = told.as_dict()["text"]
+    assert "Beobachtungen" in said.splitlines()[0]
+    assert {"erwartete Sigmas (a priori)", "geforderte Genauigkeit"} <= {line.strip() for line in said.splitlines()}
     drawn = told.drawn
     assert len(drawn.cameras) + len(drawn.points) + len(drawn.lines) >= 2
     inside = np.array([pose.translation() for pose in drawn.cameras.values()] + [x for _, x, _ in drawn.points])
@@ -109,6 +114,10 @@ def test_a_path_is_drawn_with_its_covariances_in_the_world(tmp_path):
     survey, truth = beacons(seed=4, n_table_epochs=5, n_free_epochs=4, n_night_epochs=4)
     write_project(tmp_path / "lab", survey)
     told = Workbench(tmp_path / "lab").navigate()
+    beside = {spot["id"]: spot["x"] for spot in told.as_dict()["drawn"]["scene"]["spots"]}  # there is no solution
+    assert len(beside) >= 3
+    for name, x in beside.items():
+        np.testing.assert_allclose(x, truth["point", name], atol=0.01)
     scene = Scene(survey, truth)
     assert len(told.drawn.path) == told.summary["epochs"] == 4
     for epoch, x, cov, status in told.drawn.path:

@@ -427,9 +427,9 @@ DATA = {"title", "label", "solution.solution", "capture.state"}
 """What is of the project or of its files, or a code, whatever the language: keys, some below an address only."""
 ASKED = [
     *(("jobs/compare", {"folder": name}) for name in ("other", "nowhere", "new")), ("jobs/plan", {}),
-    ("jobs/navigate", {}), ("jobs/detect", {}), ("jobs/detct", {}),
-    ("jobs/add", {"folder": "other"}), ("jobs/add", {"folder": "lab"}),
-    ("jobs/init", {"images": "", "folder": ""}), ("jobs/init", {"images": "lab", "folder": "other"}),
+    ("jobs/navigate", {}), ("jobs/detect", {}), ("jobs/detct", {}), ("jobs/add", {"folder": "other"}),
+    ("jobs/add", {"folder": "lab"}), ("jobs/init", {"images": "", "folder": ""}),
+    ("jobs/init", {"images": "lab", "folder": "other"}),
     ("jobs/show", {"folder": "nowhere"}), ("jobs/batch", {"folders": ["lab", "nowhere"]}),
     *((way, {"changes": [{"name": name, "excluded": True}], "reason": "blur"})
       for way in ("preview", "exclusions") for name in ("nothing", "camera:right")),

@@ -23,17 +23,18 @@ function panes() {
   return PANES.map((_, k) => (views[current().view[k]] ? current().view[k] : first[k]));
 }
 
-/** @param {string} view @param {string} [pane] */
-export function show(view, pane = lastPane) {
+/** @param {string} view @param {string|null} [pane] none: wherever it is already, else in the pane that was used last */
+export function show(view, pane = null) {
   const all = panes();
-  all[PANES.indexOf(pane)] = view;
+  if (!pane && all.includes(view)) return;
+  all[PANES.indexOf(pane ?? lastPane)] = view;
   go({ view: all });
 }
 
 /** The view before or after this one, in the pane that was used last. @param {number} by */
 export function nextView(by) {
   const all = Object.keys(views), at = all.indexOf(panes()[PANES.indexOf(lastPane)]);
-  show(all[(at + by + all.length) % all.length]);
+  show(all[(at + by + all.length) % all.length], lastPane);
 }
 
 /** The view of a sort that is in sight. */

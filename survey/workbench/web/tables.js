@@ -78,7 +78,7 @@ export class Tables {
       columns: [{ key: "camera", title: t("camera"), ...coded("camera") }, { key: "epoch", title: t("kind epoch"), ...coded("epoch") }, { key: "target", title: t("target"), ...coded("target") },
         { key: "point", title: t("point"), names: all, code: (i) => of[data.block[i]][data.point[i]], wide: 5 },
         { key: "residual", title: t("residual, px"), values: residual, digits: 3, size: true, wide: 6.4 }, { key: "w", title: "w", values: data.w, digits: 2, size: true },
-        ...(data.redundancy ? [{ key: "r", title: "r", values: data.redundancy, digits: 3 }] : []), { key: "used", title: t("used"), values: data.used, digits: 0, wide: 3.6, text: (i) => (data.used[i] ? "✓" : "✕") }],
+        ...(data.redundancy ? [{ key: "r", title: "r", values: data.redundancy, digits: 3 }] : []), { key: "used", title: t("used"), values: data.used, digits: 0, wide: 4.2, text: (i) => (data.used[i] ? "✓" : "✕") }],
       kind: "obs", sort: "w",
     };
   }
