@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 CAP = 50.0
 """The most that one component of an observation counts: what is left out, or cannot be predicted, counts so."""
-MOST = 7.0
+MOST = 8.0
 """Adjustments that scores, starts and trials of a diagnosis may take; other evidence takes one or two more."""
 _LEFT_OUT = 4
 _FAR = 25.0
