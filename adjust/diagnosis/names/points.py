@@ -99,7 +99,7 @@ def _hypotheses(
     for columns in (_ENDS, _ENDS[:1]) if both else (_ENDS[:1],):
         yield Hypothesis(
             "points exchanged", f"points {a} and {b} are called by each other's names {where}",
-            f"exchange them in {' and '.join(columns)} of terrestrial.csv", Place("point", (a, b), "to_id"),
+            f"exchange them in {', '.join(columns)} of terrestrial.csv", Place("point", (a, b), "to_id"),
             exchanged(survey, rows, a, b, columns),
             tuple(Rename("terrestrial", c, {a: b, b: a}, at) for c in columns), evidence,
         )  # fmt: skip
