@@ -13,7 +13,7 @@ from adjust.diagnosis.trial import Misfit, misfit_of
 from adjust.model.errors import SurveyError
 
 _SHOWN = 3
-_KEPT, _ONE = 1.25, 1.0  # adjustments for each of the later families, and for a trial of what they find
+_KEPT, _ONE = 1.5, 1.0  # adjustments for each of the later families, and for a trial of what they find
 
 FAMILIES: tuple[tuple[str, ...], ...] = (
     ("effects", "images", "names", "units", "time", "weights"),

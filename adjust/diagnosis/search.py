@@ -29,9 +29,11 @@ class Search:
     def over(self, formed: Iterable[Hypothesis], kept: float) -> None:
         """Try these and what is left, the likeliest first, as long as the budget lasts. kept: of it for later ones.
 
-        First from the values of the case; of what no values are near to, afresh. What there was no time for waits.
+        First from the values of the case; of what no values are near to, afresh. What there was no time for waits until
+        the last.
         """
-        self.queue, waiting, astray = _in_turn([*self.queue, *formed]), list[Hypothesis](), list[Trial]()
+        waiting, astray = self.queue if kept else [], list[Trial]()
+        self.queue = _in_turn([*formed] if kept else [*self.queue, *formed])
         self.case.budget.kept = kept
         while self.queue and self.case.budget.lasts:
             trial = tried(self.queue.pop(0), self.case)

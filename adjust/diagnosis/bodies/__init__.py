@@ -25,7 +25,7 @@ def hypotheses(case: Case) -> Iterable[Hypothesis]:
 
 
 def _steps(case: Case) -> Iterator[Step]:
-    found = []
+    alone, found = list(lens_steps(case)), []  # of single cameras, which cost least
     if case.result is not None:
         every = series_of(case, adjusted_values(case.result))
         found = [step for series in every if (step := step_of(series)) is not None]
@@ -34,7 +34,7 @@ def _steps(case: Case) -> Iterator[Step]:
             steps = [step_of(s) for s in series_of(case, values) if s.name[1] == owner]
             found += [s for s in steps if s is not None]
     yield from found
-    yield from lens_steps(case)
+    yield from alone
 
 
 def _of(case: Case, step: Step) -> Iterator[Hypothesis]:

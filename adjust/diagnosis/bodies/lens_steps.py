@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from adjust.diagnosis.alone import own_lenses, single_views, squares_alone
 from adjust.diagnosis.bodies.series import Step
-from adjust.diagnosis.case import Case, own_lenses, single_views, squares_alone
+from adjust.diagnosis.case import Case
 from adjust.diagnosis.table.views import single_camera_survey
 from adjust.diagnosis.trial import misfit_of
 from adjust.model.errors import SurveyError

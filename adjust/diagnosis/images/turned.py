@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from adjust.diagnosis.case import Case, squares_alone
+from adjust.diagnosis.alone import squares_alone
+from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.images.maps import TURNED, mapped, turned
 from adjust.testing.criteria import sidak

@@ -14,7 +14,7 @@ from gtsam import Pose3
 
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, Rename
-from adjust.diagnosis.screen import improvement, screen
+from adjust.diagnosis.screen import Screen, at_best, improvement, screen
 from adjust.model.observations import FrameRef, Pair, frame_text
 from adjust.model.survey import FloatArray, Survey
 from adjust.spatial.averaging import pose_distance
@@ -22,6 +22,8 @@ from adjust.spatial.rigid import inverse
 
 _CLEARLY = 3.0
 _SUSPECTS, _TRIED, _LARGE = 10, 3, 500
+_NOISE = 2.0
+"""Mean square over sigma of pairs at a start that fits."""
 _Found = tuple[float, FrameRef, FrameRef, list[int]]
 
 
@@ -30,24 +32,25 @@ def exchanged_stations(case: Case) -> Iterator[Hypothesis]:
     survey = case.survey
     if not survey.pairs or survey.image_blocks or not case.few("stations exchanged", len(survey.pairs), _LARGE):
         return
-    misses = _misses(survey)
-    if misses is None:
+    before = at_best(case)
+    if before is None:
         return
+    misses = _misses(survey, before)
     both = list(combinations(_suspects(survey, misses), 2))
     some = [f for a, b in both if (f := _misnamed(survey, a, b)) is not None]
     for _, a, b, rows in sorted(some, key=lambda f: -f[0])[:_TRIED]:
         changed = _exchanged(survey, a, b, rows)
-        after = _misses(changed)
-        gain = 0.0 if after is None else improvement(float(misses.sum()), float(after.sum()), len(misses))
+        after = screen(changed)
+        left = np.inf if after is None else float(_misses(changed, after).sum())
+        gain = improvement(float(misses.sum()), left, len(misses))
         if gain > _CLEARLY:
             yield _hypothesis(survey, changed, (a, b), rows, gain, len(both))
+        if left < _NOISE * len(misses):
+            return  # what no other one can explain better
 
 
-def _misses(survey: Survey) -> FloatArray | None:
-    """(p,) mean squares over sigmas of the pairs at the survey's own start, bounded."""
-    found = screen(survey)
-    if found is None:
-        return None
+def _misses(survey: Survey, found: Screen) -> FloatArray:
+    """(p,) mean squares over sigmas of the pairs at a start of the survey, bounded."""
     at = {o.ids[0]: found.others[i] for i, o in enumerate(found.graph.others) if o.kind == "pair"}
     return np.array([min(at.get(p.pair_id, 0.0), CAP) for p in survey.pairs])
 

@@ -7,7 +7,7 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.adjustment import adjust
-from adjust.diagnosis.case import own_lens, single_views
+from adjust.diagnosis.alone import own_lens, single_views
 from adjust.frames.tables import table_motions
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock

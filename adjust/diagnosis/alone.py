@@ -1,0 +1,92 @@
+"""What single images say by themselves: lenses of cameras, poses of targets; start values of what is new from these."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.diagnosis.prediction import Prediction, started_values
+from adjust.frames.lens_times import whole_images
+from adjust.graph.assembly import StartValues
+from adjust.model.boards import deformed
+from adjust.model.errors import SurveyError
+from adjust.model.result import ParameterName
+from adjust.model.survey import Camera, FloatArray, Survey
+from adjust.spatial.averaging import mean_pose
+from adjust.spatial.rigid import inverse
+from adjust.start.lenses import Sighting, start_lens
+from adjust.start.views import Views, focal_px, joined, make_views, rays_by_block
+
+
+def own_lens(survey: Survey, camera: Camera) -> FloatArray:
+    """Start values (n,) of a lens from the camera's images of targets alone; SurveyError where they give none."""
+    points = {t.target_id: deformed(t) for t in survey.targets}
+    mine = [
+        (i, b) for i, b in enumerate(whole_images(survey).image_blocks)
+        if b.camera_id == camera.camera_id and b.target_id is not None
+    ]  # fmt: skip
+    seen = [Sighting(i, points[str(b.target_id)][b.point_idx[b.mask]], b.uv[b.mask]) for i, b in mine]
+    return start_lens(camera, [s for s in seen if len(s.x)]).values
+
+
+def own_lenses(survey: Survey) -> dict[str, FloatArray]:
+    """:func:`own_lens` of every camera whose images give one."""
+    found = {}
+    for camera in survey.cameras:
+        try:
+            found[camera.camera_id] = own_lens(survey, camera)
+        except SurveyError:
+            continue
+    return found
+
+
+def single_views(survey: Survey, lenses: Mapping[str, FloatArray]) -> Views:
+    """Every block of a target with three used points or more that has a pose."""
+    survey = whole_images(survey)
+    points = {t.target_id: deformed(t) for t in survey.targets}
+    known = replace(survey, cameras=tuple(c for c in survey.cameras if c.camera_id in lenses))
+    focal = {c.camera_id: focal_px(c, lenses[c.camera_id]) for c in known.cameras}
+    blocks = {i: b for i, b in enumerate(survey.image_blocks) if b.target_id is not None}
+    rays, _ = rays_by_block(known, lenses, {i: b.uv[b.mask] for i, b in blocks.items()})
+    seen = {i: points[str(blocks[i].target_id)][blocks[i].point_idx[blocks[i].mask]] for i in rays}
+    sights = joined([(i, x, rays[i], focal[blocks[i].camera_id]) for i, x in seen.items() if len(x) >= 3])
+    return make_views(sights)[0]
+
+
+def squares_alone(survey: Survey, lenses: Mapping[str, FloatArray]) -> FloatArray:
+    """(b,) sums of squares over sigmas of each block at its own best pose; zero where it has none."""
+    out = np.zeros(len(survey.image_blocks))
+    for view in single_views(survey, lenses):
+        block = survey.image_blocks[view.block_idx]
+        variance = float(np.mean(np.trace(block.cov, axis1=1, axis2=2))) / 2.0
+        out[view.block_idx] = len(view.x) * float(view.error_px[0]) ** 2 / variance
+    return out
+
+
+def completed(survey: Survey, start: StartValues) -> StartValues:
+    """Start values with the lenses of new cameras and the poses of what is new, as single images tell them."""
+    new = {c.camera_id: own_lens(survey, c) for c in survey.cameras if c.camera_id not in start.lenses}
+    start = replace(start, lenses={**start.lenses, **new})
+    prediction = Prediction(survey, started_values(start))
+    missing: dict[ParameterName, list[int]] = {}
+    for i, block in enumerate(survey.image_blocks):
+        for name, _ in prediction.links(block) if block.target_id is not None else ():
+            if prediction.link(name) is None:
+                missing.setdefault(name, []).append(i)
+    if not missing:
+        return start
+    chosen = sorted({i for of in missing.values() for i in of})
+    some = replace(survey, image_blocks=tuple(survey.image_blocks[i] for i in chosen))
+    views = {chosen[v.block_idx]: v for v in single_views(some, start.lenses)}
+    poses = dict(start.poses)
+    for name, of in missing.items():
+        found = []
+        for i in of:
+            said = prediction.implied(survey.image_blocks[i], views[i].poses[0], name) if i in views else None
+            if said is not None:
+                inverted = dict(prediction.links(survey.image_blocks[i]))[name]
+                found.append(inverse(said[0]) if inverted else said[0])
+        if found:
+            poses[name] = Pose3(mean_pose(np.array(found), 1.0)[0])
+    return replace(start, poses=poses)
