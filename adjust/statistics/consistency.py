@@ -6,9 +6,9 @@ redundancy, and the variance 2 tr R_g R_g (Koch 1999, 2.7). A fault that a large
 global test stands out in its own part.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain, pairwise
+from itertools import pairwise
 
 import numpy as np
 
@@ -93,23 +93,24 @@ def parts_of_network(adjustment: Adjustment) -> tuple[Part, ...]:
 
 def parts_of(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> tuple[Part, ...]:
     """All parts that are neither the whole nor without redundancy. blocks: the image block of each observation."""
-    found = contributions(adjustment, system, blocks)
-    members: dict[tuple[str, str], list[int]] = {}
-    for i, (n, labels) in enumerate(zip(found.n.tolist(), _labels(adjustment, system, blocks), strict=True)):
-        if n:
-            for label in labels:
-                members.setdefault(label, []).append(i)
-    if not members:
-        return ()
-    every = np.fromiter(chain.from_iterable(members.values()), dtype=np.int64)
-    edges = np.cumsum([0, *map(len, members.values())])
-    sums = (np.add.reduceat(x[every], edges[:-1]).tolist() for x in (found.n, found.redundancy, found.omega))
+    found, out = contributions(adjustment, system, blocks), list[Part]()
     total = int(np.count_nonzero(found.n))
-    return tuple(
-        Part(kind, name, every[i:j], n, r, omega)
-        for (kind, name), (i, j), n, r, omega in zip(members, pairwise(edges.tolist()), *sums, strict=True)
-        if r > _LEAST and j - i < total
-    )
+    for kind, names in _labels(adjustment, system, blocks).items():
+        number = {name: i for i, name in enumerate(dict.fromkeys((None, *names)))}
+        of = np.fromiter(map(number.__getitem__, names), np.int64, len(names))
+        every = np.flatnonzero((of > 0) & (found.n != 0.0))
+        every = every[np.argsort(of[every], kind="stable")]
+        if not len(every):
+            continue
+        first = np.flatnonzero(np.diff(of[every], prepend=0))
+        sums = (np.add.reduceat(x[every], first).tolist() for x in (found.n, found.redundancy, found.omega))
+        called, edges = list(number), pairwise([*first.tolist(), len(every)])
+        out += [
+            Part(kind, str(called[i]), every[a:b], n, r, omega)
+            for i, (a, b), n, r, omega in zip(of[every[first]].tolist(), edges, *sums, strict=True)
+            if r > _LEAST and b - a < total
+        ]
+    return tuple(out)
 
 
 def contributions(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> Contributions:
@@ -134,21 +135,22 @@ def contributions(adjustment: Adjustment, system: LinearSystem, blocks: IntArray
     return Contributions(*(np.where(system.used, x, 0.0) for x in (n, r, omega)))
 
 
-def _labels(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> Iterator[list[tuple[str, str]]]:
-    """The parts that every observation belongs to."""
-    survey = adjustment.survey
-    for i in blocks.tolist():
-        b = survey.image_blocks[i]
-        target = [("target", b.target_id)] if b.target_id is not None else []
-        yield [("group", b.group), ("camera", b.camera_id), ("epoch", b.epoch_id), *target]
-    for o in system.precision.graph.others:
-        more = [("table", o.ids[0]), ("epoch", o.ids[1])] if o.kind == "table" else []
-        yield [("group", o.group), *more]
+def _labels(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> dict[str, list[str | None]]:
+    """Of every kind of part the one that each observation belongs to, or None."""
+    survey, others = adjustment.survey, system.precision.graph.others
+    images, readings = [survey.image_blocks[i] for i in blocks.tolist()], survey.readings
     instrument = {s.setup_id: s.instrument_id for s in survey.setups}
-    for reading in survey.readings:
-        setup = [("set-up", reading.setup_id)] if reading.setup_id else []
-        used = instrument.get(reading.setup_id, "")
-        yield [("group", reading.group), *setup, *([("instrument", used)] if used else [])]
+    no_image, no_other, no_reading = ([None] * len(x) for x in (images, others, readings))
+    axes = [o.ids if o.kind == "table" else (None, None) for o in others]
+    return {
+        "group": [x.group for x in (*images, *others, *readings)],
+        "camera": [*(b.camera_id for b in images), *no_other, *no_reading],
+        "epoch": [*(b.epoch_id for b in images), *(ids[1] for ids in axes), *no_reading],
+        "target": [*(b.target_id for b in images), *no_other, *no_reading],
+        "table": [*no_image, *(ids[0] for ids in axes), *no_reading],
+        "set-up": [*no_image, *no_other, *(r.setup_id or None for r in readings)],
+        "instrument": [*no_image, *no_other, *(instrument.get(r.setup_id) or None for r in readings)],
+    }
 
 
 def tested_parts(

@@ -113,8 +113,10 @@ class LinearSystem:
         """The normal matrix with weights (m,) of the rows."""
         kept = weights > 0.0
         A = self.A if kept.all() else self.A[kept]
-        weighted = A.copy()
-        weighted.data *= np.repeat(weights[kept], np.diff(A.indptr))
+        weighted = A
+        if (weights[kept] != 1.0).any():
+            weighted = A.copy()
+            weighted.data *= np.repeat(weights[kept], np.diff(A.indptr))
         return Normal((A.T @ weighted + self.datum.T @ self.datum).tocsc(), self.motions)
 
     @cached_property
@@ -273,22 +275,24 @@ def _columns(graph: AdjustmentGraph) -> Columns:
     names: list[ParameterName] = []
     components: list[str] = []
     units: list[str] = []
-    at, free = {}, {}
+    at, free, whole = {}, {}, {n: np.arange(n) for n in {u.dim for u in graph.unknowns.by_name.values()}}
     for name, unknown in graph.unknowns.by_name.items():
         held = graph.unknowns.held.get(unknown.key, ())
-        kept = [i for i in range(unknown.dim) if i not in held]
+        free[name] = kept = np.delete(whole[unknown.dim], held) if held else whole[unknown.dim]
         at[name] = np.arange(len(names), len(names) + len(kept))
-        free[name] = np.array(kept, dtype=np.int64)
         names += [name] * len(kept)
-        components += [unknown.components[i] for i in kept]
-        units += [unknown.units[i] for i in kept]
+        components += [unknown.components[i] for i in kept.tolist()] if held else unknown.components
+        units += [unknown.units[i] for i in kept.tolist()] if held else unknown.units
     return Columns(tuple(names), tuple(components), tuple(units), at, free)
 
 
 def _all_columns(graph: AdjustmentGraph, columns: Columns, name: ParameterName) -> IntArray:
     """Column (dim,) of every component of an unknown, -1 for held ones."""
-    out = np.full(graph.unknowns.by_name[name].dim, -1, dtype=np.int64)
-    out[columns.free[name]] = columns.at[name]
+    free, dim = columns.free[name], graph.unknowns.by_name[name].dim
+    if len(free) == dim:
+        return columns.at[name]
+    out = np.full(dim, -1, dtype=np.int64)
+    out[free] = columns.at[name]
     return out
 
 

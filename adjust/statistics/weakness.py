@@ -197,8 +197,9 @@ def weak_directions(
     Kuh and Welsch 1980, chapter 3).
     """
     system = system or linear_system(adjustment)
-    used = system.used[system.row_of]
-    alone = np.sqrt(np.maximum(np.asarray(system.A[used].multiply(system.A[used]).sum(axis=0)).ravel(), 1e-300))
+    A, used = system.A, system.used[system.row_of]
+    squares = A.data**2 * np.repeat(used, np.diff(A.indptr))
+    alone = np.sqrt(np.maximum(np.bincount(A.indices, squares, A.shape[1]), 1e-300))
     values, vectors = _largest(system, np.arange(len(alone)), alone, most)
     c, out = system.columns, []
     for inflation, shares, order in inflated(values, vectors, least_inflation, _SHARE):
@@ -220,8 +221,8 @@ def inflated(
         if value < least**2:
             return
         shares = move / np.abs(move).max()
-        order = [int(i) for i in np.argsort(-np.abs(shares), kind="stable") if abs(shares[i]) > share]
-        yield float(np.sqrt(value)), shares, order
+        large = np.flatnonzero(np.abs(shares) > share)
+        yield float(np.sqrt(value)), shares, large[np.argsort(-np.abs(shares[large]), kind="stable")].tolist()
 
 
 def _largest(system: LinearSystem, index: IntArray, scale: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
