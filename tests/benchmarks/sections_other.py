@@ -29,8 +29,7 @@ def targets(session: Session) -> None:
     )  # fmt: skip
     boards = [finding.OURS, finding.TWO, finding.CLASSIC, finding.SECTOR]
     runs = [("26 photographs of 640 x 480", finding.photographs(data_folder("calibration", "opencv_samples")), boards)]
-    sizes = ((640, 480), (1280, 1024), (2592, 1944), (4096, 3000))
-    for width, height in sizes[:1] if session.quick else sizes:
+    for width, height in finding.SIZES[: 1 if session.quick else None]:
         names = boards if width < 3000 else boards[:-1]
         size = f"{width} x {height}"
         runs.append((f"board, {size}", finding.rendered(width, height, False), names))
