@@ -18,6 +18,7 @@ from survey.simulate.rendering import BrownCamera, Imaging, PlacedTarget, render
 from tests.benchmarks.cases import Arrays
 from tests.benchmarks.outcome import Competitor, Outcome
 
+SIZES = ((640, 480), (1280, 1024), (2592, 1944), (4096, 3000))
 VIEWS = ((0.3, 0.25, 0.2), (-0.5, 0.4, -0.4))
 BOARD, CHARUCO = Checkerboard(9, 6, 0.02), Charuco(9, 6, 0.02, 0.015, "4X4_50")
 

@@ -1,8 +1,9 @@
 """Before and after: ``python -m tests.benchmarks.versions FOLDER [--only ROW ...] [--rounds N]``.
 
 FOLDER is another checkout of this project, built. Each version runs the competitors called "ours" of its own
-benchmarks in a process of its own, in turn with the other, on the same cases; the first run of each, which may still
-compile or load, is not counted. Processor seconds, the least of all rounds: what other work does to them it adds.
+benchmarks, and OpenCV's classic finder as a measure, in a process of its own, in turn with the other, on the same
+cases; the first run of each, which may still compile or load, is not counted. Processor seconds, the least of all
+rounds: what other work does to them it adds.
 """
 
 import argparse
@@ -49,8 +50,11 @@ ROWS: dict[str, tuple[str, Callable[[], Any]]] = {
     "1000 points, readings": (terrestrial.OURS, partial(terrestrial.case, 1000)),
     "Table 1": (trials.TABLE_1, lambda: trials.Trials(np.array(1000))),
     "26 photographs": (finding.OURS, _photographs),
+    "26 photographs, OpenCV": (finding.CLASSIC, _photographs),
     **{f"{'ChArUco' if charuco else 'board'}, {w} x {h}": (finding.OURS, partial(finding.rendered, w, h, charuco))
-       for w, h in ((2592, 1944), (4096, 3000)) for charuco in (False, True)},
+       for w, h in finding.SIZES for charuco in (False, True)},
+    **{f"board, {w} x {h}, OpenCV": (finding.CLASSIC, partial(finding.rendered, w, h, False))
+       for w, h in finding.SIZES},
 }  # fmt: skip
 
 

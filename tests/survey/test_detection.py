@@ -7,7 +7,7 @@ from gtsam import Pose3, Rot3
 from scipy.stats import chi2
 
 from adjust.model.errors import SurveyError
-from adjust.native.vision import corner_rows, fit_corners
+from adjust.native.vision import corner_rows, find_grid, fit_corners
 from survey.detection import detect_image, markers
 from survey.detection.corners import CROSSING_FLOOR_PX, MARKER_FLOOR_PX
 from survey.detection.detect import detect_targets
@@ -289,3 +289,22 @@ def test_a_fit_to_its_own_grey_values_gives_back_what_they_were_made_with(crossi
     assert status[0] == 0
     assert rms[0] < 1e-4  # grey values of single precision
     assert np.abs(found[0] - p).max() < 1e-4
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 17.0, 45.0, 100.0])
+def test_a_whole_board_is_glimpsed_where_it_is_and_no_part_of_one(turn_deg):
+    squares = np.indices((5, 8)).sum(0) % 2
+    flat = np.pad(np.kron(squares, np.full((20, 20), 200.0)) + 20.0, 70, constant_values=220.0).astype(np.float32)
+    M = cv2.getRotationMatrix2D((150.0, 120.0), turn_deg, 1.0)
+    turned = cv2.warpAffine(flat, M, (300, 240), borderValue=220.0)
+    image = np.rint(cv2.GaussianBlur(turned, (0, 0), 0.8)).astype(np.uint8)
+    v, u = np.meshgrid(89.5 + 20.0 * np.arange(4), 89.5 + 20.0 * np.arange(7), indexing="ij")
+    truth = np.stack([u, v, np.ones_like(u)], axis=2) @ M.T
+    grid = find_grid(image, 7, 4)
+    assert grid is not None
+    away = [np.abs(g - truth).max() for g in (grid, grid[::-1], grid[:, ::-1], grid[::-1, ::-1])]
+    assert min(away) < 0.7
+    assert find_grid(image, 4, 7).shape == (7, 4, 2)
+    assert find_grid(image, 6, 4) is None
+    u, v = truth[1, 3].round().astype(int)
+    assert find_grid(cv2.circle(image, (int(u), int(v)), 8, 128, -1), 7, 4) is None
