@@ -51,7 +51,6 @@ class Misfit:
         """By how much the misfit is larger than noise makes it."""
         return max(0.0, self.omega - self.redundancy)
 
-
     def times_less_than(self, other: "Misfit") -> float:
         """How many times less than another one it exceeds noise; noise itself is some of it."""
         noise = float(np.sqrt(2.0 * max(self.redundancy, 1)))

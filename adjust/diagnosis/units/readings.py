@@ -121,8 +121,9 @@ def _evidence(survey: Survey, before: Screen | None, values: FloatArray, ways: S
     """How many times smaller the bounded misfit becomes by each way to read."""
     n, out = len(survey.readings), [0.0] * len(ways)
     number = Counter(r.kind for r in survey.readings)
-    whole = [len(scope.rows) == sum(number[k] for k in {survey.readings[i].kind for i in scope.rows})
-             for scope, _ in ways]  # of all readings of its kinds
+    whole = [
+        len(scope.rows) == sum(number[k] for k in {survey.readings[i].kind for i in scope.rows}) for scope, _ in ways
+    ]  # of all readings of its kinds
     anew = [i for i, (scope, _) in enumerate(ways) if before is None or (
         whole[i] and n <= _LARGE_START and not _fits_as_it_is(before, scope.rows))]  # fmt: skip
     surveys = [mended(survey, ways[i][0].rows, ways[i][1]) for i in anew]
