@@ -101,6 +101,7 @@ class Case:
         most: float = np.inf,
     ) -> Adjustment:  # fmt: skip
         """Paid for as it goes: it begins where something is left, and every step costs."""
+
         def went(iteration: int, omega: float) -> None:
             self.budget.left -= step
             if iteration >= _HOPELESS and omega > most:

@@ -265,4 +265,3 @@ class Prediction:
             return self._on_target(self._targets[block.target_id], block.epoch_id)[block.point_idx]
         found = [self._value(("point", self.survey.points[int(i)].point_id), altered) for i in block.point_idx]
         return np.array([np.full(3, np.nan) if x is None else x for x in found])
-

@@ -8,7 +8,7 @@ from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.trial import Misfit, Trial, tried, tried_afresh
 
 _FAINT, _FAINT_TO_NOISE = 0.2, 0.7
-"""Evidence over that of a trial that leaves little, or nothing but noise, below which nothing else is tried."""
+"""Evidence over that of a trial that leaves little below which nothing is tried; of scores, where it leaves noise."""
 _MOST_OF_IT, _ENOUGH = 0.95, 0.5
 """Shares of the misfit beyond noise: what ends a search, and what a cause takes away at least."""
 _CLEAR = 3.0
@@ -36,17 +36,19 @@ class Search:
         self.queue = _in_turn([*formed] if kept else [*self.queue, *formed])
         self.case.budget.kept = kept
         while self.queue and self.case.budget.lasts:
-            trial = tried(self.queue.pop(0), self.case)
+            before, trial = self.case.budget.kept, tried(self.queue.pop(0), self.case)
             clear = trial.hypothesis.evidence > _CLEAR and not trial.explains(_ENOUGH, self.base)
-            if trial.untimely:
-                waiting.append(trial.hypothesis)
-                continue
-            if clear or trial.misfit.omega >= self.base.omega:
+            if not trial.untimely and (clear or trial.misfit.omega >= self.base.omega):
                 trial = tried_afresh(trial, self.case, self.base) or trial
-            else:
+            elif not trial.untimely:
                 astray.append(trial)
-            self.names.append(trial.hypothesis.name)
-            self._note(trial)
+            if trial.result is not None or not trial.untimely:
+                self.names.append(trial.hypothesis.name)
+                self._note(trial)
+            if trial.untimely and self.case.budget.kept < before:
+                self.queue.insert(0, trial.hypothesis)
+            elif trial.untimely:
+                waiting.append(trial.hypothesis)
         for trial in sorted(astray, key=lambda t: -t.hypothesis.evidence)[:_AFRESH]:
             again = None if self.explained(_ENOUGH) else tried_afresh(trial, self.case, self.base)
             if again is not None:
@@ -60,7 +62,7 @@ class Search:
     def done(self, following: float = 0.0) -> bool:
         """Whether one explains nearly everything with all observations, and what follows has much less evidence."""
         best = (t for t in self.trials if t.explains(_MOST_OF_IT, self.base))
-        return any(t.misfit.dropped == 0 and following < _faint(t) for t in best)
+        return any(t.misfit.dropped == 0 and following < _FAINT * t.hypothesis.evidence for t in best)
 
     @property
     def untried(self) -> tuple[str, ...]:
@@ -69,16 +71,21 @@ class Search:
 
     @property
     def told(self) -> list[Trial]:
-        """The trials to be ranked: larger variances explain anything, so what waits with more evidence goes first."""
-        most = max((h.evidence for h in self.queue), default=0.0)
-        return [t for t in self.trials if not (t.hypothesis.penalty and t.hypothesis.evidence < min(most, _CLEAR))]
+        """The trials to be ranked: scores, and what explains anything, not before what waits with more evidence."""
+        left = max((h.evidence for h in self.queue), default=0.0)
+        scores = max((h.evidence for h in self.queue if h.scored), default=0.0)
+        return [
+            t for t in self.trials
+            if not (t.hypothesis.penalty and t.hypothesis.evidence < min(left, _CLEAR))  # variances
+            and not (t.hypothesis.scored and t.hypothesis.evidence < scores and not t.explains(_MOST_OF_IT, self.base))
+        ]  # fmt: skip
 
     def _note(self, trial: Trial) -> None:
         """With what it tells more exactly, in its place or to be tried next."""
         first = trial.hypothesis
         more = list(first.follow(trial.result)) if first.follow is not None and trial.result is not None else []
         same = [replace(trial, hypothesis=h) for h in more if h.survey is first.survey]
-        self.trials += same or [trial]
+        self.trials = [t for t in self.trials if t.hypothesis.survey is not first.survey] + (same or [trial])
         if trial.explains(_MOST_OF_IT, self.base):
             self.queue = [h for h in self.queue if (h.name, h.place.ids) != (first.name, first.place.ids)]
         self.queue = [h for h in (*more, *self.queue) if h.survey is not first.survey and not self._beaten(h)]
@@ -93,7 +100,7 @@ class Search:
 
 
 def _faint(trial: Trial) -> float:
-    """Evidence that is not worth a trial beside it."""
+    """The score that is not worth a trial beside that of one."""
     return trial.hypothesis.evidence * (_FAINT_TO_NOISE if trial.misfit.is_noise() else _FAINT)
 
 

@@ -11,7 +11,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 
-_NOISE = 5.0
+_NOISE, _CLEARLY = 5.0, 3.0
 """Sigmas of v'Pv up to which what is left is noise."""
 _LAST = 0.7
 """Adjustments that finding the size of a change leaves for the one that shows what it explains."""
@@ -50,7 +50,6 @@ class Misfit:
         """By how much the misfit is larger than noise makes it."""
         return max(0.0, self.omega - self.redundancy)
 
-
     def times_less_than(self, other: "Misfit") -> float:
         """How many times less than another one it exceeds noise; noise itself is some of it."""
         noise = float(np.sqrt(2.0 * max(self.redundancy, 1)))
@@ -61,7 +60,7 @@ class Misfit:
 class Trial:
     """A hypothesis, with the misfit of its survey and the adjustment that showed it (None: it led to no solution).
 
-    untimely: there was no time to find out.
+    untimely: there was no time to find out, or to find its size to the end.
     """
 
     hypothesis: Hypothesis
@@ -71,7 +70,9 @@ class Trial:
     untimely: bool = False
 
     def explains(self, share: float, base: Misfit) -> bool:
-        """Whether it takes away this share of the misfit beyond noise, with all observations."""
+        """Whether it takes away this share of the misfit beyond noise, where there is any, with all observations."""
+        if base.is_noise(_CLEARLY):
+            return False
         left = self.misfit.cost - self.misfit.redundancy
         return self.result is not None and self.misfit.unused == 0 and left <= (1.0 - share) * base.excess
 
@@ -84,8 +85,9 @@ def tried(hypothesis: Hypothesis, case: Case) -> Trial:
     case.budget.kept -= _LAST
     if survey is None:
         return Trial(hypothesis, misfit_of(None, case.survey), None, None, case.budget.refused)
-    case.budget.refused = False
-    return _adjusted(hypothesis, survey, case, case.run if case.linear is None else case.warm)
+    cut, case.budget.refused = case.budget.refused, False
+    trial = _adjusted(hypothesis, survey, case, case.run if case.linear is None else case.warm)
+    return replace(trial, untimely=trial.untimely or (cut and not trial.misfit.is_noise()))
 
 
 def tried_afresh(trial: Trial, case: Case, base: Misfit) -> Trial | None:

@@ -70,10 +70,10 @@ def test_size_that_makes_it_worse_is_taken_back() -> None:
 
 
 @pytest.mark.parametrize(("name", "kind", "size"), [
-    ("given points exchanged", "plane", 0.0), ("points exchanged", "plane", 0.0), ("target moved", "head", 40.0),
+    ("given points exchanged", "plane", 0.0), ("points exchanged", "plane", 0.0),
 ])  # fmt: skip
 def test_where_the_start_is_lost_the_change_still_shows(name: str, kind: str, size: float) -> None:
-    """Every sight misses; one column alone was exchanged; images that the start leaves out."""
+    """Every sight misses; one column alone was exchanged."""
     mistake = next(m for m in reversed(MISTAKES) if m.name == name and kind in m.kinds and size in m.sizes)
     assert outcome_of(mistake, kind, size, 61740)["outcome"] == "first"
 
@@ -89,12 +89,12 @@ def test_diagnosis_keeps_to_its_budget() -> None:
     survey, truth = survey_of("stereo", 3)
     planted = next(m for m in MISTAKES if m.name == "camera moved").plant(survey, truth, 6.0)
     result = adjust.solve(planted)
-    whole, cut = (diagnose(Case(planted, result, None, Budget(most))) for most in (20.0, 4.5))
+    whole, cut = (diagnose(Case(planted, result, None, Budget(most))) for most in (20.0, 5.0))
     assert whole.candidates[0].hypothesis.name == "camera moved"
     assert not whole.untried
     assert "camera moved" in cut.untried
     assert set(cut.untried).isdisjoint(cut.tried)
-    assert not cut.candidates  # larger sigmas, which explain anything, are not named before it
+    assert not cut.candidates  # nothing with less evidence is named before it
     assert f"not tried, as the time of a diagnosis was spent: {', '.join(cut.untried)}" in cut.note
 
 

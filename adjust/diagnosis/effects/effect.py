@@ -52,7 +52,8 @@ class Effect:
         found: list[Mapping[str, Any]] = []
 
         def made() -> Survey | None:
-            at, (theta, result, sigmas) = self, self._estimated(case, linear, self.first.theta)
+            begin = self._last[-1][0] if self._last else self.first.theta  # where the time did not suffice before
+            at, (theta, result, sigmas) = self, self._estimated(case, linear, begin)
             if not self._last:
                 return None
             fits = misfit_of(result, result.survey).is_noise()

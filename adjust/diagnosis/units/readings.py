@@ -4,6 +4,7 @@ Evidence: values as mended against those that the rest of the survey predicts at
 where there is one). What concerns every reading of its kind may have spoilt the start: then it is found anew.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -119,7 +120,10 @@ def mended(survey: Survey, rows: IntArray, misreading: Misreading) -> Survey:
 def _evidence(survey: Survey, before: Screen | None, values: FloatArray, ways: Sequence[_Way]) -> list[float]:
     """How many times smaller the bounded misfit becomes by each way to read."""
     n, out = len(survey.readings), [0.0] * len(ways)
-    whole = [_concerns_all(survey, scope) for scope, _ in ways]
+    number = Counter(r.kind for r in survey.readings)
+    whole = [
+        len(scope.rows) == sum(number[k] for k in {survey.readings[i].kind for i in scope.rows}) for scope, _ in ways
+    ]  # of all readings of its kinds
     anew = [i for i, (scope, _) in enumerate(ways) if before is None or (
         whole[i] and n <= _LARGE_START and not _fits_as_it_is(before, scope.rows))]  # fmt: skip
     surveys = [mended(survey, ways[i][0].rows, ways[i][1]) for i in anew]
@@ -144,11 +148,6 @@ def _fits_as_it_is(before: Screen, rows: IntArray) -> bool:
     """Whether so few readings miss, of these and of all, that these cannot be misread throughout."""
     bad = before.missed
     return bool(before.scale < _ROUGH and bad.mean() < _FEW and bad[rows].mean() < 0.5)
-
-
-def _concerns_all(survey: Survey, scope: Scope) -> bool:
-    kinds = {survey.readings[i].kind for i in scope.rows}
-    return len(scope.rows) == sum(r.kind in kinds for r in survey.readings)
 
 
 def _hypothesis(survey: Survey, scope: Scope, misreading: Misreading, evidence: float, looked_at: int) -> Hypothesis:

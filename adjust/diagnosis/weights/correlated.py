@@ -53,6 +53,7 @@ def _others_if_half(
     case: Case, first: Hypothesis, others: list[Hypothesis]
 ) -> Callable[[Adjustment], list[Hypothesis]]:
     """Other sizes of a common error, where the first takes away half of the misfit."""
+
     def told(result: Adjustment) -> list[Hypothesis]:
         half = misfit_of(result, case.survey).excess < 0.5 * misfit_of(case.result, case.survey).excess
         return [first, *others] if half else [first]
