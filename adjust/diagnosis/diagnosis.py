@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
-from adjust.diagnosis.case import Case
+from adjust.diagnosis.case import MOST, Case
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.ranking import Candidate, ranked
 from adjust.diagnosis.search import Search
@@ -73,8 +73,8 @@ class Diagnosis:
 def diagnose(case: Case, families: Sequence[Family] | None = None) -> Diagnosis:
     """Form the hypotheses of all families, try the likeliest of them, and rank those that explain the misfit.
 
-    families: those of ``FAMILIES`` where None. As many are tried as the budget of the case allows. Nothing is repaired,
-    nothing is written.
+    families: those of ``FAMILIES`` where None. As many are tried as the budget of the case allows, and where none of
+    them explains anything, as many again. Nothing is repaired, nothing is written.
     """
     search = Search(case, misfit_of(case.result, case.survey))
     looked_at = 0
@@ -86,6 +86,10 @@ def diagnose(case: Case, families: Sequence[Family] | None = None) -> Diagnosis:
         looked_at += sum(h.looked_at for h in formed)
         search.over(formed, 0.0 if search.done() else kept)
     found = ranked(search.base, search.told, looked_at)
+    if not found and search.untried:
+        case.budget.left = max(case.budget.left, 0.0) + MOST
+        search.over((), 0.0)
+        found = ranked(search.base, search.told, looked_at)
     return Diagnosis(found, tuple(dict.fromkeys(search.names)), search.base, search.untried, tuple(case.passed_over))
 
 

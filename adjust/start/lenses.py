@@ -21,12 +21,11 @@ from adjust.native.lenses import Lens, fit_lens
 from adjust.native.views import homographies
 from adjust.start.closed_forms.absolute_pose import best_poses
 from adjust.start.closed_forms.zhang import pinhole_from_homographies
-from adjust.start.views import ends_of, few_of, rays_of_images
+from adjust.start.views import ends_of, rays_of_images
 
 _MOST_IMAGES = 30
 _SCAN_IMAGES = 8
 _MOST_SCREENED = 60
-_MOST_POINTS = 1_200  # of all images together that a lens is found from
 _GOOD_START = 0.01  # of the image width: with less error a closed form needs no scan beside it
 _LEVELS = ("focal centre k1 k2", "focal centre k1", "focal k1", "focal")
 _SIMPLE_PX = 2.0
@@ -119,10 +118,10 @@ class _LensSearch:
                 " show it a target, or give lens values"
             )
         # the other images of a long series are screened by their poses
-        flat = self._thinned(_every([s for s in usable if self._on_plane(s) is not None], _MOST_SCREENED))
+        flat = _every([s for s in usable if self._on_plane(s) is not None], _MOST_SCREENED)
         maps, excluded = self._screen(flat) if flat else ({}, {})
         chosen = spread_out([s for s in flat if s.block_idx in maps])
-        chosen = chosen or self._thinned([s for s in usable if s.block_idx not in excluded][:_MOST_IMAGES])
+        chosen = chosen or [s for s in usable if s.block_idx not in excluded][:_MOST_IMAGES]
         if not chosen:
             raise SurveyError(
                 f"camera {self.camera.camera_id!r}: none of its {len(flat)} images fits a plane; the first: "
@@ -138,15 +137,6 @@ class _LensSearch:
         if key not in self._plane:
             self._plane[key] = _plane_coordinates(sighting.x)
         return self._plane[key]
-
-    def _thinned(self, images: Sequence[Sighting]) -> list[Sighting]:
-        """Images with few of their points, as many as tell a lens from; images of the same points keep the same."""
-        few, most = dict[int, FloatArray](), _MOST_POINTS // max(min(len(images), _MOST_IMAGES), 1)
-        for x in (s.x for s in images if id(s.x) not in few):
-            few[id(x)] = x[few_of(len(x), most)]
-            plane = self._plane.get(id(x))
-            self._plane[id(few[id(x)])] = None if plane is None else plane[few_of(len(x), most)]
-        return [Sighting(s.block_idx, few[id(s.x)], s.uv[few_of(len(s.x), most)]) for s in images]
 
     def _screen(self, flat: Sequence[Sighting]) -> tuple[dict[int, FloatArray | None], dict[int, str]]:
         """Images that fit a plane, with their homographies where determined; a wrong point order misses by far."""

@@ -7,8 +7,7 @@ import pytest
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import Camera, LensParameter, Point, PointParameter, PoseParameter, Station, Survey, Tie
-from adjust.native.lenses import fit_lens
-from adjust.start import find_start, lenses
+from adjust.start import find_start
 from adjust.start.lenses import Sighting, start_lens
 from tests.adjust.test_initial import FREE, SIZE, TRUE, assert_near, board_views, grid, inv, looking_at, pixels
 from tests.data import data_folder
@@ -66,21 +65,6 @@ def test_a_photogrammetric_lens_is_found_in_millimetres(model):
     # the backward correction undoes a forward k1: K1 = -k1 / c^2 to first order
     k1 = found[3] if model == "brown_backward" else found[4]
     assert k1 == pytest.approx(0.13 / 8.0**2, rel=0.4)
-
-
-def test_a_lens_from_many_images_takes_few_points_of_each(monkeypatch):
-    taken = []
-
-    def counted(kind, values, constants, directions, ptr, x, *others):
-        taken.append(len(x))
-        return fit_lens(kind, values, constants, directions, ptr, x, *others)
-
-    monkeypatch.setattr(lenses, "fit_lens", counted)
-    found = start_lens(Camera("c", "s", SIZE, LensParameter("brown", FREE)),
-                       sightings(np.random.default_rng(4), 40, project))  # fmt: skip
-    assert 1_000 < taken[0] <= 1_200 < 30 * 88
-    np.testing.assert_allclose(found.values[[0, 1, 3, 4]], TRUE[:4], atol=4)
-    assert found.excluded == {}
 
 
 def test_one_image_gives_a_focal_length_and_leaves_the_centre():
