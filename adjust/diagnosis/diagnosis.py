@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
-from adjust.diagnosis.case import MOST, Case
+from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.ranking import Candidate, ranked
 from adjust.diagnosis.search import Search
@@ -76,7 +76,7 @@ def diagnose(case: Case, families: Sequence[Family] | None = None) -> Diagnosis:
     families: those of ``FAMILIES`` where None. As many are tried as the budget of the case allows, and where none of
     them explains anything, as many again. Nothing is repaired, nothing is written.
     """
-    search = Search(case, misfit_of(case.result, case.survey))
+    search, given = Search(case, misfit_of(case.result, case.survey)), case.budget.left
     looked_at = 0
     stages = _all_families() if families is None else [families]
     for later, rooms in zip(reversed(range(len(stages))), stages, strict=True):
@@ -87,7 +87,7 @@ def diagnose(case: Case, families: Sequence[Family] | None = None) -> Diagnosis:
         search.over(formed, 0.0 if search.done() else kept)
     found = ranked(search.base, search.told, looked_at)
     if not found and search.untried:
-        case.budget.left = max(case.budget.left, 0.0) + MOST
+        case.budget.left = max(case.budget.left, 0.0) + given
         search.over((), 0.0)
         found = ranked(search.base, search.told, looked_at)
     return Diagnosis(found, tuple(dict.fromkeys(search.names)), search.base, search.untried, tuple(case.passed_over))

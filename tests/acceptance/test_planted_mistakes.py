@@ -85,16 +85,17 @@ def test_part_that_can_be_adjusted_is_no_explanation() -> None:
 
 
 def test_diagnosis_keeps_to_its_budget() -> None:
-    """What is spent ends it; what was not tried any more is told."""
+    """What is spent ends it, once more as much where nothing explains anything; what was not tried any more is told."""
     survey, truth = survey_of("stereo", 3)
     planted = next(m for m in MISTAKES if m.name == "camera moved").plant(survey, truth, 6.0)
     result = adjust.solve(planted)
-    whole, cut = (diagnose(Case(planted, result, None, Budget(most))) for most in (20.0, 5.0))
-    assert whole.candidates[0].hypothesis.name == "camera moved"
-    assert not whole.untried
-    assert "camera moved" in cut.untried
+    whole, short, cut = (diagnose(Case(planted, result, None, Budget(most))) for most in (20.0, 5.0, 0.0))
+    for enough in (whole, short):
+        assert enough.candidates[0].hypothesis.name == "camera moved"
+        assert not enough.untried
+    assert "sigmas of a group" in cut.untried
     assert set(cut.untried).isdisjoint(cut.tried)
-    assert not cut.candidates  # nothing with less evidence is named before it
+    assert not cut.candidates
     assert f"not tried, as the time of a diagnosis was spent: {', '.join(cut.untried)}" in cut.note
 
 
