@@ -73,7 +73,8 @@ def _courses(linear: Linear, only: ParameterName | None = None) -> Iterator[_Cou
     survey, columns = linear.result.survey, linear.system.columns
     ptr, row_of = linear.system.ptr, linear.system.row_of
     first_reading = len(ptr) - 1 - len(survey.readings)
-    pairs = {i: k for k, i in enumerate(_other_rows(linear, "pair"))}
+    pairs = {i: survey.pairs[k].pair_id for k, i in enumerate(_other_rows(linear, "pair"))}
+    readings = {first_reading + k: r.reading_id for k, r in enumerate(survey.readings)}
 
     def course(name: ParameterName, kind: str, ids: Mapping[int, str], rows: IntArray) -> _Course:
         numbers = [i for i in np.unique(row_of[rows]).tolist() if i in ids]
@@ -89,10 +90,9 @@ def _courses(linear: Linear, only: ParameterName | None = None) -> Iterator[_Cou
         if (rows < ptr[linear.system.n_image]).any():
             yield from _of_images(linear, name, rows)
         elif name[0] == "world_from_station":
-            yield course(name, "pair", {i: survey.pairs[k].pair_id for i, k in pairs.items()}, rows)
+            yield course(name, "pair", pairs, rows)
         elif name[0] == "orientation":
-            ids = {first_reading + k: r.reading_id for k, r in enumerate(survey.readings)}
-            yield course(name, "reading", ids, rows)
+            yield course(name, "reading", readings, rows)
 
 
 def _worst_first(linear: Linear) -> list[ParameterName]:
