@@ -212,6 +212,13 @@ class TreeCovariance:
         """Length of a stacked vector of all unknowns."""
         return int(self._first[-1])
 
+    def columns_for(self, eliminations: float) -> float:
+        """How many columns go up and down the deepest way at the price of so many eliminations of the whole."""
+        own, way = (self._front * self._width).tolist(), list[int]()
+        for numbers, parent in zip(own, self._parents.tolist(), strict=True):  # parents first
+            way.append(numbers + (way[parent] if parent >= 0 else 0))
+        return eliminations * float(self._front @ self._width.astype(float) ** 2) / (2.0 * max(way, default=1))
+
     def times(self, columns: FloatArray) -> FloatArray:
         """The whole covariance matrix times columns (n, m), without forming it."""
         x = np.array(columns, dtype=float, order="C")

@@ -163,3 +163,11 @@ def test_large_networks_are_eliminated_in_the_order_of_least_work(
         assert sorted(keys.tolist()) == list(range(k * k))
         assert {pattern.home[i] for i in np.flatnonzero(np.isin(keys, last))} <= {0}
     assert found[0][1].work < found[1][1].work
+
+
+def test_columns_cost_their_way_to_the_root_and_back() -> None:
+    tree = solve_network(pose_networks.simulate(20, 4, 1, extra=10).network).precision.tree
+    numbers = tree.arrays.front * tree.arrays.width
+    ways = [numbers[tree._ancestors({c})].sum() for c in range(len(numbers))]
+    assert 0 < max(ways) < numbers.sum()  # there are branches
+    assert tree.columns_for(3.0) * 2.0 * max(ways) == pytest.approx(3.0 * float(numbers @ tree.arrays.width))

@@ -23,6 +23,8 @@ from adjust.statistics.score import Part, Score, drift_times
 
 FOCAL, CENTRE = ("fx", "fy", "c"), ("u0", "v0", "xp", "yp")
 _FEWEST = 4
+_ELIMINATIONS = 25.0
+"""Eliminations of the whole system that all courses together may cost in surveys of many unknowns."""
 _BOUND = 50.0  # of the square of one image point
 _MOVED = {  # name of the unknown: of the mistake, kind of the thing, what happened to it
     "station_from_camera": ("camera moved", "camera", "camera {} was moved on its station"),
@@ -53,8 +55,9 @@ def steps(case: Case) -> Iterator[Effect]:
     linear = case.linear
     if linear is None:
         return
-    n = len(linear.system.columns)
-    room = float(n) if n > DENSE else np.inf  # columns of the covariance matrix, as many as it has
+    n, tree = len(linear.system.columns), linear.system.precision.tree
+    # columns of the covariance matrix: as many as it has, or as cost no more than some adjustments
+    room = min(float(n), tree.columns_for(_ELIMINATIONS)) if n > DENSE else np.inf
     for course in _courses(linear):
         room -= sum(B.shape[1] for _, B in course.parts)
         if not case.few("what moved from some epoch on, of things that fit better than others", int(room < 0.0), 0):
