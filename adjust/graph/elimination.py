@@ -1,12 +1,18 @@
-"""How GTSAM eliminates a linear system: by Cholesky, or by QR where that still resolves what Cholesky refuses."""
+"""In which order, and how, a linear system is eliminated: by Cholesky, or by QR where that resolves what it refuses."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
 import gtsam
+import numpy as np
+
+from adjust.model.survey import IntArray
+from adjust.native.elimination import CliquePattern, clique_pattern
 
 _Found = TypeVar("_Found")
+_LARGE = 2000
+"""Poses of networks from which their order is looked for in a second way: smaller ones take no time in either."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,3 +44,35 @@ class Elimination:
             return tree, tree.optimize()
         except RuntimeError:
             return None
+
+
+def pose_cliques(
+    alone: Iterable[int], a: IntArray, b: IntArray, last: Sequence[int] = ()
+) -> tuple[IntArray, CliquePattern]:
+    """Poses (N,) as their cliques number them, of pairs with ends a, b (E,), of which -1 is a constant.
+
+    alone: poses that something else tells of. last: those that are eliminated last. The order is COLAMD's or, in large
+    networks, that of METIS (nested dissection; Karypis and Kumar 1998): the one that is less work.
+    """
+    symbolic = gtsam.SymbolicFactorGraph()
+    for key in alone:
+        symbolic.push_factor(key)
+    for ends in zip(b.tolist(), a.tolist(), strict=True):
+        symbolic.push_factor(*(k for k in ends if k >= 0))
+    orders = [gtsam.Ordering.ColamdConstrainedLastSymbolicFactorGraph(symbolic, list(last))]
+    if orders[0].size() > _LARGE:
+        orders.append(gtsam.Ordering.MetisSymbolicFactorGraph(symbolic))
+    found = list[tuple[IntArray, CliquePattern]]()
+    for order in orders:
+        keys = np.array([order.at(i) for i in range(order.size())], dtype=np.int64)
+        keys = keys[np.argsort(np.isin(keys, last), kind="stable")]
+        both = (a >= 0) & (b >= 0)
+        pattern = clique_pattern(len(keys), *(numbers(keys, ends[both]) for ends in (b, a)))
+        found.append((keys[pattern.order], pattern))
+    return min(found, key=lambda x: x[1].work)
+
+
+def numbers(keys: IntArray, of: IntArray) -> IntArray:
+    """Where each of these stands in ``keys``; -1 stays."""
+    order = np.argsort(keys)
+    return np.where(of < 0, -1, order[np.searchsorted(keys, np.maximum(of, keys.min()), sorter=order)])

@@ -11,8 +11,9 @@ import gtsam
 import numpy as np
 
 from adjust.graph.assembly import AdjustmentGraph, Evaluation
-from adjust.model.survey import FloatArray, IntArray
-from adjust.native.elimination import PoseFactor, PoseTree, clique_pattern, pair_gradient
+from adjust.graph.elimination import numbers, pose_cliques
+from adjust.model.survey import FloatArray
+from adjust.native.elimination import PoseFactor, PoseTree, pair_gradient
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,19 +65,10 @@ class PairNormals:
         known = [*self.batch.seen(), *(factor.keys()[0] for factor in self.priors)]
         b, a = (keys[~self.batch.both_held] for keys in (self.batch.b_key, self.batch.a_key))
         solved = np.isin(b, [*known, -1]) & np.isin(a, [*known, -1])
-        symbolic = gtsam.SymbolicFactorGraph()
-        for factor in self.priors:
-            symbolic.push_factor(factor.keys()[0])
-        for ends in zip(b[solved].tolist(), a[solved].tolist(), strict=True):
-            symbolic.push_factor(*(k for k in ends if k >= 0))
-        ordering = gtsam.Ordering.ColamdConstrainedLastSymbolicFactorGraph(symbolic, list(last))
-        keys = np.array([ordering.at(i) for i in range(ordering.size())], dtype=np.int64)
-        b, a = (_numbers(keys, ends[solved]) for ends in (b, a))
-        both = (b >= 0) & (a >= 0)
-        pattern = clique_pattern(len(keys), b[both], a[both])
-        self.keys = keys[pattern.order]
+        b, a = b[solved], a[solved]
+        self.keys, pattern = pose_cliques([factor.keys()[0] for factor in self.priors], a, b, list(last))
         active = self.batch.arrays.used[~self.batch.both_held][solved]
-        self.b, self.a = (_numbers(pattern.order, ends[active]) for ends in (b, a))
+        self.b, self.a = (numbers(self.keys, ends[active]) for ends in (b, a))
         self.number = {key: i for i, key in enumerate(self.keys.tolist())}
         self.factor = PoseFactor(pattern)
         self.kept = False
@@ -116,9 +108,3 @@ class PairNormals:
         for key, row in zip(self.number, x, strict=True):
             delta.insert(key, row)
         return delta, float(np.sum(g * x))
-
-
-def _numbers(keys: IntArray, of: IntArray) -> IntArray:
-    """Where each of these stands in ``keys``; -1 stays."""
-    order = np.argsort(keys)
-    return np.where(of < 0, -1, order[np.searchsorted(keys, np.maximum(of, keys.min()), sorter=order)])

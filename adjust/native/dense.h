@@ -4,9 +4,9 @@
 
 namespace {
 
-// C (n, m) = A (n, inner) B (inner, m); the rows of B and C are read and written in whole vectors of 2 W.
+// C (n, m) = A (n, inner) B (inner, m), or C += where more; the rows of B and C are read and written in whole vectors of 2 W.
 template <int R, int K>
-inline void product_tile(const double *A, int64_t lda, const double *B, int64_t ldb, double *C, int64_t ldc, int64_t inner) {
+inline void product_tile(const double *A, int64_t lda, const double *B, int64_t ldb, double *C, int64_t ldc, int64_t inner, bool more) {
     V c[R][K] = {};
     for (int64_t k = 0; k < inner; ++k) {
         V b[K];
@@ -20,24 +20,43 @@ inline void product_tile(const double *A, int64_t lda, const double *B, int64_t 
         }
     }
     for (int r = 0; r < R; ++r)
-        for (int j = 0; j < K; ++j) store(C + r * ldc + j * W, c[r][j]);
+        for (int j = 0; j < K; ++j) {
+            double *to = C + r * ldc + j * W;
+            store(to, more ? load(to) + c[r][j] : c[r][j]);
+        }
 }
 template <int K>
-inline void product_columns(const double *A, int64_t lda, const double *B, int64_t ldb, double *C, int64_t ldc, int64_t n, int64_t inner) {
+inline void product_columns(const double *A, int64_t lda, const double *B, int64_t ldb, double *C, int64_t ldc, int64_t n, int64_t inner, bool more) {
     int64_t i = 0;
-    for (; i + 4 <= n; i += 4) product_tile<4, K>(A + i * lda, lda, B, ldb, C + i * ldc, ldc, inner);
-    for (; i + 2 <= n; i += 2) product_tile<2, K>(A + i * lda, lda, B, ldb, C + i * ldc, ldc, inner);
-    for (; i < n; ++i) product_tile<1, K>(A + i * lda, lda, B, ldb, C + i * ldc, ldc, inner);
+    for (; i + 4 <= n; i += 4) product_tile<4, K>(A + i * lda, lda, B, ldb, C + i * ldc, ldc, inner, more);
+    for (; i + 2 <= n; i += 2) product_tile<2, K>(A + i * lda, lda, B, ldb, C + i * ldc, ldc, inner, more);
+    for (; i < n; ++i) product_tile<1, K>(A + i * lda, lda, B, ldb, C + i * ldc, ldc, inner, more);
 }
 inline int64_t padded(int64_t n) { return (n + 2 * W - 1) / (2 * W) * (2 * W); }
 
 // As wide as the widest vectors pad it, so that room taken by one set of instructions serves every other.
 constexpr int64_t WIDEST = 16;
 inline int64_t padded_most(int64_t n) { return (n + WIDEST - 1) / WIDEST * WIDEST; }
-inline void product(const double *A, int64_t lda, const double *B, int64_t ldb, double *C, int64_t ldc, int64_t n, int64_t m, int64_t inner) {
-    int64_t j = 0;
-    for (; j + W < m; j += 2 * W) product_columns<2>(A, lda, B + j, ldb, C + j, ldc, n, inner);
-    for (; j < m; j += W) product_columns<1>(A, lda, B + j, ldb, C + j, ldc, n, inner);
+
+constexpr int64_t DEPTH = 128;  // rows of B that are multiplied at once: of 2 W columns they stay in the nearest cache
+constexpr int64_t MANY = 16;    // rows of A from which they are put side by side before
+inline void product(const double *A, int64_t lda, const double *B, int64_t ldb, double *C, int64_t ldc, int64_t n, int64_t m, int64_t inner,
+                    bool more = false) {
+    alignas(64) double strip[DEPTH * 2 * W];
+    for (int64_t k = 0; k == 0 || k < inner; k += DEPTH, more = true) {
+        const int64_t some = smaller(DEPTH, inner - k);
+        const double *a = A + k, *b = B + k * ldb;
+        int64_t j = 0;
+        for (; j + W < m; j += 2 * W) {
+            if (n < MANY) {
+                product_columns<2>(a, lda, b + j, ldb, C + j, ldc, n, some, more);
+                continue;
+            }
+            for (int64_t i = 0; i < some; ++i) std::memcpy(strip + i * 2 * W, b + i * ldb + j, sizeof(double) * 2 * W);
+            product_columns<2>(a, lda, strip, 2 * W, C + j, ldc, n, some, more);
+        }
+        for (; j < m; j += W) product_columns<1>(a, lda, b + j, ldb, C + j, ldc, n, some, more);
+    }
 }
 
 // y += f x, of n numbers.

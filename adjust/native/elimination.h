@@ -5,7 +5,7 @@
 namespace {
 
 constexpr int64_t POSE = 6;
-constexpr int64_t PANEL = 12;
+constexpr int64_t PANEL = 12, BLOCK = 48;  // rows whose products are subtracted at once: among themselves, and from all others
 constexpr double LOST = 0x1p-24;  // share of its diagonal below which a pivot counts as zero, as GTSAM has it
 
 // The elimination tree of a graph with its nodes in the order of elimination, and how many nodes below each its column has
@@ -81,22 +81,27 @@ template <int R, int K> inline void gram_tile(const double *P, int64_t ld, int64
         for (int v = 0; v < K; ++v) store(C + (k + r) * ldc + j + v * W, load(C + (k + r) * ldc + j + v * W) - c[r][v]);
 }
 inline void subtract_gram(const double *P, int64_t ld, int64_t m, int64_t first, int64_t last, int64_t n, double *C, int64_t ldc) {
-    for (int64_t k = first; k < last; k += POSE)
-        for (int64_t j = k / (2 * W) * (2 * W); j < n; j += 2 * W) gram_tile<POSE, 2>(P, ld, m, k, j, C, ldc);
+    for (int64_t i = 0; i < m; i += BLOCK)
+        for (int64_t k = first; k < last; k += POSE)
+            for (int64_t j = k / (2 * W) * (2 * W); j < n; j += 2 * W) gram_tile<POSE, 2>(P + i * ld, ld, smaller(BLOCK, m - i), k, j, C, ldc);
 }
 
 // R with R'R = A and R^-T S of the rows [A S], n long, ld apart, by their upper triangle; the first row without pivot or -1.
 inline int64_t factor_rows(double *A, int64_t rows, int64_t n, int64_t ld, const double *diagonal) {
-    for (int64_t p = 0; p < rows; p += PANEL) {
-        const int64_t end = smaller(p + PANEL, rows);
-        for (int64_t i = p; i < end; ++i) {
-            double *row = A + i * ld;
-            if (!(row[i] > LOST * diagonal[i])) return i;
-            const double f = 1.0 / root(row[i]);
-            for (int64_t j = i; j < n; ++j) row[j] *= f;
-            for (int64_t k = i + 1; k < end; ++k) add_multiple(-row[k], row + k, A + k * ld + k, n - k);
+    for (int64_t b = 0; b < rows; b += BLOCK) {
+        const int64_t bound = smaller(b + BLOCK, rows);
+        for (int64_t p = b; p < bound; p += PANEL) {
+            const int64_t end = smaller(p + PANEL, bound);
+            for (int64_t i = p; i < end; ++i) {
+                double *row = A + i * ld;
+                if (!(row[i] > LOST * diagonal[i])) return i;
+                const double f = 1.0 / root(row[i]);
+                for (int64_t j = i; j < n; ++j) row[j] *= f;
+                for (int64_t k = i + 1; k < end; ++k) add_multiple(-row[k], row + k, A + k * ld + k, n - k);
+            }
+            subtract_gram(A + p * ld, ld, end - p, end, bound, n, A, ld);
         }
-        subtract_gram(A + p * ld, ld, end - p, end, rows, n, A, ld);
+        subtract_gram(A + b * ld, ld, bound - b, bound, rows, n, A, ld);
     }
     return -1;
 }

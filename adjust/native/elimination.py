@@ -58,6 +58,11 @@ class CliquePattern:
         """Where the numbers of every clique begin (C + 1,)."""
         return np.concatenate([[0], np.cumsum(self.front * self.width)])
 
+    @property
+    def work(self) -> float:
+        """Multiplications that a factor takes, and a multiple of those of its covariances."""
+        return float(self.front @ self.width.astype(float) ** 2)
+
 
 def clique_pattern(n: int, a: IntArray, b: IntArray) -> CliquePattern:
     """The cliques of ``n`` poses, given in the order of elimination, that pairs with ends a, b (E,) join."""

@@ -64,26 +64,44 @@ inline void row_influences(Ints row_ptr, Ints key_ptr, Ints key, Ints start, Vec
     }
 }
 
-// [R S] to [R^-1, -R^-1 S] in place; the first singular clique or -1. row: scratch as wide as the widest clique.
-inline int64_t invert_cliques(Ints front, Ints width, Ints at, Out<double, 1> data, Out<double, 1> row) {
+constexpr int64_t BAND = 24, COLUMNS = 128;  // rows, and columns, of an inverse that are found at once
+
+// Numbers of scratch that invert_cliques takes.
+inline int64_t inversion_room(Ints front, Ints width) {
+    int64_t most = 0;
+    for (int64_t c = 0; c < front.n[0]; ++c) most = larger(most, (front[c] + BAND) * padded_most(width[c]));
+    return most;
+}
+
+// [R S] to [R^-1, -R^-1 S] in place, from the last rows up; the first singular clique or -1. work: scratch.
+inline int64_t invert_cliques(Ints front, Ints width, Ints at, Out<double, 1> data, Out<double, 1> work) {
     for (int64_t c = 0; c < front.n[0]; ++c) {
-        const int64_t nf = front[c], n = width[c];
-        double *A = data.data + at[c], *x = row.data;
+        const int64_t nf = front[c], n = width[c], ld = padded(n);
+        double *A = data.data + at[c], *found = work.data, *X = found + nf * ld;
         for (int64_t i = 0; i < nf; ++i)
             if (!(magnitude(A[i * n + i]) > 0.0)) return c;
-        for (int64_t i = nf - 1; i >= 0; --i) {
-            for (int64_t j = i; j < n; ++j) x[j] = j >= nf ? A[i * n + j] : 0.0;
-            for (int64_t k = i + 1; k < nf; ++k) add_multiple(A[i * n + k], A + k * n + k, x + k, n - k);
-            const double d = 1.0 / A[i * n + i];
-            A[i * n + i] = d;
-            for (int64_t j = i + 1; j < n; ++j) A[i * n + j] = -d * x[j];
+        std::memset(found, 0, sizeof(double) * nf * ld);
+        for (int64_t end = nf; end > 0; end -= smaller(BAND, end)) {
+            const int64_t begin = larger(end - BAND, 0);
+            for (int64_t j = end / (2 * W) * (2 * W); j < n; j += COLUMNS)  // below row j, column j of R^-1 is zero
+                product(A + begin * n + end, n, found + end * ld + j, ld, X + j, ld, end - begin, smaller(COLUMNS, n - j), smaller(nf, j + COLUMNS) - end);
+            for (int64_t i = end - 1; i >= begin; --i) {
+                double *x = X + (i - begin) * ld, *row = found + i * ld;
+                for (int64_t j = i; j < end; ++j) x[j] = 0.0;
+                for (int64_t j = nf; j < n; ++j) x[j] += A[i * n + j];
+                for (int64_t k = i + 1; k < end; ++k) add_multiple(A[i * n + k], found + k * ld + k, x + k, n - k);
+                const double d = 1.0 / A[i * n + i];
+                row[i] = d;
+                for (int64_t j = i + 1; j < n; ++j) row[j] = -d * x[j];
+            }
         }
+        for (int64_t i = 0; i < nf; ++i) std::memcpy(A + i * n, found + i * ld, sizeof(double) * n);
     }
     return -1;
 }
 
 inline int64_t room_for_rows(int64_t nf, int64_t ns, int64_t pf, int64_t ps) {
-    return 3 * nf * pf + ns * (ps + pf) + nf * ps;
+    return 2 * nf * pf + ns * (ps + pf) + nf * ps;
 }
 
 // Numbers of scratch that covariance_rows takes.
@@ -96,36 +114,54 @@ inline int64_t covariance_room(Ints front, Ints width) {
     return most;
 }
 
+// Q_ss (rows of ps numbers) of the keys of clique c that are not its own, from the cliques that are nearer to the root. where
+// (K,): scratch.
+inline void gather_covariance(const Tree &t, int64_t c, int64_t n_front, int64_t *where, double *Q, int64_t ps) {
+    const int64_t begin = t.key_ptr[c] + n_front, end = t.key_ptr[c + 1];
+    int64_t r = 0, last = -1;
+    for (int64_t i = begin; i < end; r += t.dims[t.keys[i++]]) {
+        const int64_t a = t.keys[i], h = t.home[a], n = t.width[h], rows = t.dims[a];
+        int64_t o = 0, s = 0;
+        for (int64_t k = t.key_ptr[h]; h != last && k < t.key_ptr[h + 1]; o += t.dims[t.keys[k++]]) where[t.keys[k]] = o;
+        last = h;
+        const double *from = t.cov.data + t.at[h] + where[a] * n;
+        for (int64_t j = begin; j < end; s += t.dims[t.keys[j++]]) {
+            const int64_t b = t.keys[j], columns = t.dims[b];
+            if (t.home[b] > h) continue;
+            for (int64_t x = 0; x < rows; ++x)
+                for (int64_t y = 0; y < columns; ++y) Q[(r + x) * ps + s + y] = from[x * n + where[b] + y];
+            if (t.home[b] == h) continue;
+            for (int64_t y = 0; y < columns; ++y)
+                for (int64_t x = 0; x < rows; ++x) Q[(s + y) * ps + r + x] = from[x * n + where[b] + y];
+        }
+    }
+}
+
 // Q_fs = T Q_ss and Q_ff = R^-1 R^-T + T Q_sf, with T = -R^-1 S, parents first (Takahashi, Fagan and Chen 1973).
-inline void covariance_rows(const Tree &t, Ints n_front, Vector data, Out<double, 1> work) {
+inline void covariance_rows(const Tree &t, Ints n_front, Vector data, Out<double, 1> work, Out<int64_t, 1> where) {
     for (int64_t c = 0; c < t.front.n[0]; ++c) {
         const int64_t nf = t.front[c], n = t.width[c], ns = n - nf, pf = padded(nf), ps = padded(ns);
         const double *A = data.data + t.at[c];
         double *C = t.cov.data + t.at[c];
-        std::memset(work.data, 0, sizeof(double) * room_for_rows(nf, ns, pf, ps));
-        double *P = work.data, *X = P + nf * pf, *Z = X + nf * pf, *Q = Z + nf * pf, *turned = Q + ns * ps, *Y = turned + ns * pf;
+        double *P = work.data, *X = P + nf * pf, *Q = X + nf * pf, *turned = Q + ns * ps, *Y = turned + ns * pf;
+        std::memset(P, 0, sizeof(double) * nf * pf);
         for (int64_t i = 0; i < nf; ++i)
             for (int64_t j = i; j < nf; ++j) P[j * pf + i] = A[i * n + j];
-        for (int64_t i = 0; i < nf; ++i)  // row i of R^-1 begins at its diagonal
-            product(A + i * n + i, n, P + i * pf, pf, X + i * pf, pf, 1, nf, nf - i);
-        int64_t r = 0;
-        for (int64_t i = t.key_ptr[c] + n_front[c]; i < t.key_ptr[c + 1]; r += t.dims[t.keys[i++]]) {
-            int64_t s = 0;
-            for (int64_t j = t.key_ptr[c] + n_front[c]; j <= i; s += t.dims[t.keys[j++]]) {
-                double *to = Q + r * ps + s;
-                t.block(t.keys[i], t.keys[j], to, ps);
-                for (int64_t a = 0; a < t.dims[t.keys[i]]; ++a)
-                    for (int64_t b = 0; b < t.dims[t.keys[j]]; ++b) Q[(s + b) * ps + r + a] = to[a * ps + b];
-            }
+        for (int64_t i = 0; i < nf; i += BAND)  // row i of R^-1 begins at its diagonal
+            product(A + i * n + i, n, P + i * pf, pf, X + i * pf, pf, smaller(BAND, nf - i), nf, nf - i);
+        for (int64_t i = 0; i < ns; ++i) {
+            std::memset(Q + i * ps + ns, 0, sizeof(double) * (ps - ns));
+            std::memset(turned + i * pf + nf, 0, sizeof(double) * (pf - nf));
         }
+        gather_covariance(t, c, n_front[c], where.data, Q, ps);
         if (ns) {
             for (int64_t i = 0; i < nf; ++i)
                 for (int64_t j = 0; j < ns; ++j) turned[j * pf + i] = A[i * n + nf + j];
             product(A + nf, n, Q, ps, Y, ps, nf, ns, ns);
-            product(Y, ps, turned, pf, Z, pf, nf, nf, ns);
+            product(Y, ps, turned, pf, X, pf, nf, nf, ns, true);
         }
         for (int64_t i = 0; i < nf; ++i) {
-            for (int64_t j = 0; j < nf; ++j) C[i * n + j] = X[i * pf + j] + Z[i * pf + j];
+            std::memcpy(C + i * n, X + i * pf, sizeof(double) * nf);
             std::memcpy(C + i * n + nf, Y + i * ps, sizeof(double) * ns);
         }
     }

@@ -19,9 +19,10 @@ _row_influences = Function(
     "row_influences",
     f"row_ptr[c+1] key_ptr[c+1] key[k] start[c] J[*] {TREE} found[*] lost[c] room[*]",
 )
-_invert_cliques = Function("invert_cliques", "front[C] width[C] at[C] data[*] row[*]")
+_inversion_room = Function("inversion_room", "front[C] width[C]")
+_invert_cliques = Function("invert_cliques", "front[C] width[C] at[C] data[*] work[*]")
 _covariance_room = Function("covariance_room", "front[C] width[C]")
-_covariance_rows = Function("covariance_rows", f"{TREE} n_front[C] data[*] work[*]")
+_covariance_rows = Function("covariance_rows", f"{TREE} n_front[C] data[*] work[*] where[K]")
 _joint_blocks = Function("joint_blocks", f"{TREE} first[p] second[p] out[p,e,e]")
 _solution_room = Function("solution_room", "width[C] m")
 _solve_cliques = Function(
@@ -86,7 +87,7 @@ def row_influences(
 
 def invert_cliques(front: IntArray, width: IntArray, at: IntArray, data: FloatArray) -> int:
     """[R S] to [R^-1, -R^-1 S] in place; returns the first singular clique or -1."""
-    return _invert_cliques(front, width, at, data, np.empty(int(width.max(initial=0))))
+    return _invert_cliques(front, width, at, data, np.empty(_inversion_room(front, width)))
 
 
 def fill_block(tree: TreeArrays, a: int, b: int, out: FloatArray) -> bool:
@@ -96,7 +97,8 @@ def fill_block(tree: TreeArrays, a: int, b: int, out: FloatArray) -> bool:
 
 def covariance_rows(tree: TreeArrays, n_front: IntArray, data: FloatArray) -> None:
     """Fill ``tree.cov``: Q_fs = T Q_ss and Q_ff = R^-1 R^-T + T Q_sf, parents first."""
-    _covariance_rows(*tree, n_front, data, np.empty(_covariance_room(tree.front, tree.width)))
+    room, where = np.empty(_covariance_room(tree.front, tree.width)), np.empty(len(tree.dims), dtype=np.int64)
+    _covariance_rows(*tree, n_front, data, room, where)
 
 
 def joint_blocks(tree: TreeArrays, first: IntArray, second: IntArray, out: FloatArray) -> int:

@@ -8,14 +8,14 @@ do not meet each other. It needs isotropic weights, and so do the positions; one
 import heapq
 from collections.abc import Iterable, Mapping
 
-import gtsam
 import numpy as np
 from gtsam import Pose3
 
+from adjust.graph.elimination import pose_cliques
 from adjust.model.errors import IndeterminateError
 from adjust.model.observations import Pair
 from adjust.model.survey import FloatArray, IntArray
-from adjust.native.elimination import PoseFactor, clique_pattern, pair_gradient
+from adjust.native.elimination import PoseFactor, pair_gradient
 from adjust.pose_network.network import PoseNetwork
 from adjust.spatial.rigid import nearest_rotation
 
@@ -92,15 +92,7 @@ class _Average:
             self.by_a[constant[a], :, half], self.by_b[constant[b], :, half] = 0.0, 0.0
             alone = constant | (np.bincount(a, weight, n) + np.bincount(b, weight, n) == 0.0)
             own[alone, half, half] = np.eye(3)
-        symbolic = gtsam.SymbolicFactorGraph()
-        for ends in zip(a.tolist(), b.tolist(), strict=True):
-            symbolic.push_factor(*ends)
-        ordering = gtsam.Ordering.ColamdSymbolicFactorGraph(symbolic)
-        joined = np.array([ordering.at(i) for i in range(ordering.size())], dtype=np.int64)
-        keys = np.concatenate([joined, np.setdiff1d(np.arange(n), joined)])
-        place = np.argsort(keys)
-        pattern = clique_pattern(n, place[a], place[b])
-        self.keys = keys[pattern.order]
+        self.keys, pattern = pose_cliques(np.setdiff1d(np.arange(n), np.union1d(a, b)).tolist(), b, a)
         self.place = np.argsort(self.keys)
         self.factor = PoseFactor(pattern)
         lost = self.factor.eliminate(self.place[a], self.place[b], self.by_a, self.by_b, own[self.keys])

@@ -189,6 +189,12 @@ class TreeCovariance:
                 c = int(self._parents[c])
         return np.array(sorted(found), dtype=np.int64)
 
+    def _gathered(self, cliques: IntArray) -> tuple[IntArray, int]:
+        """By how much (C,) the rows of each of these cliques move where only their own are kept, and how many are."""
+        shift, front = np.zeros(len(self._front), dtype=np.int64), self._front[cliques]
+        shift[cliques] = np.cumsum(front) - front - self._first[self._keys[self._key_ptr[cliques]]]
+        return shift, int(front.sum())
+
     def _solve(self, up: IntArray, down: IntArray, x: FloatArray) -> None:
         solve_cliques(self.arrays, up, down, self._first, self._data, x)
 
@@ -206,6 +212,13 @@ class TreeCovariance:
         """Length of a stacked vector of all unknowns."""
         return int(self._first[-1])
 
+    def columns_for(self, eliminations: float) -> float:
+        """How many columns go up and down the deepest way at the price of so many eliminations of the whole."""
+        own, way = (self._front * self._width).tolist(), list[int]()
+        for numbers, parent in zip(own, self._parents.tolist(), strict=True):  # parents first
+            way.append(numbers + (way[parent] if parent >= 0 else 0))
+        return eliminations * float(self._front @ self._width.astype(float) ** 2) / (2.0 * max(way, default=1))
+
     def times(self, columns: FloatArray) -> FloatArray:
         """The whole covariance matrix times columns (n, m), without forming it."""
         x = np.array(columns, dtype=float, order="C")
@@ -221,10 +234,12 @@ class TreeCovariance:
         A, out = A[order], np.zeros((A.shape[0],) * 2)
         for i in range(0, A.shape[0], _COLUMNS):
             mine, rest = A[i : i + _COLUMNS], A[i:]
-            x = np.ascontiguousarray(mine.toarray().T)
             up, down = (self._ancestors(set(home[rows.indices].tolist())) for rows in (mine, rest))
-            self._solve(up, down, x)
-            out[i:, i : i + _COLUMNS] = rest @ x
+            shift, n = self._gathered(down)
+            B = sparse.csr_array((rest.data, rest.indices + shift[home[rest.indices]], rest.indptr), (rest.shape[0], n))
+            x = np.ascontiguousarray(B[:_COLUMNS].toarray().T)
+            solve_cliques(self.arrays, up, down, self._first[:-1] + shift[self._home], self._data, x)
+            out[i:, i : i + _COLUMNS] = B @ x
         back = np.argsort(order)
         return np.asarray((np.tril(out) + np.tril(out, -1).T)[np.ix_(back, back)])
 

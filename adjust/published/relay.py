@@ -18,7 +18,7 @@ import scipy.linalg
 
 from adjust.model.errors import NotConvergedError, SurveyError
 from adjust.model.survey import FloatArray
-from adjust.pose_network.loops import evaluate_loops
+from adjust.pose_network.loops import evaluate_loops, loop_vectors
 from adjust.relay.loops import LoopBasis, loop_basis
 from adjust.relay.network import MeasuredPairs
 from adjust.spatial.rigid import skew
@@ -81,7 +81,7 @@ def paper_iteration(network: MeasuredPairs, options: PaperOptions = PaperOptions
         corrections.append(float(np.abs(step).max(initial=0.0)))
         if corrections[-1] < options.tolerance:
             X = Motions(matrix_from_euler(angles))
-            left = float(np.abs(evaluate_loops(basis, X)[0]).max(initial=0.0))
+            left = float(np.abs(loop_vectors(basis, X)).max(initial=0.0))
             return PaperSolution(angles, X, basis, tuple(corrections), left)
     worst = int(np.argmin(np.abs(np.cos(angles[:, 1]))))
     raise NotConvergedError(

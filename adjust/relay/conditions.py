@@ -25,7 +25,7 @@ from adjust.model.errors import NotConvergedError, SurveyError
 from adjust.model.survey import FloatArray
 from adjust.observations.factors import Jacobians, custom
 from adjust.pose_network.cycles import connected_parts
-from adjust.pose_network.loops import Loops, evaluate_loops
+from adjust.pose_network.loops import Loops, evaluate_loops, loop_vectors
 from adjust.relay.loops import LoopBasis, loop_basis, loop_misclosures
 from adjust.relay.network import MeasuredPairs, gtsam_motion, motions_from_values, prior_factor, station_values
 from adjust.relay.normal_equations import (
@@ -82,7 +82,7 @@ def adjust_conditions(network: MeasuredPairs, options: ConditionOptions = Condit
         d = -r - (Q @ (B.T @ multipliers).reshape(*r.shape, 1))[..., 0]
         X = X.retract(d)
         step = float(np.abs(root @ d[..., None]).max())
-        closure = float(np.abs(evaluate_loops(basis, X)[0]).max()) if len(basis) else 0.0
+        closure = float(np.abs(loop_vectors(basis, X)).max()) if len(basis) else 0.0
         if not np.isfinite(step):
             break
         if closure < limit and step < options.max_step:
@@ -213,7 +213,7 @@ def _solve_factors(
         d = np.array([delta.at(e) for e in range(n)])
         X = motions_from_values(values, n, dim)
         step = float(np.abs(root @ d[..., None]).max())
-        closure = float(np.abs(evaluate_loops(basis, X)[0]).max()) if len(basis) else 0.0
+        closure = float(np.abs(loop_vectors(basis, X)).max()) if len(basis) else 0.0
         if closure < limit and step < max_step:
             marginals = gtsam.Marginals(graph, values)
             cov = np.array([marginals.marginalCovariance(e) for e in range(n)])

@@ -16,7 +16,7 @@ from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.statistics.normal import DENSE
 from adjust.statistics.system import LinearSystem, linear_system
-from adjust.statistics.weakness import times_covariance
+from adjust.statistics.weakness import among, one_solution
 from adjust.testing.distributions import chi2, fisher
 from adjust.testing.quadratic_forms import pseudo_half
 from adjust.testing.significance import LEVEL, Significance
@@ -36,10 +36,10 @@ class Score:
     seen: int
 
 
-def score(g: FloatArray, BB: FloatArray, AB: FloatArray, QAB: FloatArray) -> Score:
-    """Of ``g = B'e`` (k,), ``B'B`` (k, k), ``A'B`` (n, k) and ``Q A'B`` (n, k)."""
+def score(g: FloatArray, BB: FloatArray, taken: FloatArray) -> Score:
+    """Of ``g = B'e`` (k,), ``B'B`` (k, k) and what the unknowns take over of that, ``B'A Q A'B`` (k, k)."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(BB), 1e-300))
-    half, seen = pseudo_half(scale[:, None] * (BB - AB.T @ QAB) * scale, _SEEN)
+    half, seen = pseudo_half(scale[:, None] * (BB - taken) * scale, _SEEN)
     half = scale[:, None] * half
     cov, along = half @ half.T, half.T @ g
     return Score(-cov @ g, cov, float(along @ along), int(seen))
@@ -69,7 +69,7 @@ class LinearScores:
     def e(self) -> FloatArray:
         """(m,) at the minimum, zero for what is not in use: what is left to go of an adjustment is gone from here."""
         e = self._used * self.system.e
-        return np.asarray(e - self.A @ times_covariance(self.system, (self.A.T @ e)[:, None])[:, 0])
+        return np.asarray(e - self.A @ one_solution(self.system, self.A.T @ e))
 
     @cached_property
     def _used(self) -> FloatArray:
@@ -136,46 +136,41 @@ class LinearScores:
         cuts = list(range(2, len(parts) - 1))[:: max(1, (len(parts) - 3) // _CUTS)]
         if not cuts:
             return {}
-        g, BB, AB, QAB = (np.cumsum(x[::-1], axis=0)[::-1] for x in self._by_part(parts))
-        return {t: score(g[t], BB[t], AB[t], QAB[t]) for t in cuts}
+        lengths = np.diff([*cuts, len(parts)])
+        g, BB, taken = self._normals(parts[cuts[0] :], np.repeat(np.arange(len(cuts)), lengths))
+        g, BB = (np.cumsum(x[::-1], axis=0)[::-1] for x in (g, BB))
+        taken = np.cumsum(np.cumsum(taken[::-1, :, ::-1], axis=0), axis=2)[::-1, :, ::-1]
+        return {t: score(g[i], BB[i], taken[i, :, i]) for i, t in enumerate(cuts)}
 
     def _summed(self, parts: Sequence[Part], weights: FloatArray) -> Score:
         """Of changes of all of them in these proportions."""
         if not parts:
             return Score(np.zeros(0), np.zeros((0, 0)), 0.0, 0)
-        rows, B = (np.concatenate(x) for x in zip(*parts, strict=True))
-        B = B * (self._used[rows] * np.repeat(weights, [len(r) for r, _ in parts]))[:, None]
-        whole = np.zeros((len(self.e), B.shape[1]))
-        whole[rows] = B
-        near, AB = _not_zero(self.A.T @ whole)
-        return score(whole.T @ self.e, B.T @ B, AB, self._times_covariance(near, AB))
+        weighted = [(rows, w * self._used[rows, None] * B) for w, (rows, B) in zip(weights, parts, strict=True)]
+        g, BB, taken = self._normals(weighted, np.zeros(len(parts), dtype=np.int64))
+        return score(g[0], BB[0], taken[0, :, 0])
 
-    def _by_part(self, parts: Sequence[Part]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """B'e (p, k), B'B (p, k, k), and of the u unknowns that have a part in it A'B and Q A'B (p, u, k)."""
-        rows, B = (np.concatenate(x) for x in zip(*parts, strict=True))
-        k, lengths = B.shape[1], [len(r) for r, _ in parts]
-        first, of_part = np.cumsum([0, *lengths]), np.repeat(np.arange(len(parts)), lengths)
-        at = np.repeat(rows, k), (k * of_part[:, None] + np.arange(k)).ravel()
-        apart = sparse.csr_matrix((B.ravel(), at), (len(self.e), k * len(parts)))
-        near, AB = _not_zero((self.A.T @ apart).toarray())
-        QAB = self._times_covariance(near, AB)
-        g, BB = (np.add.reduceat(x, first[:-1]) for x in (B * self.e[rows, None], B[:, :, None] * B[:, None, :]))
-        shape = len(near), len(parts), k
-        return g, BB, AB.reshape(shape).transpose(1, 0, 2), QAB.reshape(shape).transpose(1, 0, 2)
+    def _normals(self, parts: Sequence[Part], group: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Of s groups of parts, each a change of its own: B'e (s, k), B'B (s, k, k), B'A Q A'B (s, k, s, k).
 
-    def _times_covariance(self, near: IntArray, right: FloatArray) -> FloatArray:
-        """Rows of the covariance matrix of all unknowns times what is zero elsewhere than in these rows, (u, c)."""
+        group: (p,) of every part, 0, 1, ... in this order. No two parts have a row in common.
+        """
+        rows, B = (np.concatenate(x) for x in zip(*parts, strict=True))
+        of_row, k, s = np.repeat(group, [len(r) for r, _ in parts]), B.shape[1], int(group[-1]) + 1
+        by_group = np.split(np.arange(len(rows)), np.searchsorted(of_row, np.arange(1, s)))
+        g = np.array([B[mine].T @ self.e[rows[mine]] for mine in by_group])
+        BB = np.array([B[mine].T @ B[mine] for mine in by_group])
+        at = (k * of_row[:, None] + np.arange(k)).ravel(), np.repeat(rows, k)
+        turned = sparse.csr_matrix((B.ravel(), at), (s * k, len(self.e)))
+        return g, BB, self._taken(turned @ self.A).reshape(s, k, s, k)
+
+    def _taken(self, BA: sparse.csr_matrix) -> FloatArray:
+        """``B'A Q A'B`` (c, c) of sparse rows B'A (c, n)."""
         if len(self.system.columns) <= DENSE:
-            return np.asarray(self.system.covariance[np.ix_(near, near)] @ right)
-        whole = np.zeros((len(self.system.columns), right.shape[1]))
-        whole[near] = right
-        return times_covariance(self.system, whole)[near]
-
-
-def _not_zero(AB: FloatArray) -> tuple[IntArray, FloatArray]:
-    """The rows that are not zero throughout, and these."""
-    near = np.flatnonzero(AB.any(axis=1))
-    return near, np.asarray(AB[near])
+            near = np.unique(BA.indices)
+            few = BA[:, near].toarray()
+            return np.asarray(few @ self.system.covariance[np.ix_(near, near)] @ few.T)
+        return among(self.system, BA)
 
 
 def ratio(omega: float, n: float, drop: float) -> float:

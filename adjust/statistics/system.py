@@ -100,6 +100,13 @@ class LinearSystem:
         return np.repeat(np.arange(len(self.used)), np.diff(self.ptr))
 
     @cached_property
+    def tree_rows(self) -> IntArray:
+        """Rows (n,) of the columns in a stacked vector of the tree's unknowns; there are none of hidden ones."""
+        by_name, tree = self.precision.graph.unknowns.by_name, self.precision.tree
+        rows = [tree.rows([by_name[name].key])[free] for name, free in self.columns.free.items()]
+        return np.concatenate(rows or [np.zeros(0, dtype=np.int64)])
+
+    @cached_property
     def normal(self) -> Normal:
         """The normal matrix of the used observations and the datum."""
         return self.normal_of(self.used[self.row_of].astype(float))

@@ -40,6 +40,25 @@ def times_covariance(system: LinearSystem, right: FloatArray) -> FloatArray:
     return without_datum_rows(out, system.motions, system.datum @ system.motions, right)
 
 
+def among(system: LinearSystem, rows: sparse.csr_matrix) -> FloatArray:
+    """``R Q R'`` (c, c) of sparse rows R (c, n) of the normal equations, or of what observations see: in any datum."""
+    if system.precision.hidden:
+        return np.asarray(rows @ times_covariance(system, rows.T.toarray()))
+    tree = system.precision.tree
+    entries = rows.data, system.tree_rows[rows.indices], rows.indptr
+    return tree.among(sparse.csr_array(entries, (rows.shape[0], tree.n)))
+
+
+def one_solution(system: LinearSystem, right: FloatArray) -> FloatArray:
+    """A solution (n,) of the normal equations: of those that differ by what no observation sees, any one."""
+    if len(system.columns) <= DENSE or system.precision.hidden:
+        return times_covariance(system, right[:, None])[:, 0]
+    tree = system.precision.tree
+    x = np.zeros((tree.n, 1))
+    x[system.tree_rows, 0] = right
+    return np.asarray(tree.times(x)[system.tree_rows, 0])
+
+
 def compared_columns(system: LinearSystem) -> IntArray:
     """Columns that are compared with all others: all of them, or in large surveys first what is there once.
 
@@ -70,8 +89,7 @@ def _some_columns(system: LinearSystem) -> Callable[[IntArray], FloatArray]:
     precision, c = system.precision, system.columns
     by_name, t = precision.graph.unknowns.by_name, precision.transformation
     keys = {name: by_name[name].key for name in c.at}
-    rows = np.concatenate([precision.tree.rows([key])[c.free[name]] for name, key in keys.items()])
-    Q = precision.tree.full()
+    rows, Q = system.tree_rows, precision.tree.full()
     if t is None:
         return lambda part: Q[rows[part]][:, rows].T
     G, W = (np.concatenate([of[key][c.free[name]] for name, key in keys.items()]) for of in (t.motions, t.spread))

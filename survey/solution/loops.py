@@ -18,7 +18,7 @@ from adjust.model.observations import FrameRef, Pair
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, PoseParameter, Survey
 from adjust.observations.pairs import PairArrays, pair_arrays
-from adjust.pose_network.loops import evaluate_loops
+from adjust.pose_network.loops import loop_vectors
 from adjust.pose_network.network import Topology
 from adjust.relay.closed import play
 from adjust.relay.counts import Counts, count
@@ -212,7 +212,7 @@ def loops_after(adjustment: Adjustment, loops: LoopMisclosures) -> FloatArray:
             lost[e] = True
         else:
             moved[e] = (v - play(survey.closures, pair, v) if pair.pair_id in mounts else v)[:dim]
-    w = evaluate_loops(basis, _with_given(pair_arrays(survey.pairs), given, dim).retract(moved))[0]
+    w = loop_vectors(basis, _with_given(pair_arrays(survey.pairs), given, dim).retract(moved))
     w[np.logical_or.reduceat(lost[basis.pair_idx], basis.ptr[:-1])] = np.nan
     return w
 

@@ -1,5 +1,6 @@
 """Scores of changes, of adjustments that ended early, and what units cost that make numbers smaller."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +13,10 @@ from adjust.diagnosis.units.conventions import MISREADINGS, Misreading, shrinkin
 from adjust.graph.solver import SolveOptions
 from adjust.model.boards import deformation
 from adjust.model.survey import Survey
-from adjust.statistics.score import score
+from adjust.statistics.score import Part, Score, score
 from survey.simulate import stereo
+from tests.adjust import pose_networks
+from tests.adjust.test_pose_network import survey_of
 
 
 def bent(size: float) -> Survey:
@@ -49,10 +52,36 @@ def test_parts_of_a_course_are_rows_of_the_system() -> None:
     whole = linear.of_parts(parts)
     B, some = np.concatenate([J for _, J in parts]), np.concatenate([at for at, _ in parts])
     AB = linear.A.toarray()[some].T @ B
-    dense = score(B.T @ linear.e[some], B.T @ B, AB, linear.system.covariance @ AB)
+    dense = score(B.T @ linear.e[some], B.T @ B, AB.T @ linear.system.covariance @ AB)
     assert whole.seen == dense.seen
     assert whole.theta == pytest.approx(dense.theta, rel=1e-6)
     assert whole.drop == pytest.approx(dense.drop, rel=1e-6)
+
+
+def direct(linear: Linear, parts: Sequence[Part]) -> Score:
+    """Of a change of all these parts, with full matrices."""
+    some, B = (np.concatenate(x) for x in zip(*parts, strict=True))
+    AB = linear.A[some].T @ B
+    return score(B.T @ linear.e[some], B.T @ B, AB.T @ linear.system.normal.covariance(linear.system.datum) @ AB)
+
+
+@pytest.mark.parametrize("inner", [False, True])
+def test_steps_of_large_networks_are_those_of_full_matrices(inner: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the tree, in a datum that is given and in a free one."""
+    monkeypatch.setattr("adjust.statistics.score.DENSE", 0)
+    monkeypatch.setattr("adjust.statistics.weakness.DENSE", 0)
+    linear = Linear(adjust(survey_of(pose_networks.simulate(6, 4, 1, extra=40, free=inner), inner)))
+    ptr, of = linear.system.ptr, {name: linear.rows_of(at) for name, at in linear.system.columns.at.items()}
+    name = max(of, key=lambda name: len(of[name]))
+    numbers = np.unique(linear.system.row_of[of[name]])
+    parts = linear.parts(linear.columns(name), [np.arange(ptr[i], ptr[i + 1]) for i in numbers])
+    found = linear.steps(parts)
+    assert len(found) >= 3
+    for cut, mine in {0: linear.of_parts(parts), **found}.items():
+        expected = direct(linear, parts[cut:])
+        assert mine.seen == expected.seen
+        assert mine.theta == pytest.approx(expected.theta, rel=1e-6, abs=1e-9)
+        assert mine.drop == pytest.approx(expected.drop, rel=1e-6, abs=1e-9)
 
 
 def test_a_trial_ends_where_nothing_is_gained() -> None:

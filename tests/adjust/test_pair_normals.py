@@ -6,6 +6,7 @@ import pytest
 from scipy import sparse
 
 from adjust.graph.assembly import AdjustmentGraph
+from adjust.graph.elimination import pose_cliques
 from adjust.graph.pair_normals import PairNormals
 from adjust.graph.solver import damped
 from adjust.native.elimination import clique_pattern
@@ -17,8 +18,8 @@ from tests.adjust import pose_networks
 from tests.adjust.pose_networks import solve_network
 
 
-def of_network(seed: int, nx: int = 10) -> AdjustmentGraph:
-    return minimize(pose_networks.simulate(nx, 4, seed, extra=nx).network).graph
+def of_network(seed: int, nx: int = 10, extra: int | None = None) -> AdjustmentGraph:
+    return minimize(pose_networks.simulate(nx, 4, seed, extra=nx if extra is None else extra).network).graph
 
 
 def joined(delta: gtsam.VectorValues, keys: np.ndarray) -> np.ndarray:
@@ -64,10 +65,15 @@ def test_rows_of_pairs_are_those_of_plain_arrays(size: float) -> None:
         np.testing.assert_allclose(mine, theirs, atol=1e-12 * np.abs(theirs).max())
 
 
-@pytest.mark.parametrize("nx", [1, 3, 20])
-def test_covariances_are_those_of_gtsams_tree(nx: int) -> None:
-    graph = of_network(5, nx)
+@pytest.mark.parametrize(("nx", "extra"), [(1, 1), (3, 3), (20, 20), (40, 240)])
+def test_covariances_are_those_of_gtsams_tree(nx: int, extra: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of small cliques in COLAMD's order, and of large ones in that of METIS."""
+    if extra > nx:
+        monkeypatch.setattr("adjust.graph.elimination._LARGE", 0)
+    graph = of_network(5, nx, extra)
     normals = PairNormals(graph, [])
+    width = int(normals.factor.pattern.width.max())
+    assert extra == nx or width > 300
     at = graph.prepare(graph.start, True)
     found = normals.tree(normals.linearized(at))
     assert found is not None
@@ -139,3 +145,29 @@ def test_covariances_among_sparse_rows_are_those_of_the_whole_matrix(monkeypatch
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
     np.testing.assert_array_equal(found, found.T)
     assert tree.among(A[:0]).shape == (0, 0)
+
+
+@pytest.mark.parametrize("n_last", [0, 2])
+def test_large_networks_are_eliminated_in_the_order_of_least_work(
+    n_last: int, monkeypatch: pytest.MonkeyPatch
+) -> None:  # fmt: skip
+    """On a torus that of METIS is less work than that of COLAMD; what comes last does so in either."""
+    k = 60
+    number = np.arange(k * k).reshape(k, k)
+    a, b = np.tile(number.ravel(), 2), np.concatenate([np.roll(number, -1, i).ravel() for i in (0, 1)])
+    last = number.ravel()[7 : 7 + n_last].tolist()
+    found = [pose_cliques([0], a, b, last)]
+    monkeypatch.setattr("adjust.graph.elimination._LARGE", k * k)
+    found.append(pose_cliques([0], a, b, last))
+    for keys, pattern in found:
+        assert sorted(keys.tolist()) == list(range(k * k))
+        assert {pattern.home[i] for i in np.flatnonzero(np.isin(keys, last))} <= {0}
+    assert found[0][1].work < found[1][1].work
+
+
+def test_columns_cost_their_way_to_the_root_and_back() -> None:
+    tree = solve_network(pose_networks.simulate(20, 4, 1, extra=10).network).precision.tree
+    numbers = tree.arrays.front * tree.arrays.width
+    ways = [numbers[tree._ancestors({c})].sum() for c in range(len(numbers))]
+    assert 0 < max(ways) < numbers.sum()  # there are branches
+    assert tree.columns_for(3.0) * 2.0 * max(ways) == pytest.approx(3.0 * float(numbers @ tree.arrays.width))

@@ -10,7 +10,8 @@ from adjust.graph.assembly import StartValues
 from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import Datum, PoseParameter, Station, Survey
-from adjust.pose_network.loops import evaluate_loops
+from adjust.pose_network import loops as loops_module
+from adjust.pose_network.loops import evaluate_loops, loop_vectors, misclosures
 from adjust.relay.conditions import MAX_HARD_LOOPS, ConditionOptions, adjust_condition_factors, adjust_conditions
 from adjust.relay.loops import loop_basis, loop_misclosures
 from adjust.relay.network import MeasuredPairs, network_from_pairs, topology
@@ -143,6 +144,22 @@ def test_misclosures_and_their_derivatives(dim):
         step = as_gtsam(network.b_from_a, int(basis.pair_idx[i]))
         product = (step if basis.sense[i] > 0 else step.inverse()) * product
     np.testing.assert_allclose(w[k], type(product).Logmap(product), atol=1e-12)
+
+
+@pytest.mark.parametrize("dim", [3, 6])
+def test_covariances_of_misclosures_are_those_by_their_derivatives(dim, monkeypatch):
+    monkeypatch.setattr(loops_module, "_AT_ONCE", 5)  # several portions, and loops that are longer
+    network = simulate(chain_with_chords(15, 9), dim, seed=2, noise=100.0).network
+    basis = loop_basis(network.topology, "tree")
+    assert basis.lengths.max() > 5
+    w, cov = misclosures(basis, network.b_from_a, network.cov)
+    expected, blocks = evaluate_loops(basis, network.b_from_a)
+    np.testing.assert_allclose(w, expected, atol=1e-12)
+    np.testing.assert_array_equal(w, loop_vectors(basis, network.b_from_a))
+    for k in range(len(basis)):
+        rows = slice(basis.ptr[k], basis.ptr[k + 1])
+        C = np.einsum("kij,kjl,kml->im", blocks[rows], network.cov[basis.pair_idx[rows]], blocks[rows])
+        np.testing.assert_allclose(cov[k], C, rtol=1e-9, atol=1e-12 * np.abs(C).max())
 
 
 def test_misclosure_tests_are_chi_square():

@@ -23,6 +23,8 @@ from adjust.statistics.score import Part, Score, drift_times
 
 FOCAL, CENTRE = ("fx", "fy", "c"), ("u0", "v0", "xp", "yp")
 _FEWEST = 4
+_ELIMINATIONS = 25.0
+"""Eliminations of the whole system that all courses together may cost in surveys of many unknowns."""
 _BOUND = 50.0  # of the square of one image point
 _MOVED = {  # name of the unknown: of the mistake, kind of the thing, what happened to it
     "station_from_camera": ("camera moved", "camera", "camera {} was moved on its station"),
@@ -53,8 +55,9 @@ def steps(case: Case) -> Iterator[Effect]:
     linear = case.linear
     if linear is None:
         return
-    n = len(linear.system.columns)
-    room = float(n) if n > DENSE else np.inf  # columns of the covariance matrix, as many as it has
+    n, tree = len(linear.system.columns), linear.system.precision.tree
+    # columns of the covariance matrix: as many as it has, or as cost no more than some adjustments
+    room = min(float(n), tree.columns_for(_ELIMINATIONS)) if n > DENSE else np.inf
     for course in _courses(linear):
         room -= sum(B.shape[1] for _, B in course.parts)
         if not case.few("what moved from some epoch on, of things that fit better than others", int(room < 0.0), 0):
@@ -73,7 +76,8 @@ def _courses(linear: Linear, only: ParameterName | None = None) -> Iterator[_Cou
     survey, columns = linear.result.survey, linear.system.columns
     ptr, row_of = linear.system.ptr, linear.system.row_of
     first_reading = len(ptr) - 1 - len(survey.readings)
-    pairs = {i: k for k, i in enumerate(_other_rows(linear, "pair"))}
+    pairs = {i: survey.pairs[k].pair_id for k, i in enumerate(_other_rows(linear, "pair"))}
+    readings = {first_reading + k: r.reading_id for k, r in enumerate(survey.readings)}
 
     def course(name: ParameterName, kind: str, ids: Mapping[int, str], rows: IntArray) -> _Course:
         numbers = [i for i in np.unique(row_of[rows]).tolist() if i in ids]
@@ -89,10 +93,9 @@ def _courses(linear: Linear, only: ParameterName | None = None) -> Iterator[_Cou
         if (rows < ptr[linear.system.n_image]).any():
             yield from _of_images(linear, name, rows)
         elif name[0] == "world_from_station":
-            yield course(name, "pair", {i: survey.pairs[k].pair_id for i, k in pairs.items()}, rows)
+            yield course(name, "pair", pairs, rows)
         elif name[0] == "orientation":
-            ids = {first_reading + k: r.reading_id for k, r in enumerate(survey.readings)}
-            yield course(name, "reading", ids, rows)
+            yield course(name, "reading", readings, rows)
 
 
 def _worst_first(linear: Linear) -> list[ParameterName]:
