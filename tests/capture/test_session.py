@@ -43,8 +43,9 @@ def test_a_run_writes_what_was_planned(tmp_path):
     require_complete(plan, 12)
     rows = (tmp_path / "lab" / "observations" / "table_angles.csv").read_text().splitlines()
     assert rows[0] == "epoch_id,table_id,axis1_deg,axis2_deg,sigma_axis1_arcsec,sigma_axis2_arcsec"
-    assert rows[1].startswith("t01-1,turntable,-12")
-    assert rows[2].startswith("t01-2,turntable,-12")
+    for row, epoch_id in zip(rows[1:3], ("t01-1", "t01-2"), strict=True):
+        assert row.split(",")[:2] == [epoch_id, "turntable"]
+        assert float(row.split(",")[2]) == pytest.approx(-12.0, abs=1e-6)
     assert json.loads((tmp_path / "lab" / "capture" / "status.json").read_text())["state"] == "finished"
 
 
