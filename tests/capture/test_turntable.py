@@ -255,6 +255,13 @@ def test_trapezoid_has_its_closed_form():
     assert Axis("a", -99, 99, speed=2.0, acceleration=4.0).duration(0.25) == pytest.approx(2 * math.sqrt(0.25 / 4.0))
 
 
+def test_a_move_ends_at_its_target_however_long_the_clock_runs():
+    axis = SimulatedAxis(AxisPhysics(speed=35.0, acceleration=1745.0), np.random.default_rng(1))
+    axis.move(1e7 + 1 / 3, -0.2)
+    assert axis.advance(1e7 + 9.0) == -0.2
+    assert not axis.moving(1e7 + 9.0)
+
+
 def test_reversal_on_the_way_brakes_first():
     axis = SimulatedAxis(AxisPhysics(speed=2.0, acceleration=4.0), np.random.default_rng(1))
     axis.move(0.0, 10.0)

@@ -127,4 +127,5 @@ def _trapezoid(begin: float, angle: float, target: float, speed: float, rate: fl
     first = _Piece(begin, ramp, angle, 0.0, sign * rate)
     second = _Piece(begin + ramp, cruise, first.at(begin + ramp)[0], sign * top, 0.0)
     third_begin = begin + ramp + cruise
-    return [first, second, _Piece(third_begin, ramp, second.at(third_begin)[0], sign * top, -sign * rate)]
+    third = _Piece(third_begin, ramp, second.at(third_begin)[0], sign * top, -sign * rate)
+    return [first, second, third, _Piece(third_begin + ramp, 0.0, target, 0.0, 0.0)]  # there, whatever rounding says
