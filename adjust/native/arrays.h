@@ -33,10 +33,12 @@ struct Reader {
     const Argument *next;
     char *described;
 
-    [[gnu::noinline]] void describe(char kind, int dimensions) {
+    [[gnu::noinline]] Argument take(char kind, int dimensions) {
+        if (!described) return *next++;
         *described++ = kind;
         *described++ = char('0' + dimensions);
         *described = 0;
+        return {};
     }
 };
 
@@ -58,13 +60,9 @@ template <class T, int N> struct Array {
         for (int i = 0; i < N; ++i) n[i] = shape[i];
     }
     explicit Array(Reader &reader) {
-        if (reader.described) {
-            reader.describe(kind_of<T>(), N);
-            return;
-        }
-        data = static_cast<T *>(reader.next->data);
-        for (int i = 0; i < N; ++i) n[i] = reader.next->shape[i];
-        ++reader.next;
+        const Argument given = reader.take(kind_of<T>(), N);
+        data = static_cast<T *>(given.data);
+        for (int i = 0; i < N; ++i) n[i] = given.shape[i];
     }
     operator Array<const T, N>() const {
         Array<const T, N> o;
@@ -103,12 +101,9 @@ using Vector = In<double, 1>;
 
 template <class T> T taken(Reader &reader) {
     if constexpr (std::is_same_v<T, int64_t> || std::is_same_v<T, double>) {
-        if (reader.described) {
-            reader.describe(std::is_same_v<T, double> ? 'd' : 'n', 0);
-            return {};
-        }
+        const Argument given = reader.take(std::is_same_v<T, double> ? 'd' : 'n', 0);
         T value;
-        std::memcpy(&value, &(reader.next++)->data, sizeof value);
+        std::memcpy(&value, &given.data, sizeof value);
         return value;
     } else {
         return T(reader);  // an array, or several in a structure
@@ -124,17 +119,22 @@ struct Entry {
 // The function F as Python calls it: with a list of arguments; its own parameters say of which kind each must be.
 template <auto F> struct Bound;
 template <class R, class... P, R (*F)(P...)> struct Bound<F> {
-    static std::tuple<std::remove_cvref_t<P>...> take(Reader &reader) { return {taken<std::remove_cvref_t<P>>(reader)...}; }
+    struct Call {  // between its braces the arguments are read in order (a std::tuple of so many is slow to compile)
+        int64_t result = 0;
+        explicit Call(const std::remove_cvref_t<P> &...given) {
+            R (*volatile called)(P...) = F;  // not inlined: behind all that is read here its loops would lack registers
+            if constexpr (std::is_void_v<R>) called(given...);
+            else result = int64_t(called(given...));
+        }
+    };
     static int64_t run(const Argument *arguments) {
         Reader reader{arguments, nullptr};
-        auto given = take(reader);
-        if constexpr (std::is_void_v<R>) return std::apply(F, given), 0;
-        else return int64_t(std::apply(F, given));
+        return Call{taken<std::remove_cvref_t<P>>(reader)...}.result;
     }
     static void describe(char *out) {
         Reader reader{nullptr, out};
         *out = 0;
-        take(reader);
+        (void(taken<std::remove_cvref_t<P>>(reader)), ...);
     }
 };
 template <auto F> constexpr Entry entry(const char *name) { return {name, Bound<F>::run, Bound<F>::describe}; }

@@ -55,37 +55,35 @@ struct Calibration {
         const int n = row(), free = n_free();
         alignas(64) double A[MAX_ROW][2 * VIEW_CHUNK];
         std::memset(sum, 0, sizeof sum);
-        with_lens(kind, [&]<class Lens>(Lens) {
-            for (int64_t b = 0; b < views(); ++b) {
-                double N[MAX_ROW][MAX_ROW] = {};
-                int at = 0;
-                each(b, poses + 16 * b, [&](int64_t lo, int m, const V (&q)[3], V u, V v) {
-                    V r[2], d[2][N_COLUMNS], half;
-                    for (int i = 0; i < W; ++i) half[i] = i < m ? root(weights[lo + i]) : 0.0;
-                    lens_row<Lens>(lens, constants, q, u, v, r, d);
-                    for (int s = 0; s < 2; ++s, at += W) {
-                        V g[3];
-                        for (int a = 0; a < 3; ++a) g[a] = half * d[s][MAX_LENS + a];
-                        for (int a = 0; a < 3; ++a) {  // by a turn, then by a shift, in the camera's frame
-                            const int k = (a + 1) % 3, l = (a + 2) % 3;
-                            store(&A[a][at], q[k] * g[l] - q[l] * g[k]), store(&A[3 + a][at], g[a]);
-                        }
-                        for (int j = 0; j < free; ++j) {
-                            V c = V{};
-                            for (int k = 0; k < Lens::n; ++k)
-                                if (directions(k, j) != 0.0) c += directions(k, j) * d[s][k];
-                            store(&A[6 + j][at], half * c);
-                        }
-                        store(&A[n - 1][at], half * r[s]);
+        for (int64_t b = 0; b < views(); ++b) {
+            double N[MAX_ROW][MAX_ROW] = {};
+            int at = 0;
+            each(b, poses + 16 * b, [&](int64_t lo, int m, const V (&q)[3], V u, V v) {
+                V r[2], d[2][N_COLUMNS], half;
+                for (int i = 0; i < W; ++i) half[i] = i < m ? root(weights[lo + i]) : 0.0;
+                with_lens(kind, [&]<class Lens>(Lens) { lens_row<Lens>(lens, constants, q, u, v, r, d); });
+                for (int s = 0; s < 2; ++s, at += W) {
+                    V g[3];
+                    for (int a = 0; a < 3; ++a) g[a] = half * d[s][MAX_LENS + a];
+                    for (int a = 0; a < 3; ++a) {  // by a turn, then by a shift, in the camera's frame
+                        const int k = (a + 1) % 3, l = (a + 2) % 3;
+                        store(&A[a][at], q[k] * g[l] - q[l] * g[k]), store(&A[3 + a][at], g[a]);
                     }
-                    if (at == 2 * VIEW_CHUNK || lo + m == ptr[b + 1]) add_gram(A, n, std::exchange(at, 0), N);
-                });
-                for (int i = 0; i < n; ++i)
-                    for (int j = i; j < n; ++j)
-                        if (i < 6) views_out[(6 * b + i) * n + j] = N[i][j];
-                        else sum[i - 6][j - 6] += N[i][j];
-            }
-        });
+                    for (int j = 0; j < free; ++j) {
+                        V c = V{};
+                        for (int k = 0; k < directions.n[0]; ++k)
+                            if (directions(k, j) != 0.0) c += directions(k, j) * d[s][k];
+                        store(&A[6 + j][at], half * c);
+                    }
+                    store(&A[n - 1][at], half * r[s]);
+                }
+                if (at == 2 * VIEW_CHUNK || lo + m == ptr[b + 1]) add_gram(A, n, std::exchange(at, 0), N);
+            });
+            for (int i = 0; i < n; ++i)
+                for (int j = i; j < n; ++j)
+                    if (i < 6) views_out[(6 * b + i) * n + j] = N[i][j];
+                    else sum[i - 6][j - 6] += N[i][j];
+        }
     }
     // The lens' equations without the poses, from normal equations damped by a share of their diagonal: by row the left
     // and the right side. solved: per view the factor of its pose block, and inv(factor) times the rest. False where a

@@ -140,7 +140,7 @@ template <class F> inline void each_chunk(const Batch &B, int64_t b, F &&f) {
 
 // Whitened rows of a chunk into room.A, the columns of v ``full`` behind those of u: n_free + 6 + n_warp unknowns, then
 // the residual. least: the least depth of points with weight.
-template <class Lens> inline void local_columns(const Batch &B, int64_t b, const Chunk &chunk, V &least, Room &room) {
+template <class Lens> inline void columns_by(const Batch &B, int64_t b, const Chunk &chunk, V &least, Room &room) {
     const int64_t c = B.blocks.camera[b];
     const int nl = int(B.lenses.n_free[c]), nw = int(B.blocks.n_warp[b]), n_map = int(B.lenses.n_map[c]);
     const double *l = &B.lenses.values(c, 0), *k = &B.lenses.constants(c, 0), *factor = &B.lenses.factor(c, 0);
@@ -188,6 +188,9 @@ template <class Lens> inline void local_columns(const Batch &B, int64_t b, const
         }
     }
 }
+inline void local_columns(const Batch &B, int64_t b, const Chunk &chunk, V &least, Room &room) {
+    with_lens(B.lenses.kind[B.blocks.camera[b]], [&]<class Lens>(Lens) { columns_by<Lens>(B, b, chunk, least, room); });
+}
 inline void clear_unused(const Batch &B, int64_t b, Room &room) {
     const int64_t c = B.blocks.camera[b];
     for (int j = 0; j < B.lenses.n_free[c]; ++j) std::memset(room.A[j], 0, sizeof room.A[j]);
@@ -203,12 +206,10 @@ inline void normal_equations(Ints which, const Batch &B, Out<double, 3> H, Out<d
         V least = all<V>(__builtin_inf());
         double N[MAX_LOCAL][MAX_LOCAL] = {};
         clear_unused(B, b, room);
-        with_lens(B.lenses.kind[B.blocks.camera[b]], [&]<class Lens>(Lens) {
-            each_chunk(B, b, [&](int64_t lo, int size) {
-                const Chunk chunk(B, lo, size, room);
-                local_columns<Lens>(B, b, chunk, least, room);
-                add_gram(room.A, n, 2 * chunk.full, N);
-            });
+        each_chunk(B, b, [&](int64_t lo, int size) {
+            const Chunk chunk(B, lo, size, room);
+            local_columns(B, b, chunk, least, room);
+            add_gram(room.A, n, 2 * chunk.full, N);
         });
         for (int j = 0; j < n; ++j)
             for (int k = j; k < n; ++k) H(b, j, k) = H(b, k, j) = N[j][k];
@@ -247,14 +248,12 @@ inline void rows_of_block(int64_t b, const Batch &B, Room &room, Out<double, 2> 
     const int n = int(B.n_local(b)) + 1;
     V least = all<V>(__builtin_inf());
     clear_unused(B, b, room);
-    with_lens(B.lenses.kind[B.blocks.camera[b]], [&]<class Lens>(Lens) {
-        each_chunk(B, b, [&](int64_t lo, int size) {
-            const Chunk chunk(B, lo, size, room);
-            local_columns<Lens>(B, b, chunk, least, room);
-            for (int p = 0; p < size; ++p)
-                for (int s = 0; s < 2; ++s)
-                    for (int j = 0; j < n; ++j) out(2 * (lo - B.blocks.ptr[b] + p) + s, j) = room.A[j][s * chunk.full + p];
-        });
+    each_chunk(B, b, [&](int64_t lo, int size) {
+        const Chunk chunk(B, lo, size, room);
+        local_columns(B, b, chunk, least, room);
+        for (int p = 0; p < size; ++p)
+            for (int s = 0; s < 2; ++s)
+                for (int j = 0; j < n; ++j) out(2 * (lo - B.blocks.ptr[b] + p) + s, j) = room.A[j][s * chunk.full + p];
     });
 }
 
@@ -303,20 +302,18 @@ inline void condensed_rows(Ints which, const Batch &B, In<double, 3> factors, Ou
         for (int s = 0; s < N_SHAPE; ++s) columns[n + s] = shape[s];
         columns[n + N_SHAPE] = room.A[n];
         double R[MAX_LOCAL + N_SHAPE][MAX_LOCAL + N_SHAPE] = {};
-        with_lens(B.lenses.kind[B.blocks.camera[b]], [&]<class Lens>(Lens) {
-            each_chunk(B, b, [&](int64_t lo, int size) {
-                const Chunk chunk(B, lo, size, room);
-                clear_unused(B, b, room);
-                local_columns<Lens>(B, b, chunk, least, room);
-                for (int s = 0; s < N_SHAPE; ++s) {
-                    const double *by_point = room.A[smaller(z - 2 + s, z)];
-                    for (int p = 0; p < chunk.full; ++p) {  // those that fill up the last vector weigh nothing
-                        const double f = p < size ? factors(i, lo - B.blocks.ptr[b] + p, s) : 0.0;
-                        shape[s][p] = f * by_point[p], shape[s][chunk.full + p] = f * by_point[chunk.full + p];
-                    }
+        each_chunk(B, b, [&](int64_t lo, int size) {
+            const Chunk chunk(B, lo, size, room);
+            clear_unused(B, b, room);
+            local_columns(B, b, chunk, least, room);
+            for (int s = 0; s < N_SHAPE; ++s) {
+                const double *by_point = room.A[smaller(z - 2 + s, z)];
+                for (int p = 0; p < chunk.full; ++p) {  // those that fill up the last vector weigh nothing
+                    const double f = p < size ? factors(i, lo - B.blocks.ptr[b] + p, s) : 0.0;
+                    shape[s][p] = f * by_point[p], shape[s][chunk.full + p] = f * by_point[chunk.full + p];
                 }
-                add_rows(R, columns, k, 2 * chunk.full);
-            });
+            }
+            add_rows(R, columns, k, 2 * chunk.full);
         });
         for (int64_t j = 0; j < out.n[1]; ++j)
             for (int c = 0; c < k; ++c) out(i, j, c) = R[j][c];
@@ -479,32 +476,30 @@ inline void all_statistics(Ints which, const Batch &B, const Segments &S, In<dou
         block_by_keys(b, nl, S, C, D, Out<double, 2>(G, {n, w}));
         congruent(G, joint, n, w, K, Q);
         clear_unused(B, b, room);
-        with_lens(B.lenses.kind[B.blocks.camera[b]], [&]<class Lens>(Lens) {
-            each_chunk(B, b, [&](int64_t lo, int size) {
-                const Chunk chunk(B, lo, size, room);
-                local_columns<Lens>(B, b, chunk, least, room);
-                for (int p = 0; p < chunk.full; p += W) {
-                    V m[3] = {};
-                    for (int i = 0; i < n; ++i) {  // half of Q is enough: with its lower triangle, half the diagonal, a'Qa = 2 a'T
-                        const V u = load(&room.A[i][p]), v = load(&room.A[i][chunk.full + p]);
-                        V tu = 0.5 * Q[i][i] * u, tv = 0.5 * Q[i][i] * v;
-                        for (int j = 0; j < i; ++j) {
-                            tu += Q[i][j] * load(&room.A[j][p]);
-                            tv += Q[i][j] * load(&room.A[j][chunk.full + p]);
-                        }
-                        m[0] += 2.0 * u * tu;
-                        m[1] += u * tv + v * tu;
-                        m[2] += 2.0 * v * tv;
+        each_chunk(B, b, [&](int64_t lo, int size) __attribute__((noinline)) {  // a sixth faster than inlined
+            const Chunk chunk(B, lo, size, room);
+            local_columns(B, b, chunk, least, room);
+            for (int p = 0; p < chunk.full; p += W) {
+                V m[3] = {};
+                for (int i = 0; i < n; ++i) {  // half of Q is enough: with its lower triangle, half the diagonal, a'Qa = 2 a'T
+                    const V u = load(&room.A[i][p]), v = load(&room.A[i][chunk.full + p]);
+                    V tu = 0.5 * Q[i][i] * u, tv = 0.5 * Q[i][i] * v;
+                    for (int j = 0; j < i; ++j) {
+                        tu += Q[i][j] * load(&room.A[j][p]);
+                        tv += Q[i][j] * load(&room.A[j][chunk.full + p]);
                     }
-                    const V rv = load(&room.A[n][chunk.full + p]) / load(chunk.in[7] + p);
-                    const V ru = (load(&room.A[n][p]) - load(chunk.in[6] + p) * rv) / load(chunk.in[5] + p);
-                    for (int i = 0; i < W && p + i < size; ++i) {
-                        const int64_t at = lo + p + i;
-                        residual(at, 0) = ru[i], residual(at, 1) = rv[i];
-                        influence(at, 0) = m[0][i], influence(at, 1) = m[1][i], influence(at, 2) = m[2][i];
-                    }
+                    m[0] += 2.0 * u * tu;
+                    m[1] += u * tv + v * tu;
+                    m[2] += 2.0 * v * tv;
                 }
-            });
+                const V rv = load(&room.A[n][chunk.full + p]) / load(chunk.in[7] + p);
+                const V ru = (load(&room.A[n][p]) - load(chunk.in[6] + p) * rv) / load(chunk.in[5] + p);
+                for (int i = 0; i < W && p + i < size; ++i) {
+                    const int64_t at = lo + p + i;
+                    residual(at, 0) = ru[i], residual(at, 1) = rv[i];
+                    influence(at, 0) = m[0][i], influence(at, 1) = m[1][i], influence(at, 2) = m[2][i];
+                }
+            }
         });
     }
 }

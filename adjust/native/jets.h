@@ -7,49 +7,40 @@
 namespace {
 
 constexpr int count(unsigned m) { return std::popcount(m); }
+constexpr int bit(unsigned m, size_t i) { return i == 0 ? std::countr_zero(m) : bit(m & (m - 1), i - 1); }
 
 template <class S, unsigned M> struct Jet {
     S v;
     S d[count(M) ? count(M) : 1];
-
-    template <unsigned B> static constexpr bool has = (M >> B) & 1u;
-    template <unsigned B> S at() const { return d[count(M & ((1u << B) - 1))]; }
-    template <unsigned B> S &at() { return d[count(M & ((1u << B) - 1))]; }
 };
 
-template <unsigned B, class S, unsigned M> [[gnu::always_inline]] inline S derivative(const Jet<S, M> &f) {
-    if constexpr (Jet<S, M>::template has<B>) return f.template at<B>();
-    else return S{};
-}
+template <unsigned M, int B> constexpr bool has = (M >> B) & 1u;
+template <unsigned M, int B> constexpr int place = has<M, B> ? count(M & ((1u << B) - 1)) : 0;  // of bit B among those of M
+template <unsigned M> using Places = std::make_index_sequence<count(M)>;
+
+template <int B, class S, unsigned M> [[gnu::always_inline]] inline S derivative(const Jet<S, M> &f) { return has<M, B> ? f.d[place<M, B>] : S{}; }
 
 template <class K> concept Plain = std::is_same_v<K, double> || std::is_same_v<K, V>;
 
-// f of every bit of M, as a constant.
-template <unsigned M, class F, unsigned B = 0> [[gnu::always_inline]] inline void each_bit(F &&f) {
-    if constexpr (B < 32 && (M >> B) != 0) {
-        if constexpr ((M >> B) & 1u) f(std::integral_constant<unsigned, B>{});
-        if constexpr (B < 31) each_bit<M, F, B + 1>(std::forward<F>(f));
-    }
-}
-
-// A function of two jets: its value, its derivatives fa and fb by them.
-template <class S, unsigned A, unsigned B>
-[[gnu::always_inline]] inline auto joined(S v, S fa, const Jet<S, A> &a, S fb, const Jet<S, B> &b) {
+// A function of two jets: its value, its derivatives fa and fb by them. One function for all bits: one for each takes half of the build.
+template <size_t... I, class S, unsigned A, unsigned B>
+[[gnu::always_inline]] inline auto joined(S v, S fa, const Jet<S, A> &a, S fb, const Jet<S, B> &b, std::index_sequence<I...>) {
     Jet<S, A | B> o;
     o.v = v;
-    each_bit<A | B>([&](auto bit) {
-        constexpr unsigned k = bit;
-        if constexpr (!Jet<S, B>::template has<k>) o.template at<k>() = fa * a.template at<k>();
-        else if constexpr (!Jet<S, A>::template has<k>) o.template at<k>() = fb * b.template at<k>();
-        else o.template at<k>() = fa * a.template at<k>() + fb * b.template at<k>();
-    });
+    ((o.d[I] = !has<B, bit(A | B, I)>   ? fa * a.d[place<A, bit(A | B, I)>]
+               : !has<A, bit(A | B, I)> ? fb * b.d[place<B, bit(A | B, I)>]
+                                        : fa * a.d[place<A, bit(A | B, I)>] + fb * b.d[place<B, bit(A | B, I)>]), ...);
     return o;
+}
+template <class S, unsigned A, unsigned B>
+[[gnu::always_inline]] inline auto joined(S v, S fa, const Jet<S, A> &a, S fb, const Jet<S, B> &b) {
+    return joined(v, fa, a, fb, b, Places<(A | B)>{});
 }
 // A function of one jet: its value and its derivative.
 template <class S, unsigned A> [[gnu::always_inline]] inline Jet<S, A> chained(S v, S f, const Jet<S, A> &a) {
     Jet<S, A> o;
     o.v = v;
-    each_bit<A>([&](auto bit) { o.template at<bit>() = f * a.template at<bit>(); });
+    [&]<size_t... I>(std::index_sequence<I...>) __attribute__((always_inline)) { ((o.d[I] = f * a.d[I]), ...); }(Places<A>{});
     return o;
 }
 template <class S, unsigned A> [[gnu::always_inline]] inline Jet<S, A> shifted(S v, const Jet<S, A> &a) {

@@ -152,7 +152,9 @@ template <class Lens, class S, size_t... I>
     const auto &b = found.second;
     r[0] = a.v, r[1] = b.v;
     constexpr unsigned every = ((1u << Lens::n) - 1) | (7u << MAX_LENS);
-    each_bit<every>([&](auto bit) { d[0][bit] = derivative<bit>(a), d[1][bit] = derivative<bit>(b); });
+    [&]<size_t... K>(std::index_sequence<K...>) __attribute__((always_inline)) {
+        ((d[0][bit(every, K)] = derivative<bit(every, K)>(a), d[1][bit(every, K)] = derivative<bit(every, K)>(b)), ...);
+    }(Places<every>{});
 }
 template <class Lens, class S>
 [[gnu::always_inline]] inline void lens_row(const double *l, const double *c, const S (&q)[3], S u, S v, S (&r)[2], S (&d)[2][N_COLUMNS]) {
