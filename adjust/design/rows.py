@@ -58,7 +58,7 @@ def design_matrix(survey: Survey, start: StartValues) -> DesignMatrix:
     used = np.repeat(found.used, np.diff(found.ptr)).astype(float)
     blocks = np.cumsum([0, *(len(b.uv) for b in survey.image_blocks)])
     kinds = [("image", i) for i in range(len(survey.image_blocks))]
-    kinds += [(item.kind, i) for i, item in enumerate(graph.others)]
+    kinds += list(zip(graph.of_others(lambda o: o.kind, lambda _: "pair"), range(graph.n_others), strict=True))
     kinds += [("reading", i) for i in range(len(survey.readings))]
     ends = _ranges([*found.ptr[blocks].tolist(), *found.ptr[found.n_image + 1 :].tolist()])
     parts = tuple(Observed(kind, i, rows) for (kind, i), rows in zip(kinds, ends, strict=True))

@@ -1,6 +1,6 @@
 """One hypothesis, tried: its survey adjusted, and what is left unexplained."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,7 +8,7 @@ import numpy as np
 from adjust.diagnosis.case import CAP, Case, block_squares
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.model.errors import SurveyError
-from adjust.model.result import Adjustment
+from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.survey import FloatArray, Survey
 
 _NOISE, _CLEARLY = 5.0, 3.0
@@ -127,8 +127,15 @@ def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:
     out = _left_out(survey)
     others = [o for o in result.other_residuals if o.used or not out & {o.ids, o.ids[:1]}]
     joint = _joint_squares(result) if result.survey.reading_covariances else {}
+    alone: dict[str, list[ObservationResidual]] = {}
     for o in others:
-        groups.setdefault(o.group, []).append(joint.get(o.ids[:1], _squares(o.residual, o.sigma)))
+        if o.ids[:1] in joint:
+            groups.setdefault(o.group, []).append(joint[o.ids[:1]])
+        else:
+            alone.setdefault(o.group, []).append(o)
+    for group, same in alone.items():
+        v, sigma = (np.concatenate(x) for x in zip(*((o.residual, o.sigma) for o in same), strict=True))
+        groups.setdefault(group, []).append(_squares(v, sigma))
     n_adjusted = sum(len(s) for of in groups.values() for s in of)
     for block, squares in zip(survey.image_blocks, block_squares(survey, result), strict=True):
         groups.setdefault(block.group, []).append(np.repeat(0.5 * squares, 2))
@@ -163,7 +170,7 @@ def n_other_components(survey: Survey, used_only: bool = True) -> int:
     """Observed components in use, or all, that are no image points."""
     kinds = (survey.table_readings, survey.pairs, survey.distances, survey.coordinates, survey.readings, survey.levels,
              survey.coordinate_differences, survey.alignments, survey.laser_spots, survey.on_surfaces)  # fmt: skip
-    return sum(_n_components(o) for kind in kinds for o in kind if o.used or not used_only)
+    return sum(_n_components([o for o in kind if o.used or not used_only]) for kind in kinds)
 
 
 def _left_out(survey: Survey) -> set[tuple[str, ...]]:
@@ -172,10 +179,11 @@ def _left_out(survey: Survey) -> set[tuple[str, ...]]:
     return pairs | {(r.table_id, r.epoch_id) for r in survey.table_readings if not r.used}
 
 
-def _n_components(observed: object) -> int:
-    """Of one observation: the finite variances of its covariance, one where it has a sigma."""
-    cov = getattr(observed, "cov", None)
-    return 1 if cov is None else int(np.isfinite(np.diag(cov)).sum())
+def _n_components(observed: Sequence[object]) -> int:
+    """Of observations of a kind: the finite variances of their covariances, one each where they have sigmas."""
+    covs = [cov for o in observed if (cov := getattr(o, "cov", None)) is not None]
+    finite = [np.isfinite(cov.diagonal()) for cov in covs]
+    return len(observed) - len(covs) + int(np.concatenate([np.zeros(0), *finite]).sum())
 
 
 def _squares(residual: FloatArray, sigma: FloatArray) -> FloatArray:

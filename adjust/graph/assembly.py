@@ -1,6 +1,6 @@
 """The one graph of a survey as GTSAM has it, what it is evaluated to, and values to begin with."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, TypeVar
@@ -12,7 +12,7 @@ from gtsam import Pose3
 from adjust.frames.state import State
 from adjust.frames.unknowns import Unknowns
 from adjust.model.clocks import clocks_of
-from adjust.model.observations import ImageBlock
+from adjust.model.observations import ImageBlock, Pair
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey, VectorParameter
 from adjust.observations.factors import (
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from adjust.observations.pairs import PairBatch
 
 _Rows = TypeVar("_Rows", FloatArray, BoolArray)
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,11 +122,40 @@ class AdjustmentGraph:
     @cached_property
     def others(self) -> list[ObservationFactor]:
         """Every observation that is neither an image point nor a reading, in the order of the survey."""
-        if self.pairs is None:
-            return self.singles
-        items, rest = self.pairs.items(self.survey.pairs), iter(self.singles)
-        within = dict(zip((self.first_pair + self.pairs.rows).tolist(), items, strict=True))
-        return [within[i] if i in within else next(rest) for i in range(len(within) + len(self.singles))]
+        return [self.other(i) for i in range(self.n_others)]
+
+    def other(self, i: int) -> ObservationFactor:
+        """One of :attr:`others`, always the same; makes no other one."""
+        place, batch = self._place[i], self.pairs
+        if batch is None or place >= 0:
+            return self.singles[place]
+        if i not in self._made:
+            self._made[i] = batch.item(~place, self.survey.pairs)
+        return self._made[i]
+
+    def of_others(self, of: Callable[[ObservationFactor], _T], of_pair: Callable[[Pair], _T]) -> list[_T]:
+        """What is asked of each of :attr:`others`; makes none of the pairs in batches, which are asked themselves."""
+        rows = [] if self.pairs is None else self.pairs.rows.tolist()
+        pairs = self.survey.pairs
+        return [of(self.singles[p]) if p >= 0 else of_pair(pairs[rows[~p]]) for p in self._place]
+
+    @cached_property
+    def _made(self) -> dict[int, ObservationFactor]:
+        return {}
+
+    @cached_property
+    def _place(self) -> list[int]:
+        """Of each of :attr:`others` its number among the singles, or as ``~e`` in the batch of pairs."""
+        place = np.zeros(self.n_others, dtype=np.int64)
+        if self.pairs is not None:
+            place[self.first_pair + self.pairs.rows] = ~np.arange(len(self.pairs))
+        place[place == 0] = np.arange(len(self.singles))
+        return place.tolist()
+
+    @cached_property
+    def single(self) -> list[int]:
+        """Which of :attr:`others` are in no batch, by number, in the order of :attr:`singles`."""
+        return [i for i, p in enumerate(self._place) if p >= 0]
 
     @cached_property
     def others_graph(self) -> gtsam.NonlinearFactorGraph:

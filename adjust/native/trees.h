@@ -205,16 +205,17 @@ inline void solve_cliques(Ints up, Ints down, Ints key_ptr, Ints keys, Ints dims
         for (int64_t i = key_ptr[c]; i < key_ptr[c + 1]; ++i)
             for (int64_t j = 0; j < dims[keys[i]]; ++j) rows.data[o++] = first[keys[i]] + j;
     };
-    // C (n, m) = A B with B the first rows of x in the clique, and A (n, inner) of what entry(i, j) says
-    const auto times = [&](int64_t n, int64_t inner, auto entry) {
+    // C (n, m) = A B with B the first rows of x in the clique, and A (n, inner) of what entry(i, j) says: of its first rows
+    // zero behind the diagonal, or of all before it
+    const auto times = [&](int64_t n, int64_t inner, bool behind, auto entry) {
         double *B = work.data, *C = B + inner * pm, *A = C + n * pm;
         std::memset(B, 0, sizeof(double) * inner * pm);
         for (int64_t i = 0; i < inner; ++i) std::memcpy(B + i * pm, x.data + rows[i] * m, line);
         for (int64_t i = 0; i < n; i += STRIP) {
-            const int64_t some = smaller(STRIP, n - i);
+            const int64_t some = smaller(STRIP, n - i), begin = behind ? 0 : i, end = behind ? smaller(inner, i + some) : inner, ld = end - begin;
             for (int64_t k = 0; k < some; ++k)
-                for (int64_t j = 0; j < inner; ++j) A[k * inner + j] = entry(i + k, j);
-            product(A, inner, B, pm, C + i * pm, pm, some, m, inner);
+                for (int64_t j = begin; j < end; ++j) A[k * ld + j - begin] = entry(i + k, j);
+            product(A, ld, B + begin * pm, pm, C + i * pm, pm, some, m, ld);
         }
         return C;
     };
@@ -222,7 +223,7 @@ inline void solve_cliques(Ints up, Ints down, Ints key_ptr, Ints keys, Ints dims
         const int64_t c = up[index], nf = front[c], n = width[c];
         const double *R = data.data + at[c];
         place(c);
-        const double *C = times(n, nf, [&](int64_t i, int64_t j) { return j <= i ? R[j * n + i] : 0.0; });
+        const double *C = times(n, nf, true, [&](int64_t i, int64_t j) { return j <= i ? R[j * n + i] : 0.0; });
         for (int64_t i = 0; i < n; ++i) {
             double *to = x.data + rows[i] * m;
             if (i < nf) std::memcpy(to, C + i * pm, line);
@@ -233,7 +234,7 @@ inline void solve_cliques(Ints up, Ints down, Ints key_ptr, Ints keys, Ints dims
         const int64_t c = down[index], nf = front[c], n = width[c];
         const double *R = data.data + at[c];
         place(c);
-        const double *C = times(nf, n, [&](int64_t i, int64_t j) { return i <= j ? R[i * n + j] : 0.0; });
+        const double *C = times(nf, n, false, [&](int64_t i, int64_t j) { return i <= j ? R[i * n + j] : 0.0; });
         for (int64_t i = 0; i < nf; ++i) std::memcpy(x.data + rows[i] * m, C + i * pm, line);
     }
 }

@@ -74,7 +74,11 @@ class PairArrays:
     @cached_property
     def poses(self) -> list[Pose3]:
         """The same one by one."""
-        return [Pose3(Rot3(R), t) for R, t in zip(self.rotations, np.nan_to_num(self.translations), strict=True)]
+        return [self.pose(e) for e in range(len(self.used))]
+
+    def pose(self, e: int) -> Pose3:
+        """One of them."""
+        return Pose3(Rot3(self.rotations[e]), np.nan_to_num(self.translations[e]))
 
     @cached_property
     def logs(self) -> FloatArray:
@@ -280,24 +284,22 @@ class PairBatch:
         a, b, used = self.a_key, self.b_key, self.arrays.used
         return {*b[used & (a == _HELD)].tolist(), *a[used & (b == _HELD)].tolist()} - {_HELD}
 
-    def items(self, pairs: Sequence[Pair]) -> list[ObservationFactor]:
-        """What a report needs to know of each; ``pairs`` are those of the survey."""
-        logs = self.arrays.logs
-        out = []
-        for e, (row, is_pose) in enumerate(zip(self.rows.tolist(), self.arrays.is_pose.tolist(), strict=True)):
-            pair, k = pairs[row], 6 if is_pose else 3
-            out.append(ObservationFactor(self._exact(e, pair, is_pose), "pair", pair.group, _ids(pair),
-                                         POSE_COMPONENTS[:k], POSE_UNITS[:k], logs[e, :k], pair.used))  # fmt: skip
-        return out
+    def item(self, e: int, pairs: Sequence[Pair]) -> ObservationFactor:
+        """What a report needs to know of one; ``pairs`` are those of the survey."""
+        pair, is_pose = pairs[int(self.rows[e])], bool(self.arrays.is_pose[e])
+        k = 6 if is_pose else 3
+        return ObservationFactor(self._exact(e, pair, is_pose), "pair", pair.group, _ids(pair), POSE_COMPONENTS[:k],
+                                 POSE_UNITS[:k], self.arrays.logs[e, :k], pair.used)  # fmt: skip
 
     def _exact(self, e: int, pair: Pair, is_pose: bool) -> gtsam.NonlinearFactor:
         """A factor with just the measured components as residual, in frame a."""
-        factor, held = self.factors[e], self.a_key[e] == _HELD
-        if factor is not None and is_pose and not held:
-            return factor
-        a, b = self._ends(e)
+        (a, b), measured = self._ends(e), self.arrays.pose(e)
+        if is_pose and not isinstance(a, Pose3):
+            factor = native_factor(a, b, measured, self.arrays.whitening[e], self.noise)
+            if factor is not None:
+                return factor
         keys = list(dict.fromkeys(x for x in (b, a) if not isinstance(x, Pose3)))
-        measured, k = self.arrays.poses[e], 6 if is_pose else 3
+        k = 6 if is_pose else 3
 
         def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
             world_from_a, world_from_b = (x if isinstance(x, Pose3) else values.atPose3(x) for x in (a, b))
@@ -316,6 +318,11 @@ class PairBatch:
         state = self.state
         shift = np.nan_to_num(self.arrays.translations)
         return pair_jacobians(self.a_slot, self.b_slot, state.slot_R, state.slot_t, self.arrays.rotations, shift)
+
+    def whitened_rows(self, values: gtsam.Values) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Of all pairs, in use or not: whitened residuals (E, 6), derivatives (E, 6, 6) by b and by a."""
+        W, (residual, by_b, by_a, _) = self.arrays.whitening, self.jacobians(values)
+        return np.einsum("nij,nj->ni", W, residual), W @ by_b, W @ by_a
 
     def statistics(self, tree: KeyCovariances, values: gtsam.Values) -> PairStatistics:
         """Statistics of all pairs, in use or not; they do not depend on the datum of ``tree``."""

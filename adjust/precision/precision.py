@@ -232,14 +232,6 @@ class Precision(Covariances):
             raise ValueError("the survey has no pairs between fixed stations")
         return self.graph.pairs.statistics(self.tree, self.solved.values)
 
-    @cached_property
-    def single(self) -> list[int]:
-        """Which of the other observations are in no batch, by number, in the order of ``AdjustmentGraph.singles``."""
-        batch, alone = self.graph.pairs, np.ones(self.graph.n_others, dtype=np.bool_)
-        if batch is not None:
-            alone[self.graph.first_pair + batch.rows] = False
-        return np.flatnonzero(alone).tolist()
-
     def covs(self, keys: IntArray, dim: int) -> FloatArray:
         """Covariances (n, dim, dim) of many unknowns of the same dimension."""
         Q = np.empty((len(keys), dim, dim))
@@ -327,7 +319,7 @@ def other_residuals(precision: Precision) -> tuple[ObservationResidual, ...]:
     if graph.pairs is not None:
         places = (graph.first_pair + graph.pairs.rows).tolist()
         out |= dict(zip(places, graph.pairs.residuals(precision.pairs, graph.survey.pairs), strict=True))
-    for i, item in zip(precision.single, graph.singles, strict=True):
+    for i, item in zip(graph.single, graph.singles, strict=True):
         e, M, root = precision.influence(item)
         n = len(e)
         Q = np.eye(n) - M if item.used else np.eye(n) + M

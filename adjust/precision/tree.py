@@ -227,19 +227,23 @@ class TreeCovariance:
         return x
 
     def among(self, A: sparse.csr_array) -> FloatArray:
-        """A Q A' (m, m) of the rows of A (m, n), without forming Q: columns of Q A', on their ways to the root only."""
+        """A Q A' (m, m) of the rows of A (m, n), without forming Q: U'U with R'U = A', on the ways to the root only."""
         home = np.repeat(self._home, self._dims)
         of_row = np.maximum.reduceat(np.append(home[A.indices], 0), A.indptr[:-1]) if A.shape[0] else np.zeros(0)
         order = np.argsort(of_row, kind="stable")  # neighbours in the tree side by side
         A, out = A[order], np.zeros((A.shape[0],) * 2)
+        none, done = np.zeros(0, dtype=np.int64), list[tuple[IntArray, FloatArray]]()
         for i in range(0, A.shape[0], _COLUMNS):
-            mine, rest = A[i : i + _COLUMNS], A[i:]
-            up, down = (self._ancestors(set(home[rows.indices].tolist())) for rows in (mine, rest))
-            shift, n = self._gathered(down)
-            B = sparse.csr_array((rest.data, rest.indices + shift[home[rest.indices]], rest.indptr), (rest.shape[0], n))
-            x = np.ascontiguousarray(B[:_COLUMNS].toarray().T)
-            solve_cliques(self.arrays, up, down, self._first[:-1] + shift[self._home], self._data, x)
-            out[i:, i : i + _COLUMNS] = B @ x
+            mine = A[i : i + _COLUMNS]
+            up = self._ancestors(set(home[mine.indices].tolist()))
+            shift, n = self._gathered(up)
+            entries = mine.data, mine.indices + shift[home[mine.indices]], mine.indptr
+            U = np.ascontiguousarray(sparse.csr_array(entries, (mine.shape[0], n)).toarray().T)
+            solve_cliques(self.arrays, up, none, self._first[:-1] + shift[self._home], self._data, U)
+            done.append((np.flatnonzero(np.isin(home, up)), U))
+            for k, (rows, V) in enumerate(done):
+                _, here, there = np.intersect1d(done[-1][0], rows, assume_unique=True, return_indices=True)
+                out[i : i + _COLUMNS, k * _COLUMNS : k * _COLUMNS + V.shape[1]] = U[here].T @ V[there]
         back = np.argsort(order)
         return np.asarray((np.tril(out) + np.tril(out, -1).T)[np.ix_(back, back)])
 

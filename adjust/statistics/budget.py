@@ -55,7 +55,8 @@ def _sources(system: LinearSystem) -> tuple[list[str], IntArray]:
     """Names of all sources, and that of every row (m,): a group, or a single prior."""
     names = list(system.group_names)
     of_observation = system.group.copy()
-    for i, item in enumerate(system.precision.graph.others):
+    graph = system.precision.graph
+    for i, item in zip(graph.single, graph.singles, strict=True):
         if item.kind == "prior":
             of_observation[system.n_image + i] = len(names)
             names.append(f"prior {' '.join(item.ids)}")

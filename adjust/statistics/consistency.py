@@ -18,7 +18,7 @@ from adjust.observations.images.batch import whitened_squares
 from adjust.statistics.changes import ChangeSearch
 from adjust.statistics.condensed import CondensedSystem
 from adjust.statistics.result import Consistency, PartTest
-from adjust.statistics.system import LinearSystem
+from adjust.statistics.system import LinearSystem, groups_of_others
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2, fisher
 from adjust.testing.quadratic_forms import upper_tail, upper_tail_bound
@@ -137,13 +137,14 @@ def contributions(adjustment: Adjustment, system: LinearSystem, blocks: IntArray
 
 def _labels(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> dict[str, list[str | None]]:
     """Of every kind of part the one that each observation belongs to, or None."""
-    survey, others = adjustment.survey, system.precision.graph.others
+    survey, graph = adjustment.survey, system.precision.graph
     images, readings = [survey.image_blocks[i] for i in blocks.tolist()], survey.readings
     instrument = {s.setup_id: s.instrument_id for s in survey.setups}
-    no_image, no_other, no_reading = ([None] * len(x) for x in (images, others, readings))
-    axes = [o.ids if o.kind == "table" else (None, None) for o in others]
+    none: tuple[str | None, ...] = (None, None)
+    axes = graph.of_others(lambda o: o.ids if o.kind == "table" else none, lambda _: none)
+    no_image, no_other, no_reading = ([None] * len(x) for x in (images, axes, readings))
     return {
-        "group": [x.group for x in (*images, *others, *readings)],
+        "group": [*(b.group for b in images), *groups_of_others(graph)],
         "camera": [*(b.camera_id for b in images), *no_other, *no_reading],
         "epoch": [*(b.epoch_id for b in images), *(ids[1] for ids in axes), *no_reading],
         "target": [*(b.target_id for b in images), *no_other, *no_reading],

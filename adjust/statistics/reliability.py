@@ -90,7 +90,7 @@ def _others(precision: Precision) -> list[_Batch]:
     """All other observations, those with the same number of components together."""
     n_image = sum(len(b.uv) for b in precision.graph.survey.image_blocks)
     found: dict[int, list[tuple[int, FloatArray, FloatArray, FloatArray, FloatArray, bool]]] = {}
-    for i, item in zip(precision.single, precision.graph.singles, strict=True):
+    for i, item in zip(precision.graph.single, precision.graph.singles, strict=True):
         x = precision.rows(item)
         found.setdefault(len(x.e), []).append((n_image + i, x.e, x.influence, x.W, x.root, item.used))
     out = []

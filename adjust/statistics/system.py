@@ -209,7 +209,7 @@ def survey_rows(
     key_columns = {graph.unknowns.by_name[name].key: _all_columns(graph, columns, name) for name in columns.at}
     n = len(columns)
     images = image_rows(graph, n, key_columns)
-    others = _other_rows([of_item(item) for item in graph.others], n, key_columns)
+    others = _other_rows(graph, values, of_item, n, key_columns)
     readings = _reading_rows(graph, values, n, key_columns)
     lengths = np.concatenate([images.lengths, others[2], np.ones(len(readings[1]))])
     return SurveyRows(
@@ -254,12 +254,12 @@ def points_apart(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> Ima
 
 def groups_of_others(graph: AdjustmentGraph) -> list[str]:
     """Of all observations that are no image points, the readings last."""
-    return [o.group for o in graph.others] + [r.group for r in graph.survey.readings]
+    return graph.of_others(lambda o: o.group, lambda p: p.group) + [r.group for r in graph.survey.readings]
 
 
 def _used_others(graph: AdjustmentGraph) -> BoolArray:
     readings = graph.terrestrial.used if graph.terrestrial is not None else np.zeros(0, dtype=np.bool_)
-    return np.concatenate([np.array([o.used for o in graph.others], dtype=np.bool_), readings])
+    return np.concatenate([np.array(graph.of_others(lambda o: o.used, lambda p: p.used), dtype=np.bool_), readings])
 
 
 def joint_readings(graph: AdjustmentGraph) -> list[tuple[IntArray, FloatArray]]:
@@ -412,16 +412,31 @@ def bundle_order(bundle: BundleBatch) -> IntArray:
 
 
 def _other_rows(
-    items: Sequence[ItemRows], n: int, key_columns: KeyColumns
-) -> tuple[sparse.csr_matrix, FloatArray, IntArray]:
-    entries, residuals, lengths, at = Entries(), [np.zeros(0)], [], 0
-    for keys, A, e in items:
+    graph: AdjustmentGraph, values: gtsam.Values, of_item: Callable[[ObservationFactor], ItemRows], n: int,
+    key_columns: KeyColumns,
+) -> tuple[sparse.csr_matrix, FloatArray, IntArray]:  # fmt: skip
+    """Rows, residuals and lengths of what is neither an image point nor a reading, in the order of the survey."""
+    alone, batch, entries = [of_item(item) for item in graph.singles], graph.pairs, Entries()
+    rows = iter([len(e) for _, _, e in alone])
+    lengths = np.array(graph.of_others(lambda _: next(rows), lambda p: len(p.cov)), dtype=np.int64)
+    ptr = np.concatenate([[0], np.cumsum(lengths)])
+    residuals = np.empty(int(ptr[-1]))
+    for (keys, A, e), at in zip(alone, ptr[graph.single].tolist(), strict=True):
         columns = np.concatenate([np.zeros(0, dtype=np.int64), *(key_columns[k] for k in keys)])
+        residuals[at : at + len(e)] = e
         entries.add(np.arange(at, at + len(e)), columns, A)
-        residuals.append(e)
-        lengths.append(len(e))
-        at += len(e)
-    return entries.matrix((at, n)), np.concatenate(residuals), np.array(lengths, dtype=np.int64)
+    if batch is not None:
+        first = ptr[graph.first_pair + batch.rows]
+        r, *by = batch.whitened_rows(values)
+        places = {k: np.flatnonzero(np.equal(batch.arrays.is_pose, k == 6)) for k in (6, 3)}
+        none = np.full(6, -1)
+        ends = [np.array([key_columns.get(k, none) for k in keys.tolist()]) for keys in (batch.b_key, batch.a_key)]
+        for k, mine in places.items():
+            at = first[mine, None] + np.arange(k)
+            residuals[at] = r[mine, :k]
+            across = np.concatenate([c[mine] for c in ends], axis=1)
+            entries.add_blocks(at, across, np.concatenate([J[mine, :k] for J in by], axis=2))
+    return entries.matrix((int(ptr[-1]), n)), residuals, lengths
 
 
 def _reading_rows(graph: AdjustmentGraph, values: gtsam.Values, n: int, key_columns: KeyColumns) -> Rows:

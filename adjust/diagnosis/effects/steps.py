@@ -156,7 +156,8 @@ def _of_held(linear: Linear, only: ParameterName | None) -> Iterator[_Course]:
 
 def _other_rows(linear: Linear, kind: str) -> list[int]:
     """Numbers in the linear system of all observations of a kind, in the order of the survey."""
-    return [linear.system.n_image + i for i, o in enumerate(linear.system.precision.graph.others) if o.kind == kind]
+    kinds = linear.system.precision.graph.of_others(lambda o: o.kind, lambda _: "pair")
+    return [linear.system.n_image + i for i, k in enumerate(kinds) if k == kind]
 
 
 def _step(case: Case, course: _Course, cut: int, first: Score, looked_at: int) -> Effect:

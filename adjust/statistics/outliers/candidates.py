@@ -50,16 +50,16 @@ def candidates(graph: AdjustmentGraph, images: bool = True) -> Candidates:
     tables: dict[tuple[str, ...], int] = {(r.table_id, r.epoch_id): i for i, r in enumerate(survey.table_readings)}
     n_image, count = int(ptr[-1]), dict.fromkeys(_FIELD, 0)
     place: dict[int, tuple[str, int]] = {}
-    for i, item in enumerate(graph.others):
-        if item.kind == "table":
-            place[n_image + i] = ("table_readings", tables[item.ids])
-        elif item.kind in _FIELD:
-            place[n_image + i] = (_FIELD[item.kind], count[item.kind])
-            count[item.kind] += 1
+    for i, (kind, ids) in enumerate(graph.of_others(lambda o: (o.kind, o.ids), lambda p: ("pair", (p.pair_id,)))):
+        if kind == "table":
+            place[n_image + i] = ("table_readings", tables[ids])
+        elif kind in _FIELD:
+            place[n_image + i] = (_FIELD[kind], count[kind])
+            count[kind] += 1
     for kind, n in count.items():
         if n not in (0, len(getattr(survey, _FIELD[kind]))):
             raise ValueError(f"{n} factors of kind {kind} for {len(getattr(survey, _FIELD[kind]))} observations")
-    first = n_image + len(graph.others)
+    first = n_image + graph.n_others
     place |= {first + i: (_READINGS, i) for i in range(len(survey.readings))}
     return Candidates(place, n_image, first + len(survey.readings), tuple(ptr.tolist()))
 

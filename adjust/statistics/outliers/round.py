@@ -184,7 +184,7 @@ class Round:
         if o in self._at or every is None:
             return self._decision("rejected", self._at[o], now, how)
         r = self.now.other_residuals[o]
-        e = np.linalg.norm(precision_of(self.now).rows(precision_of(self.now).graph.others[o]).e)
+        e = np.linalg.norm(precision_of(self.now).rows(precision_of(self.now).graph.other(o)).e)
         verdict = Verdict(r.test, int(every.freedom[o]), float(e))
         return self._told("rejected", o, verdict, int(every.group[o]), how)
 

@@ -53,8 +53,8 @@ class WatchedSnooping(Snooping):
 
     def __init__(self, now: Adjustment, index: IntArray, given: BoolArray) -> None:
         precision = precision_of(now)
-        others = precision.graph.others
-        rows = [precision.rows(others[o]) for o in index.tolist()]
+        others = [precision.graph.other(o) for o in index.tolist()]
+        rows = [precision.rows(item) for item in others]
         names = groups_of_others(precision.graph)
         self.group_names = tuple(dict.fromkeys(names))
         number = {name: i for i, name in enumerate(self.group_names)}
@@ -65,7 +65,7 @@ class WatchedSnooping(Snooping):
         self.used, self.candidates = given[index], np.ones(len(index), dtype=np.bool_)
         self.joint, self.joint_of = [], {}
         self.alike = [np.flatnonzero(self.sizes == k) for k in np.unique(self.sizes)]
-        back = np.array([bool(given[o]) and not others[o].used for o in index.tolist()], dtype=np.bool_)
+        back = given[index] & ~np.array([item.used for item in others], dtype=np.bool_)
         M, e = _influences(precision, rows), np.concatenate([np.zeros(0), *(r.e for r in rows)])
         # with those that the solution left out taken back
         r = np.flatnonzero(back[self.row_of])
