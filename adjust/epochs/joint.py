@@ -2,16 +2,24 @@
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
-from typing import Any
 
 from adjust.model.errors import SurveyError
-from adjust.model.observations import PositionRef
+from adjust.model.observations import (
+    CoordinateDifferences,
+    Coordinates,
+    Distance,
+    PositionRef,
+    Reading,
+    ReadingCovariance,
+)
 from adjust.model.rewriting import Fields
 from adjust.model.subsets import Item, with_positions
-from adjust.model.survey import Datum, Instrument, Point, Survey
+from adjust.model.survey import Datum, Instrument, Point, Setup, Survey
 
 _PARTS = ("cameras", "stations", "tables", "targets", "image_blocks", "table_readings", "pairs", "levels", "alignments",
           "laser_spots", "on_surfaces", "surfaces", "beams")  # fmt: skip
+_JOINED = ("distances", "coordinates", "coordinate_differences", "setups", "readings", "reading_covariances")
+_Joined = Distance | Coordinates | CoordinateDifferences | Setup | Reading | ReadingCovariance
 _IDS = ("distance_id", "reading_id")
 
 
@@ -41,8 +49,7 @@ def joint_survey(epochs: Mapping[str, Survey], stable: Collection[str]) -> Surve
                 "project instead"
             )
     points: dict[str, Point] = {}
-    parts: dict[str, list[Any]] = {name: [] for name in ("distances", "coordinates", "coordinate_differences", "setups",
-                                                         "readings", "reading_covariances")}  # fmt: skip
+    parts: dict[str, list[_Joined]] = {name: [] for name in _JOINED}
     instruments: dict[str, Instrument] = {}
     for epoch, survey in epochs.items():
         for point in survey.points:

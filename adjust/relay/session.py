@@ -77,6 +77,8 @@ class NetworkSession:
         base = network_from_survey(survey)
         if base.rotation_only:
             raise SurveyError("sessions take networks of poses; solve a network of rotations as a whole")
+        if survey.datum.kind == "inner":
+            raise SurveyError("sessions need a station that is held or has a prior; solve a free network as a whole")
         self.options, self._survey = options, survey
         self._ids = list(base.station_ids)
         self._index = dict(base.index_of)
@@ -208,6 +210,10 @@ class NetworkSession:
         else:
             e = Rot3.Logmap(measured.between(present.rotation()))
         return float(e @ np.linalg.solve(pair.cov, e))
+
+    def uses(self, pair_id: str) -> bool:
+        """Whether a pair is in use; one between held stations is not."""
+        return pair_id in self._factor_of
 
     def remove(self, pair_ids: Sequence[str]) -> None:
         """Take pairs out again; they stay listed, out of use. Raises SurveyError for ids that are not in use."""

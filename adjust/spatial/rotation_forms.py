@@ -13,9 +13,10 @@ sign of the permutation (i, j, k), ``R_ik = e sin b``, ``R_ij = -e cos b sin c``
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+from gtsam import Rot3
 
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
@@ -60,6 +61,12 @@ def euler_from_matrix(matrix: FloatArray, order: EulerOrder = "zyx") -> FloatArr
     angles[..., j] = np.arctan2(e * m[..., i, k], cosine)
     angles[..., k] = np.arctan2(-e * m[..., i, j], m[..., i, i])
     return found.sense * angles
+
+
+def quaternion_wxyz(rotation: Rot3) -> tuple[float, float, float, float]:
+    """The unit quaternion of a rotation."""
+    q: Any = rotation.toQuaternion()  # GTSAM's stubs do not know Eigen's quaternion
+    return q.w(), q.x(), q.y(), q.z()
 
 
 def euler_jacobian(angles: FloatArray, order: EulerOrder = "zyx") -> FloatArray:

@@ -13,7 +13,7 @@ comparable; they are left out by name.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +23,14 @@ from gtsam import Pose3, Rot3
 from adjust.epochs.states import differences_of, moved_value, origin, value_motions
 from adjust.model.errors import listed
 from adjust.model.survey import FloatArray
+from adjust.spatial.rotation_forms import quaternion_wxyz
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
 from survey.solution.covariances import read_covariances
 from survey.solution.quantities import ARCSEC_PER_RAD
 
+_Kind = tuple[tuple[bool, ...], frozenset[str]]
+"""The motions that a free datum leaves open, and what carries it."""
 _TURNED = 1e-6
 _ROUNDS, _SETTLED = 20, 1e-13
 _SCALE = 6
@@ -104,7 +107,7 @@ def _world(solution: Mapping[str, Any]) -> Iterator[tuple[str, str, Sequence[flo
 
 def incomparable(data: Sequence[FreeDatum | None]) -> dict[int, str]:
     """Epochs whose world is in no common datum with that of the others, and why; None stands for a given datum."""
-    kinds: dict[Any, list[int]] = {}
+    kinds: dict[_Kind | None, list[int]] = {}
     for i, datum in enumerate(data):
         kinds.setdefault(None if datum is None else (_span(datum), frozenset(datum.carried_by)), []).append(i)
     if len(kinds) < 2:
@@ -117,7 +120,7 @@ def incomparable(data: Sequence[FreeDatum | None]) -> dict[int, str]:
     return out
 
 
-def _why(kind: Any, most: Any) -> str:
+def _why(kind: _Kind | None, most: _Kind | None) -> str:
     if kind is None or most is None:
         return "its datum is given" if kind is None else "its datum is free"
     if kind[0] != most[0]:
@@ -238,28 +241,5 @@ class _Epoch:
         x, sigmas = tuple((1e3 * origin(value)).tolist()), tuple((1e3 * own).tolist())
         if not isinstance(value, Pose3):
             return Moved(x, sigmas, None, None)
-        q: Any = value.rotation().toQuaternion()  # a class that the stubs leave out
         turned = ARCSEC_PER_RAD * (np.sqrt(np.clip(np.diag(cov)[:3], 0.0, None)) + gained[:3])
-        return Moved(x, sigmas, (q.w(), q.x(), q.y(), q.z()), tuple(turned.tolist()))
-
-
-def moved_numbers(numbers: Sequence[Any], moved: Mapping[str, Moved]) -> Iterator[Any]:
-    """Numbers of a record, those of the world in the common datum."""
-    for number in numbers:
-        path, _, axis = number.name.rpartition("/")
-        place = moved.get(path)
-        if place is None or axis not in ("x", "y", "z"):
-            yield number
-        else:
-            k = "xyz".index(axis)
-            yield replace(number, value=place.x_mm[k], sigma=place.sigmas_mm[k])
-
-
-def moved_turns(turns: Sequence[Any], moved: Mapping[str, Moved]) -> Iterator[Any]:
-    """Rotations of a record, those of the world in the common datum."""
-    for turn in turns:
-        place = moved.get(turn.name)
-        if place is None or place.wxyz is None or place.sigmas_arcsec is None:
-            yield turn
-        else:
-            yield replace(turn, wxyz=place.wxyz, sigmas_arcsec=place.sigmas_arcsec)
+        return Moved(x, sigmas, quaternion_wxyz(value.rotation()), tuple(turned.tolist()))

@@ -1,15 +1,16 @@
 """What a batch keeps of one folder: how it went, its key figures, and the numbers whose trends are watched."""
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from adjust.frames.unknowns import POSE_COMPONENTS
 from survey.batch.causes import CAUSES
 from survey.batch.common_datum import FreeDatum, Place, free_datum
 from survey.folder.shapes import NUMBER, POSITIVE, REAL, WHOLE, Each, Either, misfit
+from survey.solution.quantities import Status
 from survey.solution.verdict import misfits
 
 DONE, TEST_FAILED, FAILED = "done", "test_failed", "failed"
@@ -47,14 +48,15 @@ _RECORD = {
 }  # fmt: skip
 
 
-def _is_row(values: Any, n: int) -> bool:
-    return isinstance(values, list | tuple) and len(values) == n and all(map(NUMBER, values))
+def _is_row(values: object, n: int, of: Callable[[object], bool] = NUMBER) -> TypeGuard[Sequence[float]]:
+    return isinstance(values, list | tuple) and len(values) == n and all(map(of, values))
 
 
-def _is_turn(values: Any, n: int) -> bool:
+def _is_turn(values: object, n: int) -> bool:
     """Three sigmas, or a quaternion whose length is about 1."""
-    found = isinstance(values, list | tuple) and len(values) == n and all(map(NUMBER if n == 4 else REAL, values))
-    return found and (n == 3 or abs(sum(v * v for v in values) - 1.0) < 1e-3)
+    if n == 3:
+        return _is_row(values, n, REAL)
+    return _is_row(values, n) and abs(sum(v * v for v in values) - 1.0) < 1e-3
 
 
 @dataclass(frozen=True)
@@ -169,7 +171,7 @@ def _numbers(solution: Mapping[str, Any]) -> Iterator[Number]:
                     yield Number(f"{key}/{name}/{axis}", "mm", value, sigma)
 
 
-def _free(status: Any, components: tuple[str, ...]) -> tuple[str, ...]:
+def _free(status: Status, components: tuple[str, ...]) -> tuple[str, ...]:
     """Components that the observations alone determine: a prior would be the same in every epoch."""
     if isinstance(status, str):
         return components if status == "free" else ()

@@ -3,7 +3,7 @@
 import contextlib
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -102,7 +102,7 @@ def _bar(total: int, done: int, options: BatchOptions) -> Any:
                 file=sys.stderr, leave=False)  # fmt: skip
 
 
-def _counts(records: Any) -> str:
+def _counts(records: Iterable[Record]) -> str:
     states = [r.state for r in records]
     words = ((states.count(FAILED), "failed"), (states.count(TEST_FAILED), "test failed"))
     return ", ".join(f"{n} {word}" for n, word in words if n)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from adjust.model.errors import listed
+from adjust.model.survey import BoolArray
 from survey.batch.causes import CAUSES
 from survey.batch.control import Chart
 from survey.batch.record import DONE, FAILED, TEST_FAILED, Record
@@ -113,7 +114,7 @@ def overview_json(records: Sequence[Record], trends: Trends) -> str:
 def _chart(trends: Trends, c: Chart, records: Sequence[Record], names: Sequence[str]) -> dict[str, Any]:
     at = [names[int(i)] for i in c.series.epoch]
 
-    def named(mask: Any) -> list[str]:
+    def named(mask: BoolArray) -> list[str]:
         return [at[int(i)] for i in np.flatnonzero(mask)]
 
     runs = [{"kind": r.kind, "first": at[r.first], "last": at[r.last], "n": r.last - r.first + 1} for r in c.runs]
@@ -145,7 +146,7 @@ def folders_csv(records: Sequence[Record]) -> str:
     return out.getvalue()
 
 
-def _cell(value: Any) -> str:
+def _cell(value: float | None) -> str:
     return "" if value is None else f"{value:.12g}"
 
 

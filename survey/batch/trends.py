@@ -9,16 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import norm
-from survey.batch.common_datum import (
-    Moved,
-    in_common_datum,
-    incomparable,
-    moved_numbers,
-    moved_turns,
-    scale_is_open,
-)
+from survey.batch.common_datum import Moved, in_common_datum, incomparable, scale_is_open
 from survey.batch.control import WIDTH, Chart, Run, Series, chart
-from survey.batch.record import FAILED, Record
+from survey.batch.record import FAILED, Number, Record, Turn
 
 LEVEL = 0.05
 """Error probability of all charts together, for the tests of agreement and of slopes."""
@@ -120,10 +113,32 @@ def _without_world(record: Record) -> Record:
 
 def _moved(record: Record, moved: Mapping[str, Moved], without_lengths: bool) -> Record:
     """The record with its world moved; without lengths of bodies where the scale is open."""
-    numbers = moved_numbers(record.numbers, moved)
+    numbers = _moved_numbers(record.numbers, moved)
     if without_lengths:
         numbers = (n for n in numbers if n.unit != "mm" or n.name.startswith(_WORLD))
-    return replace(record, numbers=tuple(numbers), turns=tuple(moved_turns(record.turns, moved)))
+    return replace(record, numbers=tuple(numbers), turns=tuple(_moved_turns(record.turns, moved)))
+
+
+def _moved_numbers(numbers: Sequence[Number], moved: Mapping[str, Moved]) -> Iterator[Number]:
+    """Numbers of a record, those of the world in the common datum."""
+    for number in numbers:
+        path, _, axis = number.name.rpartition("/")
+        place = moved.get(path)
+        if place is None or axis not in ("x", "y", "z"):
+            yield number
+        else:
+            k = "xyz".index(axis)
+            yield replace(number, value=place.x_mm[k], sigma=place.sigmas_mm[k])
+
+
+def _moved_turns(turns: Sequence[Turn], moved: Mapping[str, Moved]) -> Iterator[Turn]:
+    """Rotations of a record, those of the world in the common datum."""
+    for turn in turns:
+        place = moved.get(turn.name)
+        if place is None or place.wxyz is None or place.sigmas_arcsec is None:
+            yield turn
+        else:
+            yield replace(turn, wxyz=place.wxyz, sigmas_arcsec=place.sigmas_arcsec)
 
 
 def _alarm(c: Chart) -> float:

@@ -3,7 +3,7 @@
 import argparse
 from typing import Any
 
-from survey.commands.common import DONE, require_project, show
+from survey.commands.common import DONE, Outcome, require_project, show
 from survey.commands.parser import project_folder
 
 NAMES = """\
@@ -64,6 +64,6 @@ def _include(arguments: argparse.Namespace) -> int:
     return _say(arguments, include_job(arguments.folder, arguments.names, arguments.reason, arguments.author))
 
 
-def _say(arguments: argparse.Namespace, outcome: Any) -> int:
+def _say(arguments: argparse.Namespace, outcome: Outcome) -> int:
     show(arguments, outcome, then=f"\nNext: labsurvey adjust {arguments.folder}")
     return DONE

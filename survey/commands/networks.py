@@ -1,6 +1,7 @@
 """The commands ``add``, ``remove``, ``pairs`` and ``trackers``."""
 
 import argparse
+import time
 from pathlib import Path
 from typing import Any
 
@@ -8,13 +9,15 @@ from survey.commands.common import DONE, begin_adjusting, is_set, print_json, re
 from survey.commands.excluding import NAMES
 from survey.commands.parser import project_folder
 
+_PAUSE_S = 0.3
+
 
 def declare_add(commands: Any, shaped: dict[str, Any]) -> None:
     """Add ``add`` to the commands."""
     parser = commands.add_parser(
         "add",
         help="add stations or observations to an adjusted project",
-        usage="labsurvey add lab lab/more   (labsurvey add FOLDER NEW [--out DIR])",
+        usage="labsurvey add lab lab/more   (labsurvey add FOLDER NEW [--out DIR] [--live])",
         description="NEW holds observations/*.csv and, for new stations, cameras, targets, points or tables, a "
         "survey.toml with them.\nFOLDER is adjusted with them from its last solution; on any error it stays as it was.",
         epilog="Next: open FOLDER/results/report.html",
@@ -23,6 +26,10 @@ def declare_add(commands: Any, shaped: dict[str, Any]) -> None:
     parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="adjusted project folder")
     parser.add_argument("new", type=Path, metavar="NEW", help="folder with what is new")
     parser.add_argument("--out", type=Path, metavar="DIR", help="leave FOLDER alone, write the grown project to DIR")
+    parser.add_argument(
+        "--live", action="store_true",
+        help="while NEW/observations/pairs.csv is written: say of each pair at once whether it fits; Ctrl-C adds all",
+    )  # fmt: skip
     parser.set_defaults(run=_add)
 
 
@@ -88,9 +95,25 @@ def _add(arguments: argparse.Namespace) -> int:
     require_project(arguments.folder, arguments.out)
     from survey.jobs.network import add_job
 
+    if arguments.live:
+        _tell_live(arguments)
     outcome = add_job(arguments.folder, arguments.new, out=arguments.out, progress=not is_set(arguments, "quiet"))
     show(arguments, outcome, outcome.outcome.paths.values())
     return tested(outcome.outcome.solution["summary"])
+
+
+def _tell_live(arguments: argparse.Namespace) -> None:
+    """Until Ctrl-C."""
+    from survey.jobs.growing import Growing
+
+    growing = Growing.begin(arguments.folder, arguments.new)
+    say(arguments, f"{growing.session.n_stations} stations; waiting for pairs, Ctrl-C adds them")
+    try:
+        while True:
+            say(arguments, *growing.look())
+            time.sleep(_PAUSE_S)
+    except KeyboardInterrupt:
+        say(arguments, "")
 
 
 def _remove(arguments: argparse.Namespace) -> int:

@@ -1,13 +1,13 @@
 """The example ``relay``: thirty stations through four rooms and a corridor, joined by measured pairs."""
 
 import itertools
-from typing import Any
 
 import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray
+from adjust.spatial.rotation_forms import quaternion_wxyz
 from survey.examples.truth import truth_json
 
 Files = dict[str, str]
@@ -99,8 +99,8 @@ def _correlated(cov: FloatArray, rng: np.random.Generator) -> FloatArray:
 
 
 def _motion(pose: Pose3) -> list[str]:
-    q: Any = pose.rotation().toQuaternion()  # a class that GTSAM's stubs leave out
-    return [f"{x:.10f}" for x in (q.w(), q.x(), q.y(), q.z())] + [f"{1e3 * x:.4f}" for x in pose.translation()]
+    turn = [f"{x:.10f}" for x in quaternion_wxyz(pose.rotation())]
+    return turn + [f"{1e3 * x:.4f}" for x in pose.translation()]
 
 
 def _toml(stations: list[str]) -> str:

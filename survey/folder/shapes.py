@@ -7,7 +7,7 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeGuard
 
 _LARGEST = 1e15
 
@@ -27,22 +27,22 @@ class Either:
     shapes: tuple[Any, ...]
 
 
-def is_number(value: Any) -> bool:
+def is_number(value: object) -> TypeGuard[float]:
     """Whether a value is a finite number of a size that can be meant."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _LARGEST
 
 
-def is_whole(value: Any) -> bool:
+def is_whole(value: object) -> TypeGuard[int]:
     """Whether a value is an integer of 64 bits."""
     return isinstance(value, int) and not isinstance(value, bool) and -(2**63) <= value < 2**63
 
 
-def at_least_0(value: Any) -> bool:
+def at_least_0(value: object) -> TypeGuard[float]:
     """Whether a value is a number, and not negative."""
     return is_number(value) and value >= 0.0
 
 
-def is_real(value: Any) -> bool:
+def is_real(value: object) -> TypeGuard[float]:
     """Whether a value is a number, or says that there is none (nan, inf)."""
     return is_number(value) or (isinstance(value, float) and not math.isfinite(value))
 
@@ -50,7 +50,7 @@ def is_real(value: Any) -> bool:
 NUMBER, WHOLE, POSITIVE, REAL = is_number, is_whole, at_least_0, is_real
 
 
-def misfit(value: Any, shape: Any, name: str = "") -> str | None:
+def misfit(value: object, shape: Any, name: str = "") -> str | None:
     """Where a value first differs from a shape and what is there, None where it fits.
 
     shape: a type, a function that says yes or no, None, [shape of each item], {key: shape} (a key with ``?`` behind it
@@ -70,7 +70,7 @@ def misfit(value: Any, shape: Any, name: str = "") -> str | None:
     return None if fits else _found(name, value)
 
 
-def _of_dictionary(value: Any, shape: Mapping[str, Any] | Each, name: str) -> str | None:
+def _of_dictionary(value: object, shape: Mapping[str, Any] | Each, name: str) -> str | None:
     if not isinstance(value, dict):
         return _found(name, value)
     if isinstance(shape, Each):
@@ -90,6 +90,6 @@ def _of_dictionary(value: Any, shape: Mapping[str, Any] | Each, name: str) -> st
     return None
 
 
-def _found(name: str, value: Any) -> str:
+def _found(name: str, value: object) -> str:
     shown = "a list" if isinstance(value, list) else "a table" if isinstance(value, dict) else repr(value)[:40]
     return f"{name}: {shown}" if name else shown

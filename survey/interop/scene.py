@@ -7,6 +7,7 @@ along -z) and stand where the first epoch has them.
 
 import json
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -75,7 +76,10 @@ def _ellipsoid(x: FloatArray, cov: FloatArray) -> FloatArray:
     return out
 
 
-def _enlarged(beacons: Any, targets: Any, cameras: Any, ellipsoids: Any) -> float:
+def _enlarged(
+    beacons: Mapping[str, FloatArray], targets: Mapping[str, FloatArray],
+    cameras: Mapping[str, tuple[Camera, Pose3, float]], ellipsoids: Mapping[str, tuple[FloatArray, FloatArray]],
+) -> float:  # fmt: skip
     """1, 2 or 5 times a power of ten that makes the middle ellipsoid a fiftieth of the scene."""
     if not ellipsoids:
         return 1.0

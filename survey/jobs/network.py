@@ -132,7 +132,7 @@ class AddOutcome:
     """A network that has grown. start: how the adjustment began, for people."""
 
     outcome: AdjustOutcome
-    added: dict[str, Any]
+    added: dict[str, list[str] | int]
     moved: tuple[Move, ...]
     before: Previous
     start: str
@@ -157,7 +157,7 @@ class AddOutcome:
         return "\n".join([*lines, "", self.outcome.text()])
 
 
-def _added(what: Any) -> str:
+def _added(what: list[str] | int) -> str:
     return listed(what, _MOST_NAMED) if isinstance(what, list) else str(what)
 
 
@@ -182,7 +182,7 @@ def add_job(folder: Path, new: Path, *, out: Path | None = None, progress: bool 
         else:
             complete(folder, place)
     outcome = outcome.at(out or folder)
-    added = {**merged.new_ids, **merged.rows}
+    added: dict[str, list[str] | int] = {**merged.new_ids, **merged.rows}
     moved = moves(before, adjustment, grown.options.sigmas)
     return AddOutcome(outcome, added, moved, before, start, time.perf_counter() - begin)
 

@@ -3,13 +3,14 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from markupsafe import Markup
 
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
+from adjust.model.survey import FloatArray
 from survey.folder.text import atomic_write, choice_hint, suggestion
 from survey.report import charts, picture
 from survey.report.drawing import ON_WHITE, standalone
@@ -79,7 +80,7 @@ def _histogram(adjustment: Adjustment, _scale: Scale, camera: str | None = None)
     return charts.histogram(_camera(adjustment, camera))
 
 
-def _view(adjustment: Adjustment, scale: Scale, make: Callable[[Any], picture.View]) -> Markup:
+def _view(adjustment: Adjustment, scale: Scale, make: Callable[[FloatArray], picture.View]) -> Markup:
     scene = scene_of(adjustment, scale)
     everything = scene.positions()
     if not len(everything):

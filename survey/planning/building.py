@@ -1,6 +1,6 @@
 """From a project and its plan to a survey with predicted observations, its values, and candidates."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,8 +10,9 @@ from adjust.design import Candidate, predict, with_candidates
 from adjust.graph.assembly import StartValues
 from adjust.lenses.models import MODELS, camera_constants, unit_rays
 from adjust.model.errors import SurveyError, listed
-from adjust.model.observations import Coordinates, Distance, ImageBlock, Pair, PositionRef, TableReading
+from adjust.model.observations import Coordinates, ImageBlock, PositionRef, TableReading
 from adjust.model.result import Adjustment, ParameterName
+from adjust.model.rewriting import Rewriting
 from adjust.model.survey import Camera, FloatArray, IntArray, Point, PointParameter, PoseParameter, Station, Survey
 from survey.planning.plan_file import ByHand, Measurements, Moment, Moments, NewPoint, Plan
 from survey.planning.plan_readings import Terrestrial, lengths_between, terrestrial_candidates, with_usual_sigmas
@@ -35,8 +36,8 @@ class Planned:
 
 
 @dataclass(eq=False)
-class _Values:
-    """Values as they are gathered."""
+class _Values(Rewriting):
+    """Values as they are gathered: of poses and points by a walk over a survey, which stays as it is."""
 
     lenses: dict[str, FloatArray] = field(default_factory=dict)
     poses: dict[ParameterName, Pose3] = field(default_factory=dict)
@@ -45,6 +46,16 @@ class _Values:
 
     def start(self) -> StartValues:
         return StartValues(self.lenses, self.poses, self.points, self.vectors)
+
+    def pose(self, name: ParameterName, given: PoseParameter) -> PoseParameter:
+        if given.value is not None:
+            self.poses[name] = given.value
+        return given
+
+    def point(self, name: ParameterName, given: PointParameter) -> PointParameter:
+        if given.value is not None:
+            self.points[name[1]] = np.asarray(given.value, dtype=float)
+        return given
 
 
 def build_plan(project: Project, plan: Plan, existing: Adjustment | None, notes: Sequence[str] = ()) -> Planned:
@@ -72,9 +83,9 @@ def build_plan(project: Project, plan: Plan, existing: Adjustment | None, notes:
         survey,
         image_blocks=base.image_blocks + seen,
         table_readings=base.table_readings + tuple(r for m in lit for r in _readings(m, project)),
-        distances=base.distances + tuple(Distance(d.name, d.a, d.b, 1.0, d.sigma) for d in plan.planned.distances),
+        distances=base.distances + plan.planned.distances,
         coordinates=base.coordinates + tuple(_coordinates(c.position, c.sigma) for c in plan.planned.coordinates),
-        pairs=base.pairs + tuple(Pair(p.name, p.a, p.b, Pose3(), p.cov) for p in plan.planned.pairs),
+        pairs=base.pairs + plan.planned.pairs,
     )
     extra = {p.name: p.x_in_world for p in plan.candidates.points}
     start = replace(start, points={**start.points, **extra})
@@ -99,12 +110,7 @@ def _gather(survey: Survey, existing: Adjustment | None) -> _Values:
                 f"[cameras.{c.camera_id}.lens] values, from a data sheet or an earlier calibration"
             )
         v.lenses[c.camera_id] = np.asarray(value, dtype=float)
-    for name, parameter in _poses(survey):
-        if parameter.value is not None:
-            v.poses[name] = parameter.value
-    for p in survey.points:
-        if p.x_in_world.value is not None:
-            v.points[p.point_id] = np.asarray(p.x_in_world.value, dtype=float)
+    v(survey)
     for co in survey.coordinates:
         for ref, x in zip(co.positions, co.values, strict=True):
             if ref.frame is None and ref.point_id is not None:
@@ -120,22 +126,6 @@ def _gather(survey: Survey, existing: Adjustment | None) -> _Values:
         elif name[0] != "lens":
             v.vectors[name] = np.asarray(e.value)
     return v
-
-
-def _poses(survey: Survey) -> Iterable[tuple[ParameterName, PoseParameter]]:
-    for c in survey.cameras:
-        yield ("station_from_camera", c.camera_id), c.station_from_camera
-    for s in survey.stations:
-        yield ("world_from_station", s.station_id), s.world_from_station
-        yield ("mount_from_station", s.station_id), s.mount_from_station
-        for e, p in s.epochs.items():
-            yield ("world_from_station", s.station_id, e), p
-    for t in survey.tables:
-        yield ("world_from_table", t.table_id), t.world_from_table
-    for x in survey.targets:
-        yield ("carrier_from_target", x.target_id), x.carrier_from_target
-        for e, p in x.epochs.items():
-            yield ("carrier_from_target", x.target_id, e), p
 
 
 def _check_new(plan: Plan, taken: set[str], moments: Sequence[Moment]) -> None:
@@ -326,11 +316,9 @@ def _candidates(
         out += [found] if found is not None else []
         blind += [new.name] if found is None else []
     c: Measurements = plan.candidates
-    out += [
-        Candidate(d.name, "distance", distances=(Distance(d.name, d.a, d.b, 1.0, d.sigma),)) for d in c.distances
-    ]
+    out += [Candidate(d.distance_id, "distance", distances=(d,)) for d in c.distances]
     out += [Candidate(p.name, "coordinates", coordinates=(_coordinates(p.position, p.sigma),)) for p in c.coordinates]
-    out += [Candidate(p.name, "pair", pairs=(Pair(p.name, p.a, p.b, Pose3(), p.cov),)) for p in c.pairs]
+    out += [Candidate(p.pair_id, "pair", pairs=(p,)) for p in c.pairs]
     return tuple(out + terrestrial_candidates(_terrestrial(c, whole, start, project))), blind
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.design import Seeing
-from adjust.model.observations import FrameRef, PositionRef
+from adjust.model.observations import Distance, Pair, PositionRef
 from adjust.model.survey import FloatArray, Survey
 from survey.folder.text import id_problem
 from survey.folder.units import to_si
@@ -74,32 +74,12 @@ class Moments:
 
 
 @dataclass(frozen=True)
-class PlannedDistance:
-    """A distance to be measured; sigma in m."""
-
-    name: str
-    a: PositionRef
-    b: PositionRef
-    sigma: float
-
-
-@dataclass(frozen=True)
 class PlannedPoint:
     """Coordinates to be measured; sigma in m."""
 
     name: str
     position: PositionRef
     sigma: float
-
-
-@dataclass(frozen=True, eq=False)
-class PlannedPair:
-    """A pair to be measured: a pose with cov (6, 6), or a rotation with (3, 3)."""
-
-    name: str
-    a: FrameRef
-    b: FrameRef
-    cov: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,12 +93,12 @@ class NewPoint:
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """Epochs and single observations, planned or possible."""
+    """Epochs and single observations, planned or possible; distances and pairs have no values of their own yet."""
 
     epochs: tuple[Moments, ...] = ()
-    distances: tuple[PlannedDistance, ...] = ()
+    distances: tuple[Distance, ...] = ()
     coordinates: tuple[PlannedPoint, ...] = ()
-    pairs: tuple[PlannedPair, ...] = ()
+    pairs: tuple[Pair, ...] = ()
     points: tuple[NewPoint, ...] = ()
     terrestrial: Terrestrial = field(default_factory=Terrestrial)
 
@@ -310,11 +290,11 @@ def _by_hand(node: Node, survey: Survey) -> ByHand:
     )  # fmt: skip
 
 
-def _distance(node: Node, names: Names) -> PlannedDistance:
+def _distance(node: Node, names: Names) -> Distance:
     node.allow("name", "from", "to", "sigma_mm")
     a, b = (_position(node, key, names) for key in ("from", "to"))
     name = node.text("name", f"{node.text('from')}-{node.text('to')}")
-    return PlannedDistance(name, a, b, float(to_si(node.number("sigma_mm", positive=True), "mm")))
+    return Distance(name, a, b, 1.0, float(to_si(node.number("sigma_mm", positive=True), "mm")))
 
 
 def _position(node: Node, key: str, names: Names) -> PositionRef:
@@ -336,7 +316,7 @@ def _coordinates(node: Node, names: Names) -> list[PlannedPoint]:
     return out
 
 
-def _pair(node: Node, names: Names) -> PlannedPair:
+def _pair(node: Node, names: Names) -> Pair:
     node.allow("name", "a", "b", "sigma_rotation_arcsec", "sigma_translation_mm")
     ends = []
     for key in ("a", "b"):
@@ -349,7 +329,7 @@ def _pair(node: Node, names: Names) -> PlannedPair:
     if node.has("sigma_translation_mm"):
         sigmas += [float(to_si(node.number("sigma_translation_mm", positive=True), "mm"))] * 3
     name = node.text("name", f"{node.text('a')}-{node.text('b')}")
-    return PlannedPair(name, ends[0], ends[1], np.diag(np.square(sigmas)))
+    return Pair(name, ends[0], ends[1], Pose3(), np.diag(np.square(sigmas)))
 
 
 def _new_point(node: Node, survey: Survey) -> NewPoint:

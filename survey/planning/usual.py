@@ -5,12 +5,13 @@ from dataclasses import replace
 from itertools import combinations, product
 
 import numpy as np
+from gtsam import Pose3
 
 from adjust.design import Seeing
-from adjust.model.observations import FrameRef, Reading
+from adjust.model.observations import FrameRef, Pair, Reading
 from adjust.model.result import Adjustment
 from adjust.model.survey import Camera, FloatArray, Survey, Target
-from survey.planning.plan_file import ByHand, Measurements, Moment, Moments, Plan, PlannedPair
+from survey.planning.plan_file import ByHand, Measurements, Moment, Moments, Plan
 from survey.planning.plan_readings import Terrestrial
 from survey.project import Project
 from survey.solution.frames import AdjustedFrames
@@ -99,7 +100,7 @@ def _sights(survey: Survey) -> Iterator[Reading]:
                     point.point_id)), sigma=sigma)  # fmt: skip
 
 
-def _pairs(survey: Survey) -> Iterator[PlannedPair]:
+def _pairs(survey: Survey) -> Iterator[Pair]:
     """Between stations that stay, each of which has pairs already, with the covariance of the middle one of them."""
     ends = {frozenset((p.a.frame_id, p.b.frame_id)) for p in survey.pairs}
     fixed = {s.station_id for s in survey.stations if s.motion == "fixed"}
@@ -107,4 +108,4 @@ def _pairs(survey: Survey) -> Iterator[PlannedPair]:
     usual = sorted(survey.pairs, key=lambda p: float(np.trace(p.cov)))
     for a, b in combinations(names, 2):
         if frozenset((a, b)) not in ends:
-            yield PlannedPair(f"{a}-{b}", FrameRef("station", a), FrameRef("station", b), usual[len(usual) // 2].cov)
+            yield Pair(f"{a}-{b}", FrameRef("station", a), FrameRef("station", b), Pose3(), usual[len(usual) // 2].cov)

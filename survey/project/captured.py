@@ -22,17 +22,17 @@ CAPTURE_FOLDER = "capture"
 _SIZE = 2**16  # px; larger sensors there are none
 
 
-def is_size(value: Any) -> bool:
+def is_size(value: object) -> bool:
     """Whether a value can be the width or height of an image."""
     return WHOLE(value) and 0 < value < _SIZE
 
 
-def is_id(value: Any) -> bool:
+def is_id(value: object) -> bool:
     """Whether a value can be an id."""
     return isinstance(value, str) and id_problem(value) is None
 
 
-def _is_uv(value: Any) -> bool:
+def _is_uv(value: object) -> bool:
     return isinstance(value, list) and len(value) == 2 and all(map(NUMBER, value))
 
 

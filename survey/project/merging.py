@@ -68,17 +68,22 @@ def _where(lines: Sequence[Origin], line: int) -> str:
 
 def merge(folder: Path, new: Path, place: Path) -> Merged:
     """Write the merged survey.toml and observations into ``place``; raises SurveyError for what cannot be added."""
+    check_new(folder, new)
     merged = Merged(folder, new, place)
-    if not new.is_dir():
-        raise SurveyError(f"{new}: no such folder; give a folder with observations/ and, for new stations, survey.toml")
-    if new.resolve() == folder.resolve():
-        raise SurveyError(f"{new}: is the project itself; give the folder that holds what is new")
     _merge_definition(merged)
     _merge_tables(merged)
     _take_images(merged)
     if not merged.rows and not any(merged.new_ids.values()):
         raise SurveyError(f"{new}: nothing to add; put tables into {new}/{OBSERVATIONS_FOLDER}, such as pairs.csv")
     return merged
+
+
+def check_new(folder: Path, new: Path) -> None:
+    """Raise SurveyError where ``new`` is no folder of its own."""
+    if not new.is_dir():
+        raise SurveyError(f"{new}: no such folder; give a folder with observations/ and, for new stations, survey.toml")
+    if new.resolve() == folder.resolve():
+        raise SurveyError(f"{new}: is the project itself; give the folder that holds what is new")
 
 
 def _merge_definition(merged: Merged) -> None:

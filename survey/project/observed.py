@@ -11,15 +11,20 @@ from adjust.model.observations import (
     CoordinateDifferences,
     Coordinates,
     FrameRef,
+    ImageBlock,
+    Observation,
     PositionRef,
     ReadingCovariance,
     position_text,
 )
+from adjust.model.result import ObservationResidual
 from adjust.model.survey import BoolArray, IntArray, Survey
 from survey.folder.text import suggestion
 from survey.project.exclusions import WHAT, Name, name_problem
 from survey.project.project import SpotBlock
 
+Ref = PositionRef | FrameRef | str
+"""What an observation names: a position, a frame, an epoch."""
 _READINGS: Mapping[str, tuple[str, Callable[[Any], str]]] = {  # table: field of the survey, id of an observation
     "table_angles": ("table_readings", lambda r: f"{r.table_id}/{r.epoch_id}"),
     "pairs": ("pairs", lambda p: p.pair_id),
@@ -115,7 +120,7 @@ class Observed:
         if mask.any():
             found.images[i] = found.images[i] | mask if i in found.images else mask
 
-    def _blocks_where(self, found: Hits, wanted: Callable[[Any], bool]) -> None:
+    def _blocks_where(self, found: Hits, wanted: Callable[[ImageBlock], bool]) -> None:
         for i, block in enumerate(self.survey.image_blocks):
             if wanted(block):
                 self._mask(found, i, np.ones(len(block.uv), dtype=np.bool_))
@@ -180,7 +185,7 @@ class Observed:
             elif spot in block.spot_ids:
                 found.spots[i] = {spot}
 
-    def _others_where(self, found: Hits, wanted: Callable[[Any], bool]) -> None:
+    def _others_where(self, found: Hits, wanted: Callable[[Ref], bool]) -> None:
         for name in _FIELDS:
             for i, item in enumerate(getattr(self.survey, name)):
                 rows = _rows(item)
@@ -243,7 +248,7 @@ class Observed:
         }
         return list(dict.fromkeys(found[what]))
 
-    def _names_in(self, block: Any) -> list[str]:
+    def _names_in(self, block: ImageBlock) -> list[str]:
         if block.target_id is None:
             return [self.survey.points[int(i)].point_id for i in block.point_idx]
         points = next(t.point_ids for t in self.survey.targets if t.target_id == block.target_id)
@@ -322,20 +327,20 @@ class Observed:
         return None
 
 
-def _frame(ref: Any) -> FrameRef:
+def _frame(ref: Ref) -> FrameRef:
     """The frame of a reference; the world for what is none."""
     if isinstance(ref, PositionRef):
         return ref.frame or FrameRef("world")
     return ref if isinstance(ref, FrameRef) else FrameRef("world")
 
 
-def name_of_residual(residual: Any) -> str:
+def name_of_residual(residual: ObservationResidual) -> str:
     """The name of an observation of ``Adjustment.other_residuals``: ``table:id``."""
     whole = residual.kind in ("table", "coordinates", "surface")  # the others carry their id in front of what they join
     return f"{_KINDS.get(residual.kind, residual.kind)}:{'/'.join(residual.ids) if whole else residual.ids[0]}"
 
 
-def _rows(item: Any) -> list[list[Any]]:
+def _rows(item: Observation) -> list[list[Ref]]:
     """The positions and frames that each row of an observation names, and its epoch; one row but for sets."""
     if isinstance(item, Coordinates):
         return [[ref] for ref in item.positions]
@@ -386,21 +391,22 @@ def without(
     return less, tuple(spot for spot in kept if spot.spot_ids)
 
 
-def _parted(item: Any, rows: set[int] | None) -> tuple[Any, ...]:
+def _parted(item: Observation, rows: set[int] | None) -> tuple[Observation, ...]:
     """A set as one that is used and one that is not, which has these rows."""
-    if not rows or not item.used:
+    if not rows or not item.used or not isinstance(item, Coordinates | CoordinateDifferences):
         return (item,)
-    n = len(item.values)
-    out = np.isin(np.arange(n), sorted(rows))
-    return tuple(_subset(replace(item, used=used), np.flatnonzero(mask))
+    out = np.isin(np.arange(len(item.values)), sorted(rows))
+    return tuple(_subset(item, np.flatnonzero(mask), used)
                  for used, mask in ((True, ~out), (False, out)) if mask.any())  # fmt: skip
 
 
-def _subset(item: Any, rows: IntArray) -> Any:
+def _subset(item: Coordinates | CoordinateDifferences, rows: IntArray, used: bool) -> Observation:
     axes = (3 * rows[:, None] + np.arange(3)).ravel()
-    names = ("positions",) if isinstance(item, Coordinates) else ("at", "to")
-    refs = {name: tuple(getattr(item, name)[i] for i in rows) for name in names}
-    return replace(item, values=item.values[rows], cov=item.cov[np.ix_(axes, axes)], **refs)
+    values, cov = item.values[rows], item.cov[np.ix_(axes, axes)]
+    if isinstance(item, Coordinates):
+        return replace(item, positions=tuple(item.positions[i] for i in rows), values=values, cov=cov, used=used)
+    at, to = (tuple(refs[i] for i in rows) for refs in (item.at, item.to))
+    return replace(item, at=at, to=to, values=values, cov=cov, used=used)
 
 
 def _fewer(spot: SpotBlock, ids: set[str]) -> SpotBlock:

@@ -101,12 +101,16 @@ def key_of(component: str, unit: str) -> str:
     return f"{component}_{unit}" if unit else component
 
 
+Status = str | dict[str, str]
+"""A word for all components, or one for each."""
+
+
 def sigmas_of(estimate: Estimate, scale: Scale) -> FloatArray:
     """Sigmas (n,) in the tangent, units inside."""
     return scale.factor * np.sqrt(np.clip(np.diag(estimate.cov), 0.0, None))
 
 
-def status_of(estimate: Estimate) -> Any:
+def status_of(estimate: Estimate) -> Status:
     """One word where all components share it, else a word per component."""
     if len(set(estimate.status)) == 1:
         return estimate.status[0]
@@ -158,7 +162,7 @@ class PoseColumns:
 
     rows: dict[ParameterName, int]
     columns: dict[str, FloatArray]
-    status: list[Any]
+    status: list[Status]
 
     def entry(self, name: ParameterName) -> dict[str, Any]:
         """What is said of one."""

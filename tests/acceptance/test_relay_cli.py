@@ -252,6 +252,76 @@ def test_a_free_network_grows_too(lab, tmp_path, capsys):
     assert found["moved"][0]["moved_mm"] < 2.0
 
 
+def test_pairs_are_told_while_they_are_measured(lab, monkeypatch, capsys):
+    more, rows = lab / "more", _rows(lab / "more")
+    table = more / "observations" / "pairs.csv"
+    _write(more, rows)
+    head, *lines = table.read_text().splitlines(keepends=True)
+    ids = [row["pair_id"] for row in rows]
+    turned = _turned(rows[1], 0.5)
+    wrong = ",".join(str(turned[name]) for name in head.strip().split(",")).replace(ids[1], "wrong", 1) + "\n"
+    floating = ids.index("E2-E3")
+    assert ids[:2] == ["K10-E1", "K09-E1"]
+    steps = [  # what stands in the table, and how the lines begin that are told of it
+        (lines[:1], ["K10-E1: K10 - E1; E1 is placed; v'Pv 0.0 of 6"]),
+        ([lines[0], wrong[:90]], []),  # a row that is being written
+        ([lines[0], wrong], ["wrong: K09 - E1; v'Pv"]),
+        ([lines[0], lines[floating]], ["taken out: wrong", "! E2-E3: no pair with a translation ties E2, E3"]),
+        ([lines[0], lines[floating]], []),  # said once
+        ([lines[0], "\n", "short,K01\n"], [f"! {table}:4: "]),
+        (lines, [f"{name}: " for name in ids[1:]]),
+    ]  # fmt: skip
+    said, end = list[str](), iter(steps)
+
+    def measure(_: float) -> None:
+        said.append(capsys.readouterr().err)
+        step = next(end, None)
+        if step is None:
+            raise KeyboardInterrupt
+        table.write_text(head + "".join(step[0]))
+
+    monkeypatch.setattr("survey.commands.networks.time.sleep", measure)
+    table.write_text(head)
+    assert main(["add", str(lab), str(more), "--live", "--json"]) == 0
+    added = json.loads(capsys.readouterr().out)
+    assert added["added"] == {"stations": ["E1", "E2", "E3"], "pairs": 6}
+    assert said[0] == "30 stations; waiting for pairs, Ctrl-C adds them\n"
+    for (_, expected), text in zip(steps, said[1:], strict=True):
+        found = text.splitlines()
+        assert len(found) == len(expected), text
+        for begin in expected:
+            assert any(line.startswith(begin) for line in found), (begin, text)
+    assert ["DOES NOT FIT" in text for text in said[1:]] == [False, False, True, False, False, False, False]
+    assert all("; moved: " in line for line in said[-1].splitlines() if "is placed" not in line)
+
+
+@pytest.mark.parametrize("fault", ["free network", "no folder", "held", "twice"])
+def test_what_cannot_be_told_live_is_said(lab, fault, monkeypatch, capsys):
+    def stop(_: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("survey.commands.networks.time.sleep", stop)
+    more, message = lab / "more", ""
+    if fault == "free network":
+        text = (lab / "survey.toml").read_text().replace('world_from_station = { treatment = "held" }', "")
+        (lab / "survey.toml").write_text(text + '\n[datum]\nkind = "inner"\n')
+        assert main(["adjust", str(lab), "--quiet"]) == 0
+        message = f"error: {lab}: sessions need a station that is held or has a prior"
+    elif fault == "no folder":
+        more, message = lab / "none", f"error: {lab / 'none'}: no such folder"
+    elif fault == "held":
+        held = '[stations.E1]\nworld_from_station = { treatment = "held" }\n[stations.E2]\n[stations.E3]\n'
+        (more / "survey.toml").write_text(held)
+        message = f"! {more}/survey.toml: stations.E1: is not placed by pairs alone"
+    elif fault == "twice":
+        (more / "survey.toml").write_text("[stations.E1]\n[stations.E2]\n[stations.E3]\n[stations.K04]\n")
+        message = f"! {more}/survey.toml: stations.K04: stands already in {lab}"
+    before = _files(lab)
+    main(["add", str(lab), str(more), "--live"])
+    assert message in capsys.readouterr().err
+    assert _files(lab) == before or fault == "held"
+
+
 def _faulty(lab, fault):
     more = lab / "more"
     rows = _rows(more)

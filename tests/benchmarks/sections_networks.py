@@ -67,7 +67,8 @@ def additions(session: Session) -> None:
         [str(i * step), f"{np.median(p):.2f}", f"{np.quantile(p, 0.95):.2f}", f"{p.max():.1f}"]
         for i, p in enumerate(parts)
     ]
-    session.say("A corridor, two stations a row, every one with its pairs to those before.", "")
+    what = "A corridor, two stations a row, every one with its pairs to those before"
+    session.say(f"{what}, as `labsurvey add --live` takes them.", "")
     session.say(f"Milliseconds of processor time an addition, of each the median of {len(runs)} runs:", "")
     session.say(tables.table(("stations before", "median", "95 %", "worst"), table), "")
     longer = np.median(parts[-1]) / np.median(parts[1])

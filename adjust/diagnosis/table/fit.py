@@ -5,7 +5,7 @@ Every view says ``inner_from_outer = inner_from_mount * mount_from_table(angles)
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeVar, cast
 
 import numpy as np
 
@@ -19,8 +19,9 @@ from adjust.start.closed_forms.hand_eye import relative_motions, solve_ax_xb, so
 _MEDIAN_6 = 5.348  # of chi-square with six degrees of freedom
 _BOUND = 30.0  # weights fall beyond this many times the median
 _LEVER_M = 1.0
-Known = dict[tuple[Any, ...], Any]
+Known = dict[tuple[object, ...], object]
 """Poses that fits began with, by the function and the numbers that they follow from."""
+_Found = TypeVar("_Found")
 _GEOMETRY_SIGMAS = np.array([np.radians(1.0), 0.02])  # weak: only so that no direction is wholly open
 
 
@@ -160,11 +161,11 @@ def _start(
     return np.array([X[i] for i in range(len(X))]), np.array([Z[p] for p in range(n_places)])
 
 
-def _once(known: Known, function: Callable[..., Any], *given: FloatArray) -> Any:
+def _once(known: Known, function: Callable[..., _Found], *given: FloatArray) -> _Found:
     key = (function, *(g.tobytes() for g in given))
     if key not in known:
         known[key] = function(*given)
-    return known[key]
+    return cast(_Found, known[key])
 
 
 def _mean(offers: FloatArray) -> FloatArray:

@@ -7,7 +7,6 @@ and shifts of both sides must be those of one rigid body. Inverting both sides o
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from gtsam import Pose3, Rot3
@@ -20,7 +19,7 @@ from adjust.diagnosis.units.conventions import Scope, shrinking
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.spatial.rigid_motions import Motions
-from adjust.spatial.rotation_forms import euler_from_matrix, matrix_from_euler
+from adjust.spatial.rotation_forms import euler_from_matrix, matrix_from_euler, quaternion_wxyz
 
 Motion = Pose3 | Rot3
 _CLEARLY = 3.0
@@ -63,14 +62,14 @@ def _matrix(m: Motion) -> FloatArray:
 
 def _last_first(m: Motion) -> Motion:
     """The four numbers stood as x y z w in the columns w x y z."""
-    q: Any = (m.rotation() if isinstance(m, Pose3) else m).toQuaternion()
-    return _rotated(m, Rot3.Quaternion(q.z(), q.w(), q.x(), q.y()).matrix())
+    w, x, y, z = quaternion_wxyz(m.rotation() if isinstance(m, Pose3) else m)
+    return _rotated(m, Rot3.Quaternion(z, w, x, y).matrix())
 
 
 def _first_last(m: Motion) -> Motion:
     """The four numbers stood as w x y z in columns named x y z w."""
-    q: Any = (m.rotation() if isinstance(m, Pose3) else m).toQuaternion()
-    return _rotated(m, Rot3.Quaternion(q.x(), q.y(), q.z(), q.w()).matrix())
+    w, x, y, z = quaternion_wxyz(m.rotation() if isinstance(m, Pose3) else m)
+    return _rotated(m, Rot3.Quaternion(x, y, z, w).matrix())
 
 
 def _turned_back(m: Motion) -> Motion:

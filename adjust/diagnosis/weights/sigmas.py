@@ -13,6 +13,7 @@ import numpy as np
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, ScaleKey
 from adjust.model.errors import listed
+from adjust.model.observations import Distance, Level, OnSurface, Reading
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray
 from adjust.statistics.scaling import scaled_survey
@@ -27,6 +28,7 @@ _TAILS = 3.0
 """How much heavier than normal the residuals' largest fifth may be for one factor to explain all of them."""
 _LAST = 2.0
 """Evidence at most: sigmas that are large enough fit anything, so what else there is to try is tried first."""
+_One = Distance | Level | OnSurface | Reading
 _KINDS = ("readings", "distances", "levels", "on_surfaces")
 
 
@@ -81,7 +83,7 @@ def odd_sigmas(case: Case) -> Iterator[Hypothesis]:
     """Observations whose sigma is a hundred times another's of the same kind and group, or a hundredth."""
     for field in _KINDS:
         observed = [o for o in getattr(case.survey, field) if o.used]
-        by_kind: dict[tuple[str, str], list[Any]] = {}
+        by_kind: dict[tuple[str, str], list[_One]] = {}
         for o in observed:
             by_kind.setdefault((getattr(o, "kind", field), o.group), []).append(o)
         for (kind, group), members in by_kind.items():
@@ -91,7 +93,7 @@ def odd_sigmas(case: Case) -> Iterator[Hypothesis]:
                 yield _with_usual(case, field, kind, group, odd, usual)
 
 
-def _with_usual(case: Case, field: str, kind: str, group: str, odd: list[Any], usual: float) -> Hypothesis:
+def _with_usual(case: Case, field: str, kind: str, group: str, odd: list[_One], usual: float) -> Hypothesis:
     ids = [_id(o) for o in odd]
     chosen = {id(o) for o in odd}
     every = getattr(case.survey, field)
@@ -105,6 +107,6 @@ def _with_usual(case: Case, field: str, kind: str, group: str, odd: list[Any], u
     )  # fmt: skip
 
 
-def _id(o: Any) -> str:
+def _id(o: _One) -> str:
     names = ("reading_id", "distance_id", "level_id", "surface_id")
     return str(next(getattr(o, n) for n in names if hasattr(o, n)))

@@ -5,7 +5,7 @@ Coordinates are taken along the zero of bearings, counter-clockwise of it, and u
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import TypeVar, cast
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from adjust.spatial.vertical import plumb
 
 Node = str
 """A world point's id, or the text of a position in a frame that is known."""
-_Value = TypeVar("_Value", bound=Any)
+_Value = TypeVar("_Value", float, FloatArray)
 _Place = TypeVar("_Place")
 _Grown = TypeVar("_Grown")
 
@@ -91,7 +91,7 @@ def spread(steps: Sequence[tuple[Node, Node, _Value]], known: Mapping[Node, _Val
     for a, b, step in steps:
         near.setdefault(a, []).append((b, step))
         near.setdefault(b, []).append((a, -step))
-    out: dict[Node, Any] = dict(known)
+    out = dict(known)
     front = list(out)
     while front:
         ways: dict[Node, list[_Value]] = {}
@@ -99,7 +99,7 @@ def spread(steps: Sequence[tuple[Node, Node, _Value]], known: Mapping[Node, _Val
             for b, step in near.get(a, ()):
                 if b not in out:
                     ways.setdefault(b, []).append(out[a] + step)
-        out |= {b: np.median(values, axis=0) for b, values in ways.items()}
+        out |= {b: cast(_Value, np.median(values, axis=0)) for b, values in ways.items()}
         front = list(ways)
     return out
 

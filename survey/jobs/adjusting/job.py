@@ -150,13 +150,13 @@ def kept_run(folder: Path, place: Path, project: Project, outcome: AdjustOutcome
     return record_run(folder, place, outcome.adjustment, outcome.run, outcome.solution, who)
 
 
-def command_line(command: str, folder: Path, *words: str | Path, **flags: Any) -> str:
+def command_line(command: str, folder: Path, *words: str | Path, **flags: object) -> str:
     """A command as it can be given again, with its options; folders by their names, as results may be moved."""
     said = [f"--{name}" if value is True else f"--{name} {_shown(value)}" for name, value in flags.items() if value]
     return " ".join(["labsurvey", command, _shown(folder), *map(_shown, words), *said])
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     return shlex.quote(_plain_name(value) if isinstance(value, Path) else
                        str(value).encode("utf-8", "surrogateescape").decode("utf-8", "replace"))  # fmt: skip
 

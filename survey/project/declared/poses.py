@@ -12,6 +12,7 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model.survey import FloatArray, PointParameter, PoseParameter, Treatment
+from adjust.spatial import rotation_forms
 from survey.folder.units import to_si
 from survey.project.declared.declarations import keys_of
 from survey.project.declared.node import Node
@@ -43,8 +44,7 @@ def rotation_from_quaternion(wxyz: FloatArray) -> Rot3 | None:
 
 def quaternion_wxyz(rotation: Rot3) -> list[float]:
     """The unit quaternion of a rotation, w first, to 1e-15: the way there and back through a matrix keeps no more."""
-    q: Any = rotation.toQuaternion()  # GTSAM's stubs do not know Eigen's quaternion
-    return [round(part, 15) for part in (q.w(), q.x(), q.y(), q.z())]
+    return [round(part, 15) for part in rotation_forms.quaternion_wxyz(rotation)]
 
 
 def rotation_from_euler(xyz: FloatArray) -> Rot3:

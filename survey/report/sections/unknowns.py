@@ -26,6 +26,7 @@ from survey.report.markup import (
     value_text,
     with_sigma,
 )
+from survey.solution.quantities import Status
 from survey.solution.records import having, keys_of
 
 _MOST_ROWS, _MOST_CAMERAS, _MOST_BLOCKS = 250, 40, 100
@@ -41,7 +42,7 @@ _POSE_NOTE = (
 )
 
 
-def status_pill(status: Any) -> Markup:
+def status_pill(status: Status) -> Markup:
     """The status of a component, or of a whole parameter."""
     if isinstance(status, dict):
         return joined((joined((k, status_pill(v)), " ") for k, v in status.items()), " ")
@@ -351,5 +352,5 @@ def instruments(c: Context) -> Markup:
     return section("instruments", "Instruments and surfaces", joined(parts))
 
 
-def _vector(what: str, components: list[Any]) -> Markup:
+def _vector(what: str, components: list[float | None]) -> Markup:
     return note(f"{what}: ({', '.join(fixed(x, 6) for x in components)})")
