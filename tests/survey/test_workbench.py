@@ -426,10 +426,10 @@ def test_a_remedy_is_carried_out_by_one_call_and_taken_back_by_undo_unless_other
 
 def test_what_cannot_be_adjusted_has_its_remedies_too(mine, monkeypatch):
     """The diagnosis of an adjustment that failed; what mends it is taken back to where there was no solution."""
-    import survey.workbench.resident as resident
+    import survey.jobs.adjusting.steps as steps
 
     epoch = read(mine).survey.image_blocks[0].epoch_id
-    real = resident.adjust_project
+    real = steps.adjust_project
     cause = Hypothesis("moved", "epoch moved", "leave it out", Place("epoch", (epoch,)), read(mine).survey,
                        (LeaveOut((f"epoch:{epoch}",)),))  # fmt: skip
 
@@ -439,7 +439,7 @@ def test_what_cannot_be_adjusted_has_its_remedies_too(mine, monkeypatch):
             raise DiagnosedError("nothing fits", Diagnosis(candidates, ("moved",), Misfit(1.0, 1.0, 0, 1)))
         return real(project, *given, **named)
 
-    monkeypatch.setattr(resident, "adjust_project", failing)
+    monkeypatch.setattr(steps, "adjust_project", failing)
     bench = Workbench(mine)
     with pytest.raises(SurveyError):
         bench.adjust()
