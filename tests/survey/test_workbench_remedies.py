@@ -107,7 +107,7 @@ def test_no_kind_of_change_is_missing() -> None:
 def test_one_click_mends_and_another_takes_it_back(page: Page, folder: Path, number: int) -> None:
     p, (_, name, stands) = page.page, EDITS[number - 1]
     before = files_of(folder)
-    known = page.facts().split("unsaved")[0]
+    known = page.facts().split("unsaved")[0].strip()
     page.done(lambda: p.locator("#left .remedy button").nth(number - 1).click())
     assert p.inner_text("#message").startswith("Done in ")
     after = files_of(folder)
@@ -117,5 +117,5 @@ def test_one_click_mends_and_another_takes_it_back(page: Page, folder: Path, num
     page.done(lambda: p.locator("#undo").click())
     assert files_of(folder) == before
     assert in_force(read_exclusions(folder / "observations")[0]) == {}
-    assert page.facts().split("unsaved")[0] == known
+    assert page.facts().split("unsaved")[0].strip() == known
     assert [text for text in page.complaints if "404" not in text] == []  # there are no pictures
