@@ -236,7 +236,7 @@ def _until(page: Any, condition: str, seconds: float = 30.0) -> None:
 
 def every(folder: Path, out: Path) -> None:
     """Every view and region as VIEW-SCHEME-WIDTH-LANGUAGE.png."""
-    from survey.report import report_html
+    from survey.report.page import report_html
 
     out.mkdir(parents=True, exist_ok=True)
     bench, token = Workbench(folder), new_token()

@@ -11,8 +11,8 @@ from adjust.native.parallel import Beside
 from survey.folder.replacing import changing, replace_parts
 from survey.project import atomic_write
 from survey.project.project import RESULTS
-from survey.report import report_html, summary_text
-from survey.report.page import report_pdf
+from survey.report.page import report_html, report_pdf
+from survey.report.terminal import summary_text
 from survey.solution.covariances import covariance_npz
 from survey.solution.dictionary import RunInfo, solution_dict
 from survey.solution.records import solution_json

@@ -6,7 +6,8 @@ from urllib.parse import quote
 ANCHORED = ("image", "obs", "point", "reading", "param", "camera", "epoch", "target", "group", "station", "table")
 """Kinds of things that have a place."""
 _IN_MESSAGE = re.compile(r"camera '?(?P<camera>[^\s',]+)'?(?: at|,) epoch '?(?P<epoch>[^\s',:]+)|"
-                         r"table (?P<table>\S+), epoch (?P<read>[^\s,:]+)")  # fmt: skip
+                         r"table (?P<table>\S+), epoch (?P<read>[^\s,:]+)|"
+                         r"images/(?P<image>[^\s/:]+/[^\s/:,.]+)")  # fmt: skip
 
 
 def anchor(kind: str, text: str) -> str:
@@ -18,5 +19,5 @@ def anchors_in(text: str) -> list[str]:
     """The places that a message of an adjustment names."""
     return [
         anchor("reading", f"table_angles:{m['table']}/{m['read']}") if m["table"] else
-        anchor("image", f"{m['camera']}/{m['epoch']}") for m in _IN_MESSAGE.finditer(text)
+        anchor("image", m["image"] or f"{m['camera']}/{m['epoch']}") for m in _IN_MESSAGE.finditer(text)
     ]  # fmt: skip

@@ -4,14 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from adjust.diagnosis.ranking import Candidate
 from adjust.model.errors import SurveyError
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write, decode, read_bytes
 from survey.jobs.adjusting.edits import changed_files, kept_name, left_out
-from survey.jobs.adjusting.trying import chosen_of, in_use, reason_of
 from survey.jobs.detecting import author_name
 from survey.jobs.excluding import FILE, included_rows, new_rows
 from survey.project.declared.editing import with_datum, with_sigma_scale, with_treatment
@@ -23,6 +21,9 @@ from survey.report.language import message
 from survey.solution.earlier.changes import Changes
 from survey.workbench.resident import Resident, Watch
 from survey.workbench.situation import CancelledError, ChangedError, Situation, Step, signature_of
+
+if TYPE_CHECKING:
+    from adjust.diagnosis.ranking import Candidate
 
 _NONE: Mapping[str, str] = MappingProxyType({})
 
@@ -127,7 +128,7 @@ class Deciding(Resident):
         return decode(self.folder / name, read_bytes(self.folder / name)[0])
 
     @property
-    def remedies(self) -> tuple[Candidate, ...]:
+    def remedies(self) -> "tuple[Candidate, ...]":
         """What the diagnosis of the last adjustment, failed or not, says would mend it, the best first."""
         return () if self.diagnosis is None else self.diagnosis.candidates
 
@@ -137,6 +138,8 @@ class Deciding(Resident):
         A file that is changed is kept as it was below ``kept/`` too. Otherwise as :meth:`exclude`; raises SurveyError
         where there is no such candidate, or where only a person can do it.
         """
+        from survey.jobs.adjusting.trying import chosen_of, in_use, reason_of
+
         with self._lock:
             chosen = chosen_of(self.folder, [c.hypothesis for c in self.remedies], number)
             texts = {file.name: file.after for file in changed_files(self.folder, chosen)}

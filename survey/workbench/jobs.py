@@ -8,18 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gtsam import Pose3
 
-from adjust.graph.assembly import StartValues
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, PoseParameter
 from survey.folder.plain import plain
 from survey.folder.replacing import changing, replace_parts
-from survey.jobs.adjusting.job import AdjustOutcome, Clock, command_line, kept_run, made, run_info
 from survey.project.project import DEFINITION_FILE, RESULTS
 from survey.report.language import text_said
-from survey.report.scene import scene_values
-from survey.solution.dictionary import RunInfo
 from survey.solution.earlier.runs import remove_empty
 from survey.solution.frames import AdjustedFrames
 from survey.solution.quantities import scale_of
@@ -28,11 +24,14 @@ from survey.workbench.pages.beginning import Drawn, Told
 from survey.workbench.places import Places
 
 if TYPE_CHECKING:  # detection brings in OpenCV, planning much else
+    from adjust.graph.assembly import StartValues
     from adjust.navigation.model import Beacons
     from survey.detection import ImageReport
+    from survey.jobs.adjusting.job import AdjustOutcome
     from survey.jobs.cross_validation import CrossValidation
     from survey.planning.job import PlanRequest
     from survey.planning.summary import PlanningOutcome
+    from survey.solution.dictionary import RunInfo
 
 _MOST_LINES = 300
 
@@ -40,8 +39,10 @@ _MOST_LINES = 300
 class Jobs(Deciding):
     """A project folder with its other jobs; each is the command of the same name, and raises as that does."""
 
-    def save(self) -> AdjustOutcome:
+    def save(self) -> "AdjustOutcome":
         """Write ``results`` as ``labsurvey adjust`` does, and a run beside the others. Raises as :meth:`exclude`."""
+        from survey.jobs.adjusting.job import Clock, command_line, kept_run, made
+
         with self._lock:
             self._check(None)
             clock = Clock({"adjust": self.situation.seconds})
@@ -55,8 +56,10 @@ class Jobs(Deciding):
             self.n_unsaved = 0
             return outcome.at(self.folder)
 
-    def run(self) -> RunInfo:
+    def run(self) -> "RunInfo":
         """What was run, for reports."""
+        from survey.jobs.adjusting.job import run_info
+
         return run_info(self.situation.project, {})
 
     def detect(self, *, everything: bool = False, told: "Callable[[ImageReport], None] | None" = None) -> Told:
@@ -167,7 +170,7 @@ def _in_world(pose: Pose3, cov: FloatArray) -> FloatArray:
 class _PlannedFrames(AdjustedFrames):
     """Frames that are still to be: of what is not estimated yet by the values of the plan."""
 
-    def __init__(self, adjustment: Adjustment, start: StartValues) -> None:
+    def __init__(self, adjustment: Adjustment, start: "StartValues") -> None:
         super().__init__(adjustment)
         self.start = start
 
@@ -180,6 +183,7 @@ class _PlannedFrames(AdjustedFrames):
 def _chosen(outcome: "PlanningOutcome") -> Drawn:
     """The candidates that a plan chose: cameras of new epochs, new points, lines of readings, pairs and distances."""
     from adjust.design.candidates import with_candidates
+    from survey.report.scene import scene_values
 
     steps = () if outcome.selection is None else outcome.selection.steps
     chosen = [outcome.planned.candidates[s.candidate_idx] for s in steps]

@@ -8,21 +8,18 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
+from typing import TYPE_CHECKING
 
-from adjust.diagnosis.diagnosis import Diagnosis
-from adjust.graph.assembly import StartValues
 from adjust.model.errors import DiagnosedError, SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
 from survey.folder.locking import LOCK, holder_of
 from survey.folder.text import decode, read_bytes
-from survey.jobs.adjusting.steps import adjust_project, seen_points
 from survey.project.exclusions import in_force, read_exclusions
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
 from survey.project.reading import leaving_out, read_all
 from survey.solution.earlier.changes import Changes, snapshot, solution_changes
 from survey.solution.quantities import Scale, scale_of
-from survey.solution.statistics import Statistics, statistics_of
 from survey.workbench.kept import Kept, kept_results, with_kept
 from survey.workbench.pages.beginning import Folder
 from survey.workbench.rows import PointRows, point_rows
@@ -36,6 +33,11 @@ from survey.workbench.situation import (
     signature_of,
     spot_places,
 )
+
+if TYPE_CHECKING:  # what adjusts comes when something is adjusted: the first view is there before
+    from adjust.diagnosis.diagnosis import Diagnosis
+    from adjust.graph.assembly import StartValues
+    from survey.solution.statistics import Statistics
 
 Watch = Callable[[int, float], None]
 _UNREAD = object()
@@ -101,8 +103,10 @@ class Resident(Folder):
         return self._kept if isinstance(self._kept, Kept) else None
 
     @property
-    def statistics(self) -> Statistics:
+    def statistics(self) -> "Statistics":
         """Reliability, correlations, budgets and so on, computed when first asked for. Raises SurveyError."""
+        from survey.solution.statistics import statistics_of
+
         with self._lock:
             if self._statistics is None or self._statistics[0] != self.version:
                 options = self.situation.project.options
@@ -150,11 +154,15 @@ class Resident(Folder):
             return self._take(self._solved(self._read(), "warm"))
 
     @property
-    def diagnosis(self) -> Diagnosis | None:
+    def diagnosis(self) -> "Diagnosis | None":
         """What is wrong, of the last solution; where there is none yet, of the adjustment that failed."""
         found = self.failure.diagnosis if isinstance(self.failure, DiagnosedError) else None
         if self.situation.adjustment is not None:
             found = self.situation.adjustment.diagnosis
+        if found is None:
+            return None
+        from adjust.diagnosis.diagnosis import Diagnosis
+
         return found if isinstance(found, Diagnosis) else None
 
     def cancel(self) -> None:
@@ -180,6 +188,8 @@ class Resident(Folder):
         identified = situation.identified
         if found is None:
             project = situation.project
+            from survey.jobs.adjusting.steps import adjust_project
+
             adjustment, how = adjust_project(project, False, watch=self._step), "cold"
             identified, known = identified_in(situation.everything, adjustment), spot_places(project.spots)
         else:
@@ -192,6 +202,8 @@ class Resident(Folder):
         project = situation.project
         if mode == "cold" or self.version == 0 or not spot_places(project.spots) <= situation.known_spots:
             return None, "cold"
+        from survey.jobs.adjusting.steps import adjust_project, seen_points
+
         survey = situation.now
         named = tuple(b.in_use() for b in survey.image_blocks[len(project.survey.image_blocks) :])
         blocks = (*project.survey.image_blocks, *(b for b in named if len(b.uv)))
@@ -199,7 +211,7 @@ class Resident(Folder):
         survey = seen_points(survey) if project.spots else survey
         begun: list[bool] = []
 
-        def begin(part: Survey) -> StartValues | None:
+        def begin(part: Survey) -> "StartValues | None":
             start = self._values.begin(part)
             begun.append(start is not None)
             return start

@@ -3,11 +3,10 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from adjust.graph.assembly import StartValues, values_of
 from adjust.lenses.models import MODELS
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
@@ -17,6 +16,9 @@ from survey.project import Project
 from survey.project.exclusions import Exclusion, Name
 from survey.project.observed import Hits, Observed, union
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER, SpotBlock
+
+if TYPE_CHECKING:
+    from adjust.graph.assembly import StartValues
 
 Mode = Literal["warm", "cold"]
 
@@ -103,27 +105,31 @@ class Step:
 class KnownValues:
     """Start values of everything that was ever solved, and the models of the lenses they belong to."""
 
-    start: StartValues = field(default_factory=lambda: StartValues({}, {}, {}, {}))
+    start: "StartValues | None" = None
     models: dict[str, str] = field(default_factory=dict)
 
     def keep(self, adjustment: Adjustment) -> None:
         """Newer values go before older ones."""
+        from adjust.graph.assembly import StartValues, values_of
+
         new, old = values_of(adjustment), self.start
-        self.start = StartValues({**old.lenses, **new.lenses}, {**old.poses, **new.poses},
-                                 {**old.points, **new.points}, {**old.vectors, **new.vectors})  # fmt: skip
+        self.start = new if old is None else StartValues(
+            {**old.lenses, **new.lenses}, {**old.poses, **new.poses}, {**old.points, **new.points},
+            {**old.vectors, **new.vectors})  # fmt: skip
         self.models |= {c.camera_id: c.lens.model for c in adjustment.survey.cameras}
 
-    def begin(self, survey: Survey) -> StartValues | None:
+    def begin(self, survey: Survey) -> "StartValues | None":
         """Start values of a survey; None where the search has to begin anew, as it must for a free datum.
 
         Inner constraints keep the mean place of where the search began.
         """
         known = all(self.models.get(c.camera_id) == c.lens.model for c in survey.cameras)
-        if not known or survey.datum.kind == "inner" or survey.pair_form == "closed":
+        start = self.start
+        if start is None or not known or survey.datum.kind == "inner" or survey.pair_form == "closed":
             return None
-        if any(len(self.start.lenses[c.camera_id]) != len(MODELS[c.lens.model].names) for c in survey.cameras):
+        if any(len(start.lenses[c.camera_id]) != len(MODELS[c.lens.model].names) for c in survey.cameras):
             return None
-        return self.start
+        return start
 
 
 def signature_of(folder: Path) -> dict[str, tuple[int, int]]:

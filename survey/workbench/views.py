@@ -1,12 +1,11 @@
 """What the views of the workbench show, as plain values: state, findings, parameters, scene, exclusions."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gtsam import Pose3
 
-from adjust.diagnosis.hypothesis import Place
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Reading
 from adjust.model.result import Adjustment
@@ -14,9 +13,7 @@ from survey.folder.plain import plain
 from survey.folder.text import suggestion
 from survey.project.observed import Observed, name_of_residual
 from survey.report.language import message
-from survey.report.scene import scene_values
 from survey.solution.anchors import ANCHORED, anchor, anchors_in
-from survey.solution.dictionary import solution_dict
 from survey.solution.earlier.changes import snapshot
 from survey.solution.earlier.runs import list_runs
 from survey.solution.frames import AdjustedFrames
@@ -25,6 +22,9 @@ from survey.solution.verdict import suspects
 from survey.workbench.jobs import Jobs
 from survey.workbench.places import Places, refs_of
 from survey.workbench.rows import BY_THIS_RUN, IN_USE, columns, reading_rows
+
+if TYPE_CHECKING:
+    from adjust.diagnosis.hypothesis import Place
 
 _MOST_FINDINGS = 100
 _MOST_FITTING = 20
@@ -175,7 +175,7 @@ def remedies(bench: Jobs) -> list[dict[str, Any]]:
     return out
 
 
-def _anchor_of(place: Place) -> str | None:
+def _anchor_of(place: "Place") -> str | None:
     """Where a hypothesis sits, as a place of the page."""
     return anchor(place.kind, "/".join(place.ids)) if place.kind in ANCHORED and place.ids else None
 
@@ -258,11 +258,15 @@ def runs(bench: Jobs) -> dict[str, Any]:
 
 def scene(bench: Jobs) -> dict[str, Any]:
     """Cameras, targets, tables, points and stations in the world (m), covariances (m^2) as sigmas are given."""
+    from survey.report.scene import scene_values
+
     return {"version": bench.version, **scene_values(bench.adjustment, bench.scale)}
 
 
 def loops(bench: Jobs) -> dict[str, Any]:
     """Loops of measured pairs and how they close, the worst first; None where there are none."""
+    from survey.solution.dictionary import solution_dict
+
     solution = solution_dict(bench.adjustment, bench.run(), None)
     return {"version": bench.version, "loops": solution.get("loops"), "network": solution.get("network")}
 
@@ -290,6 +294,8 @@ PARTS = {
 
 def statistics_part(bench: Jobs, part: str) -> dict[str, Any]:
     """A part of what ``solution.json`` says, one of ``PARTS``; computed when first asked for. Raises SurveyError."""
+    from survey.solution.dictionary import solution_dict
+
     if part not in PARTS:
         raise SurveyError(f"there are no statistics {part!r}; {suggestion(part, PARTS)}")
     solution, key = solution_dict(bench.adjustment, bench.run(), bench.statistics), PARTS[part]

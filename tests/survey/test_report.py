@@ -12,13 +12,15 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ImageResiduals
 from adjust.model.survey import Survey
 from survey.project.detected import DetectedImage
-from survey.report import drawing, markup, report_html, summary_text
+from survey.report import drawing, markup
 from survey.report.charts import CameraResiduals, histogram, mean_field, vector_field
 from survey.report.context import worst
 from survey.report.language import esc
+from survey.report.page import report_html
 from survey.report.picture import perspective, pictures, plan
 from survey.report.scene import Scene, Spot, enlargement, scene_of
 from survey.report.sections import observations, unknowns
+from survey.report.terminal import summary_text
 from survey.solution.dictionary import RunInfo, solution_dict
 from survey.solution.quantities import scale_of
 from tests.survey.adjustments import Lab, correlate, lab_adjustment

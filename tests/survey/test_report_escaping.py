@@ -25,9 +25,9 @@ from survey.notebook.html import heading, html_table
 from survey.planning.job import PlanRequest, planning_job
 from survey.planning.page import plan_page
 from survey.project import AdjustmentOptions, Project, Sigmas, read
-from survey.report import report_html
 from survey.report.language import esc
 from survey.report.markup import json_script
+from survey.report.page import report_html
 from survey.simulate import beacons
 from survey.solution.dictionary import RunInfo
 from survey.solution.quantities import scale_of

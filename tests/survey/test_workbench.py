@@ -20,6 +20,7 @@ from survey.examples import write_example
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.excluding import exclude_job
 from survey.project import read
+from survey.solution.anchors import anchors_in
 from survey.solution.earlier.changes import snapshot, solution_changes
 from survey.solution.earlier.runs import MOST, list_runs, load_run
 from survey.workbench import views
@@ -426,10 +427,10 @@ def test_a_remedy_is_carried_out_by_one_call_and_taken_back_by_undo_unless_other
 
 def test_what_cannot_be_adjusted_has_its_remedies_too(mine, monkeypatch):
     """The diagnosis of an adjustment that failed; what mends it is taken back to where there was no solution."""
-    import survey.workbench.resident as resident
+    import survey.jobs.adjusting.steps as steps
 
     epoch = read(mine).survey.image_blocks[0].epoch_id
-    real = resident.adjust_project
+    real = steps.adjust_project
     cause = Hypothesis("moved", "epoch moved", "leave it out", Place("epoch", (epoch,)), read(mine).survey,
                        (LeaveOut((f"epoch:{epoch}",)),))  # fmt: skip
 
@@ -439,7 +440,7 @@ def test_what_cannot_be_adjusted_has_its_remedies_too(mine, monkeypatch):
             raise DiagnosedError("nothing fits", Diagnosis(candidates, ("moved",), Misfit(1.0, 1.0, 0, 1)))
         return real(project, *given, **named)
 
-    monkeypatch.setattr(resident, "adjust_project", failing)
+    monkeypatch.setattr(steps, "adjust_project", failing)
     bench = Workbench(mine)
     with pytest.raises(SurveyError):
         bench.adjust()
@@ -481,3 +482,12 @@ def test_the_network_of_readings_is_where_the_solution_is(tmp_path):
     readings = bench.situation.everything.survey.readings
     assert {s["id"]: s["n"] for s in found["setups"]} == {k: sum(r.setup_id == k for r in readings)
                                                         for k in {r.setup_id for r in readings}}  # fmt: skip
+
+
+@pytest.mark.parametrize(("said", "places"), [
+    ("detection: images/R4/q01: blurred", ["#image=R4/q01"]),
+    ("camera 'X', epoch 'hX05': half of its points do not fit", ["#image=X/hX05"]),
+    ("table turntable, epoch t09: read twice", ["#reading=table_angles:turntable/t09"]),
+])  # fmt: skip
+def test_a_message_leads_to_the_place_it_names(said, places):
+    assert anchors_in(said) == places

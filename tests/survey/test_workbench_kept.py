@@ -1,6 +1,8 @@
 """What the page shows of results on disk before anything is adjusted."""
 
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -56,3 +58,20 @@ def test_results_of_other_inputs_or_broken_ones_say_nothing(adjusted, tmp_path, 
     bench = Workbench(folder, read_only=True)
     assert (bench.kept is None) == (name != "results/residuals.csv")
     assert np.isnan(bench.rows.test).all()
+
+
+FIRST = """
+import sys
+from survey.workbench.server import Server
+from survey.workbench.session import Workbench
+bench = Workbench(sys.argv[1], read_only=True)
+Server(bench, "token").app()
+bench.state(), bench.findings(), bench.points(), bench.readings(), bench.runs()
+assert bench.kept is not None
+print(sorted({"scipy.sparse", "adjust.adjustment", "adjust.graph.assembly", "jinja2", "cv2", "pandas"} & set(sys.modules)))
+"""
+
+
+def test_what_the_results_say_is_shown_before_what_adjusts_is_loaded(adjusted):
+    done = subprocess.run([sys.executable, "-c", FIRST, str(adjusted)], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -30,6 +30,7 @@ from tests.survey.test_workbench import exclusions, wrong_point
 TOKEN = "secret-token-of-this-test"
 HERE = {"X-Token": TOKEN}
 BASE = "http://127.0.0.1:8790"
+PYTHON = Path(__file__).parents[2] / "docs/python.md"
 LIVE = "ws://127.0.0.1:8790/live"
 
 
@@ -158,6 +159,9 @@ def test_every_address_is_a_function_of_the_python_interface(mine):
         for name in way.calls:
             assert name in vars(Workbench(mine)) or inspect.getdoc(getattr(Workbench, name)), name
     assert {"state", "exclude", "undo", "save", "plan", "detect"} <= {name for way in found for name in way.calls}
+    table = re.findall(r"(?m)^\| .+ \| `(\w+ /api/\S+)` \| (.+) \|$", PYTHON.read_text(encoding="utf-8"))
+    assert {address: tuple(re.findall(r"`(\w+)`", names)) for address, names in table} == {
+        f"{way.method} {way.path}": way.calls for way in found if way.calls}  # fmt: skip
     known = {re.sub(r"\{.*", "", way.path.removeprefix("/api/")).split("/")[0] for way in found}
     asked = {name for p in WEB.glob("*.js") for name in re.findall(r'\b(?:get|post)\([`"]([a-z_]+)', p.read_text())}
     assert len(asked) > 10

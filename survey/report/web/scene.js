@@ -283,7 +283,7 @@ export class SceneView {
     const first = new Map(scene.shots.filter((shot) => shot.main !== false).map((shot) => [shot.camera, { id: shot.camera, x: [shot.pose[3], shot.pose[7], shot.pose[11]] }]));
     const boards = scene.outlines.map((o) => ({ id: o.id, x: [0, 1, 2].map((k) => o.x.reduce((sum, x) => sum + x[k], 0) / o.x.length) }));
     for (const { id, x } of [...scene.spots, ...first.values(), ...boards]) {
-      const [u, v] = to(x), width = 7 * String(id).length;
+      const [u, v] = to(x), width = context.measureText(id).width + 6;
       if (taken.some(([a, b, w]) => u < a + w && a < u + width && Math.abs(b - v) < 12)) continue; // none over another
       taken.push([u, v, width]);
       context.lineWidth = 3;

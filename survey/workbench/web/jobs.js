@@ -8,16 +8,16 @@ import { picture, post } from "./source.js";
 
 const MOST = 60; // pictures shown at once
 
-/** Name, title, what it does, and its fields: key, label, kind (text, number, flag, words), what stands there first. */
+/** Name, title, what it does, and its fields: key, label, kind (text, number, flag, words), what stands there first or, of a text, what for example could. */
 const JOBS = [
-  ["init", "New project", "Begin a project with a folder of images; cameras, sizes and boards are read out of them, and it is shown here.", [["images", "folder of images", "text", ""], ["folder", "folder", "text", ""]]],
+  ["init", "New project", "Begin a project with a folder of images; cameras, sizes and boards are read out of them, and it is shown here.", [["images", "folder of images", "text", "recordings"], ["folder", "folder of the new project", "text", "lab-2"]]],
   ["detect", "Detect", "Find targets in images that are new or have changed, and adjust.", [["all", "all images anew", "flag", false]]],
-  ["plan", "Planning", "What to measure next, of what plan.toml lists; drawn in the scene.", [["wanted", "to become precise", "text", ""], ["add", "candidates to choose", "number", 5], ["navigation", "poses from beacons", "flag", false]]],
-  ["navigate", "Navigate", "A pose for every epoch that shows beacons and no target; drawn in the scene.", [["station", "station", "text", ""], ["interval_s", "seconds between epochs", "number", 0]]],
-  ["add", "Add", "Let the network grow by another folder, and adjust.", [["folder", "folder", "text", ""]]],
-  ["compare", "Compare epochs", "What moved since another folder of the same laboratory; drawn in the scene.", [["folder", "folder", "text", ""]]],
-  ["show", "Other project", "Another project folder on this page instead of this one.", [["folder", "folder", "text", ""]]],
-  ["batch", "Batch", "Adjust several projects; none named: all beside this one.", [["folders", "folders", "words", ""]]],
+  ["plan", "Planning", "What to measure next, of what plan.toml lists; drawn in the scene.", [["wanted", "to become precise", "text", "point/B07"], ["add", "candidates to choose", "number", 5], ["navigation", "poses from beacons", "flag", false]]],
+  ["navigate", "Navigate", "A pose for every epoch that shows beacons and no target; drawn in the scene.", [["station", "station", "text", "head"], ["interval_s", "seconds between epochs", "number", 0]]],
+  ["add", "Add", "Let the network grow by another folder, and adjust.", [["folder", "folder", "text", "new-stations"]]],
+  ["compare", "Compare epochs", "What moved since another folder of the same laboratory; drawn in the scene.", [["folder", "folder", "text", "lab-2025"]]],
+  ["show", "Other project", "Another project folder on this page instead of this one.", [["folder", "folder", "text", "lab-2"]]],
+  ["batch", "Batch", "Adjust several projects; none named: all beside this one.", [["folders", "folders", "words", "lab-1 lab-2"]]],
 ];
 
 export class JobsView {
@@ -39,7 +39,7 @@ export class JobsView {
   }
 
   job([name, title, does, fields]) {
-    const inputs = fields.map(([key, label, kind, first]) => ({ key, kind, label, input: make("input", kind === "flag" ? { type: "checkbox", checked: first } : { type: kind === "number" ? "number" : "text", min: "0", step: "any", value: first, "aria-label": `${t(title)}: ${t(label)}` }) }));
+    const inputs = fields.map(([key, label, kind, first]) => ({ key, kind, label, input: make("input", kind === "flag" ? { type: "checkbox", checked: first } : { ...(kind === "number" ? { type: "number", min: "0", step: "any", value: first } : { type: "text", placeholder: first }), "aria-label": `${t(title)}: ${t(label)}` }) }));
     const told = this.bench.told[name];
     return make("section", { "aria-label": t(title) }, make("h2", {}, t(title)), make("p", { class: "quiet" }, t(does)),
       make("div", { class: "actions" }, ...inputs.map(({ label, input }) => make("label", {}, t(label), " ", input)),
