@@ -214,6 +214,11 @@ class Case:
             return None
 
     @property
+    def starts_afresh(self) -> bool:
+        """Whether what is tried has its own start: from no values, or where these are lost and a start costs little."""
+        return (self.result is None and not self.survey.image_blocks) or self.linear is None
+
+    @property
     def is_near(self) -> bool:
         """Whether all observations take part in its adjustment, and leave its values near to where they belong."""
         return self.is_whole and self.linear is not None and self.linear.scale < _FAR

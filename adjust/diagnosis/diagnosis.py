@@ -15,8 +15,9 @@ from adjust.model.errors import SurveyError
 _SHOWN = 3
 _KEPT, _ONE = 1.5, 1.0  # adjustments for each of the later families, and for a trial of what they find
 
+_SCORES = "effects"
 FAMILIES: tuple[tuple[str, ...], ...] = (
-    ("effects", "images", "names", "units", "time", "weights"),
+    (_SCORES, "images", "names", "units", "time", "weights"),
     ("targets",),
     ("bodies",),
 )
@@ -78,7 +79,7 @@ def diagnose(case: Case, families: Sequence[Family] | None = None) -> Diagnosis:
     """
     search, given = Search(case, misfit_of(case.result, case.survey)), case.budget.left
     looked_at = 0
-    stages = _all_families() if families is None else [families]
+    stages = _all_families(case) if families is None else [families]
     for later, rooms in zip(reversed(range(len(stages))), stages, strict=True):
         kept = _KEPT * later * bool(case.survey.image_blocks)
         case.budget.kept = kept + _ONE
@@ -93,8 +94,12 @@ def diagnose(case: Case, families: Sequence[Family] | None = None) -> Diagnosis:
     return Diagnosis(found, tuple(dict.fromkeys(search.names)), search.base, search.untried, tuple(case.passed_over))
 
 
-def _all_families() -> list[list[Family]]:
-    return [[import_module(f"adjust.diagnosis.{name}").hypotheses for name in rooms] for rooms in FAMILIES]
+def _all_families(case: Case) -> list[list[Family]]:
+    """By stage; scores come last where the values at which they are taken would have to be looked for first."""
+    stages = list(FAMILIES)
+    if case.result is None and not case.survey.image_blocks:
+        stages = [*(tuple(n for n in rooms if n != _SCORES) for rooms in stages), (_SCORES,)]
+    return [[import_module(f"adjust.diagnosis.{name}").hypotheses for name in rooms] for rooms in stages]
 
 
 def _formed(family: Family, case: Case) -> list[Hypothesis]:
