@@ -75,7 +75,8 @@ def diagnose(case: Case, families: Sequence[Family] | None = None) -> Diagnosis:
     """Form the hypotheses of all families, try the likeliest of them, and rank those that explain the misfit.
 
     families: those of ``FAMILIES`` where None. As many are tried as the budget of the case allows, and where none of
-    them explains anything, as many again. Nothing is repaired, nothing is written.
+    them explains anything, or what says the first one more exactly still waits, as many again. Nothing is repaired,
+    nothing is written.
     """
     search, given = Search(case, misfit_of(case.result, case.survey)), case.budget.left
     looked_at = 0
@@ -87,7 +88,7 @@ def diagnose(case: Case, families: Sequence[Family] | None = None) -> Diagnosis:
         looked_at += sum(h.looked_at for h in formed)
         search.over(formed, 0.0 if search.done() else kept)
     found = ranked(search.base, search.told, looked_at)
-    if not found and search.untried:
+    if (not found and search.promising) or (found and search.refines(found[0].hypothesis)):
         case.budget.left = max(case.budget.left, 0.0) + given
         search.over((), 0.0)
         found = ranked(search.base, search.told, looked_at)
