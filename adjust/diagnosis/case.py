@@ -118,17 +118,18 @@ class Case:
 
         SurveyError where that fails.
         """
-        if self._last and self._last[0][0] is survey:
-            return self._last[0][1]
+        known = next((result for of, result in self._last if of is survey), None)
+        if known is not None:
+            return known
         if self.linear is None:
             raise SurveyError("there are no values to begin with")
         result = self._near(survey, self.linear.result, self.linear.result.omega)
-        self._last[:] = [(survey, result)]
+        self._last[:] = [*self._last[-1:], (survey, result)]
         return result
 
     @cached_property
     def _last(self) -> list[tuple[Survey, Adjustment]]:
-        """The survey that was adjusted last, and how."""
+        """The two surveys that were adjusted last, and how."""
         return []
 
     @cached_property
@@ -212,6 +213,11 @@ class Case:
             return Linear(result)
         except SurveyError:
             return None
+
+    @property
+    def starts_afresh(self) -> bool:
+        """Whether what is tried has its own start: from no values, or where these are lost and a start costs little."""
+        return (self.result is None and not self.survey.image_blocks) or self.linear is None
 
     @property
     def is_near(self) -> bool:

@@ -15,8 +15,9 @@ from adjust.model.errors import SurveyError
 _SHOWN = 3
 _KEPT, _ONE = 1.5, 1.0  # adjustments for each of the later families, and for a trial of what they find
 
+_SCORES = "effects"
 FAMILIES: tuple[tuple[str, ...], ...] = (
-    ("effects", "images", "names", "units", "time", "weights"),
+    (_SCORES, "images", "names", "units", "time", "weights"),
     ("targets",),
     ("bodies",),
 )
@@ -74,11 +75,12 @@ def diagnose(case: Case, families: Sequence[Family] | None = None) -> Diagnosis:
     """Form the hypotheses of all families, try the likeliest of them, and rank those that explain the misfit.
 
     families: those of ``FAMILIES`` where None. As many are tried as the budget of the case allows, and where none of
-    them explains anything, as many again. Nothing is repaired, nothing is written.
+    them explains anything, or what says the first one more exactly still waits, as many again. Nothing is repaired,
+    nothing is written.
     """
     search, given = Search(case, misfit_of(case.result, case.survey)), case.budget.left
     looked_at = 0
-    stages = _all_families() if families is None else [families]
+    stages = _all_families(case) if families is None else [families]
     for later, rooms in zip(reversed(range(len(stages))), stages, strict=True):
         kept = _KEPT * later * bool(case.survey.image_blocks)
         case.budget.kept = kept + _ONE
@@ -86,15 +88,19 @@ def diagnose(case: Case, families: Sequence[Family] | None = None) -> Diagnosis:
         looked_at += sum(h.looked_at for h in formed)
         search.over(formed, 0.0 if search.done() else kept)
     found = ranked(search.base, search.told, looked_at)
-    if not found and search.untried:
+    if (not found and search.promising) or (found and search.refines(found[0].hypothesis)):
         case.budget.left = max(case.budget.left, 0.0) + given
         search.over((), 0.0)
         found = ranked(search.base, search.told, looked_at)
     return Diagnosis(found, tuple(dict.fromkeys(search.names)), search.base, search.untried, tuple(case.passed_over))
 
 
-def _all_families() -> list[list[Family]]:
-    return [[import_module(f"adjust.diagnosis.{name}").hypotheses for name in rooms] for rooms in FAMILIES]
+def _all_families(case: Case) -> list[list[Family]]:
+    """By stage; scores come last where the values at which they are taken would have to be looked for first."""
+    stages = list(FAMILIES)
+    if case.result is None and not case.survey.image_blocks:
+        stages = [*(tuple(n for n in rooms if n != _SCORES) for rooms in stages), (_SCORES,)]
+    return [[import_module(f"adjust.diagnosis.{name}").hypotheses for name in rooms] for rooms in stages]
 
 
 def _formed(family: Family, case: Case) -> list[Hypothesis]:

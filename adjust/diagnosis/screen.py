@@ -23,6 +23,7 @@ from adjust.observations.terrestrial.building import reading_refs
 from adjust.observations.terrestrial.layout import ReadingArrays
 from adjust.precision.precision import adjusted_motion, residual_of
 from adjust.start import find_start
+from adjust.start.positions import given_points
 
 _MEDIAN = 0.455  # of chi-square with one degree of freedom
 _MISSED = 25.0
@@ -122,7 +123,7 @@ class Screen(Fit):
         out = list[Fit | None]()
         for i in range(0, len(surveys), at_once):
             some = surveys[i : i + at_once]
-            starts = [_start(s) for s in some]
+            starts = [_given(s) or _start(s) for s in some]
             known = [(s, start) for s, start in zip(some, starts, strict=True) if start is not None]
             found = iter(self._between_points(batch, known, [str(r.point_id) for r in refs]) if known else [])
             out += [None if start is None else next(found) for start in starts]
@@ -132,12 +133,14 @@ class Screen(Fit):
         self, batch: TerrestrialBatch, known: Sequence[tuple[Survey, StartValues]], ids: Sequence[str]
     ) -> list[Fit]:
         """ids: of the points of the batch's positions."""
-        a, plumb, n = batch.layout.arrays, batch.parameters.vertical.at(self.graph.start), len(known)
+        a, plumb = batch.layout.arrays, batch.parameters.vertical.at(self.graph.start)
         held, points = self.graph.unknowns.held_points, list[dict[str, Any]]()
         for survey, start in known:
             given = {p.point_id: p.x_in_world.value for p in survey.points if p.point_id in held}
             points.append({**start.points, **given})
-        X = np.array([[x[i] for i in ids] for x in points], dtype=float).reshape(-1, 3)
+        each = np.array([[x[i] for i in ids] for x in points], dtype=float).reshape(len(points), -1)
+        different, which = np.unique(each, axis=0, return_inverse=True)
+        X, n = different.reshape(-1, 3), len(different)
         first = np.repeat(len(ids) * np.arange(n), len(a.kind))
         every = a.of(np.tile(np.arange(len(a.kind)), n))
         ends = {name: np.where((at := getattr(every, name)) >= 0, at + first, at) for name in ("at", "to", "second")}
@@ -145,7 +148,8 @@ class Screen(Fit):
         geometry = replace(batch.geometry, X=X, horizon=plumb.horizon(X))
         predicted = k.predict(every, geometry, batch.sign, batch.curve)[0]
         observed = np.array([[r.value for r in survey.readings] for survey, _ in known])
-        miss = k.wrapped(every.kind, predicted, observed.ravel()).reshape(n, -1)
+        predicted = predicted.reshape(n, -1)[which.ravel()]
+        miss = k.wrapped(a.kind, predicted, observed)
         for rows in _directions(a).values():
             miss[:, rows] = _turned(miss[:, rows], _medians(miss[:, rows])[:, None])
         e = miss / batch.sigma
@@ -188,6 +192,13 @@ def _others(graph: AdjustmentGraph, values: gtsam.Values) -> FloatArray:
 
 def _finite(squares: FloatArray) -> FloatArray:
     return np.where(np.isfinite(squares), squares, np.inf)
+
+
+def _given(survey: Survey) -> StartValues | None:
+    """The start of points alone, which :func:`find_start` takes as they come; None where one does not."""
+    known = given_points(survey)
+    whole = all(p.point_id in known and np.isfinite(known[p.point_id]).all() for p in survey.points)
+    return StartValues({}, {}, known, {}) if whole else None
 
 
 def _start(survey: Survey) -> StartValues | None:

@@ -56,18 +56,27 @@ class Search:
         self.queue += [h for h in waiting if not self._beaten(h)]
 
     def explained(self, share: float) -> bool:
-        """Whether one takes away this share of the misfit beyond noise."""
-        return any(t.explains(share, self.base) for t in self.trials)
+        """Whether one takes away this share of the misfit beyond noise; larger sigmas, which can any, do not count."""
+        return any(t.explains(share, self.base) and t.hypothesis.penalty <= 0.0 for t in self.trials)
 
     def done(self, following: float = 0.0) -> bool:
         """Whether one explains nearly everything with all observations, and what follows has much less evidence."""
-        best = (t for t in self.trials if t.explains(_MOST_OF_IT, self.base))
+        best = (t for t in self.trials if t.explains(_MOST_OF_IT, self.base) and t.hypothesis.penalty <= 0.0)
         return any(t.misfit.dropped == 0 and following < _FAINT * t.hypothesis.evidence for t in best)
 
     @property
     def untried(self) -> tuple[str, ...]:
         """Names of what evidence speaks for, but the time did not suffice for."""
         return tuple(dict.fromkeys(h.name for h in self.queue if h.name not in self.names))
+
+    @property
+    def promising(self) -> bool:
+        """Whether some of that may explain enough to be named."""
+        return any(h.name not in self.names and not _hopeless(h) for h in self.queue)
+
+    def refines(self, h: Hypothesis) -> bool:
+        """Whether something waits that says the same more exactly, with more evidence."""
+        return any(w.place.ids == h.place.ids and w.evidence > h.evidence and not w.scored for w in self.queue)
 
     @property
     def told(self) -> list[Trial]:

@@ -16,7 +16,7 @@ from adjust.diagnosis.case import Case
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Pair
 from adjust.model.survey import FloatArray, IntArray, Survey
-from adjust.spatial.averaging import mean_pose, pose_distance
+from adjust.spatial.averaging import mean_pose, mean_poses, pose_distance
 from adjust.spatial.rigid import inverse
 from adjust.start.closed_forms.hand_eye import solve_ax_zb
 
@@ -154,10 +154,7 @@ def shifts(link: Link, most: int = 3) -> Sequence[Shift]:
     The motions are those that most epochs give as they stand, or shifted throughout; the border is where the sum of
     misses is least.
     """
-    n, fits = len(link.epochs), {}
-    for by in range(-most, most + 1):
-        i = _inside(n, by)
-        fits[by] = fitted(link.kind, link.first[i], link.second[i + by])
+    fits = _shifted_fits(link, most)
     plain = fits[0]
     base = typical(plain.misses(link.first, link.second)) if plain is not None else float("inf")
     found = []
@@ -168,6 +165,19 @@ def shifts(link: Link, most: int = 3) -> Sequence[Shift]:
             if fit is not None:
                 found.append(_best_border(link, fit, by, base))
     return sorted((s for s in found if s is not None), key=lambda s: -s.evidence)
+
+
+def _shifted_fits(link: Link, most: int) -> dict[int, Fit | None]:
+    """The motions of a link at every shift; those of a rig all together."""
+    inside = {by: _inside(len(link.epochs), by) for by in range(-most, most + 1)}
+    if link.kind != "rig":
+        return {by: fitted(link.kind, link.first[i], link.second[i + by]) for by, i in inside.items()}
+    lever = float(np.median(np.linalg.norm(link.first[:, :3, 3], axis=1)))
+    motions = np.concatenate([link.first[i] @ inverse(link.second[i + by]) for by, i in inside.items()])
+    means = mean_poses(motions, lever, np.cumsum([0, *map(len, inside.values())]))
+    return {
+        by: Fit(mean, np.eye(4)) if len(i) >= 3 else None for (by, i), mean in zip(inside.items(), means, strict=True)
+    }
 
 
 def _inside(n: int, by: int) -> IntArray:

@@ -86,7 +86,7 @@ def tried(hypothesis: Hypothesis, case: Case) -> Trial:
     if survey is None:
         return Trial(hypothesis, misfit_of(None, case.survey), None, None, case.budget.refused)
     cut, case.budget.refused = case.budget.refused, False
-    trial = _adjusted(hypothesis, survey, case, case.run if case.linear is None else case.warm)
+    trial = _adjusted(hypothesis, survey, case, case.run if case.starts_afresh else case.warm)
     return replace(trial, untimely=trial.untimely or (cut and not trial.misfit.is_noise()))
 
 
@@ -96,7 +96,7 @@ def tried_afresh(trial: Trial, case: Case, base: Misfit) -> Trial | None:
     None where that is no better, and of what is scored at these values. base: what the case leaves unexplained.
     """
     near = case.is_near and trial.misfit.omega < base.omega
-    if trial.survey is None or case.linear is None or near or trial.hypothesis.scored:
+    if trial.survey is None or case.starts_afresh or near or trial.hypothesis.scored:
         return None
     again = _adjusted(trial.hypothesis, trial.survey, case, case.run)
     return again if again.misfit.omega < trial.misfit.omega else None

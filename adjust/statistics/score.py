@@ -24,6 +24,7 @@ from adjust.testing.significance import LEVEL, Significance
 _SEEN = 1e-7
 """Share of a change's column that no unknown takes over, below which it does not show."""
 _CUTS = 40
+_SMALL = 1_000_000  # numbers of a matrix that is written out
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +94,11 @@ class LinearScores:
     def _by_column(self) -> sparse.csc_matrix:
         return self.A.tocsc()
 
+    @cached_property
+    def _dense(self) -> FloatArray | None:
+        """(m, n) of a small survey, whose products cost less so."""
+        return np.asarray(self.A.toarray()) if np.prod(self.A.shape) <= _SMALL else None
+
     def rows_of(self, columns: IntArray) -> IntArray:
         """Rows (r,) that these unknowns have a part in."""
         ptr, rows = self._by_column.indptr, self._by_column.indices
@@ -160,6 +166,10 @@ class LinearScores:
         by_group = np.split(np.arange(len(rows)), np.searchsorted(of_row, np.arange(1, s)))
         g = np.array([B[mine].T @ self.e[rows[mine]] for mine in by_group])
         BB = np.array([B[mine].T @ B[mine] for mine in by_group])
+        if self._dense is not None:
+            dense = self._dense
+            BA = np.concatenate([B[mine].T @ dense[rows[mine]] for mine in by_group])
+            return g, BB, (BA @ self.system.covariance @ BA.T).reshape(s, k, s, k)
         at = (k * of_row[:, None] + np.arange(k)).ravel(), np.repeat(rows, k)
         turned = sparse.csr_matrix((B.ravel(), at), (s * k, len(self.e)))
         return g, BB, self._taken(turned @ self.A).reshape(s, k, s, k)

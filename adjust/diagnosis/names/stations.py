@@ -5,8 +5,9 @@ measure; from there each pair with either of the two says where one of them is. 
 says the other one's has the wrong name.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from heapq import heappop, heappush
 from itertools import combinations
 
 import numpy as np
@@ -36,8 +37,9 @@ def exchanged_stations(case: Case) -> Iterator[Hypothesis]:
     if before is None:
         return
     misses = _misses(survey, before)
+    ways = _Ways.of(survey.pairs, misses)
     both = list(combinations(_suspects(survey, misses), 2))
-    some = [f for a, b in both if (f := _misnamed(survey, a, b)) is not None]
+    some = [f for a, b in both if (f := ways.misnamed(a, b)) is not None and f[0] > _CLEARLY]
     for _, a, b, rows in sorted(some, key=lambda f: -f[0])[:_TRIED]:
         changed = _exchanged(survey, a, b, rows)
         after = screen(changed)
@@ -65,55 +67,78 @@ def _suspects(survey: Survey, misses: FloatArray) -> list[FrameRef]:
     return sorted(several, key=lambda end: -several[end])[:_SUSPECTS]
 
 
-def _misnamed(survey: Survey, a: FrameRef, b: FrameRef) -> _Found | None:
-    """Evidence, the two, and the rows of pairs whose names are wrong; None where none are."""
-    rows = [i for i, p in enumerate(survey.pairs) if p.used and {p.a, p.b} & {a, b}]
-    poses = _joined([p for p in survey.pairs if p.used and not {p.a, p.b} & {a, b}])
-    said = [(i, p.a in (a, b), p) for i in rows for p in [survey.pairs[i]] if (p.b if p.a in (a, b) else p.a) in poses]
-    if len(said) < 4:
-        return None
-    W = np.array([poses[p.b] @ _matrix(p) if of_a else poses[p.a] @ inverse(_matrix(p)) for _, of_a, p in said])
-    lever = float(np.median([np.linalg.norm(_matrix(p)[:3, 3]) for _, _, p in said])) or 1.0
-    apart = np.array([pose_distance(W, w, lever) for w in W])
-    costs = np.minimum(apart[:, None], apart[None]).sum(axis=2)
-    one, other = np.unravel_index(int(np.argmin(costs)), costs.shape)
-    first = apart[one] <= apart[other]
-    named = np.array([(p.a if of_a else p.b) == a for _, of_a, p in said])
-    if (first & named).sum() + (~first & ~named).sum() < len(said) / 2.0:
-        first = ~first
-    wrong = [i for (i, _, _), is_first, is_named in zip(said, first, named, strict=True) if is_first != is_named]
-    as_named = sum(float(apart[np.ix_(of, of)].sum(axis=1).min()) for of in (named, ~named) if of.any())
-    if not wrong:
-        return None
-    A, B = (W[k] for k in ((one, other) if first[one] else (other, one)))
-    for i in rows:
-        p = survey.pairs[i]
-        if {p.a, p.b} == {a, b}:
-            expected = inverse(B) @ A if p.a == a else inverse(A) @ B
-            off = [float(pose_distance(_matrix(p)[None], x, lever)[0]) for x in (expected, inverse(expected))]
+@dataclass(frozen=True, eq=False)
+class _Ways:
+    """From every frame, by each of its pairs in use, that which misses least first: to another one.
+
+    near: how much the pair misses, its row, whether it leads to the pair's first end. motions: of that row, (4, 4), to
+    the first end and to the second one. lever: m, the typical length of a pair.
+    """
+
+    pairs: Sequence[Pair]
+    near: Mapping[FrameRef, Sequence[tuple[float, int, bool]]]
+    motions: Mapping[int, tuple[FloatArray, FloatArray]]
+    lever: float
+
+    @classmethod
+    def of(cls, pairs: Sequence[Pair], misses: FloatArray) -> "_Ways":
+        """misses: (p,) of the pairs at a start."""
+        near: dict[FrameRef, list[tuple[float, int, bool]]] = {}
+        motions = {i: _matrix(p) for i, p in enumerate(pairs) if p.used}
+        for i in motions:
+            near.setdefault(pairs[i].b, []).append((float(misses[i]), i, True))
+            near.setdefault(pairs[i].a, []).append((float(misses[i]), i, False))
+        lever = float(np.median([np.linalg.norm(m[:3, 3]) for m in motions.values()])) or 1.0
+        return cls(pairs, {end: sorted(ways) for end, ways in near.items()},
+                   {i: (m, inverse(m)) for i, m in motions.items()}, lever)  # fmt: skip
+
+    def end(self, row: int, first: bool) -> FrameRef:
+        """Where a way leads."""
+        return self.pairs[row].a if first else self.pairs[row].b
+
+    def joined(self, without: Collection[FrameRef]) -> dict[FrameRef, FloatArray]:
+        """Poses (4, 4) of the largest set of other frames that pairs join, by the tree of those that miss least."""
+        best: dict[FrameRef, FloatArray] = {}
+        left = {end: None for end in self.near if end not in without}
+        while left:
+            begin = next(iter(left))
+            found, queue = {begin: np.eye(4)}, [*self.near[begin]]
+            while queue:
+                _, i, first = heappop(queue)
+                there = self.end(i, first)
+                if there not in found and there not in without:
+                    found[there] = found[self.end(i, not first)] @ self.motions[i][not first]
+                    for way in self.near[there]:
+                        heappush(queue, way)
+            left = {end: None for end in left if end not in found}
+            best = max(best, found, key=len)
+        return best
+
+    def misnamed(self, a: FrameRef, b: FrameRef) -> _Found | None:
+        """Evidence, the two, and the rows of pairs whose names are wrong; None where none are."""
+        poses = self.joined((a, b))
+        said = [(i, named == a, poses[other] @ self.motions[i][first]) for named in (a, b)
+                for _, i, first in self.near[named] if (other := self.end(i, first)) in poses]  # fmt: skip
+        if len(said) < 4:
+            return None
+        W, named = np.array([pose for *_, pose in said]), np.array([is_a for _, is_a, _ in said])
+        apart = pose_distance(W[:, None], W[None], self.lever)
+        costs = np.minimum(apart[:, None], apart[None]).sum(axis=2)
+        one, two = np.unravel_index(int(np.argmin(costs)), costs.shape)
+        first = apart[one] <= apart[two]
+        if (first & named).sum() + (~first & ~named).sum() < len(said) / 2.0:
+            first = ~first
+        wrong = [i for (i, *_), is_first, is_named in zip(said, first, named, strict=True) if is_first != is_named]
+        if not wrong:
+            return None
+        as_named = sum(float(apart[np.ix_(of, of)].sum(axis=1).min()) for of in (named, ~named) if of.any())
+        A, B = (W[k] for k in ((one, two) if first[one] else (two, one)))
+        for i in [row for _, row, to_first in self.near[a] if self.end(row, to_first) == b]:
+            expected, m = inverse(B) @ A, self.motions[i][0]
+            expected = expected if self.pairs[i].a == a else inverse(expected)
+            off = [float(pose_distance(m[None], x, self.lever)[0]) for x in (expected, inverse(expected))]
             wrong += [i] * (off[1] < off[0])
-    return as_named / max(float(costs[one, other]), 1e-12), a, b, sorted(wrong)
-
-
-def _joined(pairs: Sequence[Pair]) -> dict[FrameRef, FloatArray]:
-    """Poses (4, 4) of the largest set of frames that pairs join, in that of one of them, along the shortest ways."""
-    near: dict[FrameRef, list[tuple[FrameRef, FloatArray]]] = {}
-    for p in pairs:
-        near.setdefault(p.b, []).append((p.a, _matrix(p)))
-        near.setdefault(p.a, []).append((p.b, inverse(_matrix(p))))
-    best: dict[FrameRef, FloatArray] = {}
-    left = set(near)
-    while left:
-        begin = next(end for end in near if end in left)
-        found, queue = {begin: np.eye(4)}, [begin]
-        for here in queue:
-            for there, motion in near[here]:
-                if there not in found:
-                    found[there] = found[here] @ motion
-                    queue.append(there)
-        left -= set(found)
-        best = max(best, found, key=len)
-    return best
+        return as_named / max(float(costs[one, two]), 1e-12), a, b, sorted(wrong)
 
 
 def _matrix(pair: Pair) -> FloatArray:

@@ -150,8 +150,8 @@ def misread_pairs(case: Case) -> Iterator[Hypothesis]:
              for c in CONVENTIONS]  # fmt: skip
     last = ""
     for scope in _scopes(survey, judge.worst):
-        if scope.place.kind != last and any(evidence > _SURE for evidence, *_ in found):
-            break  # what is wrong with many is not looked for in a few of them
+        if scope.place.kind != last and any(e > _SURE and c.shifts >= 1.0 for e, _, c in found):
+            break  # what is wrong with many is not looked for in a few; what makes all smaller than its sigmas fits any
         last = scope.place.kind
         rows = scope.rows.tolist()
         ways = [(c, {i: motions[i] for i in rows}) for c, motions in meant if all(i in motions for i in rows)]
