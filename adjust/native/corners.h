@@ -123,7 +123,7 @@ inline int corner_window(In<float, 2> image, int64_t u0, int64_t v0, const doubl
             if (u < 0 || v < 0 || u >= image.n[1] || v >= image.n[0]) return -1;
             if (n_near + n_far == MOST_PIXELS) break;
             // to both lists, of which one goes on
-            const bool near = (magnitude(across[0]) <= bent) & (magnitude(across[1]) <= bent);
+            const bool near = larger(magnitude(across[0]), magnitude(across[1])) <= bent;
             const float value = image(v, u);
             out.x[n_near] = i, out.y[n_near] = j, out.value[n_near] = value;
             far.x[n_far] = i, far.y[n_far] = j, far.value[n_far] = value;
