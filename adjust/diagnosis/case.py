@@ -206,7 +206,9 @@ class Case:
         try:
             result = self.result
             if result is None:
-                result = self._adjusted(self.survey, None, _NEAR, _START + _REST)
+                survey = self.survey
+                start = None if survey.image_blocks or survey.pairs else start_values(find_start(survey))
+                result = self._adjusted(survey, start, _NEAR, _START + _REST)
             elif not self.is_whole:
                 result = self._near(self.survey, result, options=_OWN)
             self.budget.spend(_SCORES)

@@ -61,7 +61,7 @@ class Search:
 
     def done(self, following: float = 0.0) -> bool:
         """Whether one explains nearly everything with all observations, and what follows has much less evidence."""
-        best = (t for t in self.trials if t.explains(_MOST_OF_IT, self.base) and t.hypothesis.penalty <= 0.0)
+        best = (t for t in self.trials if t.explains(_MOST_OF_IT, self.base))
         return any(t.misfit.dropped == 0 and following < _FAINT * t.hypothesis.evidence for t in best)
 
     @property

@@ -70,10 +70,13 @@ class Trial:
     untimely: bool = False
 
     def explains(self, share: float, base: Misfit) -> bool:
-        """Whether it takes away this share of the misfit beyond noise, where there is any, with all observations."""
+        """Whether it takes away this share of the misfit beyond noise, where there is any, with all observations.
+
+        Less what it pays for that: larger sigmas, or smaller numbers, could take away any.
+        """
         if base.is_noise(_CLEARLY):
             return False
-        left = self.misfit.cost - self.misfit.redundancy
+        left = self.misfit.cost + max(self.hypothesis.penalty, 0.0) - self.misfit.redundancy
         return self.result is not None and self.misfit.unused == 0 and left <= (1.0 - share) * base.excess
 
 

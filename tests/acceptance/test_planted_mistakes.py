@@ -11,6 +11,7 @@ import pytest
 import adjust
 from adjust.diagnosis.case import Budget, Case
 from adjust.diagnosis.diagnosis import diagnose
+from adjust.model.errors import SurveyError
 from survey.cli import main
 from survey.project.writing import write_project
 from survey.simulate.parts import wall_grid
@@ -76,6 +77,30 @@ def test_where_the_start_is_lost_the_change_still_shows(name: str, kind: str, si
     """Every sight misses; one column alone was exchanged."""
     mistake = next(m for m in reversed(MISTAKES) if m.name == name and kind in m.kinds and size in m.sizes)
     assert outcome_of(mistake, kind, size, 61740)["outcome"] == "first"
+
+
+@pytest.mark.parametrize(("name", "kind", "size"), [
+    ("camera moved", "stereo", 20.0), ("images turned", "relay", 0.4), ("unit of shifts", "poses", 0.0),
+])  # fmt: skip
+def test_what_could_fit_anything_ends_no_search(name: str, kind: str, size: float) -> None:
+    """Larger sigmas, a camera all of which is another one, shifts that all become smaller than their sigmas."""
+    mistake = next(m for m in MISTAKES if m.name == name and kind in m.kinds and size in m.sizes)
+    assert outcome_of(mistake, kind, size, 231128)["outcome"] == "first"
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "size"), [("unit of lengths", "hall", 1000.0), ("slipped decimal", "plane", 10.0)]
+)
+def test_network_that_is_not_adjusted_is_read_in_other_ways_first(name: str, kind: str, size: float) -> None:
+    """As it stands it leads nowhere: no time is spent on scores there."""
+    mistake = next(m for m in MISTAKES if m.name == name and kind in m.kinds and size in m.sizes)
+    survey, truth = survey_of(kind, 3)
+    planted = mistake.plant(survey, truth, size)
+    with pytest.raises(SurveyError) as error:
+        adjust.solve(planted)
+    case = Case(planted, None, error.value)
+    assert diagnose(case).candidates[0].hypothesis.name == name
+    assert "linear" not in vars(case)
 
 
 def test_part_that_can_be_adjusted_is_no_explanation() -> None:

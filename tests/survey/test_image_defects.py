@@ -1,18 +1,24 @@
 """Raw mosaics, interlaced fields and motion are measured in rendered images, told with a number, and else never."""
 
 import re
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
+from adjust.diagnosis.hypothesis import LeaveOut
 from adjust.model.errors import SurveyError
+from survey.cli import main
 from survey.detection import detect_image
 from survey.detection.defects import bayer_mosaic, image_defect, interlaced_fields, motion_blur
+from survey.jobs.adjusting.image_defects import blurred
 from survey.jobs.adjusting.job import adjust_job, detect_job
 from survey.planning.checking import check_job
+from survey.project.detected import DetectedImage
 from survey.project.targets import Charuco, Checkerboard
+from survey.simulate import stereo
 from survey.simulate.rendering import BrownCamera, Imaging, PlacedTarget, render
 from tests.data import data_folder
 
@@ -158,3 +164,34 @@ def test_told_where_nothing_can_be_found(tmp_path):
     lab = project(tmp_path / "lab", [fields((18.0, 0.0), (0.0, 0.0, 0.0))])
     with pytest.raises(SurveyError, match="interlaced"):
         detect_job(lab, jobs=1, progress=False)
+
+
+def test_blurred_images_are_left_out_and_taken_back(tmp_path, capsys):
+    """One of six: offered by number, a row of exclusions.csv, offered no more; of most of them it is no remedy."""
+    turns = [(0.1, -0.2, 0.0), *VIEWS, (0.4, -0.1, 0.1), (-0.1, -0.45, -0.2)]
+    good = [image_of(turn, noise=0.5, seed=i) for i, turn in enumerate(turns)]
+    lab = project(tmp_path / "lab", [moving(5.0, 0, turns[0]), *good[1:]])
+
+    def told():
+        main(["adjust", str(lab), "--quiet"])
+        return [line for line in capsys.readouterr().out.splitlines() if "! detection: " in line]
+
+    (line,) = told()
+    number = re.search(r"--try (\d+)$", line).group(1)
+    main(["adjust", str(lab), "--quiet", "--try", number])
+    assert "image,c/e1,excluded" in (lab / "observations" / "exclusions.csv").read_text()
+    capsys.readouterr()
+    assert not any("--try" in line for line in told())
+    main(["include", str(lab), "image:c/e1", "--reason", "again"])
+    capsys.readouterr()
+    assert told() == [line]
+
+
+def test_what_leaves_no_camera_is_not_offered():
+    survey, _ = stereo(3, n_pairs=3)
+    keys = [(b.camera_id, b.epoch_id) for b in survey.image_blocks if b.camera_id == "left"]
+    texts = {k: DetectedImage("", "", 0, 0, 0, defect="motion blur: wide" if k in keys[:2] else "") for k in keys}
+    assert not blurred(survey, texts)
+    assert blurred(survey, {k: texts[k] for k in keys[1:]})[0].edits == (LeaveOut((f"image:left/{keys[1][1]}",)),)
+    mosaics = {keys[0]: replace(texts[keys[0]], defect="a raw Bayer mosaic")}
+    assert not blurred(survey, mosaics)

@@ -2,25 +2,29 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from survey.project.detected import ImageKey, named
+from adjust.model.survey import Survey
+from survey.project.detected import DetectedImage, ImageKey, named
 
 if TYPE_CHECKING:  # brings in OpenCV
+    from adjust.diagnosis.hypothesis import Hypothesis
     from survey.detection import ImageReport
     from survey.detection.gray import Gray32
 
 _LOOKED_AT = 8  # images of each camera, and of the others those that are blurred
 _BLURRED = 1.5  # times as much as the typical image of their camera
 _REGION_PX = 640  # each way, about the middle of what was found
+_MOTION = "motion blur"
 _REMEDIES = {
     "bayer mosaic": "make grey images of them by their mosaic's pattern (cv2.COLOR_BayerBG2GRAY and its kin), or let "
     "the camera do so, and detect them again: corners are poor, or not found",
     "interlaced": "take every second row of each, read apart, or whole images, and detect them again: what moves is in "
     "two places",
-    "motion blur": "expose for a shorter time, or stand still; leave them out where the others suffice",
+    _MOTION: "expose for a shorter time, or stand still; leave them out where the others suffice",
 }
 
 
@@ -94,6 +98,29 @@ def defective(texts: Mapping[ImageKey, str]) -> tuple[DefectiveImages, ...]:
                  for (_, kind), keys in groups.items())  # fmt: skip
 
 
-def defect_warnings(texts: Mapping[ImageKey, str]) -> tuple[str, ...]:
-    """The same as lines for people."""
-    return tuple(f"{d.found}; {d.remedy}" for d in defective(texts))
+def defect_warnings(
+    texts: Mapping[ImageKey, str], offered: Mapping[str, int] = MappingProxyType({})
+) -> tuple[str, ...]:
+    """The same as lines for people. offered: by camera the number of the change that leaves its blurred images out."""
+    return tuple(
+        f"{d.found}; {d.remedy}{f'; --try {n}' if (n := offered.get(d.images[0][0])) and d.kind == _MOTION else ''}"
+        for d in defective(texts)
+    )
+
+
+def blurred(survey: Survey, images: Mapping[ImageKey, DetectedImage]) -> "tuple[Hypothesis, ...]":
+    """Of every camera its images in use that moved while they were exposed, left out, where more of its others are not.
+
+    A mosaic or interlaced fields are in all images of a camera: what is left out then is the camera.
+    """
+    used = {(b.camera_id, b.epoch_id) for b in survey.image_blocks if b.n_used}
+    found = [d for d in defective({key: i.defect for key, i in images.items() if key in used}) if d.kind == _MOTION]
+    return tuple(_left_out(d) for d in found if 2 * len(d.images) < sum(c == d.images[0][0] for c, _ in used))
+
+
+def _left_out(d: DefectiveImages) -> "Hypothesis":
+    from adjust.diagnosis.hypothesis import Hypothesis, LeaveOut, Place  # here: good images start without it
+
+    place = Place("camera", (d.images[0][0],), epochs=tuple(epoch for _, epoch in d.images))
+    names = tuple("image:" + "/".join(key) for key in d.images)
+    return Hypothesis(d.kind, d.found, "leave them out", place, lambda: None, (LeaveOut(names),))

@@ -4,6 +4,7 @@ import sys
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 from tqdm import tqdm
 
@@ -16,7 +17,7 @@ from adjust.model.survey import Survey
 from adjust.statistics.outliers.supported import lost_notes, supported
 from adjust.statistics.outliers.undetermined_points import without_lost_points
 from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
-from survey.jobs.adjusting.image_defects import defect_warnings
+from survey.jobs.adjusting.image_defects import blurred, defect_warnings
 from survey.jobs.adjusting.probable_causes import explained, with_probable_causes
 from survey.jobs.adjusting.symmetric_boards import consistent_turns
 from survey.jobs.identify import identify_spots, without_points
@@ -176,20 +177,24 @@ def _result(work: Work) -> Adjustment:
 
 def told(project: Project, given: Survey, adjustment: Adjustment) -> Adjustment:
     """An adjustment that says what was noticed when its project was read, and how much of ``given`` it left out."""
-    warnings = adjustment.warnings + project.notes + project.image_notes + image_warnings(project.detected)
+    named = 0 if adjustment.diagnosis is None else len(adjustment.diagnosis.told())
+    offered = {h.place.ids[0]: n for n, h in enumerate(blurred(project.survey, project.detected), start=named + 1)}
+    warnings = adjustment.warnings + project.notes + project.image_notes + image_warnings(project.detected, offered)
     images = sum(b.n_used for b in given.image_blocks)
     images -= int(adjustment.image_residuals.used.sum())
     others = given.n_others_used - adjustment.survey.n_others_used
     return replace(adjustment, warnings=warnings, n_screened=images + others)
 
 
-def image_warnings(images: Mapping[tuple[str, str], DetectedImage]) -> tuple[str, ...]:
+def image_warnings(
+    images: Mapping[tuple[str, str], DetectedImage], offered: Mapping[str, int] = MappingProxyType({})
+) -> tuple[str, ...]:
     """Boards of a wrong size, once each; images that are wrong as such, by camera; those without targets, or not read.
 
-    At every adjustment, not only at the first.
+    At every adjustment, not only at the first. offered: see :func:`defect_warnings`.
     """
     sizes = dict.fromkeys(entry.wrong_size for entry in images.values() if entry.wrong_size)
-    wrong = defect_warnings({key: entry.defect for key, entry in images.items()})
+    wrong = defect_warnings({key: entry.defect for key, entry in images.items()}, offered)
     return tuple(f"detection: {text}" for text in (*sizes, *wrong)) + tuple(
         f"detection: {entry.file}: {entry.status}{': ' + entry.message if entry.message else ''}"
         for entry in images.values()

@@ -9,6 +9,7 @@ from adjust.model.errors import DiagnosedError, SurveyError
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write
 from survey.jobs.adjusting.edits import changed_files, left_out
+from survey.jobs.adjusting.image_defects import blurred
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.excluding import FILE, new_rows
 from survey.project import read
@@ -41,11 +42,14 @@ def chosen_of(folder: Path, candidates: Sequence[Hypothesis], number: int) -> Hy
 
 
 def _candidates(folder: Path) -> list[Hypothesis]:
+    """Those that the diagnosis tells, then what leaves blurred images out."""
+    project = read(folder)
     try:
-        diagnosis = adjust_project(read(folder), False).diagnosis
+        diagnosis = adjust_project(project, False).diagnosis
     except DiagnosedError as error:
         diagnosis = error.diagnosis
-    return [c.hypothesis for c in diagnosis.candidates] if isinstance(diagnosis, Diagnosis) else []
+    named = diagnosis.candidates[: len(diagnosis.told())] if isinstance(diagnosis, Diagnosis) else ()
+    return [*(c.hypothesis for c in named), *blurred(project.survey, project.detected)]
 
 
 def carried_out(folder: Path, chosen: Hypothesis) -> str:
