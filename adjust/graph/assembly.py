@@ -256,6 +256,15 @@ class AdjustmentGraph:
             bundle.prepare(values, jacobians, damping)
         return Evaluation(values, damping, reduction, self.state.evaluation)
 
+    def prepare_rows(self, values: gtsam.Values) -> None:
+        """The same for the rows of single observations alone: no normal equations of image blocks, no reduction."""
+        self.state.load(values)
+        self.images.chains.evaluate(self.state)
+        if self.terrestrial is not None:
+            self.terrestrial.prepare(values, True)
+        for bundle in self.bundles:
+            bundle.prepare(values, False)
+
     def _reduced_here(self, damping: float) -> PoseReduction | None:
         return self.reduction if self.reduction is not None and self.reduction.reduce(damping) else None
 

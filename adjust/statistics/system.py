@@ -229,7 +229,7 @@ def stacked(parts: Sequence[sparse.csr_matrix]) -> sparse.csr_matrix:
 def assembled(precision: Precision, image_rows: MakeImageRows) -> LinearSystem:
     """The system of these image rows over n columns, and of all other observations."""
     graph = precision.graph
-    graph.prepare(precision.solved.values, jacobians=True)
+    graph.prepare_rows(precision.solved.values)
 
     def of_item(item: ObservationFactor) -> ItemRows:
         kept = precision.rows(item)

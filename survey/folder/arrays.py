@@ -1,5 +1,6 @@
-"""Arrays out of an ``.npz`` that may come from anywhere: nothing is run, and nothing unpacks to more than it may."""
+"""Arrays into an ``.npz``, and out of one from anywhere: nothing is run, nothing unpacks to more than it may."""
 
+import io
 import math
 import struct
 import tokenize
@@ -31,6 +32,16 @@ def read_arrays(path: Path, names: Iterable[str] | None = None) -> dict[str, npt
             return {name: _array(archive, f"{name}.npy") for name in wanted}
     except _DAMAGE as error:
         raise ValueError(f"{path.name} is damaged: {error}") from error
+
+
+def packed_arrays(**arrays: npt.NDArray[Any]) -> bytes:
+    """An ``.npz`` of these: packed lightly, as covariances are noise that no more work makes much smaller."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, values in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, values, allow_pickle=False)
+    return out.getvalue()
 
 
 def _check_sizes(archive: zipfile.ZipFile, packed: int) -> None:

@@ -1,13 +1,12 @@
 """The file ``covariance.npz`` of results: covariances of all parameters."""
 
-import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from adjust.model.result import Adjustment
-from survey.folder.arrays import read_arrays
+from survey.folder.arrays import packed_arrays, read_arrays
 from survey.solution.quantities import SigmaKind, scale_of
 
 _README = (
@@ -25,9 +24,7 @@ def covariance_npz(adjustment: Adjustment, sigmas: SigmaKind = "a_posteriori") -
     parameters = ["/".join(e.name) for e in estimates]
     names = [f"{p}/{c}" for p, e in zip(parameters, estimates, strict=True) for c in e.components]
     sizes = np.array([len(e.components) for e in estimates], dtype=np.int64)
-    out = io.BytesIO()
-    np.savez_compressed(
-        out,
+    return packed_arrays(
         README=np.array(_README),
         names=np.array(names, dtype=str),
         units=np.array([u for e in estimates for u in e.units], dtype=str),
@@ -38,7 +35,6 @@ def covariance_npz(adjustment: Adjustment, sigmas: SigmaKind = "a_posteriori") -
         sigmas=np.array(scale.sigmas),
         factor=np.array(scale.factor),
     )
-    return out.getvalue()
 
 
 def read_covariances(path: Path) -> dict[str, Any]:

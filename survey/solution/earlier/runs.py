@@ -7,7 +7,6 @@ Images are never kept.
 """
 
 import hashlib
-import io
 import json
 import re
 from collections.abc import Iterable, Mapping
@@ -21,7 +20,7 @@ from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Estimate, ParameterName
-from survey.folder.arrays import read_arrays
+from survey.folder.arrays import packed_arrays, read_arrays
 from survey.folder.plain import plain
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write, decode, read_bytes
@@ -176,9 +175,7 @@ def _estimates_npz(estimates: Iterable[Estimate]) -> bytes:
     values = [e.value.matrix()[:3].ravel() if isinstance(e.value, Pose3) else np.asarray(e.value, dtype=float).ravel()
               for e in every]  # fmt: skip
     sizes = np.array([len(e.components) for e in every], dtype=np.int64)
-    out = io.BytesIO()
-    np.savez_compressed(
-        out,
+    return packed_arrays(
         parameters=np.array(["/".join(e.name) for e in every], dtype=str),
         names=np.array([c for e in every for c in e.components], dtype=str),
         units=np.array([u for e in every for u in e.units], dtype=str),
@@ -189,7 +186,6 @@ def _estimates_npz(estimates: Iterable[Estimate]) -> bytes:
         value_start=np.cumsum([0, *map(len, values)]),
         values=np.concatenate([*values, np.empty(0)]),
     )
-    return out.getvalue()
 
 
 def _estimates(found: Mapping[str, Any]) -> Iterable[Estimate]:
