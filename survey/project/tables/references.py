@@ -154,6 +154,26 @@ def check_epochs(a: FrameRef | None, b: FrameRef | None, names: Names) -> None:
             raise NameProblemError(f"{name!r} moves and the epoch is not given; write '{name}@epoch_id'")
 
 
+def frame_at(table: Table, row: int, column: str, text: str, names: Names) -> FrameRef:
+    """The frame that a row names, with its epoch where it moves; SurveyError where it is none."""
+    try:
+        frame = read_frame(text, names)
+        check_epochs(frame, None, names)
+    except NameProblemError as problem:
+        raise table.error(row, f"{column}: {problem}") from problem
+    return frame
+
+
+def position_at(table: Table, row: int, text: str, names: Names) -> PositionRef:
+    """The position that a row names in point_id; SurveyError where it is none."""
+    try:
+        position = read_position(text, names)
+        check_epochs(position.frame, None, names)
+    except NameProblemError as problem:
+        raise table.error(row, f"point_id: {problem}") from problem
+    return position
+
+
 def read_ends(
     table: Table, row: int, texts: tuple[str, str], names: Names, what: str
 ) -> tuple[PositionRef, PositionRef]:
