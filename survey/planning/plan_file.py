@@ -16,7 +16,7 @@ from survey.folder.units import to_si
 from survey.planning.plan_readings import TERRESTRIAL_KEYS, Terrestrial, read_terrestrial
 from survey.project.declared.node import Node, read_toml
 from survey.project.declared.poses import POSE_KEYS, read_pose, rotation_from_euler
-from survey.project.tables.references import NameProblemError, Names, read_frame, read_position
+from survey.project.tables.references import NameProblemError, Names, position_of, read_frame
 
 PLAN_FILE = "plan.toml"
 _MOST = 100_000  # of whatever is counted in one place: more nobody measures, and memory ends
@@ -292,28 +292,16 @@ def _by_hand(node: Node, survey: Survey) -> ByHand:
 
 def _distance(node: Node, names: Names) -> Distance:
     node.allow("name", "from", "to", "sigma_mm")
-    a, b = (_position(node, key, names) for key in ("from", "to"))
+    a, b = (position_of(node, names, node.text(key), key) for key in ("from", "to"))
     name = node.text("name", f"{node.text('from')}-{node.text('to')}")
     return Distance(name, a, b, 1.0, float(to_si(node.number("sigma_mm", positive=True), "mm")))
-
-
-def _position(node: Node, key: str, names: Names) -> PositionRef:
-    try:
-        return read_position(node.text(key), names)
-    except NameProblemError as problem:
-        raise node.error(str(problem), key) from problem
 
 
 def _coordinates(node: Node, names: Names) -> list[PlannedPoint]:
     node.allow("of", "sigma_mm")
     sigma = float(to_si(node.number("sigma_mm", positive=True), "mm"))
-    out = []
-    for i, text in enumerate(node.names("of")):
-        try:
-            out.append(PlannedPoint(f"coordinates of {text}", read_position(text, names), sigma))
-        except NameProblemError as problem:
-            raise node.error(str(problem), "of", i) from problem
-    return out
+    return [PlannedPoint(f"coordinates of {text}", position_of(node, names, text, "of", i), sigma)
+            for i, text in enumerate(node.names("of"))]  # fmt: skip
 
 
 def _pair(node: Node, names: Names) -> Pair:
