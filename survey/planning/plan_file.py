@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from gtsam import Pose3, Rot3
@@ -20,6 +20,7 @@ from survey.project.tables.references import NameProblemError, Names, position_o
 
 PLAN_FILE = "plan.toml"
 _MOST = 100_000  # of whatever is counted in one place: more nobody measures, and memory ends
+_Count = TypeVar("_Count", int, float)
 _EPOCH_KEYS = (
     *("name", "cameras", "targets", "points", "table", "angles_deg", "grid_deg", "station", "target", "poses"),
     *("count", "by_hand", "each_camera"),
@@ -253,7 +254,7 @@ def _places(node: Node, survey: Survey, kind: str) -> tuple[list[dict[str, Any]]
     return out, None
 
 
-def _few(node: Node, n: Any, key: str) -> Any:
+def _few(node: Node, n: _Count, key: str) -> _Count:
     """The number itself. Raises SurveyError where it is more than can be meant."""
     if n > _MOST:
         raise node.error(f"makes {n:.3g}; at most {_MOST} are planned in one place, take fewer", key)

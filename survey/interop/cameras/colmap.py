@@ -20,7 +20,17 @@ from scipy.spatial.transform import Rotation
 
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, ImageBlock
-from adjust.model.survey import Camera, Datum, FloatArray, Point, PointParameter, PoseParameter, Station, Survey
+from adjust.model.survey import (
+    Camera,
+    Datum,
+    FloatArray,
+    LensParameter,
+    Point,
+    PointParameter,
+    PoseParameter,
+    Station,
+    Survey,
+)
 from survey.folder.text import atomic_write, id_problem
 from survey.interop.cameras.colmap_model import ColmapCamera, ColmapModel, read_model
 from survey.interop.cameras.lens_maps import BROWN_8, FISHEYE_4, MappedLens, mapped_lens
@@ -128,7 +138,7 @@ def _epochs(model: ColmapModel, rig_id: int) -> dict[int, str]:
     return stems
 
 
-def _lens(camera: ColmapCamera) -> Any:
+def _lens(camera: ColmapCamera) -> LensParameter:
     model, names = _READ[camera.model]
     values = dict(zip(names, camera.params.tolist(), strict=True))
     if "f" in values:
