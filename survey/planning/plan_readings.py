@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -29,6 +29,8 @@ from survey.project.tables.references import Names, frame_of, position_of
 
 READING_KINDS = ("direction", "angle", "zenith", "azimuth", "slope_distance", "horizontal_distance",
                  "height_difference")  # fmt: skip
+_MOST = 100_000  # of whatever is counted in one place: more nobody measures, and memory ends
+_Count = TypeVar("_Count", int, float)
 _ANGLES = READING_KINDS[:4]
 _KEYS = (
     *("setup", "from", "to", "second", "kinds", "sigma_arcsec", "sigma_mm", "instrument_height_mm"),
@@ -47,16 +49,30 @@ class Terrestrial:
     on_surfaces: tuple[OnSurface, ...] = ()
     coordinate_differences: tuple[CoordinateDifferences, ...] = ()
 
-
     def added_to(self, survey: Survey) -> Survey:
         """The survey with these observations too."""
         lists: dict[str, Any] = {f.name: getattr(survey, f.name) + getattr(self, f.name) for f in fields(self)}
         return replace(survey, **lists)
 
 
-def read_terrestrial(nodes: Callable[[str], list[Node]], names: Names, prefix: str) -> Terrestrial:
-    """Everything of these kinds; nodes: the tables of a list by its key. prefix: of the ids. Raises SurveyError."""
-    parts = {key: nodes(key) for key in TERRESTRIAL_KEYS}
+def tables_of(node: Node, key: str) -> list[Node]:
+    """The tables of a list ``[[key]]``."""
+    values = node.values.get(key, [])
+    if not isinstance(values, list) or not all(isinstance(v, dict) for v in values):
+        raise node.error(f"expected a list of tables; write [[{'.'.join(map(str, (*node.path, key)))}]]", key)
+    return [Node(node.file, node.lines, (*node.path, key, i), v) for i, v in enumerate(values)]
+
+
+def few(node: Node, n: _Count, key: str) -> _Count:
+    """The number itself. Raises SurveyError where it is more than can be meant."""
+    if n > _MOST:
+        raise node.error(f"makes {n:.3g}; at most {_MOST} are planned in one place, take fewer", key)
+    return n
+
+
+def read_terrestrial(node: Node, names: Names, prefix: str) -> Terrestrial:
+    """Everything of these kinds. prefix: of the ids. Raises SurveyError."""
+    parts = {key: tables_of(node, key) for key in TERRESTRIAL_KEYS}
     return Terrestrial(
         tuple(r for i, n in enumerate(parts["readings"]) for r in _readings(n, names, f"{prefix}{i + 1}")),
         tuple(_level(n, names, f"{prefix}level{i + 1}") for i, n in enumerate(parts["levels"])),
