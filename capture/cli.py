@@ -8,12 +8,12 @@ import argparse
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from adjust.model.errors import SurveyError
 from survey.commands.common import DONE, is_set, print_json, run_as_program, run_command, say
 from survey.commands.completion import declare_completion
-from survey.commands.parser import port, program_parser, project_folder
+from survey.commands.parser import Commands, port, program_parser, project_folder
 
 if TYPE_CHECKING:
     from capture.devices.camera import CameraInfo
@@ -53,44 +53,42 @@ def build_parser() -> argparse.ArgumentParser:
     return program_parser("labcapture", _OPENING, _DESCRIPTION, _EPILOG, flags, declared)
 
 
-def _add_run(commands: Any, shaped: dict[str, Any]) -> None:
-    parser = commands.add_parser(
+def _add_run(commands: Commands) -> None:
+    parser = commands.add(
         "run",
+        _run,
         help="take the images of a plan (the main job)",
         usage=f"{_OPENING}   (labcapture run PLAN [--dry-run])",
         description="Turns the table to every pose of the plan, takes one image with every camera, writes them to the\n"
         "project folder with a journal. Epochs that are recorded already are not taken again.\n"
         "While it runs: p pauses and goes on (or: kill -USR1 PID), Ctrl-C stops table and session at once.",
         epilog="Next: labsurvey adjust FOLDER   (the folder that the plan names)",
-        **shaped,
     )
     parser.add_argument("plan", type=Path, metavar="PLAN", help="capture plan, a TOML file")
     parser.add_argument("--dry-run", action="store_true", help="print poses and time, check limits; move nothing")
-    parser.set_defaults(run=_run)
 
 
-def _add_cameras(commands: Any, shaped: dict[str, Any]) -> None:
-    parser = commands.add_parser(
+def _add_cameras(commands: Commands) -> None:
+    parser = commands.add(
         "cameras",
+        _cameras,
         help="list the cameras that can be reached",
         usage="labcapture cameras   (labcapture cameras [DRIVER])",
         description="Asks every driver whose software is installed; the first column is the address for a plan.",
         epilog="Next: labcapture run plan.toml --dry-run",
-        **shaped,
     )
     parser.add_argument("driver", nargs="?", default="all", metavar="DRIVER", help="ask this driver only")
-    parser.set_defaults(run=_cameras)
 
 
-def _add_table(commands: Any, shaped: dict[str, Any]) -> None:
-    parser = commands.add_parser(
+def _add_table(commands: Commands) -> None:
+    parser = commands.add(
         "table",
+        _table,
         help="list drivers; show, turn, home or stop the table of a plan",
         usage="labcapture table plan.toml   (labcapture table [PLAN] [--jog AXIS=DEG ...] [--home] [--stop])",
         description="Without a plan: the drivers and dialects. With one: where its table is.\n"
         "The plan's limits hold for --jog as for a session.",
         epilog="Next: labcapture run plan.toml --dry-run",
-        **shaped,
     )
     parser.add_argument("plan", nargs="?", type=Path, metavar="PLAN", help="capture plan whose table is meant")
     parser.add_argument(
@@ -98,18 +96,17 @@ def _add_table(commands: Any, shaped: dict[str, Any]) -> None:
     )
     parser.add_argument("--home", action="store_true", help="look for the references")
     parser.add_argument("--stop", action="store_true", help="stop all axes")
-    parser.set_defaults(run=_table)
 
 
-def _add_view(commands: Any, shaped: dict[str, Any]) -> None:
-    parser = commands.add_parser(
+def _add_view(commands: Commands) -> None:
+    parser = commands.add(
         "view",
+        _view,
         help="watch a session on a local web page",
         usage="labcapture view plan.toml   (labcapture view PLAN [--port N] [--live] [--allow-move])",
         description="Serves a page on this machine only: the last images with the targets found in them, what of each\n"
         "camera's image is covered, progress. --live shows what the cameras see now, while no session runs.",
         epilog="Next: open the address that it prints",
-        **shaped,
     )
     parser.add_argument("plan", type=Path, metavar="PLAN", help="capture plan")
     parser.add_argument("--port", type=port, default=8780, metavar="N", help="on loopback; 0 takes a free one")
@@ -118,21 +115,19 @@ def _add_view(commands: Any, shaped: dict[str, Any]) -> None:
     parser.add_argument(
         "--allow-move", action="store_true", help="let the page turn and stop the table, with the token that is printed"
     )
-    parser.set_defaults(run=_view)
 
 
-def _add_export(commands: Any, shaped: dict[str, Any]) -> None:
-    parser = commands.add_parser(
+def _add_export(commands: Commands) -> None:
+    parser = commands.add(
         "export",
+        _export,
         help="write a recorded run as NeXus/HDF5",
         usage="labcapture export lab lab.nxs   (labcapture export FOLDER FILE.nxs)",
         description="Images, setpoints, readbacks and times of all recorded epochs in one NXentry.",
         epilog="Next: labsurvey adjust FOLDER",
-        **shaped,
     )
     parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder that was captured")
     parser.add_argument("file", type=Path, metavar="FILE.nxs", help="new file")
-    parser.set_defaults(run=_export)
 
 
 def _run(arguments: argparse.Namespace) -> int:

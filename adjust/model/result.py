@@ -10,7 +10,7 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.model.errors import Explanation
-from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, Survey
 
 # ("lens", camera) ("station_from_camera", camera) ("world_from_station", station[, epoch])
 # ("mount_from_station", station) ("world_from_table", table) ("table_geometry", table) ("table_angles", table, epoch)
@@ -37,6 +37,16 @@ class Estimate:
     units: tuple[str, ...]
     cov: FloatArray
     status: tuple[str, ...]
+
+
+def adjusted_pose(
+    estimates: Mapping[ParameterName, Estimate], name: ParameterName, parameter: PoseParameter
+) -> Pose3 | None:
+    """The estimate of a pose; where it is no unknown its value, the identity where it is held without one."""
+    if name in estimates:
+        value = estimates[name].value
+        return value if isinstance(value, Pose3) else None
+    return Pose3() if parameter.value is None and parameter.treatment == "held" else parameter.value
 
 
 @dataclass(frozen=True, eq=False)

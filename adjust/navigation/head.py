@@ -12,8 +12,8 @@ from adjust.frames.lens_times import LensTimes
 from adjust.lenses.crops import crop_size, cropped_lens
 from adjust.lenses.models import MODELS, camera_constants
 from adjust.model.errors import SurveyError
-from adjust.model.result import Adjustment, ParameterName
-from adjust.model.survey import Camera, FloatArray, ImageCrop, PoseParameter, Survey
+from adjust.model.result import Adjustment, ParameterName, adjusted_pose
+from adjust.model.survey import Camera, FloatArray, ImageCrop, Survey
 from adjust.navigation.model import Beacons, Head, HeadCamera, HeadTable
 from adjust.precision.precision import precision_of
 
@@ -87,7 +87,7 @@ def _cropped(
 def _camera(adjustment: Adjustment, camera: Camera, epoch_id: str | None) -> HeadCamera:
     camera_id, times = camera.camera_id, LensTimes(adjustment.survey)
     lens = times.lens(camera, epoch_id, partial(_known, adjustment))
-    pose = _pose(adjustment, ("station_from_camera", camera_id), camera.station_from_camera)
+    pose = adjusted_pose(adjustment.estimates, ("station_from_camera", camera_id), camera.station_from_camera)
     if pose is None:
         raise SurveyError(f"camera {camera_id}: the adjustment does not tell how it sits on its station")
     return HeadCamera(camera_id, times.size(camera, epoch_id), camera.lens.model, lens, camera_constants(camera), pose)
@@ -99,8 +99,8 @@ def _table(adjustment: Adjustment, station_id: str) -> HeadTable | None:
     if station is None or station.motion != "table" or station.table_id is None:
         return None
     table = next(t for t in survey.tables if t.table_id == station.table_id)
-    base = _pose(adjustment, ("world_from_table", table.table_id), table.world_from_table)
-    mount = _pose(adjustment, ("mount_from_station", station_id), station.mount_from_station)
+    base = adjusted_pose(adjustment.estimates, ("world_from_table", table.table_id), table.world_from_table)
+    mount = adjusted_pose(adjustment.estimates, ("mount_from_station", station_id), station.mount_from_station)
     if base is None or mount is None:
         return None
     values = dict(zip(table.geometry.names, table.geometry.values.tolist(), strict=True))
@@ -108,15 +108,6 @@ def _table(adjustment: Adjustment, station_id: str) -> HeadTable | None:
     if found is not None and not isinstance(found.value, Pose3):
         values |= dict(zip(found.components, found.value.tolist(), strict=True))
     return HeadTable(table.axes, base, values, mount)
-
-
-def _pose(adjustment: Adjustment, name: ParameterName, parameter: PoseParameter) -> Pose3 | None:
-    found = adjustment.estimates.get(name)
-    if found is not None and isinstance(found.value, Pose3):
-        return found.value
-    if parameter.value is None and parameter.treatment == "held":
-        return Pose3()
-    return parameter.value
 
 
 def _known(adjustment: Adjustment, name: ParameterName) -> FloatArray | None:

@@ -14,6 +14,7 @@ from adjust.frames.state import State
 from adjust.frames.unknowns import Chain, Unknown, Unknowns, VectorMap
 from adjust.model.observations import Coordinates, Distance, Pair
 from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, VectorPrior
+from adjust.observations.adapter import evaluated
 from adjust.observations.images.batch import Chains
 from adjust.spatial.rigid import skew
 
@@ -43,13 +44,13 @@ def gaussian(cov: FloatArray) -> gtsam.noiseModel.Gaussian:
 def custom(
     keys: Sequence[int], noise: FloatArray | gtsam.noiseModel.Base, residual: Residual
 ) -> gtsam.CustomFactor:
-    """The one place that knows GTSAM's callback: from ``values -> (residual, [(key, jacobian)])`` to a factor.
+    """From ``values -> (residual, [(key, jacobian)])`` to a factor.
 
     noise: covariance, or a model of GTSAM's. A key that comes more than once has its Jacobians added.
     """
     at = {key: i for i, key in enumerate(keys)}
 
-    def call(_factor, values, jacobians):  # type: ignore[no-untyped-def]  # GTSAM's protocol, bound untyped
+    def call(values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
         r, blocks = residual(values)
         if jacobians is not None:
             sums: dict[int, FloatArray] = {}
@@ -60,7 +61,7 @@ def custom(
         return r
 
     model = noise if isinstance(noise, gtsam.noiseModel.Base) else gaussian(noise)
-    return gtsam.CustomFactor(model, list(keys), call)
+    return evaluated(model, keys, call)
 
 
 class ChainPose:

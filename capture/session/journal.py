@@ -33,7 +33,7 @@ class Journal:
         if is_new:
             sync_folder(path.parent)
 
-    def append(self, kind: str, **values: Any) -> Record:
+    def append(self, kind: str, **values: object) -> Record:
         """Add a record; on return it is on disk. Where that fails, nothing of it stays. Raises OSError."""
         record = {"n": len(self.records), "kind": kind, **values}
         line = json.dumps(record, allow_nan=False, ensure_ascii=False).encode() + b"\n"

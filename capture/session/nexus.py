@@ -16,11 +16,12 @@ from capture.session.folder import damaged, journal_path
 from capture.session.journal import Record, read_journal, taken_sets
 from capture.session.recorded import require_recorded
 from survey.detection.gray import read_image
+from survey.folder.extras import library
 
 
 def export(folder: Path, file: Path) -> dict[str, Any]:
     """Write the recorded epochs of a project to a new file; counts. Raises SurveyError."""
-    h5py = _h5py()
+    h5py = library("h5py", "nexus", "NeXus files need h5py")
     folder, file = Path(folder), Path(file)
     if file.exists():
         raise SurveyError(f"{file}: it exists already; name a new file, or remove it")
@@ -58,15 +59,6 @@ def _start_of(folder: Path, records: Sequence[Record], sets: Sequence[Record]) -
             raise SurveyError(f"{folder}: {record['epoch_id']} has other cameras, images or axes than the rest; a file "
                               "holds one kind of session: export a folder for each")  # fmt: skip
     return started
-
-
-def _h5py() -> Any:
-    try:
-        import h5py
-    except ImportError as error:
-        advice = "pip install 'labsurvey[nexus]'"
-        raise SurveyError(f"NeXus files need h5py, which is not installed; {advice}") from error
-    return h5py
 
 
 def _group(parent: Any, name: str, kind: str) -> Any:

@@ -13,7 +13,7 @@ from survey.project.captured import LOCATION, is_id, is_size
 from survey.project.project import IMAGES_FOLDER
 
 
-def _is_time(value: Any) -> bool:
+def _is_time(value: object) -> bool:
     """Since 1970 in ns, in years of four digits."""
     return bool(WHOLE(value) and value >= 0)
 

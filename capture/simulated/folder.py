@@ -16,16 +16,15 @@ from capture.simulated.angles import write_angles
 from capture.simulated.laboratory import (
     BEACON_EXPOSURE_US,
     CAMERA_IDS,
-    IMAGE_SIZE,
     LabPose,
     LabSize,
     SimulatedLab,
     furnished_lab,
     make_lab,
 )
+from survey.examples.folders import GIVEN, HEAD_ON_TABLE, camera_text, coordinates_text, spots_text, target_text
 from survey.examples.truth import truth_json
 from survey.folder.whole import whole_folder
-from survey.simulate.parts import BOARD
 
 LAB, ANGLES = "lab.json", "angles.json"
 _COORDINATES_SIGMA_MM = 0.4
@@ -66,77 +65,23 @@ def read_lab(folder: Path, noise_seed: int | None = None) -> SimulatedLab:
 
 
 def _survey_toml(lab: SimulatedLab) -> str:
+    draft = lab.draft
     text = """# A head with three cameras on a two-axis table before a board that hangs in the laboratory: simulated.
 format = 1
 title = "Simulated laboratory"
 """
-    for camera_id in CAMERA_IDS:
-        text += f"""
-[cameras.{camera_id}]
-station = "head"
-image_size_px = [{IMAGE_SIZE[0]}, {IMAGE_SIZE[1]}]
-
-[cameras.{camera_id}.lens]
-model = "brown"
-free = ["fx", "fy", "u0", "v0", "k1", "k2", "p1", "p2"]
-"""
-    text += f"""
-[stations.head]
-motion = "table"
-table = "turntable"
-mount_from_station = {{ treatment = "held" }}        # the frame of the head is that of the table's inner axis
-
-[tables.turntable]
-axes = ["x", "z"]                                  # outermost first
-sigma_arcsec = 8.0
-world_from_table = {{ treatment = "free" }}
-geometry = {{ free = ["non_orthogonality", "axis_offset"] }}
-
-[targets.board]
-kind = "checkerboard"
-columns = {BOARD.columns}
-rows = {BOARD.rows}
-square_mm = {1e3 * BOARD.square_m:.1f}
-pose = {{ treatment = "held" }}                      # the board is the world
-"""
-    return text + _beacons(lab) + _END
-
-
-_END = """
-[sigmas]
-image_px = 0.1                                     # where the detector gives none
-
-[datum]
-kind = "given"                                     # the board is held
-
-[adjustment]
-alpha = 0.05
-"""
-
-
-def _beacons(lab: SimulatedLab) -> str:
-    if not lab.draft.points:
-        return ""
-    points = "\n".join(f"[points.{p.point_id}]" for p in lab.draft.points)
-    cameras = ", ".join(f'"{name}"' for name in CAMERA_IDS)
-    dark = ", ".join(f'"{p.epoch_id}"' for p in lab.poses if p.exposure_us == BEACON_EXPOSURE_US)
-    return f"""
-{points}
-
-[spots]                                            # images in which beacons are looked for
-cameras = [{cameras}]
-epochs = [{dark}]
-diameter_px = [1.5, 12.0]
-gate_px = 15.0
-"""
+    text += "".join(map(camera_text, draft.cameras)) + HEAD_ON_TABLE.replace("{}", "")
+    text += "".join(target_text(target, draft.kinds[target.target_id]) for target in draft.targets)
+    if draft.points:
+        text += "\n" + "\n".join(f"[points.{p.point_id}]" for p in draft.points) + "\n"
+        dark = (p.epoch_id for p in lab.poses if p.exposure_us == BEACON_EXPOSURE_US)
+        text += spots_text(CAMERA_IDS, dark, 1.5)
+    return text + GIVEN
 
 
 def _coordinates(lab: SimulatedLab) -> str:
     rng = np.random.default_rng((lab.seed, 1))
-    sigma = f"{_COORDINATES_SIGMA_MM:.1f}"
-    lines = ["point_id,x_mm,y_mm,z_mm,sigma_x_mm,sigma_y_mm,sigma_z_mm"]
-    for point in lab.draft.points:
-        true = lab.draft.scene().vector("point", point.point_id)
-        x, y, z = 1e3 * true + rng.normal(0.0, _COORDINATES_SIGMA_MM, 3)
-        lines.append(f"{point.point_id},{x:.3f},{y:.3f},{z:.3f},{sigma},{sigma},{sigma}")
-    return "\n".join(lines) + "\n"
+    true = ((p.point_id, lab.draft.scene().vector("point", p.point_id)) for p in lab.draft.points)
+    return coordinates_text(
+        ((name, x + 1e-3 * rng.normal(0.0, _COORDINATES_SIGMA_MM, 3)) for name, x in true), _COORDINATES_SIGMA_MM
+    )

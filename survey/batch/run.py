@@ -63,7 +63,7 @@ def run_batch(folders: Sequence[Path], options: BatchOptions, told: Told = lambd
     with contextlib.ExitStack() as stack:
         journal = stack.enter_context(Journal(options.report, kept)) if options.report is not None else None
         bar = stack.enter_context(_bar(len(paths), len(records), options))
-        tasks = {i: _task(str(folders[i]), paths[i], options) for i in left}
+        tasks = {i: {"folder": str(folders[i]), "path": str(paths[i]), "redetect": options.redetect} for i in left}
         for i, record in _run(tasks, options):
             records[i] = record
             if journal is not None:
@@ -91,10 +91,6 @@ def _known(folder: str, path: Path, options: BatchOptions, before: Mapping[str, 
         return None
     same = found[0] and found[0] == fingerprint(path)
     return replace(found[1], folder=folder, origin="resumed") if same else None
-
-
-def _task(folder: str, path: Path, options: BatchOptions) -> dict[str, Any]:
-    return {"folder": folder, "path": str(path), "redetect": options.redetect}
 
 
 def _bar(total: int, done: int, options: BatchOptions) -> Any:
@@ -125,6 +121,7 @@ def _here(tasks: Mapping[int, Mapping[str, Any]], options: BatchOptions) -> Iter
 
     pool = ThreadPoolExecutor(jobs, "batch", initializer=prepare)
     try:
+
         def run(task: Mapping[str, Any]) -> Record:
             return attempts(own.worker, task, options.retries)
 

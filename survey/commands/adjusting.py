@@ -2,7 +2,7 @@
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from survey.commands.common import (
     begin_adjusting,
@@ -15,22 +15,22 @@ from survey.commands.common import (
     show,
     tested,
 )
-from survey.commands.parser import project_folder
+from survey.commands.parser import Commands, project_folder
 
 if TYPE_CHECKING:
     from survey.batch.record import Record
 
 
-def declare_adjust(commands: Any, shaped: dict[str, Any]) -> None:
+def declare_adjust(commands: Commands) -> None:
     """Add ``adjust`` to the commands."""
-    parser = commands.add_parser(
+    parser = commands.add(
         "adjust",
+        _adjust,
         help="adjust a project folder, or many side by side (the main job)",
         usage="labsurvey adjust lab   (labsurvey adjust FOLDER [FOLDER ...] [--report DIR] [--out DIR] [--redetect])",
         description="Detects targets where that has not been done, adjusts all observations, writes FOLDER/results.\n"
         "Several folders are a batch: side by side on all cores, past failures, without those that are unchanged.",
         epilog="Next: open FOLDER/results/report.html, of a batch DIR/overview.html",
-        **shaped,
     )
     parser.add_argument("folders", nargs="+", type=project_folder, metavar="FOLDER", help="folder with a survey.toml")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER")
@@ -58,7 +58,6 @@ def declare_adjust(commands: Any, shaped: dict[str, Any]) -> None:
     )  # fmt: skip
     batch.add_argument("--scheduler", metavar="ADDRESS", help="work on the Dask cluster at ADDRESS")
     batch.add_argument("--language", choices=("en", "de"), default="en", help="of the overview; default: en")
-    parser.set_defaults(run=_adjust)
 
 
 def _adjust(arguments: argparse.Namespace) -> int:

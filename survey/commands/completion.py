@@ -5,9 +5,9 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 from survey.commands.common import DONE
+from survey.commands.parser import Commands
 
 SHELLS = ("bash", "zsh", "fish")
 _EPILOG = """\
@@ -133,20 +133,17 @@ def _fish(program: str, commands: tuple[Command, ...]) -> Iterator[str]:
             yield f"complete -c {program} {seen} -a '{' '.join(c.words)}'"
 
 
-def declare_completion(
-    program: str, build_parser: Callable[[], argparse.ArgumentParser], commands: Any, shaped: dict[str, Any]
-) -> None:
+def declare_completion(program: str, build_parser: Callable[[], argparse.ArgumentParser], commands: Commands) -> None:
     """Add ``completion`` to the commands of a program whose parser ``build_parser`` makes."""
-    parser = commands.add_parser(
+    parser = commands.add(
         "completion",
+        partial(_completion, build_parser),
         help="print what makes Tab complete commands and flags in bash, zsh or fish",
         usage=f"{program} completion bash   ({program} completion SHELL)",
         description="Prints a script for the shell; nothing is installed.",
         epilog=_EPILOG.format(program=program),
-        **shaped,
     )
     parser.add_argument("shell", choices=SHELLS, metavar="SHELL", help="bash, zsh or fish")
-    parser.set_defaults(run=partial(_completion, build_parser))
 
 
 def _completion(build_parser: Callable[[], argparse.ArgumentParser], arguments: argparse.Namespace) -> int:

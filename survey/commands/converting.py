@@ -2,10 +2,9 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from survey.commands.common import DONE, require_project, show
-from survey.commands.parser import project_folder
+from survey.commands.parser import Commands, project_folder
 
 FORMATS = (
     "gama", "krumm", "lgc", "csv", "dbat", "aicon", "g2o", "json", "sinex", "colmap", "colmap-text", "opencv", "ros",
@@ -14,10 +13,11 @@ FORMATS = (
 )  # fmt: skip
 
 
-def declare_convert(commands: Any, shaped: dict[str, Any]) -> None:
+def declare_convert(commands: Commands) -> None:
     """Add ``convert`` to the commands."""
-    parser = commands.add_parser(
+    parser = commands.add(
         "convert",
+        _convert,
         help="files of other programs to project folders, and projects to files of other programs",
         usage="labsurvey convert tunnel.gkf tunnel   (labsurvey convert FROM TO [--format NAME])",
         description="FROM a file: it becomes a project folder. Read are GNU Gama's .gkf, Krumm's .dat, LGC's .lgc, a\n"
@@ -27,7 +27,6 @@ def declare_convert(commands: Any, shaped: dict[str, Any]) -> None:
         "Cameras, both ways: COLMAP's models (folders), OpenCV, ROS, ROS-Industrial, Kalibr, mrcal, MC-Calib,\n"
         "transforms.json, URDF, SDF, TUM, KITTI; only written: PLY and GLB. Most of them need --format.",
         epilog="Next: labsurvey adjust TO",
-        **shaped,
     )
     parser.add_argument("source", type=project_folder, metavar="FROM",
                         help="file of another program, or project folder")
@@ -43,7 +42,6 @@ def declare_convert(commands: Any, shaped: dict[str, Any]) -> None:
         "--block-diagonal", action="store_true",
         help="of g2o's information matrices read only the blocks of translation and of rotation",
     )  # fmt: skip
-    parser.set_defaults(run=_convert)
 
 
 def _convert(arguments: argparse.Namespace) -> int:

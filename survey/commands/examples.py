@@ -3,45 +3,43 @@
 import argparse
 import json
 from pathlib import Path
-from typing import Any
 
 from survey.commands.common import DONE, is_set, not_negative, positive, print_json
+from survey.commands.parser import Commands
 from survey.examples import EXAMPLES, write_example
 
 
-def declare_example(commands: Any, shaped: dict[str, Any]) -> None:
+def declare_example(commands: Commands) -> None:
     """Add ``example`` to the commands."""
     listed = "\n".join(f"  {name:<15}{what}" for name, what in EXAMPLES.items())
-    parser = commands.add_parser(
+    parser = commands.add(
         "example",
+        _example,
         help="write a ready project folder to try things on",
         usage="labsurvey example full-lab lab   (labsurvey example NAME DIR [--seed N] [--jobs N])",
         description=f"Writes a project with rendered images and simulated readings.\n\n{listed}",
         epilog="Next: labsurvey adjust DIR",
-        **shaped,
     )
     parser.add_argument("name", choices=tuple(EXAMPLES), metavar="NAME", help=", ".join(EXAMPLES))
     parser.add_argument("folder", type=Path, metavar="DIR", help="new folder")
     parser.add_argument("--seed", type=not_negative, default=1, metavar="N", help="other numbers give other noise")
     parser.add_argument("--jobs", type=positive, metavar="N", help="images at a time; default: one per processor")
-    parser.set_defaults(run=_example)
 
 
-def declare_schema(commands: Any, shaped: dict[str, Any]) -> None:
+def declare_schema(commands: Commands) -> None:
     """Add ``schema`` to the commands."""
-    parser = commands.add_parser(
+    parser = commands.add(
         "schema",
+        _schema,
         help="print a JSON schema of survey.toml for editors, or its reference",
         usage="labsurvey schema --out lab/survey.schema.json   (labsurvey schema [--markdown] [--out FILE])",
         description="Prints a JSON schema of survey.toml, made from the declarations that check it. With the first\n"
         "line #:schema ./survey.schema.json in survey.toml, editors complete and check its keys.\n"
         "With --markdown: the reference of all keys and of all columns of the tables.",
         epilog="Next: write #:schema ./survey.schema.json above the first line of survey.toml",
-        **shaped,
     )
     parser.add_argument("--markdown", action="store_true", help="the reference as a page, not the schema")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write FILE, not to stdout")
-    parser.set_defaults(run=_schema)
 
 
 def _example(arguments: argparse.Namespace) -> int:

@@ -1,10 +1,9 @@
 """The commands ``exclude`` and ``include``."""
 
 import argparse
-from typing import Any
 
 from survey.commands.common import DONE, Outcome, require_project, show
-from survey.commands.parser import project_folder
+from survey.commands.parser import Commands, project_folder
 
 NAMES = """\
 Names: image:X/h05  epoch:h05  camera:X  target:board  target:X/h05/board  point:board/r7c2  point:B07
@@ -13,41 +12,39 @@ A name alone will do where only one thing has it; an epoch goes before its readi
 """
 
 
-def declare_exclude(commands: Any, shaped: dict[str, Any]) -> None:
+def declare_exclude(commands: Commands) -> None:
     """Add ``exclude`` to the commands."""
-    parser = commands.add_parser(
+    parser = commands.add(
         "exclude",
+        _exclude,
         help="leave observations out from now on, with the reason",
         usage='labsurvey exclude lab X/h05 --reason "motion blur"   (labsurvey exclude FOLDER NAME [NAME ...] '
         "--reason TEXT)",
         description="Adds rows to FOLDER/observations/exclusions.csv, which every command obeys; nothing is "
         "adjusted.\n\n" + NAMES,
         epilog="Next: labsurvey adjust FOLDER",
-        **shaped,
     )
     parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder")
     parser.add_argument("names", nargs="+", metavar="NAME", help="what is to be left out")
     parser.add_argument("--reason", required=True, metavar="TEXT", help="why; stands in the report")
     parser.add_argument("--author", default="", metavar="TEXT", help="who; default: $LABSURVEY_AUTHOR, or the user")
-    parser.set_defaults(run=_exclude)
 
 
-def declare_include(commands: Any, shaped: dict[str, Any]) -> None:
+def declare_include(commands: Commands) -> None:
     """Add ``include`` to the commands."""
-    parser = commands.add_parser(
+    parser = commands.add(
         "include",
+        _include,
         help="take back what was excluded",
         usage="labsurvey include lab X/h05   (labsurvey include FOLDER NAME [NAME ...] [--reason TEXT])",
         description="Adds rows to FOLDER/observations/exclusions.csv that take others back; nothing is adjusted.\n\n"
         + NAMES,
         epilog="Next: labsurvey adjust FOLDER",
-        **shaped,
     )
     parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder")
     parser.add_argument("names", nargs="+", metavar="NAME", help="what was left out, by its name in the file")
     parser.add_argument("--reason", default="", metavar="TEXT", help="why")
     parser.add_argument("--author", default="", metavar="TEXT", help="who; default: $LABSURVEY_AUTHOR, or the user")
-    parser.set_defaults(run=_include)
 
 
 def _exclude(arguments: argparse.Namespace) -> int:

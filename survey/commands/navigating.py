@@ -2,22 +2,21 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from survey.commands.common import DONE, TEST_FAILED, is_set, require_project, say, show
-from survey.commands.parser import project_folder
+from survey.commands.parser import Commands, project_folder
 
 
-def declare_navigate(commands: Any, shaped: dict[str, Any]) -> None:
+def declare_navigate(commands: Commands) -> None:
     """Add ``navigate`` to the commands."""
-    parser = commands.add_parser(
+    parser = commands.add(
         "navigate",
+        _navigate,
         help="find the pose of the head at every epoch from beacons, named or not",
         usage="labsurvey navigate lab   (labsurvey navigate FOLDER [--epochs E ...] [--station S] [--interval S])",
         description="Calibrates from the epochs that show targets, then gives the others a pose with covariance from\n"
         "their beacons; writes FOLDER/results/trajectory.csv and .json.",
         epilog="Next: open FOLDER/results/trajectory.csv",
-        **shaped,
     )
     parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="folder with a survey.toml")
     parser.add_argument("--station", metavar="S", help="the head; default: the one that a table carries")
@@ -27,7 +26,6 @@ def declare_navigate(commands: Any, shaped: dict[str, Any]) -> None:
     parser.add_argument("--no-table", action="store_true", help="make no use of the table's angles")
     parser.add_argument("--unnamed", action="store_true", help="forget the names that spots have")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER")
-    parser.set_defaults(run=_navigate)
 
 
 def _navigate(arguments: argparse.Namespace) -> int:
@@ -45,21 +43,20 @@ def _navigate(arguments: argparse.Namespace) -> int:
     return DONE
 
 
-def declare_align(commands: Any, shaped: dict[str, Any]) -> None:
+def declare_align(commands: Commands) -> None:
     """Add ``align`` to the commands."""
-    parser = commands.add_parser(
+    parser = commands.add(
         "align",
+        _align,
         help="say how a board or table is to be turned until it is aligned",
         usage="labsurvey align lab   (labsurvey align FOLDER)",
         description="Adjusts levels, laser spots and everything else of the project, and writes a working sheet for\n"
         "each [align.ID] of survey.toml: which foot to raise and which way to turn, by how much, and\n"
         "whether that is significant. Exit code 3 while something is left to do.",
         epilog="Next: turn, measure again, labsurvey align FOLDER",
-        **shaped,
     )
     parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write DIR/results instead of FOLDER/results")
-    parser.set_defaults(run=_align)
 
 
 def _align(arguments: argparse.Namespace) -> int:

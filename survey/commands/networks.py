@@ -3,25 +3,24 @@
 import argparse
 import time
 from pathlib import Path
-from typing import Any
 
 from survey.commands.common import DONE, begin_adjusting, is_set, print_json, require_project, say, show, tested
 from survey.commands.excluding import NAMES
-from survey.commands.parser import project_folder
+from survey.commands.parser import Commands, project_folder
 
 _PAUSE_S = 0.3
 
 
-def declare_add(commands: Any, shaped: dict[str, Any]) -> None:
+def declare_add(commands: Commands) -> None:
     """Add ``add`` to the commands."""
-    parser = commands.add_parser(
+    parser = commands.add(
         "add",
+        _add,
         help="add stations or observations to an adjusted project",
         usage="labsurvey add lab lab/more   (labsurvey add FOLDER NEW [--out DIR] [--live])",
         description="NEW holds observations/*.csv and, for new stations, cameras, targets, points or tables, a "
         "survey.toml with them.\nFOLDER is adjusted with them from its last solution; on any error it stays as it was.",
         epilog="Next: open FOLDER/results/report.html",
-        **shaped,
     )
     parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="adjusted project folder")
     parser.add_argument("new", type=Path, metavar="NEW", help="folder with what is new")
@@ -30,32 +29,31 @@ def declare_add(commands: Any, shaped: dict[str, Any]) -> None:
         "--live", action="store_true",
         help="while NEW/observations/pairs.csv is written: say of each pair at once whether it fits; Ctrl-C adds all",
     )  # fmt: skip
-    parser.set_defaults(run=_add)
 
 
-def declare_remove(commands: Any, shaped: dict[str, Any]) -> None:
+def declare_remove(commands: Commands) -> None:
     """Add ``remove`` to the commands."""
-    parser = commands.add_parser(
+    parser = commands.add(
         "remove",
+        _remove,
         help="adjust a project again without some observations",
         usage="labsurvey remove lab p3   (labsurvey remove FOLDER NAME [NAME ...] [--reason TEXT] [--out DIR])",
         description="Excludes observations as 'labsurvey exclude' does, adjusts again and says what moved.\nRefuses "
         "what the rest cannot do without; on any error FOLDER stays as it was.\n\n" + NAMES,
         epilog="Next: open FOLDER/results/report.html; labsurvey include FOLDER NAME takes back",
-        **shaped,
     )
     parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder, adjusted or not")
     parser.add_argument("names", nargs="+", metavar="NAME", help="what is to be left out")
     parser.add_argument("--reason", default="", metavar="TEXT", help="why; stands in the report")
     parser.add_argument("--author", default="", metavar="TEXT", help="who; default: $LABSURVEY_AUTHOR, or the user")
     parser.add_argument("--out", type=Path, metavar="DIR", help="leave FOLDER alone, write the new project to DIR")
-    parser.set_defaults(run=_remove)
 
 
-def declare_pairs(commands: Any, shaped: dict[str, Any]) -> None:
+def declare_pairs(commands: Commands) -> None:
     """Add ``pairs`` to the commands."""
-    parser = commands.add_parser(
+    parser = commands.add(
         "pairs",
+        _pairs,
         help="pairs of a station's cameras, marker blocks or trackers, from what each of them saw",
         usage="labsurvey pairs lab --out closed   (labsurvey pairs FOLDER [--station ID] [--out DIR] [--joint])",
         description="Each camera is adjusted by itself before its own targets, which stand still; each marker block\n"
@@ -63,7 +61,6 @@ def declare_pairs(commands: Any, shaped: dict[str, Any]) -> None:
         "FOLDER/trajectories/EYE.csv (t,x,y,z,qx,qy,qz,qw) are read instead where they are there.\n"
         "DIR becomes a project in which every eye is a station, with observations/pairs.csv.",
         epilog="Next: labsurvey adjust DIR closes the loops",
-        **shaped,
     )
     parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder with image points")
     parser.add_argument("--station", metavar="ID", help="station whose eyes they are; default: the only one with two")
@@ -72,22 +69,20 @@ def declare_pairs(commands: Any, shaped: dict[str, Any]) -> None:
         "--joint", action="store_true",
         help="write the station from all eyes at once: one pair from its first eye to each other, already closed",
     )  # fmt: skip
-    parser.set_defaults(run=_pairs)
 
 
-def declare_trackers(commands: Any, shaped: dict[str, Any]) -> None:
+def declare_trackers(commands: Commands) -> None:
     """Add ``trackers`` to the commands."""
-    parser = commands.add_parser(
+    parser = commands.add(
         "trackers",
+        _trackers,
         help="clocks, drift and relative poses of trackers on one station, from their trajectories",
         usage="labsurvey trackers a.csv b.csv c.csv   (labsurvey trackers FILE FILE FILE ... [--out DIR])",
         description="Files have lines t,x,y,z,qx,qy,qz,qw (s, m, world_from_eye); a file's name is its tracker's.",
         epilog="Next: labsurvey trackers FILE FILE FILE --out DIR",
-        **shaped,
     )
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="trajectories, three or more")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write the pairs to DIR/pairs.csv")
-    parser.set_defaults(run=_trackers)
 
 
 def _add(arguments: argparse.Namespace) -> int:

@@ -6,21 +6,21 @@ from pathlib import Path
 from typing import Any
 
 from survey.commands.common import DONE, is_set, not_negative, positive, print_json, require_project, say
-from survey.commands.parser import project_folder
+from survey.commands.parser import Commands, project_folder
 from survey.folder.kept import undo_killed
 
 
-def declare_open(commands: Any, shaped: dict[str, Any]) -> None:
+def declare_open(commands: Commands) -> None:
     """Add ``open`` to the commands."""
-    parser = commands.add_parser(
+    parser = commands.add(
         "open",
+        _open,
         help="look at a project in the browser: find what is wrong, leave it out, adjust again",
         usage="labsurvey open lab   (labsurvey open FOLDER [--at PLACE] [--port N] [--read-only] [--no-browser])",
         description="Serves the workbench of a project on this machine alone, under an address that holds a token, "
         "until Ctrl-C. What is decided there goes to observations/exclusions.csv and survey.toml at once; results and "
         "runs are written by Save.\n\nFrom another machine: ssh -L 8790:127.0.0.1:8790 THIS_MACHINE",
         epilog="Next: labsurvey adjust FOLDER, labsurvey runs FOLDER",
-        **shaped,
     )
     parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder")
     parser.add_argument("--at", metavar="PLACE", default="", help="what to show first: '#image=X/hX05', '#point=B07'")
@@ -28,26 +28,24 @@ def declare_open(commands: Any, shaped: dict[str, Any]) -> None:
     parser.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help="loopback: 127.0.0.1 or ::1")
     parser.add_argument("--read-only", action="store_true", help="look only; nothing can be changed")
     parser.add_argument("--no-browser", action="store_true", help="print the address, open no browser")
-    parser.set_defaults(run=_open)
 
 
-def declare_runs(commands: Any, shaped: dict[str, Any]) -> None:
+def declare_runs(commands: Commands) -> None:
     """Add ``runs`` to the commands."""
-    parser = commands.add_parser(
+    parser = commands.add(
         "runs",
+        _runs,
         help="the runs of a project: list, compare any two, pin, restore",
         usage="labsurvey runs lab   (labsurvey runs FOLDER [list | compare A B | pin N | unpin N | restore N])",
         description="Every run of adjust that changed anything is kept under FOLDER/runs. compare: every parameter in "
         "sigmas of A, and the verdict. pin: keep it for ever; of the others the last 50 stay. restore: survey.toml and "
         "exclusions as they were then, where that can be solved.",
         epilog="Next: labsurvey runs FOLDER compare 1 2",
-        **shaped,
     )
     parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder")
     actions = ("list", "compare", "pin", "unpin", "restore")
     parser.add_argument("action", nargs="?", choices=actions, default="list", metavar="ACTION", help=", ".join(actions))
     parser.add_argument("numbers", nargs="*", type=positive, metavar="N", help="numbers of runs")
-    parser.set_defaults(run=_runs)
 
 
 def _open(arguments: argparse.Namespace) -> int:

@@ -37,12 +37,22 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: error: {_mended(message, self.prog)}\n")
 
 
-Declare = Callable[[Any, dict[str, Any]], None]
+class Commands:
+    """The commands of a program."""
+
+    def __init__(self, parser: argparse.ArgumentParser, shaped: dict[str, Any]) -> None:
+        self._known, self._shaped = parser.add_subparsers(title="commands", metavar="COMMAND", required=True), shaped
+
+    def add(self, name: str, run: Callable[[argparse.Namespace], int], **words: str) -> argparse.ArgumentParser:
+        """A command that ``run`` carries out. words: help, usage, description and epilog, as argparse has them."""
+        parser: argparse.ArgumentParser = self._known.add_parser(name, **{**self._shaped, **words})
+        parser.set_defaults(run=run, parser=parser)  # every command's arguments know the parser that they came through
+        return parser
 
 
 def program_parser(
     program: str, opening: str, description: str, epilog: str, flags: Mapping[str, str],
-    declared: Iterable[Declare],
+    declared: Iterable[Callable[[Commands], None]],
 ) -> Parser:  # fmt: skip
     """A program's parser with all its commands. flags: that stand before or after any of them, with their help."""
     shared = argparse.ArgumentParser(add_help=False)
@@ -53,11 +63,9 @@ def program_parser(
         program, usage=f"{opening}   ({program} COMMAND ...)", description=description, epilog=epilog, **shaped
     )
     parser.add_argument("--version", action=Version, nargs=0, help="print the version and stop")
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    commands = Commands(parser, shaped)
     for declare in declared:
-        declare(commands, shaped)
-    for each in commands.choices.values():  # every command's arguments know the parser that they came through
-        each.set_defaults(parser=each)
+        declare(commands)
     return parser
 
 

@@ -2,7 +2,6 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from adjust.model.errors import SurveyError
 from survey.commands.common import (
@@ -16,7 +15,7 @@ from survey.commands.common import (
     say,
     show,
 )
-from survey.commands.parser import project_folder
+from survey.commands.parser import Commands, project_folder
 
 _DESCRIPTION = """\
 With FOLDER/plan.toml: predicts what will be seen and says what sigmas everything will have, which directions are weak,
@@ -25,16 +24,16 @@ already is counted in. Without: counts conditions and redundancy of observations
 """
 
 
-def declare_plan(commands: Any, shaped: dict[str, Any]) -> None:
+def declare_plan(commands: Commands) -> None:
     """Add ``plan`` to the commands."""
-    parser = commands.add_parser(
+    parser = commands.add(
         "plan",
+        _plan,
         help="precision before measuring, what to measure next, tolerances, places for beacons",
         usage="labsurvey plan lab   (labsurvey plan FOLDER [--for NAME ...] [--add N] [--trials N] [--navigation]\n"
         "                              [--place N] | labsurvey plan --error-analysis [--out DIR])",
         description=_DESCRIPTION,
         epilog="Next: labsurvey adjust FOLDER",
-        **shaped,
     )
     parser.add_argument("folder", type=project_folder, nargs="?", metavar="FOLDER",
                         help="folder with survey.toml and plan.toml")
@@ -51,13 +50,13 @@ def declare_plan(commands: Any, shaped: dict[str, Any]) -> None:
                         help="pixel error by beacon and camera errors, 10000 trials a point")  # fmt: skip
     parser.add_argument("--pixels", type=float, default=5.0, metavar="PX", help="pixel error allowed in it (5)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER")
-    parser.set_defaults(run=_plan)
 
 
-def declare_check(commands: Any, shaped: dict[str, Any]) -> None:
+def declare_check(commands: Commands) -> None:
     """Add ``check`` to the commands."""
-    parser = commands.add_parser(
+    parser = commands.add(
         "check",
+        _check,
         help="what is weak or suspicious in a project, before it is adjusted",
         usage="labsurvey check lab   (labsurvey check FOLDER)",
         description="Looks at the observations of FOLDER without adjusting them: what they leave undetermined, points\n"
@@ -65,10 +64,8 @@ def declare_check(commands: Any, shaped: dict[str, Any]) -> None:
         "too far or too flat, suspicious units and sigmas; and what to measure next. Writes nothing.\n"
         "The exit code is 3 where something would stop or spoil the adjustment.",
         epilog="Next: labsurvey adjust FOLDER",
-        **shaped,
     )
     parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="folder with a survey.toml")
-    parser.set_defaults(run=_check)
 
 
 def _plan(arguments: argparse.Namespace) -> int:

@@ -2,29 +2,27 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from survey.commands.common import DONE, TEST_FAILED, begin_adjusting, is_set, print_json, require_project, say, tested
-from survey.commands.parser import project_folder
+from survey.commands.parser import Commands, project_folder
 
 
-def declare_report(commands: Any, shaped: dict[str, Any]) -> None:
+def declare_report(commands: Commands) -> None:
     """Add ``report`` to the commands."""
-    parser = commands.add_parser(
+    parser = commands.add(
         "report",
+        _report,
         help="write the precision report of a project, also in German, as PDF, or as a check",
         usage="labsurvey report lab --pdf   (labsurvey report FOLDER [--language en|de] [--pdf] [--check] [--out DIR])",
         description="Adjusts the observations of FOLDER and writes FOLDER/results, report.html in the language asked "
         "for.\nWith --check the exit code is 3 when the global test or a tolerance of survey.toml is not met.",
         epilog="Next: open FOLDER/results/report.html",
-        **shaped,
     )
     parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="folder with a survey.toml")
     parser.add_argument("--language", choices=("en", "de"), default="en", help="of the report; default: en")
     parser.add_argument("--pdf", action="store_true", help="write report.pdf too; needs Chromium, Chrome or WeasyPrint")
     parser.add_argument("--check", action="store_true", help="exit code 3 also where a tolerance is not met")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER")
-    parser.set_defaults(run=_report)
 
 
 def _report(arguments: argparse.Namespace) -> int:

@@ -2,27 +2,25 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from survey.commands.common import DONE, is_set, positive, print_json, require_project, say, show
-from survey.commands.parser import project_folder
+from survey.commands.parser import Commands, project_folder
 
 
-def declare_init(commands: Any, shaped: dict[str, Any]) -> None:
+def declare_init(commands: Commands) -> None:
     """Add ``init`` to the commands."""
-    parser = commands.add_parser(
+    parser = commands.add(
         "init",
+        _init,
         help="begin a project with a folder of images: cameras, sizes and boards recognised",
         usage="labsurvey init IMAGES lab   (labsurvey init IMAGES FOLDER)",
         description="Copies the images of IMAGES (one camera) or of its folders (one for each camera) to FOLDER/images "
         "and\nwrites a commented survey.toml. The name of an image is its epoch: images of the same name were taken "
         "at the\nsame moment.",
         epilog="Next: labsurvey open FOLDER, or labsurvey adjust FOLDER",
-        **shaped,
     )
     parser.add_argument("images", type=Path, metavar="IMAGES", help="images, or folders of them by camera")
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="new folder")
-    parser.set_defaults(run=_init)
 
 
 def _init(arguments: argparse.Namespace) -> int:
@@ -36,23 +34,22 @@ def _init(arguments: argparse.Namespace) -> int:
     return DONE
 
 
-def declare_detect(commands: Any, shaped: dict[str, Any]) -> None:
+def declare_detect(commands: Commands) -> None:
     """Add ``detect`` to the commands."""
-    parser = commands.add_parser(
+    parser = commands.add(
         "detect",
+        _detect,
         help="find the targets and beacons in the images of a project folder",
         usage="labsurvey detect lab   (labsurvey detect FOLDER [--all] [--jobs N] [--pictures])",
         description="Looks into images that are new or have changed, replaces their rows in "
         "FOLDER/observations/image_points.csv,\nand in spots.csv where beacons are asked for. The rows of other "
         "images stay.",
         epilog="Next: labsurvey adjust FOLDER",
-        **shaped,
     )
     parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="folder with a survey.toml and images/")
     parser.add_argument("--all", action="store_true", help="also in images that are as they were")
     parser.add_argument("--jobs", type=positive, metavar="N", help="images at a time; default: one per processor")
     parser.add_argument("--pictures", action="store_true", help="also write every image with what was found in it")
-    parser.set_defaults(run=_detect)
 
 
 def _detect(arguments: argparse.Namespace) -> int:

@@ -1,10 +1,10 @@
 """What stands in the files of each example folder, images aside."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from adjust.model.survey import FloatArray, Survey, Target
+from adjust.model.survey import Camera, FloatArray, Survey, Target
 from survey.examples.truth import truth_json
 from survey.project.targets import Charuco, Checkerboard, MarkerGrid, TargetKind
 from survey.simulate.draft import Draft
@@ -24,6 +24,28 @@ _LENS = """
 [cameras.{name}.lens]
 model = "brown"
 free = ["fx", "fy", "u0", "v0", "k1", "k2", "p1", "p2"]
+"""
+HEAD_ON_TABLE = f"""
+[stations.head]
+motion = "table"
+table = "turntable"
+mount_from_station = {{ treatment = "held" }}        # the frame of the head is that of the table's inner axis
+{{}}
+[tables.turntable]
+axes = ["x", "z"]                                  # outermost first
+sigma_arcsec = {TABLE_SIGMA_ARCSEC:.1f}
+world_from_table = {{ treatment = "free" }}
+geometry = {{ free = ["non_orthogonality", "axis_offset"] }}
+"""
+GIVEN = """
+[sigmas]
+image_px = 0.1                                     # where the detector gives none
+
+[datum]
+kind = "given"                                     # the board is held
+
+[adjustment]
+alpha = 0.05
 """
 
 
@@ -79,14 +101,15 @@ def _targets(draft: Draft) -> str:
     text = ""
     for target in draft.targets:
         seen_by = dict.fromkeys(s.camera_id for s in draft.shots if target.target_id in s.target_ids)
-        text += _target(target, draft.kinds[target.target_id])
+        text += target_text(target, draft.kinds[target.target_id])
         if len(seen_by) < len(draft.cameras):
             names = ", ".join(f'"{name}"' for name in seen_by)
             text += f"cameras = [{names}]    # only their images are searched for it\n"
     return text
 
 
-def _target(target: Target, kind: TargetKind) -> str:
+def target_text(target: Target, kind: TargetKind) -> str:
+    """A target, the world where it is held."""
     lines = [f"\n[targets.{target.target_id}]"]
     if isinstance(kind, Checkerboard):
         lines += ['kind = "checkerboard"', f"columns = {kind.columns}       # inner corners", f"rows = {kind.rows}"]
@@ -110,10 +133,11 @@ def full_lab(seed: int) -> tuple[Draft, Files]:
     """Everything in one survey."""
     draft = full_lab_draft(seed)
     survey = observed(draft, seed, 0.1, TABLE_SIGMA_ARCSEC)
+    surveyed = ((str(row.positions[0].point_id), row.values[0]) for row in survey.coordinates)
     return draft, {
         "survey.toml": _full_lab_toml(draft),
         "observations/table_angles.csv": _table_angles(survey),
-        "observations/coordinates.csv": _coordinates(survey),
+        "observations/coordinates.csv": coordinates_text(surveyed, BEACON_SIGMA_MM),
         "observations/distances.csv": _distances(survey),
         "truth.json": truth_json(draft.truth, seed),
     }
@@ -128,28 +152,24 @@ def _full_lab_toml(draft: Draft) -> str:
 format = 1
 title = "Full lab"
 """
-    for camera in draft.cameras:
-        name = camera.camera_id
-        text += f'\n[cameras.{name}]\nstation = "{camera.station_id}"\nimage_size_px = [1280, 1024]\n'
-        if camera.station_from_camera.treatment == "held":
-            text += 'station_from_camera = { treatment = "held" }       # this camera is the frame of its station\n'
-        text += _LENS.format(name=name)
-    text += f"""
-[stations.head]
-motion = "table"
-table = "turntable"
-mount_from_station = {{ treatment = "held" }}        # the frame of the head is that of the table's inner axis
+    text += "".join(map(camera_text, draft.cameras)) + HEAD_ON_TABLE.replace("{}", _RELAY)
+    return text + _targets(draft) + _points(draft) + _spots(draft)
 
+
+_RELAY = """
 [stations.relay]
 motion = "fixed"
-
-[tables.turntable]
-axes = ["x", "z"]                                  # outermost first
-sigma_arcsec = {TABLE_SIGMA_ARCSEC:.1f}
-world_from_table = {{ treatment = "free" }}
-geometry = {{ free = ["non_orthogonality", "axis_offset"] }}
 """
-    return text + _targets(draft) + _points(draft) + _spots(draft)
+
+
+def camera_text(camera: Camera) -> str:
+    """A camera and its lens."""
+    name = camera.camera_id
+    columns, rows = camera.image_size
+    text = f'\n[cameras.{name}]\nstation = "{camera.station_id}"\nimage_size_px = [{columns}, {rows}]\n'
+    if camera.station_from_camera.treatment == "held":
+        text += 'station_from_camera = { treatment = "held" }       # this camera is the frame of its station\n'
+    return text + _LENS.format(name=name)
 
 
 def _points(draft: Draft) -> str:
@@ -167,23 +187,19 @@ def _true_point(draft: Draft, point_id: str) -> FloatArray:
 
 
 def _spots(draft: Draft) -> str:
-    cameras = ", ".join(f'"{name}"' for name in dict.fromkeys(s.camera_id for s in draft.shots if s.beacons))
-    epochs = ", ".join(f'"{name}"' for name in dict.fromkeys(s.epoch_id for s in draft.shots if s.beacons))
+    shots = [s for s in draft.shots if s.beacons]
+    return spots_text((s.camera_id for s in shots), (s.epoch_id for s in shots), 2.0) + GIVEN
+
+
+def spots_text(cameras: Iterable[str], epochs: Iterable[str], least_px: float) -> str:
+    """Where beacons are looked for, and the size of their images at least."""
+    names, times = (", ".join(f'"{name}"' for name in dict.fromkeys(x)) for x in (cameras, epochs))
     return f"""
 [spots]                                            # images in which beacons are looked for
-cameras = [{cameras}]
-epochs = [{epochs}]
-diameter_px = [2.0, 12.0]
+cameras = [{names}]
+epochs = [{times}]
+diameter_px = [{least_px}, 12.0]
 gate_px = 15.0
-
-[sigmas]
-image_px = 0.1                                     # where the detector gives none
-
-[datum]
-kind = "given"                                     # the board is held
-
-[adjustment]
-alpha = 0.05
 """
 
 
@@ -195,12 +211,12 @@ def _table_angles(survey: Survey) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _coordinates(survey: Survey) -> str:
-    lines = ["point_id,x_mm,y_mm,z_mm,sigma_x_mm,sigma_y_mm,sigma_z_mm"]
-    sigma = f"{BEACON_SIGMA_MM:.1f}"
-    for row in survey.coordinates:
-        x, y, z = 1e3 * row.values[0]
-        lines.append(f"{row.positions[0].point_id},{x:.3f},{y:.3f},{z:.3f},{sigma},{sigma},{sigma}")
+def coordinates_text(found: Iterable[tuple[str, FloatArray]], sigma_mm: float) -> str:
+    """The table of coordinates: points by name, (3,) m each."""
+    lines, sigma = ["point_id,x_mm,y_mm,z_mm,sigma_x_mm,sigma_y_mm,sigma_z_mm"], f"{sigma_mm:.1f}"
+    for name, x_in_world in found:
+        x, y, z = 1e3 * x_in_world
+        lines.append(f"{name},{x:.3f},{y:.3f},{z:.3f},{sigma},{sigma},{sigma}")
     return "\n".join(lines) + "\n"
 
 

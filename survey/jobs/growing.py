@@ -32,7 +32,7 @@ _MOST_NAMED = 6
 class Growing:
     """A network that is measured: what is new stands in ``new`` and comes row by row.
 
-    pairs: of ``new``, in the session. told: complaints that were made.
+    pairs: of ``new``, in the session. told: complaints that were made. seen: states of its files at the last look.
     """
 
     definition: Definition
@@ -40,6 +40,7 @@ class Growing:
     session: NetworkSession
     pairs: dict[str, Pair] = field(default_factory=dict)
     told: set[str] = field(default_factory=set)
+    seen: tuple[tuple[int, int], ...] = ()
 
     @classmethod
     def begin(cls, folder: Path, new: Path) -> "Growing":
@@ -55,6 +56,11 @@ class Growing:
 
     def look(self) -> Iterator[str]:
         """Take in what has come since the last look; a line for each pair, and for what cannot be taken, once."""
+        files = (self.new / DEFINITION_FILE, self.new / OBSERVATIONS_FOLDER / "pairs.csv")
+        seen = tuple((status.st_mtime_ns, status.st_size) for p in files if p.is_file() for status in (p.stat(),))
+        if seen == self.seen:
+            return
+        self.seen = seen
         try:
             found = {pair.pair_id: pair for pair in self._measured()}
         except SurveyError as error:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3
 
-from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Estimate, ParameterName
+from survey.folder.extras import library
 from survey.solution.quantities import (
     ARCSEC_PER_RAD,
     Scale,
@@ -29,13 +29,7 @@ _POSES = ("station_from_camera", "mount_from_station", "world_from_station", "wo
 
 def pandas() -> Any:
     """The library. Raises SurveyError where it is not installed."""
-    try:
-        import pandas as library
-    except ImportError as error:
-        raise SurveyError(
-            "data frames need pandas, which is not installed; install it: pip install 'labsurvey[notebook]'"
-        ) from error
-    return library
+    return library("pandas", "notebook", "data frames need pandas")
 
 
 def frame(rows: list[dict[str, Any]], index: list[str], columns: list[str]) -> Any:

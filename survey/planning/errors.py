@@ -109,13 +109,9 @@ def error_analysis_job(
     bounded, paper = error_figures((BOUNDED, PAPER), n_trials, seed)
     result = ErrorAnalysis(bounded, paper, rms_px, n_trials, seed, time.perf_counter() - begin)
     if out is not None:
-        files = {f"figure_{_NUMBERS[f.kind]}.svg": _picture(f) for f in bounded}
+        files = {f"figure_{_NUMBERS[f.kind]}.svg": d.standalone(_drawn(f)) for f in bounded}
         result.paths.update(write_set(Path(out), {**files, "error_analysis.html": _page(result)}))
     return result
-
-
-def _picture(f: ErrorFigure) -> str:
-    return d.standalone(_drawn(f))
 
 
 def _drawn(f: ErrorFigure) -> Markup:

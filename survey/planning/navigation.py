@@ -13,7 +13,8 @@ from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray
 from adjust.navigation import Beacons, Expected, Head, expected_precision, head_and_beacons, head_of
-from survey.planning.plan_file import NavigationPlan, Plan
+from survey.planning.plan_file import Plan
+from survey.planning.plan_navigation import NavigationPlan
 from survey.solution.frames import AdjustedFrames
 
 _TRIALS = 1000

@@ -3,34 +3,29 @@
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from gtsam import Pose3, Rot3
+from gtsam import Pose3
 
 from adjust.design import Seeing
 from adjust.model.observations import Distance, Pair, PositionRef
 from adjust.model.survey import FloatArray, Survey
 from survey.folder.text import id_problem
 from survey.folder.units import to_si
-from survey.planning.plan_readings import TERRESTRIAL_KEYS, Terrestrial, read_terrestrial
+from survey.planning.plan_navigation import NavigationPlan, read_navigation
+from survey.planning.plan_readings import TERRESTRIAL_KEYS, Terrestrial, few, read_terrestrial, tables_of
 from survey.project.declared.node import Node, read_toml
-from survey.project.declared.poses import POSE_KEYS, read_pose, rotation_from_euler
-from survey.project.tables.references import NameProblemError, Names, read_frame, read_position
+from survey.project.declared.poses import POSE_KEYS, read_pose
+from survey.project.tables.references import NameProblemError, Names, position_of, read_frame
 
 PLAN_FILE = "plan.toml"
-_MOST = 100_000  # of whatever is counted in one place: more nobody measures, and memory ends
 _EPOCH_KEYS = (
     *("name", "cameras", "targets", "points", "table", "angles_deg", "grid_deg", "station", "target", "poses"),
     *("count", "by_hand", "each_camera"),
 )
 _HAND_KEYS = ("camera", "target", "count", "distance_mm", "tilt_deg", "seed")
 _SEEN_KEYS = ("margin_px", "nearest_mm", "farthest_mm", "widest_incidence_deg", "fewest_points", "two_sided")
-_NAVIGATION_KEYS = (
-    *("station", "sigma_px", "volume_mm", "steps", "attitudes_euler_xyz_deg", "turn_about", "turn_steps", "poses"),
-    *("required_rotation_deg", "required_translation_mm", "beacon_sigma_mm", "room_mm", "spacing_mm", "criterion"),
-    *("at_least", "camera_sigma_mm", "camera_sigma_deg", "places", "epochs"),
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,29 +107,6 @@ class Requirement:
 
 
 @dataclass(frozen=True, eq=False)
-class NavigationPlan:
-    """Where the head will be, how well its pose must be known (rad, m per component), and where beacons could be.
-
-    poses: world_from_station. epochs: patterns of planned epochs, whose poses come after these.
-    places: (m, 3) m candidate places of beacons. sigmas of a spot (px), of a beacon, of the
-    cameras' places (m) and attitudes (rad) on the head.
-    """
-
-    station_id: str | None
-    poses: tuple[Pose3, ...]
-    required_rotation: float
-    required_translation: float
-    places: FloatArray
-    sigma_px: float
-    beacon_sigma: float
-    camera_sigma: tuple[float, float]
-    criterion: Literal["worst", "mean"]
-    at_least: int
-    spacing: float
-    epochs: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
 class Plan:
     """The whole file."""
 
@@ -163,19 +135,11 @@ def read_plan(folder: Path, survey: Survey) -> Plan:
         seeing=_seeing(root.table("seen"), survey),
         planned=_measurements(root, survey, names, "p"),
         candidates=_measurements(candidates, survey, names, "c"),
-        required=tuple(_requirement(node) for node in _tables(root, "required")),
+        required=tuple(_requirement(node) for node in tables_of(root, "required")),
         wanted=root.names("wanted", ()),
-        navigation=_navigation(root.table("navigation"), survey) if root.has("navigation") else None,
+        navigation=read_navigation(root.table("navigation"), survey) if root.has("navigation") else None,
         inputs={PLAN_FILE: digest},
     )
-
-
-def _tables(node: Node, key: str) -> list[Node]:
-    """The tables of a list ``[[key]]``."""
-    values = node.values.get(key, [])
-    if not isinstance(values, list) or not all(isinstance(v, dict) for v in values):
-        raise node.error(f"expected a list of tables; write [[{'.'.join(map(str, (*node.path, key)))}]]", key)
-    return [Node(node.file, node.lines, (*node.path, key, i), v) for i, v in enumerate(values)]
 
 
 def _seeing(node: Node, survey: Survey) -> Seeing:
@@ -194,12 +158,12 @@ def _seeing(node: Node, survey: Survey) -> Seeing:
 
 def _measurements(node: Node, survey: Survey, names: Names, prefix: str) -> Measurements:
     return Measurements(
-        tuple(_moments(n, survey, i) for i, n in enumerate(_tables(node, "epochs"))),
-        tuple(_distance(n, names) for n in _tables(node, "distances")),
-        tuple(p for n in _tables(node, "coordinates") for p in _coordinates(n, names)),
-        tuple(_pair(n, names) for n in _tables(node, "pairs")),
-        tuple(_new_point(n, survey) for n in _tables(node, "points")) if prefix == "c" else (),
-        read_terrestrial(lambda key: _tables(node, key), names, prefix),
+        tuple(_moments(n, survey, i) for i, n in enumerate(tables_of(node, "epochs"))),
+        tuple(_distance(n, names) for n in tables_of(node, "distances")),
+        tuple(p for n in tables_of(node, "coordinates") for p in _coordinates(n, names)),
+        tuple(_pair(n, names) for n in tables_of(node, "pairs")),
+        tuple(_new_point(n, survey) for n in tables_of(node, "points")) if prefix == "c" else (),
+        read_terrestrial(node, names, prefix),
     )
 
 
@@ -230,7 +194,7 @@ def _moments(node: Node, survey: Survey, number: int) -> Moments:
 def _places(node: Node, survey: Survey, kind: str) -> tuple[list[dict[str, Any]], ByHand | None]:
     """What moves where, one entry per epoch."""
     if kind == "count":
-        return [{}] * _few(node, node.integer("count", 1), "count"), None
+        return [{}] * few(node, node.integer("count", 1), "count"), None
     if kind == "by_hand":
         hand = _by_hand(node.table("by_hand"), survey)
         return [{}] * hand.count, hand
@@ -244,20 +208,13 @@ def _places(node: Node, survey: Survey, kind: str) -> tuple[list[dict[str, Any]]
     known = [s.station_id for s in survey.stations] if key == "station" else [t.target_id for t in survey.targets]
     owner = node.reference(key, known, key)
     out = []
-    for pose_node in _tables(node, "poses"):
+    for pose_node in tables_of(node, "poses"):
         pose_node.allow(*POSE_KEYS)
         pose = read_pose(pose_node).value
         if pose is None:
             raise pose_node.error("a planned pose needs its place and rotation; add them")
         out.append({f"{key}_id": owner, "pose": pose})
     return out, None
-
-
-def _few(node: Node, n: Any, key: str) -> Any:
-    """The number itself. Raises SurveyError where it is more than can be meant."""
-    if n > _MOST:
-        raise node.error(f"makes {n:.3g}; at most {_MOST} are planned in one place, take fewer", key)
-    return n
 
 
 def _angles(node: Node, axes: int) -> list[FloatArray]:
@@ -271,7 +228,7 @@ def _angles(node: Node, axes: int) -> list[FloatArray]:
     for i, (low, high, step) in enumerate(ranges.tolist()):
         if step <= 0 or high < low:
             raise node.error(f"found [{low:g}, {high:g}, {step:g}]; expected [from, to, step] upwards", "grid_deg", i)
-    _few(node, math.prod((high - low) / step + 1.0 for low, high, step in ranges.tolist()), "grid_deg")
+    few(node, math.prod((high - low) / step + 1.0 for low, high, step in ranges.tolist()), "grid_deg")
     lines = [np.arange(low, high + 1e-9, step) for low, high, step in ranges]
     grid = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, axes)
     return list(to_si(grid, "deg"))
@@ -285,35 +242,23 @@ def _by_hand(node: Node, survey: Survey) -> ByHand:
     return ByHand(
         node.reference("camera", (c.camera_id for c in survey.cameras), "camera"),
         node.reference("target", (t.target_id for t in survey.targets), "target"),
-        _few(node, node.integer("count", 1), "count"), (near, far), float(to_si(node.number("tilt_deg", 40.0), "deg")),
+        few(node, node.integer("count", 1), "count"), (near, far), float(to_si(node.number("tilt_deg", 40.0), "deg")),
         node.integer("seed", 0, 1),
     )  # fmt: skip
 
 
 def _distance(node: Node, names: Names) -> Distance:
     node.allow("name", "from", "to", "sigma_mm")
-    a, b = (_position(node, key, names) for key in ("from", "to"))
+    a, b = (position_of(node, names, node.text(key), key) for key in ("from", "to"))
     name = node.text("name", f"{node.text('from')}-{node.text('to')}")
     return Distance(name, a, b, 1.0, float(to_si(node.number("sigma_mm", positive=True), "mm")))
-
-
-def _position(node: Node, key: str, names: Names) -> PositionRef:
-    try:
-        return read_position(node.text(key), names)
-    except NameProblemError as problem:
-        raise node.error(str(problem), key) from problem
 
 
 def _coordinates(node: Node, names: Names) -> list[PlannedPoint]:
     node.allow("of", "sigma_mm")
     sigma = float(to_si(node.number("sigma_mm", positive=True), "mm"))
-    out = []
-    for i, text in enumerate(node.names("of")):
-        try:
-            out.append(PlannedPoint(f"coordinates of {text}", read_position(text, names), sigma))
-        except NameProblemError as problem:
-            raise node.error(str(problem), "of", i) from problem
-    return out
+    return [PlannedPoint(f"coordinates of {text}", position_of(node, names, text, "of", i), sigma)
+            for i, text in enumerate(node.names("of"))]  # fmt: skip
 
 
 def _pair(node: Node, names: Names) -> Pair:
@@ -356,87 +301,3 @@ def _requirement(node: Node) -> Requirement:
     if not sigma:
         raise node.error("a requirement needs a sigma; add sigma_translation_mm, sigma_rotation_deg or sigma_px")
     return Requirement(node.text("of"), sigma)
-
-
-def _navigation(node: Node, survey: Survey) -> NavigationPlan:
-    node.allow(*_NAVIGATION_KEYS)
-    stations = tuple(dict.fromkeys(c.station_id for c in survey.cameras))
-    criterion = node.choice("criterion", ("worst", "mean"), "worst")
-    poses = _navigation_poses(node)
-    if not poses and not node.has("epochs"):
-        raise node.error("say where the head will be: poses, volume_mm with attitudes, or planned epochs")
-    return NavigationPlan(
-        node.reference("station", stations, "station") if node.has("station") else None,
-        poses,
-        float(to_si(node.number("required_rotation_deg", 0.17, positive=True), "deg")),
-        float(to_si(node.number("required_translation_mm", 1.0, positive=True), "mm")),
-        _beacon_places(node),
-        node.number("sigma_px", 0.2, positive=True),
-        float(to_si(node.number("beacon_sigma_mm", 0.4, positive=True), "mm")),
-        (
-            float(to_si(node.number("camera_sigma_mm", 0.1, positive=True), "mm")),
-            float(to_si(node.number("camera_sigma_deg", 0.01, positive=True), "deg")),
-        ),
-        "worst" if criterion == "worst" else "mean",
-        node.integer("at_least", 1, 3),
-        float(to_si(node.number("spacing_mm", 0.0), "mm")),
-        node.names("epochs", ()),
-    )
-
-
-def _navigation_poses(node: Node) -> tuple[Pose3, ...]:
-    out = []
-    for pose_node in _tables(node, "poses"):
-        pose = read_pose(pose_node).value
-        if pose is None:
-            raise pose_node.error("a pose needs its place and rotation; add them")
-        out.append(pose)
-    if not node.has("volume_mm"):
-        return tuple(out)
-    box = to_si(node.numbers("volume_mm", (3, 2)), "mm")
-    steps = [int(v) for v in node.numbers("steps", (3,), [2, 2, 2])]
-    attitudes = _attitudes(node)
-    _few(node, math.prod(max(n, 1) for n in steps) * len(attitudes), "steps")
-    lines = [_line(low, high, n) for (low, high), n in zip(box.tolist(), steps, strict=True)]
-    places = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)
-    return (*out, *(Pose3(R, x) for x in places.reshape(-1, 3) for R in attitudes))
-
-
-def _line(low: float, high: float, n: int) -> FloatArray:
-    return np.linspace(low, high, n) if n > 1 else np.array([0.5 * (low + high)])
-
-
-def _attitudes(node: Node) -> list[Rot3]:
-    rows = node.value("attitudes_euler_xyz_deg", [[0.0, 0.0, 0.0]])
-    n = len(rows) if isinstance(rows, list) else 1
-    first = [rotation_from_euler(a) for a in to_si(node.numbers("attitudes_euler_xyz_deg", (n, 3), rows), "deg")]
-    if not node.has("turn_about"):
-        return first
-    axis = "xyz".index(node.choice("turn_about", ("x", "y", "z")))
-    count = node.integer("turn_steps", 1, 8)
-    _few(node, count * len(first), "turn_steps")
-    turns = [rotation_from_euler(np.eye(3)[axis] * 2 * np.pi * k / count) for k in range(count)]
-    return [turn * start for start in first for turn in turns]
-
-
-def _beacon_places(node: Node) -> FloatArray:
-    """Candidate places: a grid over the six walls of ``room_mm``, its step ``places`` per wall and edge."""
-    if not node.has("room_mm"):
-        return np.zeros((0, 3))
-    box = to_si(node.numbers("room_mm", (3, 2)), "mm")
-    n = node.integer("places", 2, 6)
-    _few(node, 6 * n**2, "places")
-    out = []
-    for axis in range(3):
-        u, v = (i for i in range(3) if i != axis)
-        grid = np.stack(np.meshgrid(*(_inner(box[i], n) for i in (u, v)), indexing="ij"), axis=-1).reshape(-1, 2)
-        for wall in box[axis]:
-            x = np.empty((len(grid), 3))
-            x[:, axis], x[:, u], x[:, v] = wall, grid[:, 0], grid[:, 1]
-            out.append(x)
-    return np.concatenate(out)
-
-
-def _inner(edge: FloatArray, n: int) -> FloatArray:
-    """N places along an edge, none of them in a corner."""
-    return np.asarray(edge[0] + (np.arange(n) + 0.5) / n * (edge[1] - edge[0]))

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import (
     Alignment,
     CoordinateDifferences,
-    FrameRef,
     LaserSpot,
     Level,
     OnSurface,
@@ -26,10 +25,12 @@ from survey.folder.units import to_si
 from survey.project.declared.instruments import setup_problem
 from survey.project.declared.node import Node
 from survey.project.project import Accuracy, Project
-from survey.project.tables.references import NameProblemError, Names, check_epochs, read_frame, read_position
+from survey.project.tables.references import Names, frame_of, position_of
 
 READING_KINDS = ("direction", "angle", "zenith", "azimuth", "slope_distance", "horizontal_distance",
                  "height_difference")  # fmt: skip
+_MOST = 100_000  # of whatever is counted in one place: more nobody measures, and memory ends
+_Count = TypeVar("_Count", int, float)
 _ANGLES = READING_KINDS[:4]
 _KEYS = (
     *("setup", "from", "to", "second", "kinds", "sigma_arcsec", "sigma_mm", "instrument_height_mm"),
@@ -48,16 +49,30 @@ class Terrestrial:
     on_surfaces: tuple[OnSurface, ...] = ()
     coordinate_differences: tuple[CoordinateDifferences, ...] = ()
 
-
     def added_to(self, survey: Survey) -> Survey:
         """The survey with these observations too."""
         lists: dict[str, Any] = {f.name: getattr(survey, f.name) + getattr(self, f.name) for f in fields(self)}
         return replace(survey, **lists)
 
 
-def read_terrestrial(nodes: Callable[[str], list[Node]], names: Names, prefix: str) -> Terrestrial:
-    """Everything of these kinds; nodes: the tables of a list by its key. prefix: of the ids. Raises SurveyError."""
-    parts = {key: nodes(key) for key in TERRESTRIAL_KEYS}
+def tables_of(node: Node, key: str) -> list[Node]:
+    """The tables of a list ``[[key]]``."""
+    values = node.values.get(key, [])
+    if not isinstance(values, list) or not all(isinstance(v, dict) for v in values):
+        raise node.error(f"expected a list of tables; write [[{'.'.join(map(str, (*node.path, key)))}]]", key)
+    return [Node(node.file, node.lines, (*node.path, key, i), v) for i, v in enumerate(values)]
+
+
+def few(node: Node, n: _Count, key: str) -> _Count:
+    """The number itself. Raises SurveyError where it is more than can be meant."""
+    if n > _MOST:
+        raise node.error(f"makes {n:.3g}; at most {_MOST} are planned in one place, take fewer", key)
+    return n
+
+
+def read_terrestrial(node: Node, names: Names, prefix: str) -> Terrestrial:
+    """Everything of these kinds. prefix: of the ids. Raises SurveyError."""
+    parts = {key: tables_of(node, key) for key in TERRESTRIAL_KEYS}
     return Terrestrial(
         tuple(r for i, n in enumerate(parts["readings"]) for r in _readings(n, names, f"{prefix}{i + 1}")),
         tuple(_level(n, names, f"{prefix}level{i + 1}") for i, n in enumerate(parts["levels"])),
@@ -143,8 +158,8 @@ def _readings(node: Node, names: Names, prefix: str) -> list[Reading]:
     if setup and (problem := setup_problem(setup, names.survey.setups)):
         raise node.error(problem, "setup")
     kinds = node.names("kinds")
-    at, targets = _position(node, "from", names), _positions(node, "to", names)
-    second = _position(node, "second", names) if node.has("second") else None
+    at, targets = position_of(node, names, node.text("from"), "from"), _positions(node, "to", names)
+    second = position_of(node, names, node.text("second"), "second") if node.has("second") else None
     sigma = {True: _length(node, "sigma_arcsec", "arcsec"), False: _length(node, "sigma_mm", "mm")}
     heights = [float(to_si(node.number(f"{x}_height_mm", 0.0), "mm")) for x in ("instrument", "target")]
     out: list[Reading] = []
@@ -168,30 +183,10 @@ def _length(node: Node, key: str, unit: str) -> float:
     return float(to_si(node.number(key, positive=True), unit)) if node.has(key) else float("nan")
 
 
-def _position(node: Node, key: str, names: Names) -> PositionRef:
-    return _read_position(node, key, node.text(key), names)
-
-
 def _positions(node: Node, key: str, names: Names) -> list[PositionRef]:
     if isinstance(node.values.get(key), str):
-        return [_position(node, key, names)]
-    return [_read_position(node, key, text, names) for text in node.names(key)]
-
-
-def _read_position(node: Node, key: str, text: str, names: Names) -> PositionRef:
-    try:
-        return read_position(text, names)
-    except NameProblemError as problem:
-        raise node.error(str(problem), key) from problem
-
-
-def _frame(node: Node, key: str, names: Names) -> FrameRef:
-    try:
-        frame = read_frame(node.text(key), names)
-        check_epochs(frame, None, names)
-    except NameProblemError as problem:
-        raise node.error(str(problem), key) from problem
-    return frame
+        return [position_of(node, names, node.text(key), key)]
+    return [position_of(node, names, text, key) for text in node.names(key)]
 
 
 def _axis(node: Node, key: str) -> FloatArray:
@@ -205,13 +200,13 @@ def _axis(node: Node, key: str) -> FloatArray:
 def _level(node: Node, names: Names, name: str) -> Level:
     node.allow("frame", "axis", "sigma_arcsec")
     sigma = float(to_si(node.number("sigma_arcsec", positive=True), "arcsec"))
-    return Level(node.text("name", name), _frame(node, "frame", names), _axis(node, "axis"), 0.0, sigma)
+    return Level(node.text("name", name), frame_of(node, "frame", names), _axis(node, "axis"), 0.0, sigma)
 
 
 def _alignment(node: Node, names: Names, name: str) -> Alignment:
     node.allow("a", "axis_a", "b", "axis_b", "sigma_arcsec")
     sigma = float(to_si(node.number("sigma_arcsec", positive=True), "arcsec"))
-    a, b = _frame(node, "a", names), _frame(node, "b", names)
+    a, b = frame_of(node, "a", names), frame_of(node, "b", names)
     return Alignment(name, a, _axis(node, "axis_a"), b, _axis(node, "axis_b"), np.zeros(2), sigma**2 * np.eye(2))
 
 
@@ -232,7 +227,8 @@ def _on_surface(node: Node, names: Names) -> list[OnSurface]:
 
 def _differences(node: Node, names: Names) -> list[CoordinateDifferences]:
     node.allow("from", "to", "sigma_mm")
-    at, sigma = _position(node, "from", names), float(to_si(node.number("sigma_mm", positive=True), "mm"))
+    at = position_of(node, names, node.text("from"), "from")
+    sigma = float(to_si(node.number("sigma_mm", positive=True), "mm"))
     return [
         CoordinateDifferences((at,), (to,), np.zeros((1, 3)), sigma**2 * np.eye(3))
         for to in _positions(node, "to", names)

@@ -1,7 +1,7 @@
 """The observations of a project by the names under which they are left out, and what each name means."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,11 +14,10 @@ from adjust.model.observations import (
     ImageBlock,
     Observation,
     PositionRef,
-    ReadingCovariance,
     position_text,
 )
 from adjust.model.result import ObservationResidual
-from adjust.model.survey import BoolArray, IntArray, Survey
+from adjust.model.survey import BoolArray, Survey
 from survey.folder.text import suggestion
 from survey.project.exclusions import WHAT, Name, name_problem
 from survey.project.project import SpotBlock
@@ -364,75 +363,3 @@ def union(hits: Iterable[Hits]) -> Hits:
             out.members.setdefault(place, set()).update(parts)
     out.members = {(name, i): rows for (name, i), rows in out.members.items() if i not in out.others.get(name, ())}
     return out
-
-
-def without(
-    survey: Survey, spots: Sequence[SpotBlock], hits: Iterable[Hits]
-) -> tuple[Survey, tuple[SpotBlock, ...]]:
-    """The survey with everything hit marked as not used, and the spots less those hit."""
-    every = union(hits)
-    masks, others, members, gone = every.images, every.others, every.members, every.spots
-    blocks = tuple(
-        replace(b, used=b.mask & ~masks[i]) if i in masks else b
-        for i, b in enumerate(survey.image_blocks)
-    )
-    changed: dict[str, Any] = {
-        name: tuple(
-            part
-            for i, o in enumerate(getattr(survey, name))
-            for part in _parted(replace(o, used=False) if i in others.get(name, ()) else o, members.get((name, i)))
-        )
-        for name in {*others, *(name for name, _ in members)}
-    }
-    less = replace(survey, image_blocks=blocks, **changed)
-    if "readings" in changed:
-        less = _with_joint_readings_apart(less)
-    kept = [_fewer(spot, gone.get(i, set())) for i, spot in enumerate(spots)]
-    return less, tuple(spot for spot in kept if spot.spot_ids)
-
-
-def _parted(item: Observation, rows: set[int] | None) -> tuple[Observation, ...]:
-    """A set as one that is used and one that is not, which has these rows."""
-    if not rows or not item.used or not isinstance(item, Coordinates | CoordinateDifferences):
-        return (item,)
-    out = np.isin(np.arange(len(item.values)), sorted(rows))
-    return tuple(_subset(item, np.flatnonzero(mask), used)
-                 for used, mask in ((True, ~out), (False, out)) if mask.any())  # fmt: skip
-
-
-def _subset(item: Coordinates | CoordinateDifferences, rows: IntArray, used: bool) -> Observation:
-    axes = (3 * rows[:, None] + np.arange(3)).ravel()
-    values, cov = item.values[rows], item.cov[np.ix_(axes, axes)]
-    if isinstance(item, Coordinates):
-        return replace(item, positions=tuple(item.positions[i] for i in rows), values=values, cov=cov, used=used)
-    at, to = (tuple(refs[i] for i in rows) for refs in (item.at, item.to))
-    return replace(item, at=at, to=to, values=values, cov=cov, used=used)
-
-
-def _fewer(spot: SpotBlock, ids: set[str]) -> SpotBlock:
-    if not ids:
-        return spot
-    rows = [i for i, one in enumerate(spot.spot_ids) if one not in ids]
-    return replace(spot, spot_ids=tuple(spot.spot_ids[i] for i in rows), uv=spot.uv[rows], cov=spot.cov[rows])
-
-
-def _with_joint_readings_apart(survey: Survey) -> Survey:
-    """Readings with a joint covariance are all used or none: those left out get their own sigma, the others theirs."""
-    used = {r.reading_id: r.used for r in survey.readings}
-    alone: dict[str, float] = {}
-    joint = []
-    for item in survey.reading_covariances:
-        flags = [used[name] for name in item.reading_ids]
-        if all(flags) or not any(flags):
-            joint.append(item)
-            continue
-        kept = [i for i, flag in enumerate(flags) if flag]
-        single = [i for i in range(len(flags)) if i not in kept or len(kept) == 1]
-        alone |= {item.reading_ids[i]: float(np.sqrt(item.cov[i, i])) for i in single}
-        if len(kept) > 1:
-            names = tuple(item.reading_ids[i] for i in kept)
-            joint.append(ReadingCovariance(names, item.cov[np.ix_(kept, kept)]))
-    readings = tuple(
-        replace(r, sigma=alone[r.reading_id]) if r.reading_id in alone else r for r in survey.readings
-    )
-    return replace(survey, readings=readings, reading_covariances=tuple(joint))

@@ -31,7 +31,8 @@ from survey.project.declared.targets import read_targets
 from survey.project.detected import DetectedImage, ImageKey, ImageNews, image_news, read_detected
 from survey.project.exclusions import EXCLUSIONS, EXCLUSIONS_FILE, Exclusion, in_force, read_exclusions
 from survey.project.images import find_images, sought_in
-from survey.project.observed import Observed, union, without
+from survey.project.observed import Observed, union
+from survey.project.omitting import without
 from survey.project.project import (
     DEFINITION_FILE,
     FORMAT,

@@ -12,7 +12,6 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from markupsafe import Markup, escape
 
@@ -118,7 +117,7 @@ def unturned(text: str, shown: Mapping[int, str]) -> str:
     return text.translate(shown) if not text.isascii() and any(map(text.__contains__, _SIGNS)) else text
 
 
-def t(text: str, **values: Any) -> Markup:
+def t(text: str, **values: object) -> Markup:
     """A text of the program in the report's language, with ``{name}`` filled in; values that are no markup escaped.
 
     Raises MissingTranslationError where the language does not have it.

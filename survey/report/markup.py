@@ -38,7 +38,7 @@ def _module(template: str) -> Any:
     return _environment().get_template(template).module
 
 
-def part(name: str, *values: Any, of: str = "parts.html") -> Markup:
+def part(name: str, *values: object, of: str = "parts.html") -> Markup:
     """A piece of a page by its macro in the template ``of``."""
     return Markup(getattr(_module(of), name)(*values))
 
@@ -64,7 +64,7 @@ def document(title: str, body: Markup, after: Markup | str = "") -> str:
     return unturned(page.render(values), TURNING) + "\n"
 
 
-def json_script(anchor: str, value: Any) -> Markup:
+def json_script(anchor: str, value: object) -> Markup:
     """Plain values as a JSON block with an id, in a form that cannot end the script or become markup."""
     text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     for sign in "<>&\u2028\u2029":

@@ -223,7 +223,7 @@ def _seven_digits(x: FloatArray) -> FloatArray:
     return np.where(places >= 0.0, np.rint(x * power) / power, np.rint(x / power) * power)
 
 
-def _short(value: Any) -> Any:
+def _short(value: object) -> object:
     """Numbers to seven significant digits: enlarged ellipsoids stay round, and equal input gives equal bytes."""
     if isinstance(value, float):
         return float(f"{value:.7g}")

@@ -5,7 +5,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.frames.tables import table_motions
 from adjust.model.observations import FrameRef
-from adjust.model.result import Adjustment, ParameterName
+from adjust.model.result import Adjustment, ParameterName, adjusted_pose
 from adjust.model.survey import FloatArray, PoseParameter, Station, Table, Target
 
 
@@ -29,12 +29,7 @@ class AdjustedFrames:
 
     def pose(self, name: ParameterName, parameter: PoseParameter) -> Pose3 | None:
         """The adjusted pose of a parameter; where it was held, its constant."""
-        if name in self.estimates:
-            value = self.estimates[name].value
-            return value if isinstance(value, Pose3) else None
-        if parameter.value is None and parameter.treatment == "held":
-            return Pose3()
-        return parameter.value
+        return adjusted_pose(self.estimates, name, parameter)
 
     def world_from(self, frame: FrameRef) -> Pose3 | None:
         """``world_from_<frame>``, None where the survey does not tell (or the frame does not exist)."""

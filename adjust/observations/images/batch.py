@@ -5,7 +5,7 @@ warp | residual]: the same linear system and chi-square as its 2n rows, for any 
 """
 
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 
 import gtsam
@@ -35,6 +35,7 @@ from adjust.native.images import (
 )
 from adjust.native.parallel import run_split, split_blocks
 from adjust.native.trees import KeyCovariances, TreeArrays
+from adjust.observations.adapter import evaluated
 from adjust.observations.images.segments import block_keys
 
 
@@ -214,7 +215,7 @@ class ImageBatch:
         for b in range(len(self.blocks)) if which is None else which.tolist():
             keys = self.keys[b]
             if keys:
-                graph.add(gtsam.CustomFactor(noise[int(self.n_rows[b])], keys, _callback(self, b)))
+                graph.add(evaluated(noise[int(self.n_rows[b])], keys, partial(self.residual, b)))
 
     def alike(self) -> list[IntArray]:
         """All blocks in sets with the same numbers of points, rows and columns, none of much more than ``_AT_ONCE``."""
@@ -303,10 +304,3 @@ def _point_arrays(survey: Survey, blocks: Sequence[ImageBlock], x_in_world: Floa
     rows = index + np.repeat(np.array([start[b.target_id] for b in blocks], dtype=np.int64), sizes)
     uv = np.ascontiguousarray(np.concatenate([np.zeros((0, 2)), *(b.uv for b in blocks)]).T)
     return PointArrays(np.ascontiguousarray(np.concatenate(x)[rows].T), uv)
-
-
-def _callback(batch: ImageBatch, b: int):  # type: ignore[no-untyped-def]  # GTSAM's protocol, bound untyped
-    def residual(_factor, values, jacobians):  # type: ignore[no-untyped-def]  # as above
-        return batch.residual(b, values, jacobians)
-
-    return residual

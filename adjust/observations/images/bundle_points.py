@@ -10,6 +10,7 @@ import numpy as np
 from adjust.model.survey import FloatArray
 from adjust.native.bundles import SightArrays, rows
 from adjust.native.lenses import MAX_LENS
+from adjust.observations.adapter import evaluated
 from adjust.observations.images.bundles import BundleBatch
 
 
@@ -19,7 +20,7 @@ def add_point_factors(batch: BundleBatch, graph: gtsam.NonlinearFactorGraph) -> 
     for k in range(len(batch.block)):
         factor = PointFactor(batch, k)
         if factor.keys:
-            graph.add(gtsam.CustomFactor(noise, factor.keys, _callback(factor)))
+            graph.add(evaluated(noise, factor.keys, factor.residual))
 
 
 class PointFactor:
@@ -69,10 +70,3 @@ class PointFactor:
         if self.point_key is not None:
             out[self.point_key] += A[:, MAX_LENS + 3 : MAX_LENS + 6]
         return list(out.values())
-
-
-def _callback(factor: PointFactor):  # type: ignore[no-untyped-def]  # GTSAM's protocol, bound untyped
-    def residual(_factor, values, jacobians):  # type: ignore[no-untyped-def]  # as above
-        return factor.residual(values, jacobians)
-
-    return residual

@@ -34,6 +34,7 @@ from adjust.native.bundles import (
 )
 from adjust.native.lenses import MAX_LENS
 from adjust.native.parallel import run_split, workers
+from adjust.observations.adapter import evaluated
 from adjust.observations.images.batch import Chains, square_root_information
 from adjust.spatial.motions import motions_of, points_motions, poses_at, poses_motions
 
@@ -450,7 +451,7 @@ class BundleBatch:
     def add_factor(self, graph: gtsam.NonlinearFactorGraph) -> None:
         """The one factor of this batch, for :func:`adjust.graph.solver.solve`, which moves what it hides."""
         n = self.n_keys - self.n_hidden + 1
-        graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(n), self.interface, _callback(self)))
+        graph.add(evaluated(gtsam.noiseModel.Unit.Create(n), self.interface, self.residual))
 
     def complete(self, delta: gtsam.VectorValues) -> None:
         """Insert the steps of the hidden poses and points, which follow from those of the interface."""
@@ -482,10 +483,3 @@ class BundleBatch:
         r = self.A[:, :, MAX_LENS + 6]
         v = r[:, 1] / self.W_all[:, 2]
         return np.stack([(r[:, 0] - self.W_all[:, 1] * v) / self.W_all[:, 0], v], axis=1)
-
-
-def _callback(batch: BundleBatch):  # type: ignore[no-untyped-def]  # GTSAM's protocol, bound untyped
-    def residual(_factor, values, jacobians):  # type: ignore[no-untyped-def]  # as above
-        return batch.residual(values, jacobians)
-
-    return residual

@@ -19,6 +19,7 @@ from adjust.model.errors import IndeterminateError
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import run_split, split_blocks
 from adjust.native.reduction import WEAKEST_PIVOT, ReducedPoses, ReductionArrays, leaf_rows, pose_steps, reduce_poses
+from adjust.observations.adapter import evaluated
 from adjust.observations.images.batch import ImageBatch
 from adjust.observations.images.segments import first_seen, ranges
 
@@ -146,12 +147,8 @@ class PoseReduction:
 
     def add_factor(self, graph: gtsam.NonlinearFactorGraph) -> None:
         """The one factor, which serves what :meth:`reduce` left of these values, and reduces others by itself."""
-
-        def residual(_factor, values, jacobians):  # type: ignore[no-untyped-def]  # GTSAM's protocol, bound untyped
-            return self._residual(values, jacobians)
-
         noise = gtsam.noiseModel.Unit.Create(self.interface.n + 1)
-        graph.add(gtsam.CustomFactor(noise, list(self.interface.keys), residual))
+        graph.add(evaluated(noise, list(self.interface.keys), self._residual))
 
     def _residual(self, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
         batch = self.batch

@@ -1,7 +1,8 @@
 """All readings of a survey: evaluated together, served to GTSAM chunk by chunk."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -10,6 +11,7 @@ from adjust.frames.state import State
 from adjust.frames.unknowns import VectorMap
 from adjust.model.errors import SurveyError
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.observations.adapter import evaluated
 from adjust.observations.factors import Jacobians
 from adjust.observations.terrestrial import equations as k
 from adjust.observations.terrestrial.layout import Chunk, Layout, ReadingArrays
@@ -211,7 +213,7 @@ class TerrestrialBatch:
             # readings between held positions adjust nothing, but count in the square sum and the redundancy
             if used[chunk.rows].any() and chunk.keys:
                 noise.setdefault(m, gtsam.noiseModel.Unit.Create(m))
-                graph.add(gtsam.CustomFactor(noise[m], list(chunk.keys), _callback(self, c)))
+                graph.add(evaluated(noise[m], list(chunk.keys), partial(self.residual_of, c)))
 
     def residual_of(self, c: int, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
         """What GTSAM's custom factor of chunk ``c`` returns."""
@@ -302,10 +304,3 @@ def _blocks(chunk: Chunk, J: FloatArray) -> list[FloatArray]:
         out.append(J[at : at + m * dim].reshape(m, dim))
         at += m * dim
     return out
-
-
-def _callback(batch: TerrestrialBatch, c: int) -> Callable[..., FloatArray]:
-    def residual(_factor, values, jacobians):  # type: ignore[no-untyped-def]  # GTSAM's protocol, bound untyped
-        return batch.residual_of(c, values, jacobians)
-
-    return residual

@@ -10,38 +10,30 @@ from typing import Any
 import numpy as np
 
 from capture.devices.turntable import AxisState, ControllerError, TableDisconnectedError, TurntableError
+from capture.devices.turntables.by_axis import ByAxis
+from survey.folder.extras import library
 
 _CONNECT_S = 5.0
 _UNITS = {"deg": np.pi / 180, "degree": np.pi / 180, "degrees": np.pi / 180, "rad": 1.0, "mrad": 1e-3, "": np.pi / 180}
 
 
-class EpicsController:
+class EpicsController(ByAxis):
     """A ``Controller``: a motor record per axis. units: as EGU writes them; None: as the record's EGU says."""
 
     def __init__(
         self, prefixes: Sequence[str], signs: Sequence[int], zeros: Sequence[float], units: str | None = None
     ) -> None:
-        self._prefixes, self._signs, self._zeros = tuple(prefixes), tuple(signs), tuple(zeros)
+        super().__init__(prefixes, signs, zeros)
         self._given = units
         self._units: list[float] = []
         self._motors: list[Any] = []
 
-    @property
-    def address(self) -> str:
-        """The prefixes."""
-        return " ".join(self._prefixes)
-
-    @property
-    def modulo(self) -> float | None:
-        """A record counts turns."""
-        return None
-
     def open(self) -> None:
         """Connect to the records; nothing moves."""
-        motor_class = _epics_motor()
-        motors = [motor_class(prefix, name=f"axis{i + 1}") for i, prefix in enumerate(self._prefixes)]
+        motor_class = library("ophyd", "epics", "EPICS motors need ophyd", TurntableError).EpicsMotor
+        motors = [motor_class(prefix, name=f"axis{i + 1}") for i, prefix in enumerate(self._addresses)]
         self._motors = motors
-        for prefix, motor in zip(self._prefixes, motors, strict=True):
+        for prefix, motor in zip(self._addresses, motors, strict=True):
             try:
                 motor.wait_for_connection(timeout=_CONNECT_S)
             except TimeoutError as error:
@@ -53,7 +45,7 @@ class EpicsController:
     def _unit(self, axis: int) -> float:
         unit = self._given if self._given is not None else str(self._call(axis, lambda m: m.motor_egu.get()))
         if unit.strip().lower() not in _UNITS:
-            raise TurntableError(f"{self._prefixes[axis]}: its unit is {unit!r}; set EGU to deg, or units in the plan")
+            raise TurntableError(f"{self._addresses[axis]}: its unit is {unit!r}; set EGU to deg, or units in the plan")
         return float(_UNITS[unit.strip().lower()])
 
     def close(self) -> None:
@@ -79,21 +71,13 @@ class EpicsController:
         high = self._call(axis, lambda m: m.high_limit_travel.get())
         if low < high and not low <= value <= high:  # equal limits mean none, by the record's own rule
             raise ControllerError(
-                f"{self._prefixes[axis]}: {value:.6g} is outside the record's own limits {low:g} to {high:g}; "
+                f"{self._addresses[axis]}: {value:.6g} is outside the record's own limits {low:g} to {high:g}; "
                 "nothing was sent to this axis"
             )
         self._call(axis, lambda m: m.user_setpoint.put(value, wait=False))
 
-    def stop(self) -> None:
-        """Write STOP of every axis, the others too where one does not answer."""
-        problem: TurntableError | None = None
-        for axis in range(len(self._prefixes)):
-            try:
-                self._call(axis, lambda m: m.motor_stop.put(1, wait=False))
-            except TurntableError as error:
-                problem = error
-        if problem is not None:
-            raise problem
+    def _stop(self, axis: int) -> None:
+        self._call(axis, lambda m: m.motor_stop.put(1, wait=False))
 
     def home(self, axis: int) -> None:
         """Write HOMF."""
@@ -101,19 +85,10 @@ class EpicsController:
 
     def _call(self, axis: int, action: Any) -> Any:
         if not self._motors:
-            raise TableDisconnectedError(f"{self._prefixes[axis]}: not connected; open it first")
+            raise TableDisconnectedError(f"{self._addresses[axis]}: not connected; open it first")
         from ophyd.utils import DisconnectedError
 
         try:
             return action(self._motors[axis])
         except (DisconnectedError, TimeoutError) as error:
-            raise TableDisconnectedError(f"{self._prefixes[axis]}: does not answer; check the IOC") from error
-
-
-def _epics_motor() -> Any:
-    try:
-        from ophyd import EpicsMotor
-    except ImportError as error:
-        advice = "pip install 'labsurvey[epics]'"
-        raise TurntableError(f"EPICS motors need ophyd, which is not installed; {advice}") from error
-    return EpicsMotor
+            raise TableDisconnectedError(f"{self._addresses[axis]}: does not answer; check the IOC") from error

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 from urllib.parse import urlsplit
 
 from capture.devices.turntable import TurntableError
+from survey.folder.extras import library
 
 _CONNECT_S = 3.0
 
@@ -84,10 +85,6 @@ def open_port(url: str, timeout_s: float, settings: Mapping[str, int | float | s
     """A port by pyserial's URL. Raises OSError or ValueError; TurntableError where pyserial is missing."""
     if url.startswith("socket://"):
         return TcpPort(url, timeout_s)
-    try:
-        import serial
-    except ImportError as error:
-        advice = "pip install 'labsurvey[serial]'"
-        raise TurntableError(f"{url}: serial ports need pyserial, which is not installed; {advice}") from error
+    serial = library("serial", "serial", f"{url}: serial ports need pyserial", TurntableError)
     port: Port = serial.serial_for_url(url, timeout=timeout_s, write_timeout=1.0, **settings)
     return port

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from capture.devices.turntable import AxisState, ControllerError, TableDisconnectedError, TurntableError
+from capture.devices.turntables.by_axis import ByAxis
+from survey.folder.extras import library
 
 _FAULTS = (
     ("STATE_ALARM", "alarm"),
@@ -21,31 +23,21 @@ _FAULTS = (
 )
 
 
-class StandaController:
+class StandaController(ByAxis):
     """A ``Controller``: one libximc device per axis; rad_per_step: per full step."""
 
     def __init__(
         self, uris: Sequence[str], rad_per_step: Sequence[float], signs: Sequence[int], zeros: Sequence[float]
     ) -> None:
-        self._uris, self._steps = tuple(uris), tuple(rad_per_step)
-        self._signs, self._zeros = tuple(signs), tuple(zeros)
+        super().__init__(uris, signs, zeros)
+        self._steps = tuple(rad_per_step)
         self._devices: list[Any] = []
         self._micro: list[int] = []
 
-    @property
-    def address(self) -> str:
-        """The URIs."""
-        return " ".join(self._uris)
-
-    @property
-    def modulo(self) -> float | None:
-        """It counts steps, and so turns."""
-        return None
-
     def open(self) -> None:
         """Open every axis; nothing moves."""
-        ximc = _highlevel()
-        for uri in self._uris:
+        ximc = library("libximc.highlevel", "standa", "Standa's controllers need libximc", TurntableError)
+        for uri in self._addresses:
             device = ximc.Axis(uri)
             try:
                 device.open_device()
@@ -85,16 +77,8 @@ class StandaController:
         whole = int(total / micro)  # towards zero: the microsteps carry the same sign
         self._call(axis, "command_move", whole, total - whole * micro)
 
-    def stop(self) -> None:
-        """Stop every axis, the others too where one does not answer."""
-        problem: TurntableError | None = None
-        for axis in range(len(self._uris)):
-            try:
-                self._call(axis, "command_stop")
-            except TurntableError as error:
-                problem = error
-        if problem is not None:
-            raise problem
+    def _stop(self, axis: int) -> None:
+        self._call(axis, "command_stop")
 
     def home(self, axis: int) -> None:
         """The controller's own search, as set up with the maker's program."""
@@ -102,20 +86,11 @@ class StandaController:
 
     def _call(self, axis: int, name: str, *values: Any) -> Any:
         if not self._devices:
-            raise TableDisconnectedError(f"{self._uris[axis]}: not connected; open it first")
+            raise TableDisconnectedError(f"{self._addresses[axis]}: not connected; open it first")
         try:
             return getattr(self._devices[axis], name)(*values)
         except ConnectionError as error:
-            raise TableDisconnectedError(f"{self._uris[axis]}: does not answer; check cable and power") from error
+            raise TableDisconnectedError(f"{self._addresses[axis]}: does not answer; check cable and power") from error
         except (RuntimeError, ValueError, NotImplementedError) as error:
-            found = str(error).splitlines()[0]
-            raise ControllerError(f"{self._uris[axis]}: {name} failed ({found}); see the maker's manual") from error
-
-
-def _highlevel() -> Any:
-    try:
-        import libximc.highlevel as ximc
-    except ImportError as error:
-        advice = "pip install 'labsurvey[standa]'"
-        raise TurntableError(f"Standa's controllers need libximc, which is not installed; {advice}") from error
-    return ximc
+            found = f"{self._addresses[axis]}: {name} failed ({str(error).splitlines()[0]})"
+            raise ControllerError(f"{found}; see the maker's manual") from error

@@ -20,7 +20,17 @@ from scipy.spatial.transform import Rotation
 
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, ImageBlock
-from adjust.model.survey import Camera, Datum, FloatArray, Point, PointParameter, PoseParameter, Station, Survey
+from adjust.model.survey import (
+    Camera,
+    Datum,
+    FloatArray,
+    LensParameter,
+    Point,
+    PointParameter,
+    PoseParameter,
+    Station,
+    Survey,
+)
 from survey.folder.text import atomic_write, id_problem
 from survey.interop.cameras.colmap_model import ColmapCamera, ColmapModel, read_model
 from survey.interop.cameras.lens_maps import BROWN_8, FISHEYE_4, MappedLens, mapped_lens
@@ -128,7 +138,7 @@ def _epochs(model: ColmapModel, rig_id: int) -> dict[int, str]:
     return stems
 
 
-def _lens(camera: ColmapCamera) -> Any:
+def _lens(camera: ColmapCamera) -> LensParameter:
     model, names = _READ[camera.model]
     values = dict(zip(names, camera.params.tolist(), strict=True))
     if "f" in values:
@@ -193,7 +203,7 @@ def reconstruction(values: CameraValues) -> tuple[Any, dict[int, str], tuple[str
         for image, k in track:
             elements.add_element(image, k)
         export.model.add_point3D_with_id(point, pycolmap.Point3D(xyz=export.xyz[point], track=elements))
-    names = {point: _name(key) for key, point in export.points.items()}
+    names = {point: "_".join(key) for key, point in export.points.items()}
     return export.model, names, _notes(export, moving)
 
 
@@ -326,11 +336,6 @@ def _seen(
         yield key if stands else (*key, block.epoch_id), np.asarray(pose.transformFrom(x_all[i])), uv
 
 
-def _name(key: tuple[str, ...]) -> str:
-    """Name of a 3-D point: a beacon's own, else target, point and, where the target moves, epoch."""
-    return "_".join(key)
-
-
 def names_csv(names: dict[int, str]) -> str:
     """The table that keeps the names of points, which COLMAP has no place for."""
     out = io.StringIO(newline="")
@@ -349,4 +354,3 @@ def write_colmap(values: CameraValues, folder: Path, text: bool = False) -> tupl
     counts = {"cameras": model.num_cameras(), "frames": model.num_frames(), "images": model.num_images(),
               "points": model.num_points3D(), "image_points": model.compute_num_observations()}  # fmt: skip
     return counts, notes
-

@@ -12,7 +12,7 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.model.observations import FrameRef
-from adjust.model.survey import FloatArray, LensParameter, PoseParameter, Survey
+from adjust.model.survey import LensParameter, PoseParameter, Survey
 from survey.folder.text import id_problem
 from survey.interop.cameras.lens_maps import BROWN_5, FISHEYE_4, MappedLens, mapped_lens
 from survey.interop.cameras.rig import lens_of, pose_of
@@ -110,13 +110,9 @@ def nerf_files(values: CameraValues, station: str | None) -> tuple[dict[str, str
         pose = values.world_from(FrameRef("camera", camera_id, epoch)) * _OPENGL
         frame: dict[str, Any] = {"file_path": f"images/{camera_id}/{epoch}.png"}
         frame |= _lens_keys(lenses[camera_id], cameras[camera_id].image_size)
-        frames.append(frame | {"transform_matrix": _rows(pose.matrix())})
+        frames.append(frame | {"transform_matrix": [[float(v) for v in row] for row in pose.matrix()]})
     text = json.dumps({"frames": frames}, ensure_ascii=False, allow_nan=False, indent=1) + "\n"
     return {"": text}, tuple(lens.note for lens in lenses.values() if lens.note)
-
-
-def _rows(matrix: FloatArray) -> list[list[float]]:
-    return [[float(v) for v in row] for row in matrix]
 
 
 def _lens_keys(lens: MappedLens, size: tuple[int, int]) -> dict[str, Any]:

@@ -138,16 +138,12 @@ class _Files:
         """The rows that name a thing, table by table."""
         if place.kind == "station":  # a moving one is named with its epoch
             for column in ("b_id", "a_id"):
-                yield self.rows("pairs", {column: lambda text: _frame_of(text) in place.ids})
+                yield self.rows("pairs", {column: lambda text: text.partition("@")[0].rpartition(":")[2] in place.ids})
         epochs = {"epoch_id": place.epochs} if place.epochs else {}
         for table, column in _BY_KIND.get(place.kind, ()):
             yield self.rows(table, {column: place.ids} | (epochs if column != "epoch_id" else {}))
         if place.kind in _WHOLE:
             yield self.rows(_WHOLE[place.kind], {})
-
-
-def _frame_of(text: str) -> str:
-    return text.partition("@")[0].rpartition(":")[2]
 
 
 def _left_out(names: Collection[str]) -> Iterator[tuple[str, Wanted]]:

@@ -1,7 +1,8 @@
 """Why an adjustment failed, or what contradicts in it, where the images can tell. Nothing is repaired."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -23,7 +24,19 @@ NOT_LOOKED_FOR = ("two mistakes at once", "bodies that bend or never rest", "ref
 """Told where nothing is named; the documentation says more."""
 
 
-def explained(survey: Survey, error: SurveyError, project: Project) -> SurveyError:
+@contextmanager
+def explaining(survey: Survey, project: Project) -> Iterator[None]:
+    """What is raised inside with the probable causes in front, if any."""
+    try:
+        yield
+    except SurveyError as error:
+        said = _explained(survey, error, project)
+        if said is error:
+            raise
+        raise said from error
+
+
+def _explained(survey: Survey, error: SurveyError, project: Project) -> SurveyError:
     """What an adjustment of the ``survey`` of a project raised, with the probable causes in front, if any."""
     apart, contradictions = separate_epochs(survey), _probable_causes(survey)
     diagnosis, note = _named(_diagnosis(survey, None, error, contradictions), project)

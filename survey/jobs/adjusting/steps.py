@@ -18,7 +18,7 @@ from adjust.statistics.outliers.supported import lost_notes, supported
 from adjust.statistics.outliers.undetermined_points import without_lost_points
 from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
 from survey.jobs.adjusting.image_defects import blurred, defect_warnings
-from survey.jobs.adjusting.probable_causes import explained, with_probable_causes
+from survey.jobs.adjusting.probable_causes import explaining, with_probable_causes
 from survey.jobs.adjusting.symmetric_boards import consistent_turns
 from survey.jobs.identify import identify_spots, without_points
 from survey.project import Project
@@ -105,15 +105,10 @@ def _unobserved_left_out(work: Work) -> Work:
 def _adjusted(work: Work) -> Work:
     """Least squares without gross errors, with variance components where they are asked for."""
     how = _options(work.project)
-    try:
+    with explaining(work.survey, work.project):
         result = without_lost_points(
             work.survey, lambda part: adjust_cleaned(part, how, work.progress, work.begin(part))
         )
-    except SurveyError as error:
-        said = explained(work.survey, error, work.project)
-        if said is error:
-            raise
-        raise said from error
     return replace(work, adjustment=result)
 
 

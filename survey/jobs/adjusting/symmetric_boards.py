@@ -101,16 +101,12 @@ def _better(new: Start, old: Start | None) -> bool:
     """Whether a start leaves out fewer images, or fits those that it has decisively better."""
     if old is None or len(new.excluded_blocks) < len(old.excluded_blocks):
         return True
-    return len(new.excluded_blocks) == len(old.excluded_blocks) and _misfit(old) > _limit(new)
+    return len(new.excluded_blocks) == len(old.excluded_blocks) and _misfit(old) > max(_WORSE * _misfit(new), _LEAST_PX)
 
 
 def _misfit(start: Start) -> float:
     rms = np.array(start.block_rms_px)
     return float(np.sqrt(np.nanmean(rms**2))) if np.isfinite(rms).any() else np.inf
-
-
-def _limit(start: Start) -> float:
-    return max(_WORSE * _misfit(start), _LEAST_PX)
 
 
 def _told(survey: Survey, turn: Mapping[int, int]) -> Iterable[str]:

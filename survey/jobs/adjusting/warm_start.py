@@ -98,7 +98,7 @@ def _known_vectors(survey: Survey, previous: Previous, start: StartValues) -> di
         if (drift := camera.lens.drift) is not None:
             model, per = MODELS[camera.lens.model], "" if drift.reference_temperature is None else "/K"
             units = tuple(model.units[model.names.index(x)] + per for x in drift.parameters)
-            for name in _of(previous, ("lens_drift", camera.camera_id)):
+            for name in (n for n in previous.vectors if n[:2] == ("lens_drift", camera.camera_id)):
                 found[name] = previous.vector(name, drift.parameters, units)
     return {name: value for name, value in found.items() if value is not None}
 
@@ -118,10 +118,6 @@ def _terms(survey: Survey) -> Iterator[tuple[ParameterName, VectorParameter, tup
         if clock.jitter > 0.0 and times is not None:
             own = VectorParameter(("jitter",), np.zeros(1), ("jitter",))
             yield from (((*name, epoch), own, (unit,)) for epoch in times.of)
-
-
-def _of(previous: Previous, owner: ParameterName) -> list[ParameterName]:
-    return [name for name in previous.vectors if name[:2] == owner]
 
 
 class _Known(Rewriting):

@@ -35,7 +35,7 @@ class Calibration:
     causes: tuple[str, ...] = ()
 
 
-def digest(*values: Any) -> str:
+def digest(*values: object) -> str:
     """A hash of frozen values down to the last bit of every array; the same for the same survey, read anew."""
     sha = hashlib.sha256()
     for value in values:
@@ -43,7 +43,7 @@ def digest(*values: Any) -> str:
     return sha.hexdigest()
 
 
-def _feed(update: Callable[[bytes], None], value: Any) -> None:
+def _feed(update: Callable[[bytes], None], value: object) -> None:
     if isinstance(value, Pose3):
         value = value.matrix()
     if isinstance(value, np.ndarray):

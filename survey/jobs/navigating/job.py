@@ -18,7 +18,7 @@ from adjust.model.names import natural_key
 from adjust.navigation import EpochPose, Motion, NavigateOptions, Trajectory, head_and_beacons, navigate
 from survey.folder.replacing import changing, replace_parts
 from survey.jobs.adjusting.job import run_info
-from survey.jobs.adjusting.probable_causes import explained, with_probable_causes
+from survey.jobs.adjusting.probable_causes import explaining, with_probable_causes
 from survey.jobs.navigating.calibration import Calibration, digest, keep, kept
 from survey.jobs.navigating.lenses import lenses_taken
 from survey.jobs.navigating.task import (
@@ -233,13 +233,8 @@ def _calibrated(
     found = kept(there, key)
     if found is not None:
         return found
-    try:
+    with explaining(survey, project):
         adjustment = with_probable_causes(survey, adjust(survey, options=options), project)
-    except SurveyError as error:
-        said = explained(survey, error, project)
-        if said is error:
-            raise
-        raise said from error
     head, beacons = head_and_beacons(adjustment, station, None, taken.epochs, taken.crops)
     said_of = tuple(w for w in adjustment.warnings if w.startswith("probable cause"))
     calibration = Calibration(head, beacons, adjustment.sigma0 if adjustment.redundancy > 0 else None, causes=said_of)

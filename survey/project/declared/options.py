@@ -24,7 +24,7 @@ from survey.project.project import (
     Foot,
     Tolerance,
 )
-from survey.project.tables.references import NameProblemError, Names, check_epochs, read_frame
+from survey.project.tables.references import Names, frame_of
 
 _UNITS = ("mm", "arcsec", "deg", "px", "1")
 _SAID = {POSITION: ("mm",), ROTATION: ("arcsec", "deg")}
@@ -160,14 +160,7 @@ def read_alignment_tasks(root: Node, survey: Survey) -> tuple[AlignmentTask, ...
     tasks = []
     for task_id, node in root.tables("align"):
         node.allow(*keys_of("align"))
-        frames = []
-        for key in ("body", "onto"):
-            try:
-                frame = read_frame(node.text(key), names)
-                check_epochs(frame, None, names)
-            except NameProblemError as problem:
-                raise node.error(str(problem), key) from problem
-            frames.append(frame)
+        frames = [frame_of(node, key, names) for key in ("body", "onto")]
         if frames[0] == frames[1]:
             raise node.error("body and onto are the same; name the frame that the body is to be aligned with", "onto")
         feet_node = node.table("feet_mm")

@@ -6,14 +6,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from adjust.model.names import natural_key
-from adjust.model.observations import CoordinateDifferences, Coordinates, PositionRef
+from adjust.model.observations import CoordinateDifferences, Coordinates
 from adjust.model.survey import FloatArray
 from survey.folder.text import suggestion
 from survey.folder.units import to_si
 from survey.project.project import Sigmas
 from survey.project.tables.covariance import joint_problem, read_triples
 from survey.project.tables.reading import FLAGS, Layout, Table, group_names
-from survey.project.tables.references import NameProblemError, Names, check_epochs, read_ends, read_position
+from survey.project.tables.references import Names, position_at, read_ends
 
 XYZ_SIGMAS, XYZ_RHO = ("sigma_x_mm", "sigma_y_mm", "sigma_z_mm"), ("rho_xy", "rho_xz", "rho_yz")
 XYZ = ("x_mm", "y_mm", "z_mm")
@@ -59,7 +59,7 @@ class _Joint:
 def read_coordinates(table: Table, extra: Table | None, names: Names, sigmas: Sigmas) -> tuple[Coordinates, ...]:
     """Coordinates sorted by set and position; a row without set_id is an observation of its own."""
     texts = table.text("point_id").values()
-    positions = [_coordinate_position(table, row, text, names) for row, text in enumerate(texts)]
+    positions = [position_at(table, row, text, names) for row, text in enumerate(texts)]
     sets: dict[str, _Set] = {}
     members: dict[tuple[str, str], int] = {}
     for row, (set_id, text) in enumerate(zip(table.text("set_id").values(), texts, strict=True)):
@@ -77,15 +77,6 @@ def read_coordinates(table: Table, extra: Table | None, names: Names, sigmas: Si
         Coordinates(tuple(positions[row] for row in j.rows), j.values, j.cov, j.group, j.used, one.name)
         for one, j in zip(ordered, _joined(table, ordered, texts, own, sigmas, "coordinates"), strict=True)
     )
-
-
-def _coordinate_position(table: Table, row: int, text: str, names: Names) -> PositionRef:
-    try:
-        position = read_position(text, names)
-        check_epochs(position.frame, None, names)
-    except NameProblemError as problem:
-        raise table.error(row, f"point_id: {problem}") from problem
-    return position
 
 
 def _add_coordinate_entries(extra: Table, sets: Mapping[str, _Set], members: Mapping[tuple[str, str], int]) -> None:

@@ -82,9 +82,10 @@ def read_triples(
 def table_correlations(table: Table, columns: tuple[str, ...]) -> FloatArray:
     """Correlations (n, k), zero where blank."""
     rho = np.nan_to_num(np.stack([table.numbers(name) for name in columns], axis=1))
-    wrong = (np.abs(rho) >= 1).any(axis=1)
+    wrong = np.abs(rho) >= 1
     if wrong.any():
-        raise table.error(first_row(wrong), f"{','.join(columns)}: a correlation lies between -1 and 1")
+        row, i = (int(x[0]) for x in np.nonzero(wrong))
+        raise table.error(row, f"{columns[i]}: found {rho[row, i]:g}; a correlation lies between -1 and 1")
     return rho
 
 

@@ -3,14 +3,14 @@
 import numpy as np
 
 from adjust.model.names import natural_key
-from adjust.model.observations import Alignment, FrameRef, LaserSpot, Level, OnSurface
+from adjust.model.observations import Alignment, LaserSpot, Level, OnSurface
 from adjust.model.survey import FloatArray
 from survey.folder.text import LARGEST_NUMBER, suggestion
 from survey.folder.units import to_si
 from survey.project.project import Sigmas
-from survey.project.tables.covariance import covariance_from_sigmas
+from survey.project.tables.covariance import covariance_from_sigmas, table_correlations
 from survey.project.tables.reading import FLAGS, Layout, Table, first_row, group_names, needed, one_of, quantity
-from survey.project.tables.references import NameProblemError, Names, check_epochs, read_frame, read_position
+from survey.project.tables.references import Names, frame_at, position_at
 
 _TILTS = ("arcsec", "mgon", "deg", "mm_per_m")
 LEVELS = Layout(
@@ -86,20 +86,11 @@ def read_levels(table: Table, names: Names, sigmas: Sigmas) -> tuple[Level, ...]
     groups, used = group_names(table, "level"), table.flags("used").tolist()
     levels = []
     for row, text in enumerate(table.text("frame_id").values()):
-        frame = _frame(table, row, "frame_id", text, names)
+        frame = frame_at(table, row, "frame_id", text, names)
         axis = read_axis(table, row, "axis", axes[row])
         scaled = float(sigma[row]) * sigmas.scale.get(groups[row], 1.0)
         levels.append(Level(ids[row], frame, axis, float(values[row]), scaled, groups[row], used[row]))
     return tuple(sorted(levels, key=lambda level: natural_key(level.level_id)))
-
-
-def _frame(table: Table, row: int, column: str, text: str, names: Names) -> FrameRef:
-    try:
-        frame = read_frame(text, names)
-        check_epochs(frame, None, names)
-    except NameProblemError as problem:
-        raise table.error(row, f"{column}: {problem}") from problem
-    return frame
 
 
 def read_alignments(table: Table, names: Names, sigmas: Sigmas) -> tuple[Alignment, ...]:
@@ -115,19 +106,19 @@ def read_alignments(table: Table, names: Names, sigmas: Sigmas) -> tuple[Alignme
     if lost.any():
         row, i = (int(x[0]) for x in np.nonzero(lost))
         raise table.error(row, f"value_{i + 1}: has no sigma_{i + 1}; add it, or remove the value")
-    rho = _correlation(table, "rho_12")
+    rho = table_correlations(table, ("rho_12",))
     groups, used = group_names(table, "alignment"), table.flags("used").tolist()
     ends, axes = ([table.text(f"{what}{x}").values() for x in suffixes]
                   for what, suffixes in (("", ("a_id", "b_id")), ("axis_", ("a", "b"))))  # fmt: skip
     result = []
     for row, alignment_id in enumerate(ids):
-        a, b = (_frame(table, row, column, ends[k][row], names) for k, column in enumerate(("a_id", "b_id")))
+        a, b = (frame_at(table, row, column, ends[k][row], names) for k, column in enumerate(("a_id", "b_id")))
         if a == b:
             raise table.error(row, f"a_id, b_id: both are {ends[0][row]!r}; an alignment joins two different frames")
         known = ~np.isnan(sigma[row])
         cov = np.diag(np.where(known, 1.0, np.inf))
         if known.all():
-            cov = covariance_from_sigmas(sigma[row][None], rho[row : row + 1, None])[0]
+            cov = covariance_from_sigmas(sigma[row][None], rho[row : row + 1])[0]
         else:
             cov[known, known] = sigma[row][known] ** 2
         cov[np.isfinite(cov)] *= sigmas.scale.get(groups[row], 1.0) ** 2
@@ -135,15 +126,6 @@ def read_alignments(table: Table, names: Names, sigmas: Sigmas) -> tuple[Alignme
         result.append(Alignment(alignment_id, a, axis_a, b, axis_b, np.nan_to_num(values[row]), cov, groups[row],
                                 used[row]))  # fmt: skip
     return tuple(sorted(result, key=lambda alignment: natural_key(alignment.alignment_id)))
-
-
-def _correlation(table: Table, column: str) -> FloatArray:
-    rho = np.nan_to_num(table.numbers(column))
-    wrong = np.abs(rho) >= 1
-    if wrong.any():
-        row = first_row(wrong)
-        raise table.error(row, f"{column}: found {rho[row]:g}; a correlation lies between -1 and 1")
-    return rho
 
 
 def read_laser_spots(table: Table, names: Names, sigmas: Sigmas) -> tuple[LaserSpot, ...]:
@@ -157,7 +139,7 @@ def read_laser_spots(table: Table, names: Names, sigmas: Sigmas) -> tuple[LaserS
         raise table.error(first_row(twice), "sigma_mm and sigma_x_mm are both given; keep one of the two")
     sigma = to_si(np.where(np.isnan(each), both[:, None], each), "mm")
     needed(table, sigma.sum(axis=1), np.ones(len(table), dtype=bool), "sigma: is blank; fill in sigma_mm")
-    cov = covariance_from_sigmas(sigma, _correlation(table, "rho_xy")[:, None])
+    cov = covariance_from_sigmas(sigma, table_correlations(table, ("rho_xy",)))
     xy = to_si(np.stack([table.numbers("x_mm"), table.numbers("y_mm")], axis=1), "mm")
     groups, used = group_names(table, "laser"), table.flags("used").tolist()
     known = {beam.beam_id: beam for beam in names.survey.beams}
@@ -189,11 +171,7 @@ def read_on_surfaces(table: Table, names: Names, sigmas: Sigmas) -> tuple[OnSurf
     for row, (surface_id, text) in enumerate(zip(surfaces, texts, strict=True)):
         if surface_id not in known:
             raise table.error(row, f"surface_id: unknown surface {surface_id!r}; {suggestion(surface_id, known)}")
-        try:
-            position = read_position(text, names)
-            check_epochs(position.frame, None, names)
-        except NameProblemError as problem:
-            raise table.error(row, f"point_id: {problem}") from problem
+        position = position_at(table, row, text, names)
         scaled = float(sigma[row]) * sigmas.scale.get(groups[row], 1.0)
         item = OnSurface(surface_id, position, scaled, float(offset[row]), groups[row], used[row])
         result.append(((natural_key(surface_id), natural_key(text)), item))

@@ -13,7 +13,7 @@ from adjust.model.observations import ImageBlock
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from survey.folder.text import suggestion
 from survey.project.project import ImagePointsWhere, Sigmas, SpotBlock
-from survey.project.tables.covariance import covariance_from_sigmas
+from survey.project.tables.covariance import covariance_from_sigmas, table_correlations
 from survey.project.tables.reading import Layout, Table, TextColumn, checked_groups, first_row
 from survey.project.tables.references import Names
 
@@ -160,16 +160,13 @@ def _covariances(table: Table, default_px: float | None, scale: FloatArray) -> F
     half = blank.any(axis=1) & (~blank.all(axis=1) | ~np.isnan(rho))
     if half.any():
         raise table.error(first_row(half), "sigma_u_px, sigma_v_px: one is missing; give both or leave all blank")
-    wrong = np.abs(rho) >= 1
-    if wrong.any():
-        row = first_row(wrong)
-        raise table.error(row, f"rho_uv: found {rho[row]:g}; a correlation lies between -1 and 1")
+    filled = table_correlations(table, ("rho_uv",))
     if blank.any():
         if default_px is None:
             problem = "the row has no sigma; fill in sigma_u_px, sigma_v_px, or give [sigmas] image_px in survey.toml"
             raise table.error(first_row(blank.any(axis=1)), problem)
         sigma[blank] = default_px
-    return covariance_from_sigmas(sigma * scale[:, None], np.nan_to_num(rho)[:, None])
+    return covariance_from_sigmas(sigma * scale[:, None], filled)
 
 
 def _point_positions(table: Table, targets: TextColumn, names: Names) -> IntArray:

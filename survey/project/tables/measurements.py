@@ -8,7 +8,7 @@ from adjust.model.survey import FloatArray
 from survey.folder.text import suggestion
 from survey.folder.units import to_si
 from survey.project.project import Sigmas
-from survey.project.tables.covariance import covariance_from_sigmas
+from survey.project.tables.covariance import covariance_from_sigmas, table_correlations
 from survey.project.tables.reading import FLAGS, Layout, Table, first_row, group_names
 from survey.project.tables.references import Names, read_ends
 
@@ -41,23 +41,14 @@ def read_angles(table: Table, names: Names, sigmas: Sigmas) -> tuple[TableReadin
             advice = "fill in axis2_deg" if k == 2 else "leave axis2_deg blank"
             raise table.error(row, f"axis2_deg: table {table_id!r} has {k} axes; {advice}")
     sigma = _angle_sigmas(table, [axes[table_id] for table_id in tables], sigmas)
-    rho = _angle_correlations(table)
+    rho = table_correlations(table, ("rho_12",))
     readings = []
     for row, (epoch_id, table_id) in enumerate(zip(epochs, tables, strict=True)):
         k = axes[table_id]
-        cov = covariance_from_sigmas(sigma[None, row, :k], np.full((1, k - 1), rho[row]))[0]
+        cov = covariance_from_sigmas(sigma[None, row, :k], rho[row : row + 1, : k - 1])[0]
         scaled = cov * sigmas.scale.get(groups[row], 1.0) ** 2
         readings.append(TableReading(table_id, epoch_id, to_si(angles[row, :k], "deg"), scaled, groups[row]))
     return tuple(sorted(readings, key=lambda r: (natural_key(r.table_id), natural_key(r.epoch_id))))
-
-
-def _angle_correlations(table: Table) -> FloatArray:
-    rho = np.nan_to_num(table.numbers("rho_12"))
-    wrong = np.abs(rho) >= 1
-    if wrong.any():
-        row = first_row(wrong)
-        raise table.error(row, f"rho_12: found {rho[row]:g}; a correlation lies between -1 and 1")
-    return rho
 
 
 def _angle_sigmas(table: Table, row_axes: list[int], sigmas: Sigmas) -> FloatArray:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from adjust.model.observations import FrameKind, FrameRef, PositionRef, frame_text
 from adjust.model.survey import Survey
 from survey.folder.text import id_problem, suggestion
+from survey.project.declared.node import Node
 from survey.project.tables.reading import Table
 
 _KINDS: tuple[FrameKind, ...] = ("station", "camera", "target", "table", "mount")
@@ -152,6 +153,44 @@ def check_epochs(a: FrameRef | None, b: FrameRef | None, names: Names) -> None:
         if ref and body and ref.epoch_id is None:
             name = frame_text(ref)
             raise NameProblemError(f"{name!r} moves and the epoch is not given; write '{name}@epoch_id'")
+
+
+def frame_of(node: Node, key: str, names: Names) -> FrameRef:
+    """The frame that a key of a TOML table names, with its epoch where it moves; SurveyError where it is none."""
+    try:
+        frame = read_frame(node.text(key), names)
+        check_epochs(frame, None, names)
+    except NameProblemError as problem:
+        raise node.error(str(problem), key) from problem
+    return frame
+
+
+def position_of(node: Node, names: Names, text: str, *keys: str | int) -> PositionRef:
+    """The position that a text at these keys of a TOML table names; SurveyError where it is none."""
+    try:
+        return read_position(text, names)
+    except NameProblemError as problem:
+        raise node.error(str(problem), *keys) from problem
+
+
+def frame_at(table: Table, row: int, column: str, text: str, names: Names) -> FrameRef:
+    """The frame that a row names, with its epoch where it moves; SurveyError where it is none."""
+    try:
+        frame = read_frame(text, names)
+        check_epochs(frame, None, names)
+    except NameProblemError as problem:
+        raise table.error(row, f"{column}: {problem}") from problem
+    return frame
+
+
+def position_at(table: Table, row: int, text: str, names: Names) -> PositionRef:
+    """The position that a row names in point_id; SurveyError where it is none."""
+    try:
+        position = read_position(text, names)
+        check_epochs(position.frame, None, names)
+    except NameProblemError as problem:
+        raise table.error(row, f"point_id: {problem}") from problem
+    return position
 
 
 def read_ends(

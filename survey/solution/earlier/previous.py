@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
@@ -165,7 +166,7 @@ def _vectors(found: Mapping[str, Any]) -> Iterator[tuple[ParameterName, Mapping[
             yield ("warp", target), entry["warp"]
 
 
-def _numbers(values: Any, n: int) -> FloatArray:
+def _numbers(values: npt.ArrayLike, n: int) -> FloatArray:
     out = np.array(values)
     if out.shape != (n,) or out.dtype.kind not in "if" or not np.isfinite(out).all():
         raise ValueError(f"expected {n} numbers")
