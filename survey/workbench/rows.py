@@ -8,6 +8,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from io import BytesIO
 from typing import Any
 
 import numpy as np
@@ -147,15 +148,19 @@ def columns(
     if whole:
         said, seen = _seen(rows)
         header, arrays = header | said, seen | arrays
-    typed = {k: a[every].astype("<f4" if a.dtype.kind == "f" else a.dtype, copy=False) for k, a in arrays.items()}
-    typed = dict(sorted(typed.items(), key=lambda item: -item[1].itemsize))  # each begins at a multiple of its size
+    types = {k: np.dtype("<f4") if a.dtype.kind == "f" else a.dtype for k, a in arrays.items()}
+    types = dict(sorted(types.items(), key=lambda item: -item[1].itemsize))  # each begins at a multiple of its size
     header |= {
-        "n": len(typed["w"]), "rows": None if chosen is None else chosen.tolist(),
-        "columns": [{"name": k, "type": a.dtype.str.lstrip("<|")} for k, a in typed.items()],
+        "n": len(rows.test[every]), "rows": None if chosen is None else chosen.tolist(),
+        "columns": [{"name": k, "type": kind.str.lstrip("<|")} for k, kind in types.items()],
     }  # fmt: skip
     text = json.dumps(header, ensure_ascii=False, allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
-    return b"".join([len(text).to_bytes(4, "little"), text, *(a.tobytes() for a in typed.values())])
+    out = BytesIO()
+    out.writelines([len(text).to_bytes(4, "little"), text])
+    for name, kind in types.items():  # one after the other: nowhere are all of them held twice
+        out.write(np.ascontiguousarray(arrays.pop(name)[every], dtype=kind).data)
+    return out.getvalue()
 
 
 def _small(values: IntArray) -> npt.NDArray[np.unsignedinteger[Any]]:

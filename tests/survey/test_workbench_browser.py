@@ -357,8 +357,13 @@ def test_of_a_solution_that_has_gone_the_page_keeps_nothing(browser: Any, tmp_pa
         for keys in (("x", "w", "h", "y", "Enter"), ("u",)):
             page.done(lambda keys=keys: [p.keyboard.press(key) for key in keys])
         session = page.context.new_cdp_session(p)
-        session.send("HeapProfiler.collectGarbage")
-        held = session.send("Runtime.getHeapUsage")["backingStorageSize"] / (p.evaluate(ROWS) - 1)
+        held = np.inf
+        for _ in range(20):  # what is given back is swept beside other work
+            session.send("HeapProfiler.collectGarbage")
+            held = min(held, session.send("Runtime.getHeapUsage")["backingStorageSize"] / (p.evaluate(ROWS) - 1))
+            if held < 65.0:
+                break
+            p.wait_for_timeout(250)
         page.context.close()
     assert 20.0 < held < 65.0
 
@@ -369,7 +374,7 @@ def test_columns_as_the_page_reads_them(page: Page, folder: Path) -> None:
     data = columns(bench.rows, 4.0, 1)
     found = page.page.evaluate(
         """async (bytes) => { const { columns, withImages, pointId, rowsOfImage } = await import("./columns.js");
-        const data = withImages(columns(Uint8Array.from(bytes).buffer)); const k = 1234;
+        const data = withImages(await columns(new Blob([Uint8Array.from(bytes)]).stream())); const k = 1234;
         return [data.n, pointId(data, k), data.u[k], data.images.length, [...rowsOfImage(data, "X/tX05")].length]; }""",
         list(data),
     )
