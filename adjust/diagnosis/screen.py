@@ -101,12 +101,26 @@ class Screen(Fit):
 
     def drop(self, rows: IntArray, after: FloatArray) -> float:
         """How much less everything misfits when these readings do as in ``after`` (n,), squares over sigmas."""
-        own, now = (np.minimum(s / self.scale, CAP).sum() for s in (self.readings[rows], after))
-        return improvement(self._of_readings, self._of_readings - float(own) + float(now), len(self.readings))
+        found = []
+        for scales, whole in self._scales:
+            own, now = (np.minimum(s / scales[rows], CAP).sum() for s in (self.readings[rows], after))
+            found.append(improvement(whole, whole - float(own) + float(now), len(self.readings)))
+        return max(found)
 
     @cached_property
-    def _of_readings(self) -> float:
-        return float(np.minimum(self.readings / self.scale, CAP).sum())
+    def _scales(self) -> list[tuple[FloatArray, float]]:
+        """Variance factors (N,) of the rough values, and the bounded misfit by them: of all alike; of angles and of the rest.
+
+        Places that are off by so much miss angles by more of their sigmas than distances. Where all have one factor, more
+        than half of the angles may be misread.
+        """
+        alike = np.full(len(self.readings), self.scale)
+        kind = self.graph.terrestrial.layout.arrays.kind if self.graph.terrestrial is not None else np.zeros(0)
+        angles, apart = np.isin(kind, (k.DIRECTION, k.ANGLE, k.ZENITH, k.AZIMUTH)), alike.copy()
+        for rows in (angles, ~angles):
+            if rows.any():
+                apart[rows] = max(1.0, float(np.median(self.readings[rows])) / _MEDIAN)
+        return [(s, float(np.minimum(self.readings / s, CAP).sum())) for s in (alike, apart)]
 
     def afresh(self, surveys: Sequence[Survey]) -> list[Fit | None]:
         """The same readings with other values, or between points with other given coordinates, each at its own start.

@@ -42,7 +42,9 @@ def test_a_score_is_the_same_where_the_adjustment_ended_early() -> None:
     assert b.theta[0] == pytest.approx(-1e-3, rel=0.05)
 
 
-def test_parts_of_a_course_are_rows_of_the_system() -> None:
+@pytest.mark.parametrize("written_out", [0, 10**9])
+def test_parts_of_a_course_are_rows_of_the_system(written_out: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("adjust.statistics.score._SMALL", written_out)
     linear = adjusted(bent(0.0))
     columns = linear.columns(("lens", "right"))
     rows = linear.rows_of(columns)

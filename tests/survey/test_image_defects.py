@@ -18,6 +18,7 @@ from survey.jobs.adjusting.job import adjust_job, detect_job
 from survey.planning.checking import check_job
 from survey.project.detected import DetectedImage
 from survey.project.targets import Charuco, Checkerboard
+from survey.report.language import message, speaking
 from survey.simulate import stereo
 from survey.simulate.rendering import BrownCamera, Imaging, PlacedTarget, render
 from tests.data import data_folder
@@ -178,6 +179,8 @@ def test_blurred_images_are_left_out_and_taken_back(tmp_path, capsys):
 
     (line,) = told()
     number = re.search(r"--try (\d+)$", line).group(1)
+    with speaking("de"):
+        assert message(line.strip("! ")).endswith(f"wo die anderen genügen; --try {number}")
     main(["adjust", str(lab), "--quiet", "--try", number])
     assert "image,c/e1,excluded" in (lab / "observations" / "exclusions.csv").read_text()
     capsys.readouterr()

@@ -113,6 +113,8 @@ def blurred(survey: Survey, images: Mapping[ImageKey, DetectedImage]) -> "tuple[
 
     A mosaic or interlaced fields are in all images of a camera: what is left out then is the camera.
     """
+    if not any(i.defect for i in images.values()):
+        return ()
     used = {(b.camera_id, b.epoch_id) for b in survey.image_blocks if b.n_used}
     found = [d for d in defective({key: i.defect for key, i in images.items() if key in used}) if d.kind == _MOTION]
     return tuple(_left_out(d) for d in found if 2 * len(d.images) < sum(c == d.images[0][0] for c, _ in used))
