@@ -1,5 +1,6 @@
 """Finding a checkerboard's inner corners, in an order that its colours define."""
 
+import math
 from typing import Any
 
 import cv2
@@ -154,7 +155,7 @@ def _noise(gray8: Gray8) -> float:
     """Standard deviation of white noise, by the quartile of second differences along rows: less than half are edges."""
     rows = gray8[:: max(1, len(gray8) // 200)].astype(np.int16)
     second = np.abs(rows[:, 2:] - 2 * rows[:, 1:-1] + rows[:, :-2])
-    return float(np.quantile(second, 0.25)) / (0.3186 * 6.0**0.5)  # a normal's quartile; weights 1, -2, 1
+    return float(np.quantile(second, 0.25)) / (0.3186 * math.sqrt(6.0))  # a normal's quartile; weights 1, -2, 1
 
 
 def _enlarged(gray8: Gray8, grid: FloatArray, factor: FloatArray) -> FloatArray:
