@@ -40,8 +40,8 @@ struct Candidates {
     bool taken[MOST_CORNERS];
 };
 
-// The local maxima of the response, an eighth of it, above a share of the largest; false where there are too many.
-inline bool candidates(Bytes image, Out<uint8_t, 2> response, double share, Candidates &out) {
+// The local maxima of the response, an eighth of it, above a share of the largest and so much; false where there are too many.
+[[gnu::noinline]] inline bool candidates(Bytes image, Out<uint8_t, 2> response, double share, double above, Candidates &out) {
     const int64_t h = image.n[0], w = image.n[1];
     Byte largest = Byte{};
     std::memset(response.data, 0, h * w);
@@ -55,7 +55,7 @@ inline bool candidates(Bytes image, Out<uint8_t, 2> response, double share, Cand
         }
     int most = 0;
     for (int i = 0; i < LANES; ++i) most = largest[i] > most ? largest[i] : most;
-    const int least = int(larger(share * most, 4.0));
+    const int least = int(larger(share * most, above));
     for (int64_t v = RADIUS; v < h - RADIUS; ++v)
         for (int64_t u = RADIUS; u < w - RADIUS; ++u) {
             const uint8_t *at = &response.data[v * w + u];
@@ -170,13 +170,22 @@ struct Growing {
     }
 };
 
+inline bool too_small(Bytes image) { return image.n[0] <= 2 * RADIUS || image.n[1] < 2 * RADIUS + 32; }
+
+// How many places of an image of 8 bit have a response (an eighth of it) of so much, MOST_CORNERS at most. response: work.
+inline int64_t count_crossings(Bytes image, double above, Out<uint8_t, 2> response) {
+    static thread_local Candidates found;
+    found.n = 0;
+    return !too_small(image) && !candidates(image, response, 0.0, larger(above, 1.0), found) ? MOST_CORNERS : found.n;
+}
+
 // The corners (rows, columns, 2) px of the one board of so many that is whole in an image of 8 bit, good to half a pixel;
 // false where there is none, or more of it: a finder that looks longer is to be asked then. response: work.
 inline bool find_grid(Bytes image, Out<uint8_t, 2> response, Out<double, 3> grid) {
     static thread_local Candidates found;
     const int rows = int(grid.n[0]), columns = int(grid.n[1]);
     found.n = 0;
-    if (image.n[0] <= 2 * RADIUS || image.n[1] < 2 * RADIUS + 32 || !candidates(image, response, 0.15, found)) return false;
+    if (too_small(image) || !candidates(image, response, 0.15, 4.0, found)) return false;
     for (int tried = 0; tried < 8; ++tried) {
         int seed = -1;
         for (int i = 0; i < found.n; ++i)

@@ -51,6 +51,8 @@ _squares_follow = Function("squares_follow", "image[*,*] corners[n,2] places[n,2
 _may_go_on = Function("may_go_on", "image[*,*] grid[r,c,2] step share")
 _off_grid = Function("off_grid", "grid[r,c,2] off[r,c] work[*]")
 _find_grid = Function("find_grid", "image[h,w] response[h,w] grid[r,c,2]")
+MOST_CROSSINGS = 600  # that are counted, as in grids.h
+_count_crossings = Function("count_crossings", "image[h,w] above response[h,w]")
 _unbend = Function("unbend", "xy[n,2] keep[n] angles[n,2] bend[n,2] uv[n,2] cov[n,2,2] work[*]")
 _spread_and_sum = Function("spread_and_sum", "first last image[*,*] weights[t] reach n out[*,*] work[*,*]")
 
@@ -131,6 +133,16 @@ def find_grid(image: npt.NDArray[np.uint8], columns: int, rows: int) -> FloatArr
     grid = np.empty((rows, columns, 2))
     image = np.ascontiguousarray(image)
     return grid if _find_grid(image, np.empty_like(image), grid) else None
+
+
+def count_crossings(image: npt.NDArray[np.uint8], above: float) -> int:
+    """How many places respond so strongly as the corner of four squares; at most MOST_CROSSINGS.
+
+    A corner responds by a third of what its squares differ by in grey value at least, and by all of it at most, where
+    the ring of five pixels around it lies in its four squares: those of less than some six pixels are not seen.
+    """
+    image = np.ascontiguousarray(image)
+    return _count_crossings(image, above, np.empty_like(image))
 
 
 def of_neighbours(image: Gray, grid: FloatArray, contrast: float) -> bool:
@@ -218,9 +230,7 @@ def pixel_corner_rays(width: int, height: int, lens: FloatArray) -> FloatArray:
     return rays
 
 
-def draw_facets(
-    rays: FloatArray, n: int, facets: Facets, background: float, samples: FloatArray, image: Gray
-) -> None:
+def draw_facets(rays: FloatArray, n: int, facets: Facets, background: float, samples: FloatArray, image: Gray) -> None:
     """Draw sub-pixels (n * height, n * width), each integrated over its area, into image; rays: of the pixel corners.
 
     samples: (S, 2) offsets in the unit square of a sub-pixel that sees an edge.

@@ -1,12 +1,13 @@
 """Finding a checkerboard's inner corners, in an order that its colours define."""
 
+import math
 from typing import Any
 
 import cv2
 import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray
-from adjust.native.vision import find_grid, first_is_dark, of_neighbours, off_grid
+from adjust.native.vision import MOST_CROSSINGS, count_crossings, find_grid, first_is_dark, of_neighbours, off_grid
 from survey.detection.corners import CornerFit, refine_corners, unbent
 from survey.detection.extent import grown
 from survey.detection.gray import Gray8, Gray32, halved, reduced
@@ -17,6 +18,10 @@ _SQUARE_PX = 32  # longer side of the image in which the board is looked for fir
 _REGULAR = 0.25  # squares by which what is found there may bend from one to the next: more is a corner beside its place
 _NEAR = 2.0  # times by which an image may be reduced for its corners to be near enough in the full one
 _COARSE_PX = 900  # that of the image in which it is then looked for by all finders
+_ABOVE_NOISE = 1.6  # response of a corner, in sigmas of the noise, that noise alone shows nowhere
+_SMOOTHED = 0.375  # standard deviation of white noise after the smoothing by 1, 2, 1 along rows and columns
+_ROUNDED = 0.3  # that of whole grey values
+_CROSSINGS = 0.5  # share of a board's corners that are seen wherever any finder finds them all
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _MAX_DECOYS = 3
 
@@ -112,6 +117,8 @@ def _find(gray8: Gray8, columns: int, rows: int) -> FloatArray | None:
     """
     if (found := _glimpsed(gray8, columns, rows)) is not None:
         return found
+    if not _may_show(gray8, columns * rows):
+        return None
     small, factor = reduced(gray8, _COARSE_PX)
     ok, corners = _found_in(small, (columns, rows))
     if not ok and small is not gray8:
@@ -124,10 +131,31 @@ def _glimpsed(gray8: Gray8, columns: int, rows: int) -> FloatArray | None:
     """Corners (rows, columns, 2) px that are seen in a small image at once, and lie as on a board."""
     small, factor = halved(gray8, _SQUARE_PX * max(columns, rows))
     grid = find_grid(small, columns, rows)
-    if grid is None:
+    if grid is None and _may_show(gray8, columns * rows):
         ok, corners = cv2.findChessboardCorners(small, (columns, rows), flags=0)
         grid = np.reshape(corners, (rows, columns, 2)).astype(float) if ok else None
     return None if grid is None or off_grid(grid).max() > _REGULAR else _enlarged(gray8, grid, factor)
+
+
+def _may_show(gray8: Gray8, corners: int) -> bool:
+    """Whether the image, whole or halved however often, has places enough that look like a board's corners.
+
+    Where it has not, no finder need look, each of which takes longer the less there is to be found.
+    """
+    while min(gray8.shape) >= _SQUARE_PX:
+        above = _ABOVE_NOISE * _SMOOTHED * max(_noise(gray8), _ROUNDED) + 1.0
+        smooth = np.asarray(cv2.GaussianBlur(gray8, (3, 3), 0.0), np.uint8)
+        if count_crossings(smooth, above) >= min(_CROSSINGS * corners, MOST_CROSSINGS):
+            return True
+        gray8, _ = halved(gray8, max(gray8.shape) // 2)
+    return False
+
+
+def _noise(gray8: Gray8) -> float:
+    """Standard deviation of white noise, by the quartile of second differences along rows: less than half are edges."""
+    rows = gray8[:: max(1, len(gray8) // 200)].astype(np.int16)
+    second = np.abs(rows[:, 2:] - 2 * rows[:, 1:-1] + rows[:, :-2])
+    return float(np.quantile(second, 0.25)) / (0.3186 * math.sqrt(6.0))  # a normal's quartile; weights 1, -2, 1
 
 
 def _enlarged(gray8: Gray8, grid: FloatArray, factor: FloatArray) -> FloatArray:

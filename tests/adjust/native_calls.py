@@ -182,6 +182,7 @@ def _pictures() -> None:
     image = render(camera, [view], seed=1)
     found = detect_image(image, board)
     assert len(found) == 40
+    assert not len(detect_image(np.full_like(image, 128), board))
     gray, grid = image.astype(np.float32), found.uv.reshape(5, 8, 2)
     assert grown(gray, grid[1:-1, 1:-1], found.contrast).shape == grid.shape
     one, disc = np.ones(len(found)), [6.0, 0.0, 0.0, 0.0]

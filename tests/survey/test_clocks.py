@@ -119,6 +119,7 @@ def test_without_times_clocks_count_intervals(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undiagnosed")
 def test_what_was_found_before_is_where_the_next_search_begins(tmp_path: Path) -> None:
     """Clocks, warps and lenses that change: the values of the last solution, not those of survey.toml."""
     survey, _ = board_before_cameras(14, {"right": clock(1e-3, offset=0.03)}, {RIGHT: np.array([0.03])})

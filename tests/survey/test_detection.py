@@ -7,7 +7,7 @@ from gtsam import Pose3, Rot3
 from scipy.stats import chi2
 
 from adjust.model.errors import SurveyError
-from adjust.native.vision import corner_rows, find_grid, fit_corners
+from adjust.native.vision import corner_rows, count_crossings, find_grid, fit_corners
 from survey.detection import detect_image, markers
 from survey.detection.corners import CROSSING_FLOOR_PX, MARKER_FLOOR_PX
 from survey.detection.detect import detect_targets
@@ -308,3 +308,36 @@ def test_a_whole_board_is_glimpsed_where_it_is_and_no_part_of_one(turn_deg):
     assert find_grid(image, 6, 4) is None
     u, v = truth[1, 3].round().astype(int)
     assert find_grid(cv2.circle(image, (int(u), int(v)), 8, 128, -1), 7, 4) is None
+
+
+def test_places_like_corners_are_counted_above_the_noise():
+    flat = np.pad(np.kron(np.indices((5, 8)).sum(0) % 2, np.full((20, 20), 40.0)) + 80.0, 70, constant_values=100.0)
+    noise = np.random.default_rng(1).normal(0.0, 1.0, flat.shape)
+    board, empty = (np.rint(image + noise).astype(np.uint8) for image in (flat, np.full_like(flat, 100.0)))
+    assert count_crossings(board, 10.0) == 28
+    assert count_crossings(board, 60.0) == 0
+    assert count_crossings(empty, 10.0) == 0
+    assert count_crossings(empty[:10], 0.0) == 0
+
+
+@pytest.mark.parametrize("noise", [1.0, 5.0, 20.0])
+def test_where_nothing_looks_like_corners_no_finder_looks_longer(monkeypatch, noise):
+    def asked(*given, **options):
+        raise AssertionError("asked")
+
+    monkeypatch.setattr("survey.detection.checkerboard.cv2.findChessboardCorners", asked)
+    monkeypatch.setattr("survey.detection.checkerboard.cv2.findChessboardCornersSB", asked)
+    ramp = np.linspace(100.0, 120.0, 640) + np.random.default_rng(1).normal(0.0, noise, (512, 640))
+    found = detect_image(np.clip(np.rint(ramp), 0.0, 255.0).astype(np.uint8), BOARD)
+    assert not len(found)
+    assert found.reason == "no complete board of 8 x 5 inner corners"
+
+
+@pytest.mark.parametrize(
+    ("z", "tilt", "blur_px", "noise"), [(2.2, 0.0, 0.4, 1.0), (0.5, 1.1, 0.7, 4.0), (0.6, 0.3, 4.0, 2.0)]
+)
+def test_small_tilted_and_blurred_boards_are_still_looked_for(z, tilt, blur_px, noise):
+    image = render(CAMERA, [placed(BOARD, (tilt, 0.1, 0.3), z)], imaging=Imaging(blur_px, noise), seed=1)
+    low = np.rint(100.0 + 0.1 * image).astype(np.uint8)
+    assert len(detect_image(image, BOARD)) > 30
+    assert len(detect_image(low, BOARD)) > 30
