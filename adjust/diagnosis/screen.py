@@ -109,10 +109,10 @@ class Screen(Fit):
 
     @cached_property
     def _scales(self) -> list[tuple[FloatArray, float]]:
-        """Variance factors (N,) of the rough values, and the bounded misfit by them: of all alike; of angles and of the rest.
+        """Variance factors (N,) of the rough values, and the bounded misfit by them: all alike; angles and the rest apart.
 
-        Places that are off by so much miss angles by more of their sigmas than distances. Where all have one factor, more
-        than half of the angles may be misread.
+        Places that are off by so much miss angles by more of their sigmas than distances. Where all have one factor,
+        more than half of the angles may be misread.
         """
         alike = np.full(len(self.readings), self.scale)
         kind = self.graph.terrestrial.layout.arrays.kind if self.graph.terrestrial is not None else np.zeros(0)

@@ -44,6 +44,23 @@ def test_what_diverges_names_the_set_up(name: str) -> None:
     assert "undetermined" not in said
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "cause"),
+    [
+        ("m_ccw_S2", "direction of set-up S2a: their values count the other way round"),
+        ("m_gon_S2", "direction of set-up S2a: their values are gon, read as degrees"),
+        ("m_swap_ts2", "points B11 and B03 are called by each other's names in set-up S2a"),
+    ],
+)
+def test_what_is_wrong_in_one_set_up_among_cameras_is_named(name: str, cause: str) -> None:
+    with pytest.raises(SurveyError) as caught:
+        adjusted(data_folder("calibration", "wobbling", name))
+    first = str(caught.value).splitlines()[1]
+    assert cause in first
+    assert "--try 1" in first
+
+
 @pytest.mark.usefixtures("undiagnosed")
 def test_a_mirrored_camera_is_named_and_nothing_is_undetermined() -> None:
     with pytest.raises(SurveyError) as caught:

@@ -270,14 +270,20 @@ def _by_start(case: Case) -> _Judge | None:
     degree = np.bincount(ends.ravel())
     opened = float(np.minimum(loops([{}]), CAP).sum())
 
+    def told(rows: IntArray) -> bool:
+        """Whether they told the pose of an end, which is to be found anew then."""
+        return bool((2 * np.bincount(ends[rows].ravel(), minlength=len(degree)) > degree).any())
+
     def evidence(sets: Sequence[Mapping[int, Motion]]) -> list[float]:
         rows = np.array(list(sets[0]))
         if len(rows) > 1 and np.median(squares[rows]) < _MISSED:
             return [0.0] * len(sets)
-        if not (2 * np.bincount(ends[rows].ravel(), minlength=len(degree)) > degree).any():
-            return [gain(rows, _read_as(before, new)) for new in sets]
-        # what told the pose of an end
+        there = [gain(rows, _read_as(before, new)) for new in sets] if survey.image_blocks or not told(rows) else []
+        if not told(rows):
+            return there
         still = np.minimum(loops(sets), CAP).sum(axis=1) > max(2.0 * len(squares), 0.5 * opened)
+        if there:  # where images tell the poses too, what is meant fits them better than what is read
+            still |= np.array(there) <= 1.0
         after = (None if x else screen(_with(survey, new)) for x, new in zip(still, sets, strict=True))
         return [0.0 if x is None else gain(np.arange(len(squares)), _of_pairs(x, survey)) for x in after]
 

@@ -46,7 +46,10 @@ def misread_readings(case: Case) -> Iterator[Hypothesis]:
     before, values = at_best(case), np.array([r.value for r in survey.readings])
     ways = [(scope, m) for scope in scopes(survey) for m in _possible(survey, scope, values)]
     looked_at = len(ways)
-    found = [(e, *way) for e, way in zip(_evidence(survey, before, values, ways), ways, strict=True)]
+    gains = _evidence(survey, before, values, ways)
+    if before is not None and max(gains, default=0.0) < _CLEARLY:
+        gains = _without_worst(survey, before, values, ways) or gains
+    found = [(gain, *way) for gain, way in zip(gains, ways, strict=True)]
     # what explains many first: that of single readings is of each alone, which many misread ones have as well
     for some in ([f for f in found if f[0] > _CLEARLY], _slips(survey, before, values)):
         for evidence, scope, misreading in sorted(some, key=lambda f: (-f[0], -len(f[1].rows)))[:_MOST]:
@@ -141,6 +144,30 @@ def _evidence(survey: Survey, before: Screen | None, values: FloatArray, ways: S
         after_each = before.alternatives(sets, observed=np.concatenate([np.zeros(0), *read]))
         for i, rows, squares in zip(there, sets, after_each, strict=True):
             out[i] = before.drop(rows, squares)
+    return out
+
+
+def _without_worst(survey: Survey, before: Screen, values: FloatArray, ways: Sequence[_Way]) -> list[float]:
+    """The same at the start without the angles of the set-up that misses most, which may have spoilt it for all others.
+
+    Empty where there is only one set-up, or no such start.
+    """
+    kinds = [r.kind for r in survey.readings]
+    angles = [scope for scope, _ in ways if scope.place.kind == "setup" and kinds[scope.rows[0]] in TURNS]
+    worst = max(angles, key=lambda scope: float(np.median(before.readings[scope.rows])), default=None)
+    if worst is None:
+        return []
+    turned = {i for i in worst.rows.tolist() if kinds[i] in TURNS}
+    without = screen(replace(survey, readings=tuple(r for i, r in enumerate(survey.readings) if i not in turned)))
+    apart = None if without is None else screen(survey, without.start)
+    if apart is None:
+        return []
+    mine = [i for i, (scope, _) in enumerate(ways) if set(scope.rows.tolist()) <= set(worst.rows.tolist())]
+    read = [ways[i][1].mend(values[ways[i][0].rows]) for i in mine]
+    out = [0.0] * len(ways)
+    after = apart.alternatives([ways[i][0].rows for i in mine], observed=np.concatenate(read))
+    for i, squares in zip(mine, after, strict=True):
+        out[i] = apart.drop(ways[i][0].rows, squares)
     return out
 
 
