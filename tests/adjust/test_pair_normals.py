@@ -170,4 +170,4 @@ def test_columns_cost_their_way_to_the_root_and_back() -> None:
     numbers = tree.arrays.front * tree.arrays.width
     ways = [numbers[tree._ancestors({c})].sum() for c in range(len(numbers))]
     assert 0 < max(ways) < numbers.sum()  # there are branches
-    assert tree.columns_for(3.0) * 2.0 * max(ways) == pytest.approx(3.0 * float(numbers @ tree.arrays.width))
+    assert tree.columns_for(3.0) * max(ways) == pytest.approx(3.0 * float(numbers @ tree.arrays.width))
