@@ -187,7 +187,8 @@ def test_rows_of_pairs_in_batches_are_those_of_their_factors() -> None:
     result = adjust(replace(survey, pairs=tuple(pairs)))
     system, precision = linear_system(result), precision_of(result)
     graph = precision.graph
-    assert graph.pairs is not None and (graph.pairs.a_key < 0).any() | (graph.pairs.b_key < 0).any()
+    assert graph.pairs is not None
+    assert (graph.pairs.a_key < 0).any() | (graph.pairs.b_key < 0).any()
     column = {u.key: system.columns.at[name] for name, u in graph.unknowns.by_name.items()}
     for i in range(graph.n_others):
         item = graph.other(i)
