@@ -213,11 +213,11 @@ class TreeCovariance:
         return int(self._first[-1])
 
     def columns_for(self, eliminations: float) -> float:
-        """How many columns go up and down the deepest way at the price of so many eliminations of the whole."""
+        """How many columns go up the deepest way at the price of so many eliminations of the whole."""
         own, way = (self._front * self._width).tolist(), list[int]()
         for numbers, parent in zip(own, self._parents.tolist(), strict=True):  # parents first
             way.append(numbers + (way[parent] if parent >= 0 else 0))
-        return eliminations * float(self._front @ self._width.astype(float) ** 2) / (2.0 * max(way, default=1))
+        return eliminations * float(self._front @ self._width.astype(float) ** 2) / max(way, default=1)
 
     def times(self, columns: FloatArray) -> FloatArray:
         """The whole covariance matrix times columns (n, m), without forming it."""
@@ -240,10 +240,14 @@ class TreeCovariance:
             entries = mine.data, mine.indices + shift[home[mine.indices]], mine.indptr
             U = np.ascontiguousarray(sparse.csr_array(entries, (mine.shape[0], n)).toarray().T)
             solve_cliques(self.arrays, up, none, self._first[:-1] + shift[self._home], self._data, U)
-            done.append((np.flatnonzero(np.isin(home, up)), U))
-            for k, (rows, V) in enumerate(done):
-                _, here, there = np.intersect1d(done[-1][0], rows, assume_unique=True, return_indices=True)
-                out[i : i + _COLUMNS, k * _COLUMNS : k * _COLUMNS + V.shape[1]] = U[here].T @ V[there]
+            out[i : i + _COLUMNS, i : i + _COLUMNS] = U.T @ U
+            way = np.zeros(len(self._front), dtype=np.bool_)
+            way[up] = True
+            rows = np.flatnonzero(way[home])
+            for k, (before, V) in enumerate(done):
+                _, here, there = np.intersect1d(rows, before, assume_unique=True, return_indices=True)
+                out[i : i + _COLUMNS, k * _COLUMNS : (k + 1) * _COLUMNS] = U[here].T @ V[there]
+            done.append((rows, U))
         back = np.argsort(order)
         return np.asarray((np.tril(out) + np.tril(out, -1).T)[np.ix_(back, back)])
 

@@ -36,6 +36,11 @@ class InTurn:
     def __init__(self) -> None:
         self.parts = self.steps = 0.0
         self.begun: list[float] = []
+        self.entered = (0.0, 0.0)
+
+    def beside(self) -> None:
+        """From here on what this thread does itself is a step beside those that it begins."""
+        self.entered = (time.thread_time(), self.parts)
 
     def map(self, function: Callable[[Any], Any], parts: Iterable[Any]) -> list[Any]:
         """As of an executor: parts that are shared out."""
@@ -64,7 +69,9 @@ class InTurn:
 
     def finished(self) -> None:
         """No more steps beside these."""
-        self.steps += saved(self.begun)
+        begin, before = self.entered
+        own = time.thread_time() - begin - (self.parts - before) - sum(self.begun)
+        self.steps += saved([*self.begun, own]) if self.begun else 0.0
         self.begun = []
 
 
@@ -72,6 +79,7 @@ def main() -> None:
     """Runs the command of the arguments."""
     pool = InTurn()
     parallel._pool = parallel._stages = lambda workers: pool
+    parallel.Beside.__enter__ = lambda self: pool.beside() or self
     parallel.Beside.__exit__ = lambda self, *_: pool.finished()
     from survey.jobs.adjusting import job
 

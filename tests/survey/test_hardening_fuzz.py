@@ -23,6 +23,7 @@ NO_READERS = {
     "survey/report/page.py:_words": "a part of the package",
     "survey/workbench/server.py:Server._page": "a part of the package",
     "survey/solution/earlier/runs.py:record_run": "copies what was written or read before",
+    "survey/folder/arrays.py:packed_arrays": "writes, into memory",
     "survey/batch/cache.py:fingerprint": "hashes whatever is there",
     "survey/batch/journal.py:Journal.__init__": "opens to write",
     "survey/batch/worker.py:Worker._answer": "a pipe from a process of its own",

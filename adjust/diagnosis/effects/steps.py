@@ -23,7 +23,7 @@ from adjust.statistics.score import Part, Score, drift_times
 
 FOCAL, CENTRE = ("fx", "fy", "c"), ("u0", "v0", "xp", "yp")
 _FEWEST = 4
-_ELIMINATIONS = 25.0
+_ELIMINATIONS = 12.5
 """Eliminations of the whole system that all courses together may cost in surveys of many unknowns."""
 _BOUND = 50.0  # of the square of one image point
 _MOVED = {  # name of the unknown: of the mistake, kind of the thing, what happened to it
