@@ -1,6 +1,6 @@
 """Pictures of these pages, taken from reports with Chromium.
 
-Run: python docs/make_pictures.py PAGE.html SECTION OUT.png [TALLEST]
+Run: python -m docs.make_pictures PAGE.html SECTION OUT.png [TALLEST]
 SECTION is the anchor of a section, or "head" for everything above the second one. Needs Chromium or Chrome.
 """
 
@@ -13,6 +13,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+
+from docs.palette import write_palette_png
 
 WIDTH, HEIGHT, MARGIN = 1000, 3200, 12
 BROWSERS = ("chromium", "google-chrome", "chromium-browser")
@@ -40,7 +42,7 @@ def main(page: Path, section: str, out: Path, tallest: int = 900) -> None:
     inked = np.argwhere((image < 250).any(axis=2))
     (top, left), (bottom, right) = inked.min(axis=0), inked.max(axis=0)
     box = image[max(top - MARGIN, 0) : min(bottom + MARGIN, top + tallest), max(left - MARGIN, 0) : right + MARGIN]
-    cv2.imwrite(str(out), box)
+    write_palette_png(out, cv2.imencode(".png", box)[1].tobytes())
 
 
 if __name__ == "__main__":

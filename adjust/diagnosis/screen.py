@@ -109,7 +109,7 @@ class Screen(Fit):
 
     @cached_property
     def _scales(self) -> list[tuple[FloatArray, float]]:
-        """Variance factors (N,) of the rough values, and the bounded misfit by them: all alike; angles and the rest apart.
+        """Variance factors (N,) of the rough values, and the misfit by them: all alike; angles and the rest apart.
 
         Places that are off by so much miss angles by more of their sigmas than distances. Where all have one factor,
         more than half of the angles may be misread.

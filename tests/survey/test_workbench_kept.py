@@ -68,7 +68,8 @@ bench = Workbench(sys.argv[1], read_only=True)
 Server(bench, "token").app()
 bench.state(), bench.findings(), bench.points(), bench.readings(), bench.runs()
 assert bench.kept is not None
-print(sorted({"scipy.sparse", "adjust.adjustment", "adjust.graph.assembly", "jinja2", "cv2", "pandas"} & set(sys.modules)))
+heavy = {"scipy.sparse", "adjust.adjustment", "adjust.graph.assembly", "jinja2", "cv2", "pandas"}
+print(sorted(heavy & set(sys.modules)))
 """
 
 

@@ -10,29 +10,21 @@ const ARRAYS = { u1: Uint8Array, u2: Uint16Array, u4: Uint32Array, i4: Int32Arra
  */
 
 /**
- * Columns as they come: the length of a header (u32), the header (JSON, padded to four bytes), then the arrays one after the
- * other, the widest elements first. Each array is filled from the parts that arrive; nowhere is all of it held twice.
- * @param {ReadableStream<Uint8Array>} stream
+ * Columns: the length of a header (u32), the header (JSON, padded to four bytes), then the arrays one after the other.
+ * @param {ArrayBuffer} buffer
  */
-export async function columns(stream) {
-  const reader = stream.getReader();
-  let part = new Uint8Array();
-  const fill = async (array) => {
-    const bytes = new Uint8Array(array.buffer);
-    for (let at = 0; at < bytes.length;) {
-      if (!part.length) part = (await reader.read()).value ?? missing(bytes.length - at);
-      bytes.set(part.subarray(0, bytes.length - at), at);
-      [at, part] = [Math.min(bytes.length, at + part.length), part.subarray(bytes.length - at)];
-    }
-    return array;
-  };
-  const [length] = await fill(new Uint32Array(1));
-  const out = JSON.parse(new TextDecoder().decode(await fill(new Uint8Array(length))));
-  for (const { name, type } of out.columns) out[name] = await fill(new ARRAYS[type](out.n));
+export function columns(buffer) {
+  const length = new DataView(buffer).getUint32(0, true);
+  const out = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
+  let at = 4 + length;
+  for (const { name, type: kind } of out.columns) {
+    const type = ARRAYS[kind];
+    at = Math.ceil(at / type.BYTES_PER_ELEMENT) * type.BYTES_PER_ELEMENT;
+    out[name] = new type(buffer, at, out.n);
+    at += out[name].byteLength;
+  }
   return out;
 }
-
-const missing = (n) => { throw new Error(`the connection was lost, ${n} bytes before its end`); };
 
 /** Rows of an image k are `rows[first[k]] ... rows[first[k + 1] - 1]`, without `rows` `first[k]` and so on. @param {any} data */
 export function withImages(data) {
