@@ -68,6 +68,12 @@ def test_a_page_on_the_example_runs(page: Page, tmp_path: Path, monkeypatch: pyt
     _run(page)
 
 
+@pytest.mark.skipif(not LAB, reason="LABSURVEY_DOCS_LAB names no adjusted example full-lab")
+def test_the_first_verdict_on_the_example_is_that_all_fits() -> None:
+    summary = json.loads((Path(str(LAB)) / "results" / "solution.json").read_text(encoding="utf-8"))["summary"]
+    assert (summary["verdict"], summary["fit"]) == ("passed", "fits"), summary["reason"]
+
+
 def _run(page: Page) -> None:
     with Runner(_free_ports(page)) as runner:
         for block in page.blocks:
