@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -45,10 +46,11 @@ def _explained(survey: Survey, error: SurveyError, project: Project) -> SurveyEr
         diagnosis = replace(diagnosis, candidates=tuple(done))
     tried = diagnosis.lines if diagnosis is not None else ()
     if not apart and not contradictions and not tried:
-        return error
+        said = copy(error)
+        said.args = ("\n  - ".join([str(error), *note]),)
+        return said if note else error
     lines = "\n  - ".join(["probable cause:", *apart, *tried, *contradictions, *note])
-    said = _consequence(error) if contradictions or tried else f"without that: {error}"
-    message = f"{lines}\n{said}"
+    message = f"{lines}\n{_consequence(error) if contradictions or tried else f'without that: {error}'}"
     return SurveyError(message) if diagnosis is None else DiagnosedError(message, diagnosis)
 
 
