@@ -31,13 +31,13 @@ def explaining(survey: Survey, project: Project) -> Iterator[None]:
     try:
         yield
     except SurveyError as error:
-        said = _explained(survey, error, project)
+        said = explained(survey, error, project)
         if said is error:
             raise
         raise said from error
 
 
-def _explained(survey: Survey, error: SurveyError, project: Project) -> SurveyError:
+def explained(survey: Survey, error: SurveyError, project: Project) -> SurveyError:
     """What an adjustment of the ``survey`` of a project raised, with the probable causes in front, if any."""
     apart, contradictions = separate_epochs(survey), _probable_causes(survey)
     diagnosis, note = _named(_diagnosis(survey, None, error, contradictions), project)
