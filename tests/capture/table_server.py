@@ -35,6 +35,14 @@ class TableServer:
         """The lines that ask for motion or its end, in either language."""
         return [row for row in self.received() if row[1].startswith(("MA", "ST", "HM")) or row[1][1:3] in ("PA", "OR")]
 
+    def stopped(self) -> int:
+        """The monotonic time in ns of the stop that is the last command; no reply tells that it has arrived."""
+        limit = time.monotonic() + 10.0
+        while not (rows := self.commands()) or rows[-1][1] != "ST":
+            assert time.monotonic() < limit, f"no stop came behind {rows[-1:]}"
+            time.sleep(0.002)
+        return rows[-1][0]
+
     def truth_deg(self) -> list[float]:
         """True angles of both axes, as of a moment after the call (the file is written anew every few milliseconds)."""
         asked, limit = time.monotonic_ns(), time.monotonic() + 30.0

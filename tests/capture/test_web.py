@@ -211,7 +211,7 @@ def test_nothing_moves_without_flag_and_token(tmp_path):
             assert ask(server, "POST", "/jog", {"X-Token": "right"}, turn)[0] == 200
             assert [line for _, line in table.commands()] == ["MA 1 5.000000", "MA 2 0.000000"]
             assert ask(server, "POST", "/stop", {"X-Token": "right"}, {})[0] == 200
-            assert table.commands()[-1][1] == "ST"
+            assert table.stopped()
 
 
 def test_live_images_and_lock(tmp_path):
