@@ -1,6 +1,7 @@
 """A start for the lens of one camera, from the targets it sees."""
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -27,6 +28,7 @@ _MOST_IMAGES = 30
 _SCAN_IMAGES = 8
 _MOST_SCREENED = 60
 _GOOD_START = 0.01  # of the image width: with less error a closed form needs no scan beside it
+_SEVERAL, _OTHER_STARTS = 3, 4  # images, and starts that are tried beside the first where that leads nowhere
 _LEVELS = ("focal centre k1 k2", "focal centre k1", "focal k1", "focal")
 _SIMPLE_PX = 2.0
 _FOCAL = {"fx", "fy", "c", "ck"}
@@ -128,8 +130,14 @@ class _LensSearch:
                 + next(iter(excluded.values()))
             )
         determined = [m for s in chosen if (m := maps.get(s.block_idx)) is not None]
-        start, how = self._focal_length(determined, chosen)
-        return self._refine(start, how, chosen, excluded)
+        starts = self._focal_lengths(determined, chosen)
+        start, how = next(starts)
+        found = self._refined(start, how, chosen)
+        # a closed form that misses little may lead nowhere: few images that are hardly tilted fit any focal length
+        others = itertools.islice(starts, _OTHER_STARTS if len(chosen) >= _SEVERAL else 0)
+        found = found or next((f for values, said in others if (f := self._refined(values, said, chosen))), None)
+        unrefined = start, f"lens from {len(chosen)} images ({how}; too few to refine it)"
+        return LensStart(*(found or unrefined), excluded)
 
     def _on_plane(self, sighting: Sighting) -> FloatArray | None:
         """Coordinates in the points' plane, asked for once for all images that show the same array of points."""
@@ -153,7 +161,10 @@ class _LensSearch:
         }
         return good, excluded
 
-    def _focal_length(self, maps: Sequence[FloatArray], chosen: Sequence[Sighting]) -> tuple[FloatArray, str]:
+    def _focal_lengths(
+        self, maps: Sequence[FloatArray], chosen: Sequence[Sighting]
+    ) -> Iterator[tuple[FloatArray, str]]:
+        """Values to begin with and how they were found: a closed form that misses little, else what misses least."""
         trials: list[tuple[FloatArray, str]] = []
         errors: list[float] = []
         trial_images = _every(chosen, _SCAN_IMAGES)
@@ -167,19 +178,22 @@ class _LensSearch:
             errors.append(self._error_px(trials[-1][0], trial_images))
             if errors[-1] < _SIMPLE_PX:  # nor does it need another one
                 break
-        if errors and min(errors) < _GOOD_START * max(self.size):
-            return trials[int(np.argmin(errors))]
+        begun = bool(errors) and min(errors) < _GOOD_START * max(self.size)
+        if begun:
+            first = int(np.argmin(errors))
+            yield trials.pop(first)
+            del errors[first]
         low, high = (0.15, 2.0) if self.model.name == "fisheye" else (0.35, 8.0)
-        for factor in np.geomspace(low, high, 16):
-            trials.append((self._values(factor * max(self.size)), "scan of focal lengths"))
-        errors += [self._error_px(values, trial_images) for values, _ in trials[len(errors) :]]
-        best = int(np.argmin(errors))
-        if not np.isfinite(errors[best]):
+        scanned = [self._values(factor * max(self.size)) for factor in np.geomspace(low, high, 16)]
+        trials += [(values, "scan of focal lengths") for values in scanned]
+        errors += [self._error_px(values, trial_images) for values in scanned]
+        order = [int(i) for i in np.argsort(errors, kind="stable") if np.isfinite(errors[i])]
+        if not order and not begun:
             raise SurveyError(
                 f"camera {self.camera.camera_id!r}: no focal length from {low:g} to {high:g} image widths explains its"
                 " images of known points; check point order, coordinates and image size, or give lens values"
             )
-        return trials[best]
+        yield from (trials[i] for i in order)
 
     def _values(self, fx: float, fy: float | None = None, centre: FloatArray | None = None) -> FloatArray:
         """Values without distortion; prior means where there are any, ties respected."""
@@ -211,8 +225,8 @@ class _LensSearch:
             poses[some], errors[some] = best_poses(x, seen, ptr, refinements)
         return poses, errors
 
-    def _refine(self, start: FloatArray, how: str, chosen: Sequence[Sighting], excluded: dict[int, str]) -> LensStart:
-        """The richest lens that the images determine, refined together with the poses."""
+    def _refined(self, start: FloatArray, how: str, chosen: Sequence[Sighting]) -> tuple[FloatArray, str] | None:
+        """The richest lens that the images determine, refined together with the poses, and a note; None without one."""
         poses, errors = self._poses(start, chosen, 3)
         # images without a pose are left to the screening of all blocks, which reports them
         images, poses = [s for s, e in zip(chosen, errors, strict=True) if np.isfinite(e)], poses[np.isfinite(errors)]
@@ -232,8 +246,8 @@ class _LensSearch:
                     if self._sane(full, everything) and full.median_px < 0.5 * fit.median_px:
                         fit, level = full, "all that is free"
                 note = f"lens from {len(images)} images ({how}; refined: {level}), median error {fit.median_px:.2f} px"
-                return LensStart(fit.values, note, excluded)
-        return LensStart(start, f"lens from {len(images)} images ({how}; too few to refine it)", excluded)
+                return fit.values, note
+        return None
 
     def _fit(
         self, start: FloatArray, directions: FloatArray, poses: FloatArray, images: Sequence[Sighting],

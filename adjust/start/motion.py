@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_array
 
+from adjust.frames.unknowns import Chain
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, IntArray
 from adjust.spatial.averaging import pose_distance
@@ -13,6 +14,8 @@ from adjust.start.closed_forms.hand_eye import relative_motions, solve_ax_xb, so
 from adjust.start.network import ChainObservation, FrameNetwork
 
 _CHOICES = 4
+_CLEAR_TURNS = np.deg2rad(20.0)
+"""Spread of turns below which the errors of a few views count for much in what they determine."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,14 +43,17 @@ class _Group:
 def solve_motion(network: FrameNetwork, degenerate: bool = True) -> str | None:
     """Find what two unknowns and the motion between them determine; a note on what was done, or None.
 
-    Robot-world closed form where a group of observations turns about two axes; else hand-eye from the motions of all
-    groups that share an unknown; else all views together, where what a chain lacks on either side may be several poses
-    in a row; with all turns about one axis (where ``degenerate`` ones will do) the smallest of the consistent solutions
-    is taken, since a start need only be consistent.
+    Robot-world closed form where a group of observations turns about two axes (where it hardly does, two cameras on one
+    body first, as below); else hand-eye from the motions of all groups that share an unknown; else all views together,
+    where what a chain lacks on either side may be several poses in a row. Where ``degenerate`` motions will do: two
+    cameras on one body, each before targets of its own, from how the body moved between its epochs; with all turns
+    about one axis the smallest of the consistent solutions, since a start need only be consistent.
     """
     found = _rows_of_poses(network)
-    groups = _groups(found)
-    for group in sorted(groups, key=lambda g: -g.spread()):
+    groups = sorted(_groups(found), key=lambda g: -g.spread())
+    if groups and groups[0].spread() < _CLEAR_TURNS and (note := _side_by_side(network)) is not None:
+        return note
+    for group in groups:
         try:
             second, first, _ = solve_ax_zb(group.motions, group.products)
         except SurveyError:
@@ -56,7 +62,9 @@ def solve_motion(network: FrameNetwork, degenerate: bool = True) -> str | None:
         network.set(group.first[0], inverse(first), group.first[1])
         return f"{_text(network, group.first)} and {_text(network, group.second)} from {len(group.motions)} motions"
     note = _shared(network, groups, False) or _together(network, found)
-    return note or (_shared(network, groups, True) if degenerate else None)
+    if note is not None or not degenerate:
+        return note
+    return _side_by_side(network) or _shared(network, groups, True)
 
 
 def _shared(network: FrameNetwork, groups: list[_Group], minimum_norm: bool) -> str | None:
@@ -76,6 +84,39 @@ def _shared(network: FrameNetwork, groups: list[_Group], minimum_norm: bool) -> 
         network.set(link[0], x, link[1])
         how = "turns about one axis only: smallest consistent solution" if minimum_norm else f"{len(a)} motions"
         return f"{_text(network, link)} from {how}"
+    return None
+
+
+def _side_by_side(network: FrameNetwork) -> str | None:
+    """A pose on a moving body from another that is known there: both see the same motions, whatever they look at.
+
+    With ``C_i S_e G_a`` seen of the body's pose S in every epoch e, ``C_i S_e S_f^-1 C_i^-1`` knows nothing of thing a;
+    nor does that of j before b, in the same epochs: hand-eye for ``C_i C_j^-1`` over all that either looks at.
+    """
+    seen: dict[int, list[tuple[Chain, Chain, FloatArray]]] = {}
+    for o in network.observations:
+        moving = [i for i, link in enumerate(o.chain) if network.names[link.slot][0] == "world_from_station"]
+        if len(moving) == 1 and 0 < moving[0] < len(o.chain) - 1 and not o.rotation_only:
+            at = moving[0]
+            seen.setdefault(o.chain[at].slot, []).append((o.chain[:at], o.chain[at + 1 :], o.poses[0]))
+    alike: dict[tuple[Chain, Chain], dict[tuple[Chain, Chain], list[tuple[FloatArray, FloatArray]]]] = {}
+    for views in seen.values():
+        for before, after, pose in views:
+            for other, behind, another in views:
+                if not network.open_slots(before) and len(other) == 1 and network.open_slots(other):
+                    alike.setdefault((before, other), {}).setdefault((after, behind), []).append((pose, another))
+    for (before, other), by_things in sorted(alike.items(), key=lambda item: -sum(map(len, item[1].values()))):
+        several = [np.array(both) for both in by_things.values() if len(both) >= 2]
+        if not several:
+            continue
+        motions = [relative_motions(inverse(both[:, 0]), inverse(both[:, 1])) for both in several]
+        a, b = (np.concatenate(m) for m in zip(*motions, strict=True))
+        try:
+            x, _ = solve_ax_xb(a, b)
+        except SurveyError:
+            continue
+        network.set_link(other[0], inverse(x) @ network.product(before))
+        return f"{_text(network, (other[0].slot, other[0].inverse))} from {len(a)} motions of two on one body"
     return None
 
 
