@@ -174,6 +174,7 @@ class Case:
         for owner, known in self._without[field_name].items():
             if not known:
                 if not self.budget.lasts:
+                    self.budget.refused = True
                     return
                 known = self._without[field_name][owner] = (self.rough(without(self.survey, field_name, owner)),)
             if known[0] is not None:

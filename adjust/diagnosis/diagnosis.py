@@ -75,22 +75,29 @@ def diagnose(case: Case, families: Sequence[Family] | None = None) -> Diagnosis:
     """Form the hypotheses of all families, try the likeliest of them, and rank those that explain the misfit.
 
     families: those of ``FAMILIES`` where None. As many are tried as the budget of the case allows, and where none of
-    them explains anything, or what says the first one more exactly still waits, as many again. Nothing is repaired,
-    nothing is written.
+    them explains anything though not all was looked at, or what says the first one more exactly still waits, as many
+    again. Nothing is repaired, nothing is written.
     """
     search, given = Search(case, misfit_of(case.result, case.survey)), case.budget.left
-    looked_at = 0
+    looked_at, cut = 0, list[Family]()
     stages = _all_families(case) if families is None else [families]
     for later, rooms in zip(reversed(range(len(stages))), stages, strict=True):
         kept = _KEPT * later * bool(case.survey.image_blocks)
         case.budget.kept = kept + _ONE
-        formed = [] if search.done() else [h for family in rooms for h in _formed(family, case)]
+        formed = list[Hypothesis]()
+        for family in () if search.done() else rooms:
+            case.budget.refused = False
+            formed += _formed(family, case)
+            cut += [family] * case.budget.refused
         looked_at += sum(h.looked_at for h in formed)
         search.over(formed, 0.0 if search.done() else kept)
     found = ranked(search.base, search.told, looked_at)
-    if (not found and search.promising) or (found and search.refines(found[0].hypothesis)):
-        case.budget.left = max(case.budget.left, 0.0) + given
-        search.over((), 0.0)
+    again = not found and (search.promising or cut)
+    if again or (found and search.refines(found[0].hypothesis)):
+        case.budget.left, case.budget.kept = max(case.budget.left, 0.0) + given, _ONE
+        formed = [h for family in cut if again for h in _formed(family, case) if search.is_new(h)]
+        looked_at += sum(h.looked_at for h in formed)
+        search.over(formed, 0.0)
         found = ranked(search.base, search.told, looked_at)
     return Diagnosis(found, tuple(dict.fromkeys(search.names)), search.base, search.untried, tuple(case.passed_over))
 

@@ -64,6 +64,11 @@ class Search:
         best = (t for t in self.trials if t.explains(_MOST_OF_IT, self.base))
         return any(t.misfit.dropped == 0 and following < _FAINT * t.hypothesis.evidence for t in best)
 
+    def is_new(self, h: Hypothesis) -> bool:
+        """Whether nothing of that name and place was tried, or waits."""
+        known = [*(t.hypothesis for t in self.trials), *self.queue]
+        return not any((h.name, h.change, h.place) == (k.name, k.change, k.place) for k in known)
+
     @property
     def untried(self) -> tuple[str, ...]:
         """Names of what evidence speaks for, but the time did not suffice for."""
