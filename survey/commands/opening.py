@@ -2,12 +2,20 @@
 
 import argparse
 import os
+import signal
+import threading
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from survey.commands.common import DONE, is_set, not_negative, positive, print_json, require_project, say
 from survey.commands.parser import Commands, project_folder
 from survey.folder.kept import undo_killed
+
+if TYPE_CHECKING:
+    from survey.workbench.pages.beginning import Beginning
+    from survey.workbench.session import Workbench
+
+_PATIENCE_S = 10.0
 
 
 def declare_open(commands: Commands) -> None:
@@ -51,14 +59,11 @@ def declare_runs(commands: Commands) -> None:
 def _open(arguments: argparse.Namespace) -> int:
     if not _holds_images(arguments.folder):
         require_project(arguments.folder)
-    import signal
     import webbrowser
 
     from survey.workbench.guard import loopback_address, new_token
     from survey.workbench.live import Listening
-    from survey.workbench.pages.beginning import Beginning
     from survey.workbench.server import Server
-    from survey.workbench.session import Workbench
 
     folder, port, place = arguments.folder, arguments.port, arguments.at
     host = loopback_address(arguments.host, port)
@@ -66,8 +71,7 @@ def _open(arguments: argparse.Namespace) -> int:
     if read_only and not arguments.read_only:
         say(arguments, f"{folder}: cannot be written; it is open for reading only")
     token = new_token()
-    shown = (Workbench if (folder / "survey.toml").is_file() else Beginning)(folder, read_only=read_only)
-    server = Server(shown, token, f"labsurvey_{port}")
+    server = Server(lambda: _shown(folder, read_only), token, f"labsurvey_{port}")
     endings = {signal.SIGINT, signal.SIGTERM}
     before = signal.pthread_sigmask(signal.SIG_BLOCK, endings)  # in all threads from here on: this one waits for them
     try:
@@ -77,10 +81,25 @@ def _open(arguments: argparse.Namespace) -> int:
             say(arguments, "Ctrl-C ends it")
             if not arguments.no_browser:
                 webbrowser.open(address)
+            waiting = threading.get_ident()
+            server.opened.add_done_callback(
+                lambda found: signal.pthread_kill(waiting, signal.SIGTERM) if found.exception() else None
+            )
             signal.sigwait(endings)
+            if server.opened.done() and server.opened.exception():
+                server.told.wait(0.0 if arguments.no_browser else _PATIENCE_S)  # the page says it too
+                server.opened.result()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
     return DONE
+
+
+def _shown(folder: Path, read_only: bool) -> "Workbench | Beginning":
+    """The project of a folder, or its images; read while the browser starts and loads the page."""
+    from survey.workbench.pages.beginning import Beginning
+    from survey.workbench.session import Workbench
+
+    return (Workbench if (folder / "survey.toml").is_file() else Beginning)(folder, read_only=read_only)
 
 
 def _holds_images(folder: Path) -> bool:

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 from starlette.requests import Request
 
 from adjust.model.errors import SurveyError
-from survey.workbench.pages.beginning import Told
-from survey.workbench.session import Workbench
 
 if TYPE_CHECKING:
     from survey.detection import ImageReport
+    from survey.workbench.pages.beginning import Told
+    from survey.workbench.session import Workbench
 
 
 _LARGEST = 1e12  # what any number of a request may be
@@ -104,7 +104,7 @@ class Body:
         return names
 
 
-def _plan(bench: Workbench, body: Body, _: Any) -> Told:
+def _plan(bench: "Workbench", body: Body, _: Any) -> "Told":
     from survey.planning.job import PlanRequest
 
     wanted = tuple(body.text("wanted").split())
@@ -117,7 +117,7 @@ class Job:
     """A job of a page. call: what of ``survey.Workbench`` it is; changes: whether files may change."""
 
     call: str
-    run: Callable[[Any, Body, "Callable[[ImageReport], None]"], Told]
+    run: "Callable[[Any, Body, Callable[[ImageReport], None]], Told]"
     changes: bool = True
 
 

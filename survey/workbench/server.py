@@ -1,19 +1,22 @@
 """The local server of ``labsurvey open``: one project, one browser on this machine, a token.
 
 Everything that it answers is a method of :class:`survey.workbench.session.Workbench`; here stand the addresses, the
-guard and the messages while something runs.
+guard and the messages while something runs. Nothing here loads what a project is read with: the page comes to the
+browser while that is done.
 """
 
 import asyncio
+import threading
 from collections.abc import AsyncIterator, Awaitable, Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
 from contextvars import copy_context
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from starlette.applications import Starlette
+from starlette.background import BackgroundTask
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route, WebSocketRoute
@@ -21,20 +24,19 @@ from starlette.types import ASGIApp
 
 from adjust.model.errors import SurveyError
 from survey.folder.locking import BusyError
-from survey.folder.plain import plain
 from survey.folder.text import suggestion
 from survey.report.language import LANGUAGES, message, speaking
 from survey.report.modules import WEB as SHARED
-from survey.solution.earlier.changes import Changes
-from survey.solution.records import solution_json
-from survey.workbench import pictures
 from survey.workbench.bodies import JOBS, Body, BodyError, distance_of, json_of, whole_of
 from survey.workbench.guard import LONGEST_BODY, Guard, TooLongError
 from survey.workbench.live import Live
-from survey.workbench.pages.beginning import Beginning
-from survey.workbench.session import Workbench
-from survey.workbench.situation import CancelledError, ChangedError
-from survey.workbench.views import in_words
+
+if TYPE_CHECKING:
+    from survey.solution.earlier.changes import Changes
+    from survey.workbench.pages.beginning import Beginning
+    from survey.workbench.session import Workbench
+
+    Shown = Workbench | Beginning
 
 WEB = Path(__file__).parent / "web"
 _KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".json": "application/json",
@@ -58,22 +60,35 @@ class Way:
 class Server:
     """What is served, and the one thread in which everything about the project runs."""
 
-    def __init__(self, shown: Workbench | Beginning, token: str, cookie: str = "labsurvey") -> None:
-        self.shown, self.token, self.cookie = shown, token, cookie
+    def __init__(self, shown: "Shown | Callable[[], Shown]", token: str, cookie: str = "labsurvey") -> None:
+        """Questions wait where ``shown`` is still to be read; ``opened`` says when it is, or why it cannot be."""
+        self.token, self.cookie = token, cookie
+        self.opened: Future[Shown] = Future()
+        self._project: Workbench | None = None
         self.live, self._worker = Live(), ThreadPoolExecutor(1, "workbench")
         self._running, self._asked = "", asyncio.Event()
         self.patience_s = _PATIENCE_S
         self._files = {f"/{p.relative_to(at).as_posix()}": p for at in (SHARED, WEB) for p in at.rglob("*")
                        if p.suffix in _KINDS}  # fmt: skip
-        if isinstance(shown, Workbench):
-            shown.watch = self._progress
+        self.told = threading.Event()  # a page that it cannot be
+        self._make = shown if callable(shown) else None
+        if not callable(shown):
+            self._use(shown)
 
     @property
-    def bench(self) -> Workbench:
+    def bench(self) -> "Workbench":
         """The project; raises SurveyError where it is only to begin."""
-        if isinstance(self.shown, Beginning):
+        if self._project is None:
             raise SurveyError(f"{self.shown.folder}: there is no survey.toml yet; begin a project with its images")
-        return self.shown
+        return self._project
+
+    def _use(self, shown: "Shown") -> None:
+        from survey.workbench.session import Workbench
+
+        self.shown, self._project = shown, shown if isinstance(shown, Workbench) else None
+        if self._project is not None:
+            self._project.watch = self._progress
+        self.opened.set_result(shown)
 
     def ways(self) -> tuple[Way, ...]:
         """All addresses of the interface."""
@@ -119,21 +134,30 @@ class Server:
 
     def end(self) -> None:
         """Give up what runs."""
-        if isinstance(self.shown, Workbench):
-            self.shown.cancel()
+        if self._project is not None:
+            self._project.cancel()
 
     @asynccontextmanager
     async def _lifespan(self, _app: Starlette) -> AsyncIterator[None]:
         self.live.begin()
-        tasks = [asyncio.create_task(self._watch_folder())]
-        if isinstance(self.shown, Workbench) and self.shown.version == 0:
-            tasks.append(asyncio.create_task(self._first()))
+        tasks = [asyncio.create_task(work()) for work in (self._open, self._watch_folder)]
         yield
         for task in tasks:
             task.cancel()
         self.end()
         self.live.post(None)
         self._worker.shutdown(wait=False, cancel_futures=True)
+
+    async def _open(self) -> None:
+        """Read what is shown, where that is still to be done, and adjust it for the first time."""
+        if self._make is not None:
+            try:
+                self._use(await asyncio.to_thread(self._make))
+            except Exception as error:  # whoever started this learns of it, a page that asks too
+                self.opened.set_exception(error)
+                return
+        if self._project is not None and self._project.version == 0:
+            await self._first()
 
     async def _first(self) -> None:
         """The first adjustment, once a page has drawn what there is, or where none asks."""
@@ -149,7 +173,7 @@ class Server:
         told: tuple[str, ...] = ()
         while True:
             await asyncio.sleep(_LOOK_S)
-            if isinstance(self.shown, Beginning):
+            if self._project is None:
                 continue
             changed = await asyncio.to_thread(self.bench.changed_files)
             if changed != told and not self._running:  # else it may be what is being written here
@@ -176,7 +200,7 @@ class Server:
             spoken = copy_context()  # the language of who asks
             return await asyncio.get_running_loop().run_in_executor(self._worker, spoken.run, working)
         finally:
-            if isinstance(self.shown, Workbench) and (self.shown.version != version or what == "save"):
+            if self._project is not None and (self._project.version != version or what == "save"):
                 self.live.post({"type": "state", "version": self.bench.version, "unsaved": self.bench.n_unsaved})
 
     def _said(self, way: Way) -> _Handler:
@@ -185,6 +209,10 @@ class Server:
         async def answering(request: Request) -> Response:
             asked = request.headers.get("x-language", "en")
             with speaking(asked if asked in LANGUAGES else "en"):
+                try:
+                    await asyncio.shield(asyncio.wrap_future(self.opened))
+                except SurveyError as error:
+                    return JSONResponse({"error": message(str(error))}, 409, background=BackgroundTask(self.told.set))
                 return await said(request)
 
         async def said(request: Request) -> Response:
@@ -193,6 +221,8 @@ class Server:
             try:
                 return await way.handler(request)
             except SurveyError as error:
+                from survey.workbench.situation import CancelledError, ChangedError
+
                 kind = {"cancelled": True} if isinstance(error, CancelledError) else {}
                 kind |= {"retry": True} if isinstance(error, ChangedError | BusyError) else {}
                 return JSONResponse({"error": message(str(error)), "version": self.shown.version, **kind}, 409)
@@ -241,6 +271,8 @@ class Server:
         return Response(data, media_type="application/octet-stream")
 
     async def _statistics(self, request: Request) -> Response:
+        from survey.solution.records import solution_json
+
         part = request.path_params["part"]
         found = await self._run("statistics", lambda: self.bench.statistics_part(part))
         return Response(solution_json(found), media_type="application/json")
@@ -260,6 +292,8 @@ class Server:
         return JSONResponse(await self._run("view", lambda: self.bench.lens_change(camera, run, other, distance)))
 
     async def _halves(self, request: Request) -> Response:
+        from survey.folder.plain import plain
+
         distance, bench = distance_of(request), self.bench
         found = await asyncio.to_thread(bench.cross_validate, distance)  # of values that nobody changes: others go on
         told = {"version": bench.version, "cameras": [c.summary() | c.pixels() for c in found.cameras],
@@ -267,6 +301,8 @@ class Server:
         return JSONResponse(plain(found.summary() | told))
 
     async def _image(self, request: Request) -> Response:
+        from survey.workbench import pictures
+
         key = request.path_params["camera"], request.path_params["epoch"]
         project = self.bench.situation.everything
         size = _size_of(request)
@@ -348,17 +384,21 @@ class Server:
 
     async def _save(self, _request: Request) -> Response:
         said = (await self._run("save", self.bench.save)).summary()
+        from survey.workbench.views import in_words
+
         told = {"summary": in_words(said["summary"]), "warnings": [*map(message, said["warnings"])]}
         return JSONResponse(said | told)
 
     def _job(self, name: str) -> _Handler:
         """A job: what it said, and the state after it."""
         async def answering(request: Request) -> Response:
+            from survey.workbench.pictures import found_in
+
             body = Body(await json_of(request))
             bench = self.shown if name in ("init", "show") else self.bench
 
             def found(report: Any) -> None:
-                self.live.post({"type": "detected"} | pictures.found_in(report))
+                self.live.post({"type": "detected"} | found_in(report))
 
             told = await self._run(name, lambda: JOBS[name].run(bench, body, found))
             if name in ("init", "show"):
@@ -373,10 +413,12 @@ class Server:
 
     def _show(self, folder: Path) -> None:
         """Another project from now on; one of which nothing is found yet says what is missing."""
+        from survey.workbench.session import Workbench
+
         bench = Workbench(folder, read_only=self.shown.read_only, watch=self._progress)
         with suppress(SurveyError):
             bench.adjust()
-        self.shown = bench
+        self.shown = self._project = bench
 
     async def _cancel(self, _request: Request) -> Response:
         self.bench.cancel()
@@ -390,7 +432,9 @@ class Server:
         return {"version": self.bench.version, "changes": None if found is None else _in_words(found, 500)}
 
 
-def _in_words(changes: Changes, most: int | None) -> dict[str, Any]:
+def _in_words(changes: "Changes", most: int | None) -> dict[str, Any]:
+    from survey.workbench.views import in_words
+
     found = changes.as_dict(most)
     return found | {k: in_words(found[k]) for k in ("before", "after")}
 

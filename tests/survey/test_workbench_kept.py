@@ -73,6 +73,14 @@ print(sorted(heavy & set(sys.modules)))
 """
 
 
+SERVED = "import sys, uvicorn, survey.workbench.live, survey.workbench.server; print({'gtsam', 'numpy'} & {*sys.modules})"
+
+
+def test_the_page_is_served_before_what_reads_a_project_is_loaded():
+    done = subprocess.run([sys.executable, "-c", SERVED], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
 def test_what_the_results_say_is_shown_before_what_adjusts_is_loaded(adjusted):
     done = subprocess.run([sys.executable, "-c", FIRST, str(adjusted)], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -6,6 +6,7 @@ import re
 import shutil
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from urllib.request import Request, urlopen
@@ -403,6 +404,7 @@ def test_a_folder_of_images_is_offered_to_begin_a_project_with(tmp_path):
     (lambda at: at.write_text(""), "is a file"), (lambda at: images_alone(at, 'a"b/e1.png'), "that of the camera"),
     (lambda at: images_alone(at, "X/e1.png", "X/e1.jpg"), "two images are named e1"),
     (lambda at: (at.mkdir(), (at / "survey.toml").write_bytes(b"\xff\x00")), "survey.toml"),
+    (lambda at: (at.mkdir(), (at / "survey.toml").write_text("format = ")), "survey.toml:1: not valid TOML"),
 ])  # fmt: skip
 def test_what_cannot_be_opened_is_said(tmp_path, capsys, make, says):
     make(tmp_path / "lab")
@@ -411,6 +413,29 @@ def test_what_cannot_be_opened_is_said(tmp_path, capsys, make, says):
     assert says in said
     assert "lab" in said
     assert "Traceback" not in said
+
+
+def test_the_page_comes_before_the_project_is_read(mine):
+    go_on = threading.Event()
+    server = Server(lambda: (go_on.wait(20.0), Workbench(mine))[1], TOKEN)
+    with TestClient(server.app(), base_url=BASE) as client, ThreadPoolExecutor(1) as other:
+        state = other.submit(client.get, "/api/state", headers=HERE)
+        assert all(client.get(f"/{name}").status_code == 200 for name in ("", "app.js", "en.json"))
+        assert not (server.opened.done() or state.done())
+        go_on.set()
+        assert state.result(20.0).json()["tree"]["cameras"]
+    assert server.bench.folder == mine
+
+
+def test_a_page_that_is_there_already_says_why_a_project_cannot_be_opened(tmp_path):
+    (tmp_path / "survey.toml").write_text("format = ")
+    server = Server(lambda: Workbench(tmp_path), TOKEN)
+    with TestClient(server.app(), base_url=BASE) as client:
+        answer = client.get("/api/state", headers=HERE)
+        assert (answer.status_code, "survey.toml:1: not valid TOML" in answer.json()["error"]) == (409, True)
+        assert server.told.wait(5.0)
+    with pytest.raises(SurveyError, match="not valid TOML"):
+        server.opened.result()
 
 
 def test_messages_are_in_the_language_that_is_asked_for(mine):
