@@ -272,6 +272,12 @@ class Project(Definition):
     origins: Mapping[str, Sequence[tuple[Path, int]]] = field(default_factory=dict)
 
     @property
+    def is_empty(self) -> bool:
+        """Whether there is nothing to adjust yet: angles of turntables alone are not."""
+        others = (v for k, v in self.survey.others.items() if k != "table_readings")
+        return not any((self.survey.image_blocks, self.spots, *others))
+
+    @property
     def contents(self) -> list[tuple[str, str]]:
         """What is observed, of what, in which datum: names and texts of a table."""
         return contents(self.survey, sum(len(b.uv) for b in self.spots))

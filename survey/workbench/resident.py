@@ -149,9 +149,11 @@ class Resident(Folder):
                 raise
 
     def reload(self) -> Changes | None:
-        """Read the folder again and adjust it."""
+        """Read the folder again and adjust it, where there is anything to adjust."""
         with self._lock:
-            return self._take(self._solved(self._read(), "warm"))
+            new = self._read()
+            still_empty = new.everything.is_empty and self.situation.adjustment is None
+            return self._take(new if still_empty else self._solved(new, "warm"))
 
     @property
     def diagnosis(self) -> "Diagnosis | None":

@@ -156,7 +156,7 @@ class Server:
             except Exception as error:  # whoever started this learns of it, a page that asks too
                 self.opened.set_exception(error)
                 return
-        if self._project is not None and self._project.version == 0:
+        if self._project is not None and self._project.version == 0 and not self._project.situation.everything.is_empty:
             await self._first()
 
     async def _first(self) -> None:
@@ -416,8 +416,9 @@ class Server:
         from survey.workbench.session import Workbench
 
         bench = Workbench(folder, read_only=self.shown.read_only, watch=self._progress)
-        with suppress(SurveyError):
-            bench.adjust()
+        if not bench.situation.everything.is_empty:
+            with suppress(SurveyError):
+                bench.adjust()
         self.shown = self._project = bench
 
     async def _cancel(self, _request: Request) -> Response:

@@ -41,7 +41,7 @@ def limits(bench: Jobs) -> tuple[float, float]:
 def state(bench: Jobs) -> dict[str, Any]:
     """What there is, how it stands, and what can be done; the tree of names among it."""
     now = bench.situation
-    solved = now.adjustment
+    solved, empty = now.adjustment, now.everything.is_empty
     return dict(plain({
         "version": bench.version, "folder": str(bench.folder), "title": now.project.title,
         "read_only": bench.read_only, "lock": bench.holder(), "changed_files": bench.changed_files(),
@@ -50,7 +50,8 @@ def state(bench: Jobs) -> dict[str, Any]:
             "mode": now.mode, "seconds": now.seconds, "sigmas": bench.scale.sigmas},
         "kept": None if bench.kept is None else in_words(bench.kept.summary) | {"date": bench.kept.date},
         "warnings": [message(w) for w in _warnings(bench)],
-        "failure": None if bench.failure is None else message(str(bench.failure)),
+        "failure": None if bench.failure is None or empty else message(str(bench.failure)),
+        "empty": empty, "n_looked_at": len(now.everything.detected),
         "exclusions": [{"name": str(e.name), "what": e.name.what, "id": e.name.id, "reason": e.reason,
                         "author": e.author, "time": e.time, "line": e.line} for e in now.exclusions.values()],
         "tree": _tree(bench),

@@ -405,7 +405,9 @@ def test_a_folder_of_images_becomes_a_project_on_the_page(browser: Any, tmp_path
         assert "holds images and no survey.toml" in p.inner_text("#left")
         assert p.evaluate("document.documentElement.scrollWidth") <= 390
         page.done(lambda: p.locator("#begin").click())
-        page.wait("document.querySelector('#left .verdict')?.textContent.includes('nothing to adjust')")
+        page.wait("document.querySelector('#left .next')?.textContent.includes('nothing was looked for')")
+        assert p.inner_text("#verdict") == ""
+        assert p.locator("#left .verdict, #left .failed").count() == 0
         page.context.close()
     assert (tmp_path / "lab/survey.toml").read_text().startswith("# Begun by labsurvey init")
     assert {path: path.read_bytes() for path in (tmp_path / "lab/images").glob("*/*")} == images
@@ -422,7 +424,7 @@ def test_images_are_detected_and_shown_as_they_come(browser: Any, tmp_path: Path
     with Listening(Server(Workbench(tmp_path / "lab"), token), "127.0.0.1", 0) as listening:
         page = Page(browser, f"{listening.address}#token={token}&view=findings,jobs", 1280)
         p = page.page
-        page.wait("document.querySelector('#left .verdict').textContent.includes('nothing to adjust')")
+        page.wait("document.querySelector('#left .next')?.textContent.includes('nothing was looked for')")
         page.done(lambda: p.get_by_label("Run: Detect").click())
         page.wait("document.querySelectorAll('#right .arrived canvas').length === 6")
         assert p.inner_text("#right .told").startswith(str(tmp_path))

@@ -73,7 +73,10 @@ print(sorted(heavy & set(sys.modules)))
 """
 
 
-SERVED = "import sys, uvicorn, survey.workbench.live, survey.workbench.server; print({'gtsam', 'numpy'} & {*sys.modules})"
+SERVED = """
+import sys, uvicorn, survey.workbench.live, survey.workbench.server
+print({"gtsam", "numpy"} & {*sys.modules})
+"""
 
 
 def test_the_page_is_served_before_what_reads_a_project_is_loaded():

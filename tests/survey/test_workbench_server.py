@@ -421,7 +421,7 @@ def test_the_page_comes_before_the_project_is_read(mine):
     with TestClient(server.app(), base_url=BASE) as client, ThreadPoolExecutor(1) as other:
         state = other.submit(client.get, "/api/state", headers=HERE)
         assert all(client.get(f"/{name}").status_code == 200 for name in ("", "app.js", "en.json"))
-        assert not (server.opened.done() or state.done())
+        assert not any((server.opened.done(), state.done()))
         go_on.set()
         assert state.result(20.0).json()["tree"]["cameras"]
     assert server.bench.folder == mine
@@ -539,3 +539,17 @@ def test_the_page_goes_to_another_project(mine):
     assert [Path(row["folder"]).name for row in rows] == ["lab", "other"]
     assert {row["state"] for row in rows} <= {"done", "test_failed"}
     assert all(row["sigma0"] > 0 and row["redundancy"] > 0 and not row["error"] for row in rows)
+
+
+def test_a_project_in_which_nothing_is_observed_yet_has_no_failure(mine):
+    shutil.rmtree(mine / "observations")
+    bench = Workbench(mine)
+    with TestClient(Server(bench, TOKEN).app(), base_url=BASE) as client:
+        state = client.get("/api/state", headers=HERE).json()
+        assert (state["empty"], state["failure"], state["solution"], state["n_looked_at"]) == (True, None, None, 0)
+        (mine / "survey.toml").write_text((mine / "survey.toml").read_text() + "\n# read again\n")
+        assert post(client, "/api/reload", {}).json()["empty"]
+        refused = post(client, "/api/adjust", {"mode": "warm"})
+        assert (refused.status_code, "there is nothing to adjust" in refused.json()["error"]) == (409, True)
+        assert client.get("/api/state", headers=HERE).json()["failure"] is None
+    assert bench.situation.definition_text.endswith("# read again\n")

@@ -139,8 +139,7 @@ def adjust_project(
     begin: start values of a survey, found where it gives None. timed: what each step is run in, by its name. watch:
     called with (iteration, v'Pv); what it raises ends the adjustment.
     """
-    others = (v for k, v in project.survey.others.items() if k != "table_readings")
-    if not any((project.survey.image_blocks, project.spots, *others)):
+    if project.is_empty:
         remedy = (f"no target is known in its {len(project.images)} images: labsurvey detect {project.folder}"
                   if project.images else
                   "put images at images/<camera_id>/<epoch_id>.png or tables into observations/")  # fmt: skip

@@ -5,9 +5,9 @@ import { parts } from "./store.js";
 
 /** Until there is a solution, what the results in the folder say stands for it. @param {any} raw answer of /api/state */
 export function stateOf(raw) {
-  const found = raw.solution ?? (raw.failure ? null : raw.kept);
-  return { ...raw, ...found, version: raw.version, title: raw.title || raw.folder, reason: found?.reason ?? raw.failure ?? "", verdict: found?.verdict ?? (raw.failure ? "failed" : "check"),
-    solved: raw.solution !== null, known: Boolean(found), waiting: raw.solution === null && !raw.failure };
+  const found = raw.solution ?? (raw.failure ? null : raw.kept), waiting = raw.solution === null && !raw.failure && !raw.empty;
+  return { ...raw, ...found, version: raw.version, title: raw.title || raw.folder, reason: found?.reason ?? raw.failure ?? "", verdict: found?.verdict ?? (raw.failure ? "failed" : waiting ? "check" : ""),
+    solved: raw.solution !== null, known: Boolean(found), waiting };
 }
 
 /** Image sizes by camera. @param {any} raw */

@@ -160,7 +160,7 @@ async function begin() {
   try {
     await renew(null);
     live(told); // its cookie comes with the first answer
-    if (bench.state && !bench.state.solved && !bench.state.failure) working(t("adjusting …")); // a message tells when it is done
+    if (bench.state?.waiting) working(t("adjusting …")); // a message tells when it is done
   } catch (error) { tell(error.message, "bad"); }
 }
 

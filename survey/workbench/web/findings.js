@@ -31,9 +31,8 @@ export class FindingsView {
   draw(state, findings) {
     const suspects = findings.suspects ?? [], causes = findings.causes ?? [];
     fill(this.element, 
-      state.waiting && !state.known ? make("p", { class: "verdict" }, t("adjusting …")) : make("p", { class: `verdict ${state.verdict}` }, make("b", {}, verdictText(state.verdict)), " ", make("span", {}, state.reason ?? "")),
+      state.empty && !state.known ? this.begin(state) : state.waiting && !state.known ? make("p", { class: "verdict" }, t("adjusting …")) : make("p", { class: `verdict ${state.verdict}` }, make("b", {}, verdictText(state.verdict)), " ", make("span", {}, state.reason ?? "")),
       state.waiting && state.known ? make("p", { class: "quiet" }, t("As saved {time}; it is being adjusted again.", { time: time(state.date) })) : null,
-      this.undetected() ? make("p", {}, t("{n} images, and nothing was looked for in them yet.", { n: count(this.bench.images.length) }), " ", state.read_only ? null : button(t("Detect"), () => this.detect(), "", { class: "primary" })) : null,
       ...causes.map((cause) => this.cause(cause)),
       findings.remedies?.length ? make("h2", {}, t("What would mend it")) : null,
       ...(findings.remedies ?? []).map((remedy) => this.remedy(remedy)),
@@ -47,13 +46,19 @@ export class FindingsView {
       findings.largest?.length ? this.suspects(t("Largest within the limit"), findings.largest) : null);
   }
 
-  /** Whether there is nothing but images. */
-  undetected() { return !this.bench.points.n && !this.bench.readings.length && this.bench.images.length > 0; }
+  /** What to do first, where nothing is observed yet. */
+  begin(state) {
+    const n = count(this.bench.images.length), looked = count(state.n_looked_at);
+    const said = !this.bench.images.length ? t("Nothing is observed yet. Put images at images/CAMERA/EPOCH.png or tables into observations/; this page tells when they are there.")
+      : state.n_looked_at ? t("No target was found in {n} images. Compare the targets in survey.toml with what the images show, and detect again.", { n: looked })
+        : t("{n} images, and nothing was looked for in them yet.", { n });
+    return make("div", { class: "next" }, make("h2", {}, t("Next step")), make("p", {}, said), this.bench.images.length && !state.read_only ? make("p", {}, button(t("Detect"), () => this.detect(state.n_looked_at > 0), "", { class: "primary" })) : null);
+  }
 
   /** The pictures come in under Jobs. */
-  detect() {
+  detect(all) {
     this.actions.show("jobs", "left");
-    this.actions.job("detect", () => post("jobs/detect", { all: false }));
+    this.actions.job("detect", () => post("jobs/detect", { all }));
   }
 
   cause(cause) { return make("p", { class: "cause" }, make("b", {}, t("Probable cause")), " ", cause.text, ...places(cause)); }

@@ -10,7 +10,7 @@ export const verdictText = (verdict) => ({ passed: `✓ ${t("verdict passed")}`,
 export function drawHeader(state, actions, page) {
   by("title").textContent = state.title;
   document.title = `${state.title} · labsurvey`;
-  const none = state.waiting && !state.known;
+  const none = !state.known && (state.waiting || state.empty);
   by("verdict").className = none ? "" : state.verdict;
   by("verdict").textContent = none ? "" : verdictText(state.verdict);
   const fact = (name, value) => make("span", {}, make("span", { class: "quiet" }, `${name} `), value);
