@@ -165,8 +165,10 @@ def _joint_squares(result: Adjustment) -> dict[tuple[str, ...], FloatArray]:
 
 def _at_best_scale(squares: FloatArray) -> float:
     """Minus twice the log likelihood of squares (n,), each bounded, with the best common factor for their variances."""
-    scaled = np.minimum(squares[None] / _FACTORS[:, None], CAP).sum(axis=1) + len(squares) * np.log(_FACTORS)
-    return float(scaled.min())
+    total = np.concatenate([[0.0], np.cumsum(ordered := np.sort(squares))])
+    within = np.searchsorted(ordered, CAP * _FACTORS)
+    n = len(squares)
+    return float((total[within] / _FACTORS + CAP * (n - within) + n * np.log(_FACTORS)).min())
 
 
 def n_other_components(survey: Survey, used_only: bool = True) -> int:
