@@ -60,9 +60,9 @@ class Search:
         return any(t.explains(share, self.base) and t.hypothesis.penalty <= 0.0 for t in self.trials)
 
     def done(self, following: float = 0.0) -> bool:
-        """Whether one explains nearly everything with all observations, and what follows has much less evidence."""
-        best = (t for t in self.trials if t.explains(_MOST_OF_IT, self.base))
-        return any(t.misfit.dropped == 0 and following < _FAINT * t.hypothesis.evidence for t in best)
+        """Whether one explains nearly everything, and what follows has much less evidence."""
+        best = (t for t in self.trials if t.explains_all_but(_MOST_OF_IT, self.base))
+        return any(following < _FAINT * t.hypothesis.evidence for t in best)
 
     def is_new(self, h: Hypothesis) -> bool:
         """Whether nothing of that name and place was tried, or waits."""

@@ -79,6 +79,12 @@ class Trial:
         left = self.misfit.cost + max(self.hypothesis.penalty, 0.0) - self.misfit.redundancy
         return self.result is not None and self.misfit.unused == 0 and left <= (1.0 - share) * base.excess
 
+    def explains_all_but(self, share: float, base: Misfit) -> bool:
+        """The same, though all that it does without may have contradicted; save copies, which are no observations."""
+        lost = 0.0 if self.hypothesis.penalty < 0.0 else (CAP - 2.0) * self.misfit.dropped
+        worse = replace(self, misfit=replace(self.misfit, omega=self.misfit.omega + lost))
+        return worse.explains(share, base)
+
 
 def tried(hypothesis: Hypothesis, case: Case) -> Trial:
     """The survey of a hypothesis adjusted from the values of its case, where there are none from its own start."""
