@@ -53,7 +53,7 @@ class Link:
         return float(np.median(np.linalg.norm(self.first[:, :3, 3], axis=1)))
 
     def joins(self, misses: FloatArray) -> bool:
-        """Whether sequences that miss each other by so much (n,) m may belong together: else no order is the right one."""
+        """Whether sequences that miss each other by so much (n,) m may belong together."""
         return typical(misses) < _JOINED * _POSE * self.error * self.lever
 
     @cached_property

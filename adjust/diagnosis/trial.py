@@ -104,7 +104,9 @@ def tried_afresh(trial: Trial, case: Case, base: Misfit) -> Trial | None:
 
     None where that is no better, and of what is scored at these values. base: what the case leaves unexplained.
     """
-    near = case.is_near and trial.misfit.omega < base.omega
+    near = trial.misfit.omega < base.omega and (case.is_near or trial.hypothesis.of_variances)
+    if trial.result is not None and case.is_near and case.linear is not None:  # a minimum, if not a better one
+        near |= trial.result.omega <= case.linear.result.omega
     if trial.survey is None or case.starts_afresh or near or trial.hypothesis.scored:
         return None
     again = _adjusted(trial.hypothesis, trial.survey, case, case.run)
