@@ -1,6 +1,6 @@
 """What single images say by themselves: lenses of cameras, poses of targets; start values of what is new from these."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from adjust.model.survey import Camera, FloatArray, Survey
 from adjust.spatial.averaging import mean_pose
 from adjust.spatial.rigid import inverse
 from adjust.start.lenses import Sighting, start_lens
-from adjust.start.views import Views, focal_px, joined, make_views, rays_by_block
+from adjust.start.views import View, Views, focal_px, joined, make_views, rays_by_block
 
 
 def own_lens(survey: Survey, camera: Camera) -> FloatArray:
@@ -56,8 +56,13 @@ def single_views(survey: Survey, lenses: Mapping[str, FloatArray]) -> Views:
 
 def squares_alone(survey: Survey, lenses: Mapping[str, FloatArray]) -> FloatArray:
     """(b,) sums of squares over sigmas of each block at its own best pose; zero where it has none."""
+    return squares_of(survey, single_views(survey, lenses))
+
+
+def squares_of(survey: Survey, views: Iterable[View]) -> FloatArray:
+    """The same of views that are known."""
     out = np.zeros(len(survey.image_blocks))
-    for view in single_views(survey, lenses):
+    for view in views:
         block = survey.image_blocks[view.block_idx]
         variance = float(np.mean(np.trace(block.cov, axis1=1, axis2=2))) / 2.0
         out[view.block_idx] = len(view.x) * float(view.error_px[0]) ** 2 / variance

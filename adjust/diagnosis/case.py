@@ -17,6 +17,7 @@ from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyErr
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 from adjust.start import find_start
+from adjust.start.given import given_starts
 from adjust.start.views import View
 
 if TYPE_CHECKING:
@@ -36,6 +37,8 @@ _CLOCKS = 2.5
 _NEAR = AdjustOptions(reject_blocks=False, solve=SolveOptions(max_step=1e-3, max_iterations=20, settled=1e-4))
 _OWN = replace(_NEAR, solve=replace(_NEAR.solve, max_iterations=8))
 """From near values and from own start values: a survey that is right converges soon, and is only compared."""
+_LOST = 1e4
+"""v'Pv over that of observations none of which is explained, from which values that are on their way say nothing."""
 _HOPELESS = 8
 """Steps after which a trial from near values leaves less than the survey as it stands does, or leads nowhere."""
 
@@ -141,8 +144,7 @@ class Case:
         """Start values of a survey: closed forms and robust means of what agrees; None where these find none."""
         for _ in range(_LOST_ROUNDS):
             try:
-                self.budget.spend(_START if survey.image_blocks else 0.1)
-                return started_values(start_values(find_start(survey)))
+                return started_values(self.start if survey is self.survey else self._started(survey))
             except IndeterminateError as error:
                 lost = {n.removeprefix("point ") for n in error.parameters}
                 if not lost & {p.point_id for p in survey.points}:
@@ -151,6 +153,15 @@ class Case:
             except (SurveyError, RuntimeError):
                 return None
         return None
+
+    @cached_property
+    def start(self) -> StartValues:
+        """Start values of the survey as it stands. Raises SurveyError where there are none, each time."""
+        return self._started(self.survey)
+
+    def _started(self, survey: Survey) -> StartValues:
+        self.budget.spend(_START if survey.image_blocks else 0.1)
+        return start_values(find_start(survey))
 
     @cached_property
     def views(self) -> Mapping[int, View]:
@@ -208,8 +219,10 @@ class Case:
             result = self.result
             if result is None:
                 survey = self.survey
-                start = None if survey.image_blocks or survey.pairs else start_values(find_start(survey))
-                result = self._adjusted(survey, start, _NEAR, _START + _REST)
+                start = None if survey.pairs or given_starts(survey) and survey.image_blocks else self.start
+                most = _LOST * CAP * (2 * sum(b.n_used for b in survey.image_blocks) + survey.n_others_used)
+                first = _START * (start is None) + _REST
+                result = self._adjusted(survey, start, _NEAR, first, most=most)
             elif not self.is_whole:
                 result = self._near(self.survey, result, options=_OWN)
             self.budget.spend(_SCORES)
@@ -225,7 +238,12 @@ class Case:
     @property
     def is_near(self) -> bool:
         """Whether all observations take part in its adjustment, and leave its values near to where they belong."""
-        return self.is_whole and self.linear is not None and self.linear.scale < _FAR
+        return self.is_whole and self.linear is not None and not self.is_spoilt
+
+    @property
+    def is_spoilt(self) -> bool:
+        """Whether its values are far from where they belong, as far as there are any."""
+        return self.linear is not None and self.linear.scale >= _FAR
 
     @cached_property
     def is_whole(self) -> bool:

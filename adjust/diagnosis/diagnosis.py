@@ -11,6 +11,7 @@ from adjust.diagnosis.ranking import Candidate, ranked
 from adjust.diagnosis.search import Search
 from adjust.diagnosis.trial import Misfit, misfit_of
 from adjust.model.errors import SurveyError
+from adjust.start.lenses import remembering
 
 _SHOWN = 3
 _KEPT, _ONE = 1.5, 1.0  # adjustments for each of the later families, and for a trial of what they find
@@ -78,6 +79,11 @@ def diagnose(case: Case, families: Sequence[Family] | None = None) -> Diagnosis:
     them explains anything though not all was looked at, or what says the first one more exactly still waits, as many
     again. Nothing is repaired, nothing is written.
     """
+    with remembering():  # most of what is tried has most of its images in common
+        return _diagnosed(case, families)
+
+
+def _diagnosed(case: Case, families: Sequence[Family] | None) -> Diagnosis:
     search, given = Search(case, misfit_of(case.result, case.survey)), case.budget.left
     looked_at, cut = 0, list[Family]()
     stages = _all_families(case) if families is None else [families]

@@ -106,7 +106,8 @@ class Hypothesis:
     adjustment tells more exactly, in place of this one: the same survey under its right name, or another one to be
     tried. penalty: what the change adds to minus twice the log likelihood beside v'Pv, where it changes variances: the
     sum of the logarithms of their factors. scored: the evidence is how many times less the misfit beyond noise becomes
-    by the score at the solution.
+    by the score at the solution. of_variances: nothing else is changed, so that the values there are as good a start as
+    any.
     """
 
     name: str
@@ -121,6 +122,7 @@ class Hypothesis:
     follow: Callable[[Adjustment], Sequence["Hypothesis"]] | None = None
     penalty: float = 0.0
     scored: bool = False
+    of_variances: bool = False
 
     def changed(self) -> Survey | None:
         """The survey to be tried; None where the change turns out not to be possible."""

@@ -33,7 +33,7 @@ class Search:
         the last.
         """
         waiting, astray = self.queue if kept else [], list[Trial]()
-        self.queue = _in_turn([*formed] if kept else [*self.queue, *formed])
+        self.queue = _in_turn([*formed] if kept else [*self.queue, *formed], self.case.is_spoilt)
         self.case.budget.kept = kept
         while self.queue and self.case.budget.lasts:
             before, trial = self.case.budget.kept, tried(self.queue.pop(0), self.case)
@@ -60,9 +60,9 @@ class Search:
         return any(t.explains(share, self.base) and t.hypothesis.penalty <= 0.0 for t in self.trials)
 
     def done(self, following: float = 0.0) -> bool:
-        """Whether one explains nearly everything with all observations, and what follows has much less evidence."""
-        best = (t for t in self.trials if t.explains(_MOST_OF_IT, self.base))
-        return any(t.misfit.dropped == 0 and following < _FAINT * t.hypothesis.evidence for t in best)
+        """Whether one explains nearly everything, and what follows has much less evidence."""
+        best = (t for t in self.trials if t.explains_all_but(_MOST_OF_IT, self.base))
+        return any(following < _FAINT * t.hypothesis.evidence for t in best)
 
     def is_new(self, h: Hypothesis) -> bool:
         """Whether nothing of that name and place was tried, or waits."""
@@ -106,8 +106,15 @@ class Search:
         if self.explained(_ENOUGH):
             self.case.budget.kept = 0.0
 
+    def _all_told(self, parameters: int) -> bool:
+        """Whether something that was not scored leaves nothing but noise with no more parameters than these."""
+        good = (t for t in self.trials if t.misfit.is_noise() and t.explains_all_but(_MOST_OF_IT, self.base))
+        return any(not t.hypothesis.scored and t.hypothesis.parameters <= parameters for t in good)
+
     def _beaten(self, h: Hypothesis) -> bool:
         """Whether what was tried leaves too little for a hypothesis; of scores, also where it drops observations."""
+        if h.scored and self.case.is_spoilt and self._all_told(h.parameters):
+            return True
         best = [t for t in self.trials if t.explains(_MOST_OF_IT, self.base)] if h.scored else []
         scores = [max(_faint(t), _FAINT * t.misfit.times_less_than(self.base)) for t in best if t.hypothesis.scored]
         return bool(best and _hopeless(h)) or h.evidence < max(scores, default=0.0) or self.done(h.evidence)
@@ -123,15 +130,16 @@ def _hopeless(h: Hypothesis) -> bool:
     return h.scored and h.evidence < 1.0 / (1.0 - _ENOUGH)
 
 
-def _in_turn(formed: Sequence[Hypothesis]) -> list[Hypothesis]:
+def _in_turn(formed: Sequence[Hypothesis], spoilt: bool) -> list[Hypothesis]:
     """The most evident first; of every kind one before the second of any: their evidence is not of one measure.
 
-    Last what by its score leaves most of the misfit, and could not be named.
+    Last what by its score leaves most of the misfit, and could not be named. spoilt: the values at which that was
+    scored promise what they do not hold, so that what is clear without them comes before.
     """
     before: dict[tuple[str, str], int] = {}
     turns = []
     for h in sorted(formed, key=lambda h: -h.evidence):
         kind = h.name, h.place.kind
-        turns.append((_hopeless(h), before.setdefault(kind, 0), h))
+        turns.append((_hopeless(h), before.setdefault(kind, 0), spoilt and (h.scored or h.evidence < _CLEAR), h))
         before[kind] += 1
-    return [h for *_, h in sorted(turns, key=lambda item: item[:2])]
+    return [h for *_, h in sorted(turns, key=lambda item: item[:3])]

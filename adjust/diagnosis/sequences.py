@@ -7,6 +7,7 @@ in the base (closed form: Shah 2013, in :mod:`adjust.start.closed_forms.hand_eye
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import Literal
 
 import numpy as np
@@ -21,6 +22,12 @@ from adjust.spatial.rigid import inverse
 from adjust.start.closed_forms.hand_eye import solve_ax_zb
 
 _FEWEST = 5
+MOST = 3
+"""Epochs that sequences are shifted by."""
+_POSE = 10.0
+"""How many times less sure a pose is than the directions of its points."""
+_JOINED = 30.0
+"""Times the error of single poses that two sequences miss each other at most where they belong together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +35,7 @@ class Link:
     """Poses (n, 4, 4) of two things at n epochs. kind: "rig" or "hand_eye". names: of first and second.
 
     pairs: positions in ``Survey.pairs`` of the second, where it is measured by pairs; target_id: seen by the first.
+    error: rad, by which single images typically miss their own best poses, with the sigma of measured turns.
     """
 
     kind: Literal["rig", "hand_eye"]
@@ -36,7 +44,22 @@ class Link:
     first: FloatArray
     second: FloatArray
     target_id: str
+    error: float
     pairs: tuple[int, ...] = ()
+
+    @cached_property
+    def lever(self) -> float:
+        """m: the target's distance."""
+        return float(np.median(np.linalg.norm(self.first[:, :3, 3], axis=1)))
+
+    def joins(self, misses: FloatArray) -> bool:
+        """Whether sequences that miss each other by so much (n,) m may belong together."""
+        return typical(misses) < _JOINED * _POSE * self.error * self.lever
+
+    @cached_property
+    def fit(self) -> "Fit | None":
+        """As the epochs stand."""
+        return fitted(self.kind, self.first, self.second)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,11 +94,12 @@ def typical(misses: FloatArray) -> float:
     return float(np.quantile(misses, 0.9)) + 1e-9 if len(misses) else float("inf")
 
 
-def links(case: Case) -> Iterator[Link]:
+@lru_cache(maxsize=2)
+def links(case: Case) -> tuple[Link, ...]:
     """The rigs and hands of a survey that have five epochs or more in common."""
     seen = _views_by_thing(case)
-    yield from _rigs(case.survey, seen)
-    yield from _hands(case.survey, seen)
+    error = float(np.median([v.error_px[0] / v.focal_px for v in case.views.values() if len(v.poses)] or [0.0]))
+    return *_rigs(case.survey, seen, error), *_hands(case.survey, seen, error)
 
 
 def _views_by_thing(case: Case) -> dict[tuple[str, str], dict[str, FloatArray]]:
@@ -88,7 +112,10 @@ def _views_by_thing(case: Case) -> dict[tuple[str, str], dict[str, FloatArray]]:
     return out
 
 
-def _rigs(survey: Survey, seen: Mapping[tuple[str, str], Mapping[str, FloatArray]]) -> Iterator[Link]:
+_Views = Mapping[tuple[str, str], Mapping[str, FloatArray]]
+
+
+def _rigs(survey: Survey, seen: _Views, error: float) -> Iterator[Link]:
     rigid = {s.station_id for s in survey.stations if s.motion == "fixed"}
     bodies = {c.camera_id: "world" if c.station_id in rigid else c.station_id for c in survey.cameras}
     moving = {t.target_id for t in survey.targets if t.station_id is None}
@@ -100,10 +127,10 @@ def _rigs(survey: Survey, seen: Mapping[tuple[str, str], Mapping[str, FloatArray
                 epochs = tuple(e for e in a if e in b)
                 if len(epochs) >= _FEWEST:
                     first, second = (np.array([x[e] for e in epochs]) for x in (a, b))
-                    yield Link("rig", (camera, other), epochs, first, second, target)
+                    yield Link("rig", (camera, other), epochs, first, second, target, error)
 
 
-def _hands(survey: Survey, seen: Mapping[tuple[str, str], Mapping[str, FloatArray]]) -> Iterator[Link]:
+def _hands(survey: Survey, seen: _Views, error: float) -> Iterator[Link]:
     station_of = {c.camera_id: c.station_id for c in survey.cameras}
     carrier_of = {t.target_id: t.station_id for t in survey.targets}
     for station, poses in hand_poses(survey).items():
@@ -114,7 +141,9 @@ def _hands(survey: Survey, seen: Mapping[tuple[str, str], Mapping[str, FloatArra
                 second = np.array([poses[e][1].matrix() for e in epochs])
                 second = second if on_hand else inverse(second)
                 first = np.array([views[e] for e in epochs])
+                turns = [np.diag(survey.pairs[poses[e][0]].cov)[:3].max() for e in epochs]
                 yield Link("hand_eye", (camera, station), epochs, first, second, target,
+                           float(np.hypot(error, np.sqrt(np.median(turns)))),
                            tuple(poses[e][0] for e in epochs))  # fmt: skip
 
 
@@ -148,7 +177,7 @@ class Shift:
     evidence: float
 
 
-def shifts(link: Link, most: int = 3) -> Sequence[Shift]:
+def shifts(link: Link, most: int = MOST) -> Sequence[Shift]:
     """Shifts of the second sequence that join it with the first, everywhere or from an epoch on; the best first.
 
     The motions are those that most epochs give as they stand, or shifted throughout; the border is where the sum of
@@ -169,13 +198,14 @@ def shifts(link: Link, most: int = 3) -> Sequence[Shift]:
 
 def _shifted_fits(link: Link, most: int) -> dict[int, Fit | None]:
     """The motions of a link at every shift; those of a rig all together."""
-    inside = {by: _inside(len(link.epochs), by) for by in range(-most, most + 1)}
+    inside = {by: _inside(len(link.epochs), by) for by in range(-most, most + 1) if by}
     if link.kind != "rig":
-        return {by: fitted(link.kind, link.first[i], link.second[i + by]) for by, i in inside.items()}
-    lever = float(np.median(np.linalg.norm(link.first[:, :3, 3], axis=1)))
+        return {0: link.fit} | {
+            by: fitted(link.kind, link.first[i], link.second[i + by]) for by, i in inside.items()
+        }
     motions = np.concatenate([link.first[i] @ inverse(link.second[i + by]) for by, i in inside.items()])
-    means = mean_poses(motions, lever, np.cumsum([0, *map(len, inside.values())]))
-    return {
+    means = mean_poses(motions, link.lever, np.cumsum([0, *map(len, inside.values())]))
+    return {0: link.fit} | {
         by: Fit(mean, np.eye(4)) if len(i) >= 3 else None for (by, i), mean in zip(inside.items(), means, strict=True)
     }
 
@@ -193,7 +223,5 @@ def _best_border(link: Link, fit: Fit, by: int, base: float) -> Shift | None:
     before, after = np.minimum(as_is, bound), np.minimum(moved, bound)
     costs = np.concatenate([[0.0], np.cumsum(before)]) + np.concatenate([np.cumsum(after[::-1])[::-1], [0.0]])
     begin = int(np.argmin(costs))
-    if begin >= n - 1:
-        return None
     rest = np.concatenate([as_is[:begin], moved[inside[inside >= begin]]])
-    return Shift(begin, by, base / typical(rest))
+    return Shift(begin, by, base / typical(rest)) if begin < n - 1 and link.joins(rest) else None

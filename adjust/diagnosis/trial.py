@@ -79,6 +79,12 @@ class Trial:
         left = self.misfit.cost + max(self.hypothesis.penalty, 0.0) - self.misfit.redundancy
         return self.result is not None and self.misfit.unused == 0 and left <= (1.0 - share) * base.excess
 
+    def explains_all_but(self, share: float, base: Misfit) -> bool:
+        """The same, though all that it does without may have contradicted; save copies, which are no observations."""
+        lost = 0.0 if self.hypothesis.penalty < 0.0 else (CAP - 2.0) * self.misfit.dropped
+        worse = replace(self, misfit=replace(self.misfit, omega=self.misfit.omega + lost))
+        return worse.explains(share, base)
+
 
 def tried(hypothesis: Hypothesis, case: Case) -> Trial:
     """The survey of a hypothesis adjusted from the values of its case, where there are none from its own start."""
@@ -98,7 +104,9 @@ def tried_afresh(trial: Trial, case: Case, base: Misfit) -> Trial | None:
 
     None where that is no better, and of what is scored at these values. base: what the case leaves unexplained.
     """
-    near = case.is_near and trial.misfit.omega < base.omega
+    near = trial.misfit.omega < base.omega and (case.is_near or trial.hypothesis.of_variances)
+    if trial.result is not None and case.is_near and case.linear is not None:  # a minimum, if not a better one
+        near |= trial.result.omega <= case.linear.result.omega
     if trial.survey is None or case.starts_afresh or near or trial.hypothesis.scored:
         return None
     again = _adjusted(trial.hypothesis, trial.survey, case, case.run)
@@ -165,8 +173,10 @@ def _joint_squares(result: Adjustment) -> dict[tuple[str, ...], FloatArray]:
 
 def _at_best_scale(squares: FloatArray) -> float:
     """Minus twice the log likelihood of squares (n,), each bounded, with the best common factor for their variances."""
-    scaled = np.minimum(squares[None] / _FACTORS[:, None], CAP).sum(axis=1) + len(squares) * np.log(_FACTORS)
-    return float(scaled.min())
+    total = np.concatenate([[0.0], np.cumsum(ordered := np.sort(squares))])
+    within = np.searchsorted(ordered, CAP * _FACTORS)
+    n = len(squares)
+    return float((total[within] / _FACTORS + CAP * (n - within) + n * np.log(_FACTORS)).min())
 
 
 def n_other_components(survey: Survey, used_only: bool = True) -> int:

@@ -335,6 +335,8 @@ class _Loop:
             f"the adjustment did not converge in {iteration} steps: the last step moved an unknown by "
             f"{self.moved:.2g} sigma{what}; look for gross errors in the observations or a wrong start value"
         )
+        if self.options.settled > 0.0:  # nobody reads why what is only compared does not converge
+            return NotConvergedError(head)
         said = [head, *describe_divergence(self.graph, self.start, self.at.values)]
         stopped = stopped_at(self.graph, self.start, self.at.values, iteration, self.omega, float(self.moved))
         return NotConvergedError("\n  - ".join(said), stopped)

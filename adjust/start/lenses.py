@@ -2,7 +2,9 @@
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -76,7 +78,39 @@ def start_lens(
     if camera.lens.values is not None:
         _check_given(camera, model)
         return LensStart(np.array(camera.lens.values, dtype=float), "lens as given", {})
-    return _LensSearch(camera, model, lent).run(sightings)
+    known = _remembered.get()
+    if known is None:
+        return _LensSearch(camera, model, lent).run(sightings)
+    key = (camera.camera_id, camera.image_size, id(camera.lens), tuple(lent.items()),
+           tuple((s.x.tobytes(), s.uv.tobytes()) for s in sightings))  # fmt: skip
+    if key not in known:
+        alone = [replace(s, block_idx=i) for i, s in enumerate(sightings)]
+        try:
+            known[key] = camera, _LensSearch(camera, model, lent).run(alone)
+        except SurveyError as error:
+            known[key] = camera, error
+    found = known[key][1]
+    if isinstance(found, SurveyError):
+        raise found
+    return replace(found, values=found.values.copy(),
+                   excluded={sightings[i].block_idx: why for i, why in found.excluded.items()})  # fmt: skip
+
+
+@contextmanager
+def remembering() -> Iterator[None]:
+    """Inside, what the same images of a camera have told of its lens is not searched again: of surveys that are alike.
+
+    The cameras are kept as long: their lenses are told apart by identity.
+    """
+    token = _remembered.set({})
+    try:
+        yield
+    finally:
+        _remembered.reset(token)
+
+
+_remembered: ContextVar[dict[object, tuple[Camera, "LensStart | SurveyError"]] | None]
+_remembered = ContextVar("remembered lenses", default=None)
 
 
 def _check_given(camera: Camera, model: LensModel) -> None:

@@ -137,6 +137,11 @@ class LinearScores:
         """A change in proportion to time, by ``theta`` from the first part to the last."""
         return self._summed(parts, drift_times(len(parts)))
 
+    def apart(self, parts: Sequence[Part]) -> tuple[FloatArray, FloatArray]:
+        """Of p changes by one number each: B'e (p,) and M (p, p), what the unknowns leave of B'B."""
+        g, BB, taken = self._normals(parts, np.arange(len(parts)))
+        return g[:, 0], np.diag(BB[:, 0, 0]) - taken[:, 0, :, 0]
+
     def steps(self, parts: Sequence[Part]) -> dict[int, Score]:
         """A change from part t on: the scores of t, at most ``_CUTS`` of them. parts: in the order of time."""
         cuts = list(range(2, len(parts) - 1))[:: max(1, (len(parts) - 3) // _CUTS)]

@@ -29,7 +29,7 @@ def moving(offset: float, n: int = 20) -> Link:
     rng = np.random.default_rng(3)
     first, second = (np.array([pose(t + d) for t in range(n)]) for d in (0.0, offset))
     first[:, :3, 3] += rng.normal(0.0, 1e-4, (n, 3))
-    return Link("rig", ("a", "b"), tuple(f"e{i}" for i in range(n)), first, second, "board")
+    return Link("rig", ("a", "b"), tuple(f"e{i}" for i in range(n)), first, second, "board", 1e-4)
 
 
 @pytest.mark.parametrize("offset", [-0.3, 0.05, 0.2])

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from adjust.diagnosis.alone import own_lenses, single_views, squares_alone
+from adjust.diagnosis.alone import own_lenses, single_views, squares_alone, squares_of
 from adjust.diagnosis.bodies.series import Step
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.table.views import single_camera_survey
@@ -24,17 +24,20 @@ def lens_steps(case: Case) -> Iterator[Step]:
 
     The lens of its first images and that of its last ones tell which of the others are of either.
     """
+    squares = squares_of(case.survey, case.views.values())
     for camera in case.survey.cameras:
-        alone = single_camera_survey(case.survey, camera.camera_id)
-        n = len(alone.image_blocks)
+        mine = [i for i, b in enumerate(case.survey.image_blocks)
+                if b.camera_id == camera.camera_id and b.target_id is not None]  # fmt: skip
+        n = len(mine)
         if n < 2 * _LEAST or not camera.lens.free:
             continue
+        alone = single_camera_survey(case.survey, camera.camera_id)
+        if case.views.keys() >= {*mine} and squares[mine].sum() < _limit(alone):
+            continue  # as the search for its lens leaves them already
         whole = _misfit(case, alone)
         if whole < _limit(alone):
             continue
         best, cost = _split(case, alone, _cut(case, alone))
-        mine = [i for i, b in enumerate(case.survey.image_blocks)
-                if b.camera_id == camera.camera_id and b.target_id is not None]  # fmt: skip
         if whole - cost > 0.5 * (whole - _limit(alone)):
             yield Step(("station_from_camera", camera.camera_id), mine[best], whole - cost, n - 2 * _LEAST + 1)
 

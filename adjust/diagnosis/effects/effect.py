@@ -89,13 +89,16 @@ class Effect:
         """Its size, the adjustment at which that was found, and the sigmas (k,).
 
         A size is one of a change of the values there: where these were spoilt, the next one may be worse, and is none.
+        Where v'Pv falls by what the score has promised, the change is linear, and there is nothing more to be scored.
         """
         cov, now, last, made = self.first.cov, linear, np.inf, list[tuple[FloatArray, Survey]]()
+        promised = linear.result.omega - self.first.drop
         for _ in range(ROUNDS - 1):
             try:
                 survey = self.mended(now.result, theta)
                 new = Linear(case.warm(survey))
-                more = self.score(new)
+                kept = abs(new.result.omega - promised) < _SMALL * new.scale
+                more = Score(theta, cov, 0.0, 0) if kept else self.score(new)
             except SurveyError:
                 theta = made[-1][0] if made else theta
                 break
@@ -109,6 +112,7 @@ class Effect:
             if more.drop > _SLOW * last and new.result.omega > _SLOW * now.result.omega:
                 break
             theta, cov, now, last = self.added(theta, more.theta), more.cov, new, more.drop
+            promised = new.result.omega - more.drop
         self._last.extend(made[-1:])
         return theta, now.result, np.sqrt(np.maximum(np.diag(cov), 0.0) * now.scale)
 

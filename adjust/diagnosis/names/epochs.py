@@ -13,7 +13,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, LeaveOut, Place, Rename
-from adjust.diagnosis.sequences import Link, Shift, fitted, links, shifts
+from adjust.diagnosis.sequences import MOST, Link, Shift, links, shifts
 from adjust.model.errors import listed
 from adjust.model.observations import FrameRef, ImageBlock, Pair, TableReading
 from adjust.model.survey import FloatArray, Survey
@@ -66,10 +66,9 @@ def _said(link: Link) -> tuple[str, str, Place]:
 
 
 def _shifted(survey: Survey, link: Link) -> Iterator[Hypothesis]:
-    found = shifts(link)
-    for shift in found[:2]:
+    for shift in shifts(link)[:2]:
         if shift.evidence > _CLEARLY:
-            yield _shift(survey, link, shift, len(found) * len(link.epochs))
+            yield _shift(survey, link, shift, 2 * MOST * len(link.epochs))
 
 
 def _shift(survey: Survey, link: Link, shift: Shift, looked_at: int) -> Hypothesis:
@@ -89,22 +88,22 @@ def _shift(survey: Survey, link: Link, shift: Shift, looked_at: int) -> Hypothes
 
 def _exchanged(survey: Survey, link: Link) -> Iterator[Hypothesis]:
     """Two epochs of the second that changed places."""
-    fit = fitted(link.kind, link.first, link.second)
-    if fit is None:
+    if (fit := link.fit) is None:
         return
     misses = fit.misses(link.first, link.second)
     suspects = np.argsort(-misses)[:_SUSPECTS].tolist()
-    found = []
-    for i, j in combinations(sorted(suspects), 2):
+    found, pairs = [], list(combinations(sorted(suspects), 2))
+    for i, j in pairs:
         now = fit.misses(link.first[[i, j]], link.second[[j, i]])
-        found.append((float(misses[[i, j]].min() / (now.max() + float(np.median(misses)) + 1e-9)), i, j))
+        if link.joins(now):
+            found.append((float(misses[[i, j]].min() / (now.max() + float(np.median(misses)) + 1e-9)), i, j))
     for evidence, i, j in sorted(found, reverse=True)[:1]:
         if evidence > _CLEARLY:
             a, b = link.epochs[i], link.epochs[j]
             what, file, place = _said(link)
             yield Hypothesis("epochs exchanged", f"{what} at epochs {a} and {b} changed places",
                              f"exchange them in {file}", replace(place, epochs=(a, b)),
-                             _moved(survey, link, {a: b, b: a}), (), evidence, 2, len(found))  # fmt: skip
+                             _moved(survey, link, {a: b, b: a}), (), evidence, 2, len(pairs))  # fmt: skip
 
 
 def _cameras(survey: Survey, link: Link) -> Iterator[Hypothesis]:
@@ -112,16 +111,16 @@ def _cameras(survey: Survey, link: Link) -> Iterator[Hypothesis]:
 
     An exchange inverts the motion between the two: the one that joins all epochs either way is found first.
     """
-    n, lever = len(link.epochs), float(np.median(np.linalg.norm(link.first[:, :3, 3], axis=1)))
+    n = len(link.epochs)
     motions = link.first @ inverse(link.second)
     both, members = np.concatenate([motions, inverse(motions)]), np.tile(np.arange(n), 2)
-    apart = mean_pose(both, lever, members)[1].reshape(2, n)
+    apart = mean_pose(both, link.lever, members)[1].reshape(2, n)
     wrong = apart[1] < apart[0]
     if 2 * wrong.sum() > n or (2 * wrong.sum() == n and wrong[0]):
         wrong = ~wrong
     near, far = apart.min(axis=0), apart.max(axis=0)
     ratio = float(np.min(far / (near + float(np.median(near)) + 1e-9)))
-    if wrong.any() and ratio > _CLEARLY:
+    if wrong.any() and ratio > _CLEARLY and link.joins(near):
         epochs = tuple(e for e, w in zip(link.epochs, wrong, strict=True) if w)
         a, b = link.names
         yield Hypothesis(

@@ -39,17 +39,18 @@ def misnamed_images(case: Case) -> Iterator[Hypothesis]:
     yield from _copies(case.survey)
     if case.values is not None and case.survey.image_blocks:
         prediction = Prediction(case.survey, case.values)
-        found = [x for b in case.survey.image_blocks if (x := prediction.squares(b)) is not None]
-        scale = max(1.0, float(np.nanmedian(np.concatenate([*found, np.ones(1)]))) / _MEDIAN)  # start values are rough
-        now = Now(prediction, [_squares(prediction, b, scale) for b in case.survey.image_blocks], scale)
+        squares = [prediction.squares(b) for b in case.survey.image_blocks]
+        found = np.concatenate([np.ones(1), *(x for x in squares if x is not None)])
+        scale = max(1.0, float(np.nanmedian(found)) / _MEDIAN)  # start values are rough
+        bounded = [_bounded(x, b, scale) for x, b in zip(squares, case.survey.image_blocks, strict=True)]
+        now = Now(prediction, bounded, scale)
         yield from _targets(now)
         yield from _points(now)
         yield from _cameras(now)
 
 
-def _squares(prediction: Prediction, block: ImageBlock, scale: float) -> FloatArray:
+def _bounded(squares: FloatArray | None, block: ImageBlock, scale: float) -> FloatArray:
     """Of a block, bounded: the bound where it cannot be predicted."""
-    squares = prediction.squares(block)
     return np.full(len(block.uv), 2.0 * CAP) if squares is None else np.fmin(squares / scale, 2.0 * CAP)
 
 
@@ -63,7 +64,8 @@ def _better(now: Now, other: dict[int, ImageBlock]) -> tuple[list[int], float]:
     for i, block in other.items():
         same = block.target_id is None and block.camera_id == blocks[i].camera_id
         rows = np.flatnonzero(block.point_idx != blocks[i].point_idx) if same else np.arange(len(block.uv))
-        before, after = (float(x[rows].sum()) for x in (now.squares[i], _squares(now.prediction, block, now.scale)))
+        other_way = _bounded(now.prediction.squares(block), block, now.scale)
+        before, after = (float(x[rows].sum()) for x in (now.squares[i], other_way))
         gain += before - after
         if before > _CLEARLY * max(after, 2.0 * len(rows)):
             good.append(i)

@@ -25,6 +25,8 @@ _CLEARLY = 3.0
 _SUSPECTS, _TRIED, _LARGE = 10, 3, 500
 _NOISE = 2.0
 """Mean square over sigma of pairs at a start that fits."""
+_JOINED = 30.0
+"""Typical sigmas by which pairs miss the places of two frames at most, in the mean, where the names explain it."""
 _Found = tuple[float, FrameRef, FrameRef, list[int]]
 
 
@@ -71,60 +73,68 @@ def _suspects(survey: Survey, misses: FloatArray) -> list[FrameRef]:
 class _Ways:
     """From every frame, by each of its pairs in use, that which misses least first: to another one.
 
-    near: how much the pair misses, its row, whether it leads to the pair's first end. motions: of that row, (4, 4), to
-    the first end and to the second one. lever: m, the typical length of a pair.
+    number: of a frame. near: by that of a frame, how much each pair misses, its row, whether it leads to the first end
+    of the pair. ends: by row the numbers of the second end and of the first one. motions: of that row, (4, 4), to the
+    first end and to the second one. lever: m, the typical length of a pair; sigma: m, of it.
     """
 
     pairs: Sequence[Pair]
-    near: Mapping[FrameRef, Sequence[tuple[float, int, bool]]]
+    number: Mapping[FrameRef, int]
+    near: Sequence[Sequence[tuple[float, int, bool]]]
+    ends: Mapping[int, tuple[int, int]]
     motions: Mapping[int, tuple[FloatArray, FloatArray]]
     lever: float
+    sigma: float
 
     @classmethod
     def of(cls, pairs: Sequence[Pair], misses: FloatArray) -> "_Ways":
         """misses: (p,) of the pairs at a start."""
-        near: dict[FrameRef, list[tuple[float, int, bool]]] = {}
-        motions = {i: _matrix(p) for i, p in enumerate(pairs) if p.used}
-        for i in motions:
-            near.setdefault(pairs[i].b, []).append((float(misses[i]), i, True))
-            near.setdefault(pairs[i].a, []).append((float(misses[i]), i, False))
+        used, number = {i: p for i, p in enumerate(pairs) if p.used}, dict[FrameRef, int]()
+        ends = {i: (number.setdefault(p.b, len(number)), number.setdefault(p.a, len(number))) for i, p in used.items()}
+        near: list[list[tuple[float, int, bool]]] = [[] for _ in number]
+        for i, (b, a) in ends.items():
+            near[b].append((float(misses[i]), i, True))
+            near[a].append((float(misses[i]), i, False))
+        motions = {i: _matrix(p) for i, p in used.items()}
         lever = float(np.median([np.linalg.norm(m[:3, 3]) for m in motions.values()])) or 1.0
-        return cls(pairs, {end: sorted(ways) for end, ways in near.items()},
-                   {i: (m, inverse(m)) for i, m in motions.items()}, lever)  # fmt: skip
+        variances = np.array([np.diag(p.cov).reshape(-1, 3).max(axis=1) for p in used.values() if len(p.cov) == 6])
+        turn, shift = np.median(variances, axis=0) if len(variances) else (np.inf, np.inf)
+        both = {i: (m, inverse(m)) for i, m in motions.items()}
+        sigma = float(np.sqrt(lever**2 * turn + shift))
+        return cls(pairs, number, [sorted(ways) for ways in near], ends, both, lever, sigma)
 
-    def end(self, row: int, first: bool) -> FrameRef:
-        """Where a way leads."""
-        return self.pairs[row].a if first else self.pairs[row].b
-
-    def joined(self, without: Collection[FrameRef]) -> dict[FrameRef, FloatArray]:
+    def joined(self, without: Collection[int]) -> dict[int, FloatArray]:
         """Poses (4, 4) of the largest set of other frames that pairs join, by the tree of those that miss least."""
-        best: dict[FrameRef, FloatArray] = {}
-        left = {end: None for end in self.near if end not in without}
+        best: dict[int, FloatArray] = {}
+        left = dict.fromkeys(end for end in range(len(self.near)) if end not in without)
         while left:
             begin = next(iter(left))
             found, queue = {begin: np.eye(4)}, [*self.near[begin]]
             while queue:
                 _, i, first = heappop(queue)
-                there = self.end(i, first)
+                there = self.ends[i][first]
                 if there not in found and there not in without:
-                    found[there] = found[self.end(i, not first)] @ self.motions[i][not first]
+                    found[there] = found[self.ends[i][not first]] @ self.motions[i][not first]
                     for way in self.near[there]:
                         heappush(queue, way)
-            left = {end: None for end in left if end not in found}
+            left = dict.fromkeys(end for end in left if end not in found)
             best = max(best, found, key=len)
         return best
 
     def misnamed(self, a: FrameRef, b: FrameRef) -> _Found | None:
         """Evidence, the two, and the rows of pairs whose names are wrong; None where none are."""
-        poses = self.joined((a, b))
-        said = [(i, named == a, poses[other] @ self.motions[i][first]) for named in (a, b)
-                for _, i, first in self.near[named] if (other := self.end(i, first)) in poses]  # fmt: skip
+        both = self.number[a], self.number[b]
+        poses = self.joined(both)
+        said = [(i, named == both[0], poses[other] @ self.motions[i][first]) for named in both
+                for _, i, first in self.near[named] if (other := self.ends[i][first]) in poses]  # fmt: skip
         if len(said) < 4:
             return None
         W, named = np.array([pose for *_, pose in said]), np.array([is_a for _, is_a, _ in said])
         apart = pose_distance(W[:, None], W[None], self.lever)
         costs = np.minimum(apart[:, None], apart[None]).sum(axis=2)
         one, two = np.unravel_index(int(np.argmin(costs)), costs.shape)
+        if not costs[one, two] <= _JOINED * self.sigma * len(said):
+            return None
         first = apart[one] <= apart[two]
         if (first & named).sum() + (~first & ~named).sum() < len(said) / 2.0:
             first = ~first
@@ -133,7 +143,7 @@ class _Ways:
             return None
         as_named = sum(float(apart[np.ix_(of, of)].sum(axis=1).min()) for of in (named, ~named) if of.any())
         A, B = (W[k] for k in ((one, two) if first[one] else (two, one)))
-        for i in [row for _, row, to_first in self.near[a] if self.end(row, to_first) == b]:
+        for i in [row for _, row, to_first in self.near[both[0]] if self.ends[row][to_first] == both[1]]:
             expected, m = inverse(B) @ A, self.motions[i][0]
             expected = expected if self.pairs[i].a == a else inverse(expected)
             off = [float(pose_distance(m[None], x, self.lever)[0]) for x in (expected, inverse(expected))]

@@ -13,7 +13,7 @@ from gtsam import Pose3
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.late import Freed, as_unknowns
-from adjust.diagnosis.sequences import Link, fitted, links
+from adjust.diagnosis.sequences import Link, links
 from adjust.model.survey import Camera, PoseParameter, Station, Survey
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import norm
@@ -70,7 +70,7 @@ def unsynchronised(case: Case) -> Iterator[Hypothesis]:
 
 def time_offset(link: Link) -> Offset | None:
     """The second's offset after the first, by least squares; None where the target hardly moves."""
-    fit = fitted("rig", link.first, link.second)
+    fit = link.fit
     if fit is None or len(link.epochs) < 6:
         return None
     seen, moved = link.first[:, :3, 3], (fit.left @ link.second)[:, :3, 3]

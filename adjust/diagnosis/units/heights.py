@@ -67,7 +67,8 @@ def _by_scores(case: Case, constants: list[_Constant]) -> list[tuple[float, floa
         return []
     if not all(r.used for r in result.survey.readings):
         return []
-    system = linear_system(result)
+    linear = case.linear
+    system = linear.system if linear is not None and linear.result is result else linear_system(result)
     first = int(system.ptr[len(system.ptr) - 1 - len(case.survey.readings)])
     sigma = np.array([r.sigma for r in case.survey.readings])
     B = np.zeros((len(system.e), len(constants)))

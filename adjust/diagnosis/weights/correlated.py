@@ -4,16 +4,14 @@ One variance component beside their own (Searle, Casella, McCulloch 1992, balanc
 the means of such sets exceed what independent residuals make by ``n s^2``.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
-from adjust.diagnosis.trial import misfit_of
 from adjust.model.observations import ReadingCovariance
-from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.testing.distributions import chi2
 
@@ -21,7 +19,11 @@ _Common = tuple[str, list[IntArray], float]
 """A kind of readings, its sets, and the error that each set has in common over their own sigma."""
 _ALPHA = 1e-6
 _FEWEST, _SETS = 3, 3
-_TRIED = (3.0, 1.0, 10.0)
+_SIZES = tuple(np.geomspace(0.5, 30.0, 12).tolist())
+"""Of a common error, over what the residuals show of it: the unknowns take some of it over."""
+_UNKNOWN = 3.0
+_LESS_LIKELY = 30.0
+"""Minus twice the log likelihood by which one kind alone explains less than all together, and is not tried."""
 _LAST = 1.5
 """Evidence: as for sigmas, larger variances fit anything, so what else there is to try is tried first."""
 
@@ -43,22 +45,28 @@ def correlated_readings(case: Case) -> Iterator[Hypothesis]:
         if between > float(chi2.isf(_ALPHA, len(sets))):
             n = float(np.mean([len(s) for s in sets]))
             found.append((kind, sets, float(np.sqrt(max(between / len(sets) - 1.0, 0.0) / n))))
-    for some in ([found] if len(found) > 1 else []) + [[one] for one in found]:
-        # what the unknowns take over of a common error does not show in residuals
-        first, *others = (_hypothesis(survey, some, factor) for factor in _TRIED)
-        yield replace(first, follow=_others_if_half(case, first, others))
+    every = [(some, *_best_size(case, some)) for some in ([found] if len(found) > 1 else []) + [[one] for one in found]]
+    least = min((cost for *_, cost in every), default=0.0)
+    yield from (_hypothesis(survey, some, size) for some, size, cost in every if cost < least + _LESS_LIKELY)
 
 
-def _others_if_half(
-    case: Case, first: Hypothesis, others: list[Hypothesis]
-) -> Callable[[Adjustment], list[Hypothesis]]:
-    """Other sizes of a common error, where the first takes away half of the misfit."""
+def _best_size(case: Case, found: Sequence[_Common]) -> tuple[float, float]:
+    """That of ``_SIZES`` for which all residuals are likeliest, and minus twice the logarithm of that, less a constant.
 
-    def told(result: Adjustment) -> list[Hypothesis]:
-        half = misfit_of(result, case.survey).excess < 0.5 * misfit_of(case.result, case.survey).excess
-        return [first, *others] if half else [first]
-
-    return told
+    With the sums s of the whitened residuals of each set and M, what the unknowns leave of their sizes n, v'Pv falls by
+    ``s' inv(M + inv(K)) s`` where the sets have errors of variances K in common; log det of ``I + n K`` counts against.
+    """
+    if case.linear is None:
+        return _UNKNOWN, 0.0
+    sets, own = [s for _, of, _ in found for s in of], np.array([k for _, of, k in found for _ in of])
+    first = case.linear.system.ptr[-1 - len(case.survey.readings)]
+    s, M = case.linear.apart([(first + rows, np.ones((len(rows), 1))) for rows in sets])
+    n, costs = np.array([len(rows) for rows in sets]), list[float]()
+    for size in _SIZES:
+        K = (size * np.maximum(own, 1e-6)) ** 2
+        costs.append(float(np.log1p(n * K).sum() - s @ np.linalg.solve(M + np.diag(1.0 / K), s)))
+    best = int(np.argmin(costs))
+    return _SIZES[best], costs[best]
 
 
 def _sets(survey: Survey, kind: str) -> list[IntArray]:
@@ -69,7 +77,7 @@ def _sets(survey: Survey, kind: str) -> list[IntArray]:
     return [np.array(rows) for rows in by_setup.values() if len(rows) >= _FEWEST]
 
 
-def _hypothesis(survey: Survey, found: list[_Common], factor: float) -> Hypothesis:
+def _hypothesis(survey: Survey, found: Sequence[_Common], factor: float) -> Hypothesis:
     joint, penalty = [], 0.0
     for _, sets, own in found:
         for rows in sets:
@@ -83,5 +91,5 @@ def _hypothesis(survey: Survey, found: list[_Common], factor: float) -> Hypothes
         f"about {common:.2g} times their own sigma: they are given as independent",
         "give their covariance, or free the constant they share (an instrument's offset or index, a height)",
         Place("group", kinds, "sigma"), replace(survey, reading_covariances=tuple(joint)), (), _LAST, len(found),
-        len(_TRIED), penalty=penalty,
+        len(_SIZES), penalty=penalty, of_variances=True,
     )  # fmt: skip

@@ -56,6 +56,7 @@ def wrong_factors(case: Case) -> Iterator[Hypothesis]:
             "sigmas that the instrument has", Place("group", (group.group,), "sigmas.scale"),
             scaled_survey(case.survey, {group.group: factor}), (ScaleKey(("sigmas", "scale", group.group), k),),
             min(max(factor, 1.0 / factor), _LAST), 1, len(tested), penalty=group.n_observations * float(np.log(factor)),
+            of_variances=True,
         )  # fmt: skip
 
 
@@ -104,6 +105,7 @@ def _with_usual(case: Case, field: str, kind: str, group: str, odd: list[_One], 
         f"is {ratio:.0f} times off the usual one of group {group}", "give the sigma that was meant, or none",
         Place("reading", tuple(ids), "sigma"), replace(case.survey, **changed), (),
         min(ratio, 10.0), len(odd),  # if the sigma were right, doing nearly without it would be worth chi-square
+        of_variances=True,
     )  # fmt: skip
 
 
