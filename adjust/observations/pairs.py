@@ -78,7 +78,8 @@ class PairArrays:
 
     def pose(self, e: int) -> Pose3:
         """One of them."""
-        return Pose3(Rot3(self.rotations[e]), np.nan_to_num(self.translations[e]))
+        measured = self.motions
+        return Pose3(Rot3(measured.rotation[e]), measured.translation[e])
 
     @cached_property
     def logs(self) -> FloatArray:

@@ -139,8 +139,8 @@ def shortest_loops(
     """Independent loops, shortest first, until there is one for each chord or the budget of steps is used up.
 
     walk: of :func:`adjacency`; chords: (L,) pairs outside a spanning forest. Returns the loops' pairs in the order of
-    the walk, as :func:`flat` does, the stations at which they begin, and which (L,) chords lead a set of the elimination: the loops that the
-    other chords close with the forest are what is missing.
+    the walk, as :func:`flat` does, the stations at which they begin, and which (L,) chords lead a set of the
+    elimination: the loops that the other chords close with the forest are what is missing.
     """
     n, n_loops = len(walk[0]) - 1, len(chords)
     chord = np.full(len(walk[1]) // 2, -1, dtype=np.int64)
@@ -184,8 +184,9 @@ def forest_loops(a: IntArray, b: IntArray, forest: Forest, chords: IntArray) -> 
 
 
 def _ways_back(a: IntArray, b: IntArray, forest: Forest, chords: IntArray) -> Iterator[tuple[IntArray, ...]]:
-    """Of the chords whose ends have not met yet, step by step: which, the pair that is walked, whether on the way from
-    b, and the station that it leads to, always from the deeper end.
+    """The ways back from both ends of chords until they meet, step by step, always from the deeper end.
+
+    Of the chords still on their way: which, the pair that is walked, whether on the way from b, and where it leads.
     """
     loops, v, w = np.arange(len(chords)), b[chords], a[chords]
     while (apart := v != w).any():
