@@ -12,7 +12,7 @@ extern "C" __attribute__((visibility("default"))) const Entry *images() {
         entry<block_rows>("block_rows"), entry<condensed_rows>("condensed_rows"), entry<serve>("serve"), entry<local_by_keys>("local_by_keys"),
         entry<all_statistics>("all_statistics"), entry<reduce_poses>("reduce_poses"), entry<pose_steps>("pose_steps"),
         entry<leaf_rows>("leaf_rows"), entry<tree_block>("tree_block"), entry<invert_cliques>("invert_cliques"), entry<inversion_room>("inversion_room"),
-        entry<covariance_room>("covariance_room"), entry<covariance_rows>("covariance_rows"),
+        entry<covariance_room>("covariance_room"), entry<covariance_rows>("covariance_rows"), entry<clique_covariance>("clique_covariance"),
         entry<joint_blocks>("joint_blocks"), entry<solution_room>("solution_room"),
         entry<solve_cliques>("solve_cliques"),
         entry<refine_views>("refine_views"), entry<errors_of_views>("errors_of_views"),

@@ -167,6 +167,15 @@ inline void covariance_rows(const Tree &t, Ints n_front, Vector data, Out<double
     }
 }
 
+// Joint covariance (n, n) of all keys of clique c, in their order. where (K,): scratch.
+inline void clique_covariance(const Tree &t, Ints n_front, int64_t c, Out<double, 2> out, Out<int64_t, 1> where) {
+    const int64_t nf = t.front[c], n = t.width[c];
+    std::memcpy(out.data, t.cov.data + t.at[c], sizeof(double) * nf * n);
+    for (int64_t i = 0; i < nf; ++i)
+        for (int64_t j = nf; j < n; ++j) out(j, i) = out(i, j);
+    gather_covariance(t, c, n_front[c], where.data, out.data + nf * n + nf, n);
+}
+
 // Joint covariances (p, 2 d, 2 d) of pairs of keys of dimension d that share a clique; a key -1 is a constant. The first
 // pair that shares none, or -1.
 inline int64_t joint_blocks(const Tree &t, Ints first, Ints second, Out<double, 3> out) {

@@ -23,6 +23,7 @@ _inversion_room = Function("inversion_room", "front[C] width[C]")
 _invert_cliques = Function("invert_cliques", "front[C] width[C] at[C] data[*] work[*]")
 _covariance_room = Function("covariance_room", "front[C] width[C]")
 _covariance_rows = Function("covariance_rows", f"{TREE} n_front[C] data[*] work[*] where[K]")
+_clique_covariance = Function("clique_covariance", f"{TREE} n_front[C] clique out[n,n] where[K]")
 _joint_blocks = Function("joint_blocks", f"{TREE} first[p] second[p] out[p,e,e]")
 _solution_room = Function("solution_room", "width[C] m")
 _solve_cliques = Function(
@@ -101,6 +102,13 @@ def covariance_rows(tree: TreeArrays, n_front: IntArray, data: FloatArray) -> No
     _covariance_rows(*tree, n_front, data, room, where)
 
 
+def clique_covariance(tree: TreeArrays, n_front: IntArray, clique: int) -> FloatArray:
+    """Joint covariance (n, n) of all keys of a clique, in their order."""
+    out = np.empty((int(tree.width[clique]),) * 2)
+    _clique_covariance(*tree, n_front, clique, out, np.empty(len(tree.dims), dtype=np.int64))
+    return out
+
+
 def joint_blocks(tree: TreeArrays, first: IntArray, second: IntArray, out: FloatArray) -> int:
     """Joint covariances ``out`` (p, 2 d, 2 d) of pairs of keys of dimension d that share a clique; -1: a constant.
 
@@ -114,7 +122,8 @@ def solve_cliques(
 ) -> None:
     """Q x in place (D, m), x not zero only in the cliques ``up`` and Q x wanted only in ``down``.
 
-    Both parents first, with every ancestor of each of theirs. first: row of x at which a key begins.
+    Both parents first, with every ancestor of each of theirs. first: row of x at which a key begins. Without ``down``
+    R^-T x, where ancestors are missing what is left for them.
     """
     rows = np.empty(int(tree.width.max(initial=0)), dtype=np.int64)
     work = np.empty(_solution_room(tree.width, x.shape[1]))

@@ -67,9 +67,14 @@ class PairArrays:
         return out
 
     @cached_property
+    def shifts(self) -> FloatArray:
+        """Translations (E, 3), zero where none was measured."""
+        return np.nan_to_num(self.translations)
+
+    @cached_property
     def motions(self) -> Motions:
         """All of them; translations that were not measured count as zero."""
-        return Motions(self.rotations, np.nan_to_num(self.translations))
+        return Motions(self.rotations, self.shifts)
 
     @cached_property
     def poses(self) -> list[Pose3]:
@@ -78,7 +83,7 @@ class PairArrays:
 
     def pose(self, e: int) -> Pose3:
         """One of them."""
-        return Pose3(Rot3(self.rotations[e]), np.nan_to_num(self.translations[e]))
+        return Pose3(Rot3(self.rotations[e]), self.shifts[e])
 
     @cached_property
     def logs(self) -> FloatArray:
@@ -261,7 +266,7 @@ class PairBatch:
     def _measured(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Rotations, translations and whitening of these."""
         rows, arrays = self.active, self.arrays
-        return arrays.rotations[rows], np.nan_to_num(arrays.translations[rows]), arrays.whitening[rows]
+        return arrays.rotations[rows], arrays.shifts[rows], arrays.whitening[rows]
 
     def rows_here(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Of the active pairs: whitened residuals (k, 6), derivatives (k, 6, 6) by b and by a, at the state of now."""
@@ -316,8 +321,8 @@ class PairBatch:
         """Residuals (E, 6), derivatives (E, 6, 6) by b and by a, and Ad(b_from_a^-1) (E, 6, 6), unweighted."""
         self.state.load(values)
         state = self.state
-        shift = np.nan_to_num(self.arrays.translations)
-        return pair_jacobians(self.a_slot, self.b_slot, state.slot_R, state.slot_t, self.arrays.rotations, shift)
+        measured = self.arrays.rotations, self.arrays.shifts
+        return pair_jacobians(self.a_slot, self.b_slot, state.slot_R, state.slot_t, *measured)
 
     def whitened_rows(self, values: gtsam.Values) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Of all pairs, in use or not: whitened residuals (E, 6), derivatives (E, 6, 6) by b and by a."""

@@ -12,7 +12,7 @@ from itertools import count
 import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
-from adjust.pose_network.cycles import short_loops
+from adjust.pose_network.cycles import flat, short_loops
 from adjust.pose_network.loops import Loops, misclosures, walked
 from adjust.pose_network.network import PoseNetwork
 from adjust.pose_network.solve import NetworkOptions, minimize
@@ -106,7 +106,7 @@ def _short_loops(network: PoseNetwork, pairs: BoolArray, through: BoolArray) -> 
     """One for each of these pairs (E,), where there is one that goes through those (E,)."""
     a, b = network.a_idx, network.b_idx
     found = short_loops(network.n_stations, a, b, np.flatnonzero(pairs), np.flatnonzero(through), _SEEN)
-    return walked(a, b, found, [int(a[loop[0]]) for loop in found])
+    return walked(a, b, flat(found), a[np.array([loop[0] for loop in found], dtype=np.int64)])
 
 
 def _tests(network: PoseNetwork, loops: Loops) -> tuple[FloatArray, IntArray]:

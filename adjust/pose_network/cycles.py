@@ -10,7 +10,7 @@ meets every loop (Mehlhorn and Michail 2009, ACM J. Exp. Algorithmics 14).
 """
 
 import heapq
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -135,12 +135,12 @@ def meeting_stations(ptr: IntArray, neighbour: IntArray) -> list[int]:
 
 def shortest_loops(
     walk: tuple[IntArray, IntArray, IntArray], chords: IntArray, budget: int
-) -> tuple[list[list[int]], list[int], BoolArray]:
+) -> tuple[tuple[IntArray, IntArray], IntArray, BoolArray]:
     """Independent loops, shortest first, until there is one for each chord or the budget of steps is used up.
 
     walk: of :func:`adjacency`; chords: (L,) pairs outside a spanning forest. Returns the loops' pairs in the order of
-    the walk, the stations at which they begin, and which (L,) chords lead a set of the elimination: the loops that the
-    other chords close with the forest are what is missing.
+    the walk, as :func:`flat` does, the stations at which they begin, and which (L,) chords lead a set of the
+    elimination: the loops that the other chords close with the forest are what is missing.
     """
     n, n_loops = len(walk[0]) - 1, len(chords)
     chord = np.full(len(walk[1]) // 2, -1, dtype=np.int64)
@@ -150,34 +150,52 @@ def shortest_loops(
     bits, rows = np.zeros(words, dtype=np.int64), np.empty((n_loops, words), dtype=np.int64)
     sets = chord, bits, rows, np.zeros(n_loops, dtype=np.bool_)
     roots, work = np.array(meeting_stations(*walk[:2]), dtype=np.int64), np.zeros(1, dtype=np.int64)
-    found: list[list[int]] = []
-    start: list[int] = []
+    found, start, lengths = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], [0]
+    missing = n_loops
     for length in range(2, n + 1):
-        if len(found) == n_loops or work[0] >= budget:
+        if not missing or work[0] >= budget:
             break
-        loops = np.empty((n_loops - len(found), length), dtype=np.int64)
-        begin = np.empty(len(loops), dtype=np.int64)
+        loops, begin = np.empty((missing, length), dtype=np.int64), np.empty(missing, dtype=np.int64)
         more = horton_loops((*walk, depth, *room), sets, roots, budget, work, loops, begin)
-        found += loops[:more].tolist()
-        start += begin[:more].tolist()
-    return found, start, sets[-1]
+        found.append(loops[:more].ravel())
+        start.append(begin[:more])
+        lengths += [length] * more
+        missing -= more
+    return (np.cumsum(lengths), np.concatenate(found)), np.concatenate(start), sets[-1]
 
 
-def forest_loops(a: IntArray, b: IntArray, forest: Forest, chords: IntArray) -> list[list[int]]:
-    """The loop that each chord closes with the forest, from its station a: its pairs, the chord first."""
-    parent, by, depth = forest.parent.tolist(), forest.by.tolist(), forest.depth.tolist()
-    out = []
-    for c, v, w in zip(chords.tolist(), b[chords].tolist(), a[chords].tolist(), strict=True):
-        down, up = [c], []
-        while v != w:
-            if depth[v] >= depth[w]:
-                down.append(by[v])
-                v = parent[v]
-            else:
-                up.append(by[w])
-                w = parent[w]
-        out.append(down + up[::-1])
-    return out
+def forest_loops(a: IntArray, b: IntArray, forest: Forest, chords: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """The loop that each chord (L,) closes with the forest, from its station a: its pairs, the chord first.
+
+    Returns these as :func:`flat` does, and the stations (L,) where the ways back from both ends meet.
+    """
+    n, meet = np.ones(len(chords), dtype=np.int64), b[chords].copy()
+    for loops, _, _, stations in _ways_back(a, b, forest, chords):
+        n[loops] += 1
+        meet[loops] = stations
+    ptr = np.concatenate([[0], np.cumsum(n)])
+    out, first, last = np.empty(ptr[-1], dtype=np.int64), ptr[:-1] + 1, ptr[1:] - 1
+    out[ptr[:-1]] = chords
+    for loops, pairs, down, _ in _ways_back(a, b, forest, chords):
+        out[np.where(down, first[loops], last[loops])] = pairs
+        first[loops] += down
+        last[loops] -= ~down
+    return ptr, out, meet
+
+
+def _ways_back(a: IntArray, b: IntArray, forest: Forest, chords: IntArray) -> Iterator[tuple[IntArray, ...]]:
+    """The ways back from both ends of chords until they meet, step by step, always from the deeper end.
+
+    Of the chords still on their way: which, the pair that is walked, whether on the way from b, and where it leads.
+    """
+    loops, v, w = np.arange(len(chords)), b[chords], a[chords]
+    while (apart := v != w).any():
+        loops, v, w = loops[apart], v[apart], w[apart]
+        down = forest.depth[v] >= forest.depth[w]
+        here = np.where(down, v, w)
+        there = forest.parent[here]
+        yield loops, forest.by[here], down, there
+        v, w = np.where(down, there, v), np.where(down, w, there)
 
 
 def short_loops(

@@ -128,7 +128,7 @@ class _Average:
         if len(self.datum):
             t[self.datum] = network.station_translations[self.datum]
         a, b = self.a[:k], self.b[:k]
-        observed = np.einsum("nij,nj->ni", R[b], np.nan_to_num(network.translations[self.rows]))
+        observed = np.einsum("nij,nj->ni", R[b], network.arrays.shifts[self.rows])
         misfit = np.zeros((len(self.a), 6))
         misfit[:k, 3:] = self.shift[:k, None] * (t[a] - t[b] - observed)
         return np.where(self.fixed[:, None], t, self._solved(misfit)[:, 3:])

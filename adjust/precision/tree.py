@@ -5,6 +5,7 @@ subset of Takahashi, Fagan and Chen 1973; Golub and Plemmons 1980 for geodetic n
 lie together in one clique, so all redundancy numbers follow from it.
 """
 
+from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 
@@ -14,7 +15,15 @@ from scipy import sparse
 
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.elimination import PoseTree
-from adjust.native.trees import TreeArrays, covariance_rows, fill_block, invert_cliques, joint_blocks, solve_cliques
+from adjust.native.trees import (
+    TreeArrays,
+    clique_covariance,
+    covariance_rows,
+    fill_block,
+    invert_cliques,
+    joint_blocks,
+    solve_cliques,
+)  # fmt: skip
 from adjust.observations.images.reduction import Leaves
 
 _COLUMNS = 96
@@ -180,20 +189,33 @@ class TreeCovariance:
         out[n:, n:] = self._block(numbers[-1], numbers[-1])
         return np.asarray(0.5 * (out + out.T))
 
-    def _ancestors(self, cliques: set[int]) -> IntArray:
+    def _ancestors(self, cliques: set[int], top: int = -1) -> IntArray:
+        """These and all above them, but for those from ``top`` on, which is on the way of all."""
         found: set[int] = set()
         for start in cliques:
             c = start
-            while c >= 0 and c not in found:
+            while c > top and c not in found:
                 found.add(c)
                 c = int(self._parents[c])
         return np.array(sorted(found), dtype=np.int64)
 
-    def _gathered(self, cliques: IntArray) -> tuple[IntArray, int]:
-        """By how much (C,) the rows of each of these cliques move where only their own are kept, and how many are."""
+    @cached_property
+    def _key_of(self) -> IntArray:
+        """Key of every row in a stacked vector of all unknowns."""
+        return np.repeat(np.arange(len(self._dims)), self._dims)
+
+    def _gathered(self, cliques: IntArray, top: int) -> tuple[IntArray, int]:
+        """Row (K,) at which a key begins where only the own ones of these cliques are kept, and how many these are.
+
+        Those of ``top`` come after.
+        """
         shift, front = np.zeros(len(self._front), dtype=np.int64), self._front[cliques]
         shift[cliques] = np.cumsum(front) - front - self._first[self._keys[self._key_ptr[cliques]]]
-        return shift, int(front.sum())
+        first, n = self._first[:-1] + shift[self._home], int(front.sum())
+        if top >= 0:
+            keys = self._keys[self._key_ptr[top] : self._key_ptr[top + 1]]
+            first[keys] = n + np.cumsum(self._dims[keys]) - self._dims[keys]
+        return first, n
 
     def _solve(self, up: IntArray, down: IntArray, x: FloatArray) -> None:
         solve_cliques(self.arrays, up, down, self._first, self._data, x)
@@ -227,29 +249,57 @@ class TreeCovariance:
         return x
 
     def among(self, A: sparse.csr_array) -> FloatArray:
-        """A Q A' (m, m) of the rows of A (m, n), without forming Q: U'U with R'U = A', on the ways to the root only."""
-        home = np.repeat(self._home, self._dims)
-        of_row = np.maximum.reduceat(np.append(home[A.indices], 0), A.indptr[:-1]) if A.shape[0] else np.zeros(0)
+        """A Q A' (m, m) of the rows of A (m, n), without forming Q.
+
+        U'U with R'U = A', on the ways to the first clique that holds all that is left of A', and this with the joint
+        covariance of its keys; to the roots where there is none.
+        """
+        home, m = self._home[self._key_of], A.shape[0]
+        top = self._common(np.unique(self._key_of[A.indices]))
+        of_row = np.maximum.reduceat(np.append(home[A.indices], 0), A.indptr[:-1]) if m else np.zeros(0)
         order = np.argsort(of_row, kind="stable")  # neighbours in the tree side by side
-        A, out = A[order], np.zeros((A.shape[0],) * 2)
-        none, done = np.zeros(0, dtype=np.int64), list[tuple[IntArray, FloatArray]]()
-        for i in range(0, A.shape[0], _COLUMNS):
+        A, out = A[order], np.zeros((m, m))
+        Q = np.zeros((0, 0)) if top < 0 else clique_covariance(self.arrays, self._n_front, top)
+        none, done = np.zeros(0, dtype=np.int64), list[tuple[IntArray, FloatArray, FloatArray]]()
+        for i in range(0, m, _COLUMNS):
             mine = A[i : i + _COLUMNS]
-            up = self._ancestors(set(home[mine.indices].tolist()))
-            shift, n = self._gathered(up)
-            entries = mine.data, mine.indices + shift[home[mine.indices]], mine.indptr
-            U = np.ascontiguousarray(sparse.csr_array(entries, (mine.shape[0], n)).toarray().T)
-            solve_cliques(self.arrays, up, none, self._first[:-1] + shift[self._home], self._data, U)
-            out[i : i + _COLUMNS, i : i + _COLUMNS] = U.T @ U
+            up = self._ancestors(set(home[mine.indices].tolist()), top)
+            first, n = self._gathered(up, top)
+            entries = mine.data, (first - self._first[:-1])[self._key_of[mine.indices]] + mine.indices, mine.indptr
+            x = np.ascontiguousarray(sparse.csr_array(entries, (mine.shape[0], n + len(Q))).toarray().T)
+            solve_cliques(self.arrays, up, none, first, self._data, x)
+            U, left = x[:n], x[n:]
+            out[i : i + _COLUMNS, i : i + _COLUMNS] = U.T @ U + left.T @ (Q @ left)
+            if m <= _COLUMNS:
+                break
             way = np.zeros(len(self._front), dtype=np.bool_)
             way[up] = True
             rows = np.flatnonzero(way[home])
-            for k, (before, V) in enumerate(done):
+            for k, (before, V, held) in enumerate(done):
                 _, here, there = np.intersect1d(rows, before, assume_unique=True, return_indices=True)
-                out[i : i + _COLUMNS, k * _COLUMNS : (k + 1) * _COLUMNS] = U[here].T @ V[there]
-            done.append((rows, U))
+                out[i : i + _COLUMNS, k * _COLUMNS : (k + 1) * _COLUMNS] = U[here].T @ V[there] + left.T @ held
+            done.append((rows, U, Q @ left))
         back = np.argsort(order)
         return np.asarray((np.tril(out) + np.tril(out, -1).T)[np.ix_(back, back)])
+
+    def _common(self, keys: IntArray) -> int:
+        """The first clique, from the leaves up, that has all these keys, or those left of the cliques below; or -1."""
+        left: list[int] = sorted(set(self._home[keys].tolist()))
+        met, wanted = set[int](), set(keys.tolist())
+        while left:
+            c = left.pop()  # parents have lower numbers
+            inside = self._keys[self._key_ptr[c] : self._key_ptr[c + 1]].tolist()
+            if met.isdisjoint(left) and wanted.issubset(inside):
+                return c
+            wanted.difference_update(inside[: self._n_front[c]])
+            parent = int(self._parents[c])
+            if parent < 0:
+                return -1
+            met.add(parent)
+            at = bisect_left(left, parent)
+            if at == len(left) or left[at] != parent:
+                left.insert(at, parent)
+        return -1
 
     def full(self) -> FloatArray:
         """The whole covariance matrix (n, n) of all unknowns, rows as :meth:`places` says, parents before children.

@@ -1,14 +1,13 @@
 """Independent loops of a network, and their misclosures one by one (:mod:`adjust.pose_network.loops`)."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from adjust.model.survey import FloatArray, IntArray
-from adjust.pose_network.cycles import adjacency, breadth_first, forest_loops, shortest_loops
-from adjust.pose_network.loops import Loops, misclosures, walked
+from adjust.pose_network.cycles import adjacency, breadth_first, shortest_loops
+from adjust.pose_network.loops import Loops, misclosures, tree_loops, walked
 from adjust.pose_network.network import Topology
 from adjust.relay.network import MeasuredPairs
 from adjust.testing.criteria import sidak
@@ -59,30 +58,25 @@ def loop_basis(topology: Topology, kind: LoopKind = "shortest", budget: int = SE
     in_tree = np.zeros(topology.n_pairs, dtype=np.bool_)
     in_tree[forest.by[forest.by >= 0]] = True
     chords = np.flatnonzero(~in_tree)
-    first = topology.a_idx[chords]
-
-    def tree(kept: IntArray) -> list[list[int]]:  # these may be as long as the network is wide
-        return forest_loops(topology.a_idx, topology.b_idx, forest, kept)
-
     many = len(chords) > MAX_SHORTEST_LOOPS
     if kind == "tree" or not len(chords) or many:
+        found = tree_loops(topology.a_idx, topology.b_idx, forest, chords)
         too_many = f": more than {MAX_SHORTEST_LOOPS} loops are too many for the shortest ones"
-        note = too_many if many and kind != "tree" else ""
-        return _basis(topology, tree(chords), first, False, f"loops of a spanning tree{note}", chords)
-    loops, start, led = shortest_loops(walk, chords, budget)
-    if len(start) == len(chords):
-        return _basis(topology, loops, start, True, "shortest independent loops")
-    kept = np.flatnonzero(~led)
-    note = f"the {len(start)} shortest loops, and {len(kept)} of a spanning tree: the search used up its budget"
-    return _basis(topology, [*loops, *tree(chords[kept])], [*start, *first[kept].tolist()], False, note)
+        note = "loops of a spanning tree" + (too_many if many and kind != "tree" else "")
+        return _basis(topology, found, False, note, chords)
+    pairs, start, led = shortest_loops(walk, chords, budget)
+    found = walked(topology.a_idx, topology.b_idx, pairs, start)
+    if len(found) == len(chords):
+        return _basis(topology, found, True, "shortest independent loops")
+    rest = tree_loops(topology.a_idx, topology.b_idx, forest, chords[~led])  # as long as the network is wide, maybe
+    note = f"the {len(found)} shortest loops, and {len(rest)} of a spanning tree: the search used up its budget"
+    return _basis(topology, found.and_then(rest), False, note)
 
 
-def _basis(
-    topology: Topology, loops: Sequence[Sequence[int]], first: Sequence[int] | IntArray, minimal: bool, note: str,
-    chords: IntArray | None = None,
-) -> LoopBasis:  # fmt: skip
-    found = walked(topology.a_idx, topology.b_idx, loops, first)
-    return LoopBasis(found.ptr, found.pair_idx, found.sense, found.start_idx, topology, minimal, note, chords)
+def _basis(topology: Topology, found: Loops, minimal: bool, note: str, chords: IntArray | None = None) -> LoopBasis:
+    return LoopBasis(
+        found.ptr, found.pair_idx, found.sense, found.start_idx, topology, minimal, note, chords, tree=found.tree
+    )
 
 
 @dataclass(frozen=True, eq=False)

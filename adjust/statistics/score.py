@@ -37,13 +37,14 @@ class Score:
     seen: int
 
 
-def score(g: FloatArray, BB: FloatArray, taken: FloatArray) -> Score:
-    """Of ``g = B'e`` (k,), ``B'B`` (k, k) and what the unknowns take over of that, ``B'A Q A'B`` (k, k)."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(BB), 1e-300))
-    half, seen = pseudo_half(scale[:, None] * (BB - taken) * scale, _SEEN)
-    half = scale[:, None] * half
-    cov, along = half @ half.T, half.T @ g
-    return Score(-cov @ g, cov, float(along @ along), int(seen))
+def scores(g: FloatArray, BB: FloatArray, taken: FloatArray) -> list[Score]:
+    """Of ``g = B'e`` (s, k), ``B'B`` (s, k, k) and what the unknowns take over of that, ``B'A Q A'B`` (s, k, k)."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(BB, axis1=1, axis2=2), 1e-300))
+    half, seen = pseudo_half(scale[:, :, None] * (BB - taken) * scale[:, None], _SEEN)
+    half = scale[:, :, None] * half
+    cov, along = half @ np.swapaxes(half, 1, 2), np.einsum("sqk,sq->sk", half, g)
+    rows = zip(-np.einsum("skl,sl->sk", cov, g), cov, (along**2).sum(axis=1).tolist(), seen.tolist(), strict=True)
+    return [Score(*row) for row in rows]
 
 
 Part = tuple[IntArray, FloatArray]
@@ -151,7 +152,8 @@ class LinearScores:
         g, BB, taken = self._normals(parts[cuts[0] :], np.repeat(np.arange(len(cuts)), lengths))
         g, BB = (np.cumsum(x[::-1], axis=0)[::-1] for x in (g, BB))
         taken = np.cumsum(np.cumsum(taken[::-1, :, ::-1], axis=0), axis=2)[::-1, :, ::-1]
-        return {t: score(g[i], BB[i], taken[i, :, i]) for i, t in enumerate(cuts)}
+        every = np.arange(len(cuts))
+        return dict(zip(cuts, scores(g, BB, taken[every, :, every]), strict=True))
 
     def _summed(self, parts: Sequence[Part], weights: FloatArray) -> Score:
         """Of changes of all of them in these proportions."""
@@ -159,7 +161,7 @@ class LinearScores:
             return Score(np.zeros(0), np.zeros((0, 0)), 0.0, 0)
         weighted = [(rows, w * self._used[rows, None] * B) for w, (rows, B) in zip(weights, parts, strict=True)]
         g, BB, taken = self._normals(weighted, np.zeros(len(parts), dtype=np.int64))
-        return score(g[0], BB[0], taken[0, :, 0])
+        return scores(g, BB, taken[:, :, 0])[0]
 
     def _normals(self, parts: Sequence[Part], group: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Of s groups of parts, each a change of its own: B'e (s, k), B'B (s, k, k), B'A Q A'B (s, k, s, k).

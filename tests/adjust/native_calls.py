@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
+from scipy import sparse
 
 from adjust.adjustment import adjust
 from adjust.model.survey import PoseParameter
@@ -128,7 +129,9 @@ def _images() -> None:
     batch.rows(np.array([0]))
     batch.condensed_rows(np.array([0]), np.ones((1, len(batch.blocks[0].uv), 4)))
     batch.local_from_keys(np.array([0]))
-    solve_network(pose_networks.simulate(3, 2).network).pairs  # noqa: B018  # is computed when asked for
+    solved = solve_network(pose_networks.simulate(3, 2).network)
+    solved.pairs  # noqa: B018  # is computed when asked for
+    solved.precision.tree.among(sparse.csr_array(np.eye(solved.precision.tree.n)[:2]))
     loop_basis(topology([(a + b, a, b) for a, b in ("AB", "BC", "CA", "CD", "DA")]))
     survey, truth = head_on_table(1, n_cameras=2, n_table_epochs=3, n_free_epochs=2)
     graph, done = h.solved(survey, near(truth))  # nothing to reduce: every block is condensed for itself

@@ -12,11 +12,15 @@ from adjust.diagnosis.linear import Linear
 from adjust.diagnosis.units.conventions import MISREADINGS, Misreading, shrinking
 from adjust.graph.solver import SolveOptions
 from adjust.model.boards import deformation
-from adjust.model.survey import Survey
-from adjust.statistics.score import Part, Score, score
+from adjust.model.survey import FloatArray, Survey
+from adjust.statistics.score import Part, Score, scores
 from survey.simulate import stereo
 from tests.adjust import pose_networks
 from tests.adjust.test_pose_network import survey_of
+
+
+def one_score(g: FloatArray, BB: FloatArray, taken: FloatArray) -> Score:
+    return scores(g[None], BB[None], taken[None])[0]
 
 
 def bent(size: float) -> Survey:
@@ -54,7 +58,7 @@ def test_parts_of_a_course_are_rows_of_the_system(written_out: int, monkeypatch:
     whole = linear.of_parts(parts)
     B, some = np.concatenate([J for _, J in parts]), np.concatenate([at for at, _ in parts])
     AB = linear.A.toarray()[some].T @ B
-    dense = score(B.T @ linear.e[some], B.T @ B, AB.T @ linear.system.covariance @ AB)
+    dense = one_score(B.T @ linear.e[some], B.T @ B, AB.T @ linear.system.covariance @ AB)
     assert whole.seen == dense.seen
     assert whole.theta == pytest.approx(dense.theta, rel=1e-6)
     assert whole.drop == pytest.approx(dense.drop, rel=1e-6)
@@ -64,7 +68,7 @@ def direct(linear: Linear, parts: Sequence[Part]) -> Score:
     """Of a change of all these parts, with full matrices."""
     some, B = (np.concatenate(x) for x in zip(*parts, strict=True))
     AB = linear.A[some].T @ B
-    return score(B.T @ linear.e[some], B.T @ B, AB.T @ linear.system.normal.covariance(linear.system.datum) @ AB)
+    return one_score(B.T @ linear.e[some], B.T @ B, AB.T @ linear.system.normal.covariance(linear.system.datum) @ AB)
 
 
 @pytest.mark.parametrize("inner", [False, True])

@@ -7,7 +7,7 @@ rotation vector); GTSAM, SE-Sync and the authors of most published files mean th
 definite as a whole although its blocks of translation and of rotation are; ``block_diagonal`` reads these alone.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -31,7 +31,7 @@ class _Edge(NamedTuple):
 
     i: str
     j: str
-    row: FloatArray
+    row: list[float]
     line: int
 
 
@@ -53,7 +53,7 @@ def read_g2o_file(
     Raises SurveyError with file and line for what cannot be read, and for information matrices that are not positive
     definite.
     """
-    stations: dict[str, FloatArray] = {}
+    vertices: dict[str, tuple[list[float], int]] = {}
     edges: list[_Edge] = []
     fixed: list[str] = []
     with Path(path).open(encoding="utf-8-sig", errors="replace") as lines:
@@ -61,37 +61,46 @@ def read_g2o_file(
             words = line.split()
             if not words or words[0].startswith("#"):
                 continue
-            where = f"{path}, line {number}"
-            if words[0] == "VERTEX_SE3:QUAT":
-                stations[_id(words, where)] = _numbers(words[2:], 7, where)
-            elif words[0] == "EDGE_SE3:QUAT":
+            if words[0] == "EDGE_SE3:QUAT":
                 if len(words) < 3:
-                    raise SurveyError(f"{where}: an edge needs two vertices")
-                edges.append(_Edge(words[1], words[2], _numbers(words[3:], 28, where), number))
+                    raise SurveyError(f"{path}, line {number}: an edge needs two vertices")
+                edges.append(_Edge(words[1], words[2], _numbers(words[3:], 28, path, number), number))
+            elif words[0] == "VERTEX_SE3:QUAT":
+                if len(words) < 2:
+                    raise SurveyError(f"{path}, line {number}: a vertex needs an id")
+                vertices[words[1]] = _numbers(words[2:], 7, path, number), number
             elif words[0] == "FIX":
                 fixed += words[1:]
             else:
-                raise SurveyError(f"{where}: {words[0]!r} is not supported; VERTEX_SE3:QUAT, EDGE_SE3:QUAT and FIX are")
-    info, notes = _information(path, edges, information, block_diagonal)
-    return G2oFile(_network(path, stations, edges, fixed, info, use_vertices), notes)
+                known = "VERTEX_SE3:QUAT, EDGE_SE3:QUAT and FIX are"
+                raise SurveyError(f"{path}, line {number}: {words[0]!r} is not supported; {known}")
+    stations = dict(zip(vertices, _rows(vertices.values(), 7, path), strict=True))
+    rows = _rows([(edge.row, edge.line) for edge in edges], 28, path)
+    info, notes = _information(path, edges, rows[:, 7:], information, block_diagonal)
+    return G2oFile(_network(path, stations, edges, rows, fixed, info, use_vertices), notes)
 
 
-def _id(words: Sequence[str], where: str) -> str:
-    if len(words) < 2:
-        raise SurveyError(f"{where}: a vertex needs an id")
-    return words[1]
-
-
-def _numbers(words: Sequence[str], n: int, where: str) -> FloatArray:
+def _numbers(words: Sequence[str], n: int, path: Path, line: int) -> list[float]:
     try:
-        out = np.array(words, dtype=float)
+        out = [float(word) for word in words]
     except ValueError:
-        raise SurveyError(f"{where}: expected {n} numbers, found {' '.join(words)[:60]!r}") from None
-    if len(out) != n or not (np.abs(out) < 1e100).all():
-        raise SurveyError(f"{where}: expected {n} finite numbers, found {len(out)}")
-    if np.linalg.norm(out[3:7]) < 1e-9:
-        raise SurveyError(f"{where}: the quaternion is zero")
+        found = " ".join(words)[:60]
+        raise SurveyError(f"{path}, line {line}: expected {n} numbers, found {found!r}") from None
+    if len(out) != n:
+        raise SurveyError(f"{path}, line {line}: expected {n} finite numbers, found {len(out)}")
     return out
+
+
+def _rows(found: Collection[tuple[list[float], int]], n: int, path: Path) -> FloatArray:
+    """Numbers (k, n) of lines; raises for the first line that holds no pose."""
+    rows, lines = np.array([row for row, _ in found]).reshape(-1, n), [line for _, line in found]
+    for wrong, what in (
+        (~(np.abs(rows) < 1e100).all(axis=1), f"expected {n} finite numbers, found {n}"),
+        (np.linalg.norm(rows[:, 3:7], axis=1) < 1e-9, "the quaternion is zero"),
+    ):
+        if wrong.any():
+            raise SurveyError(f"{path}, line {lines[int(np.argmax(wrong))]}: {what}")
+    return rows
 
 
 def _poses(rows: FloatArray) -> FloatArray:
@@ -101,8 +110,8 @@ def _poses(rows: FloatArray) -> FloatArray:
 
 
 def _network(
-    path: Path, stations: dict[str, FloatArray], edges: list[_Edge], fixed: list[str], info: FloatArray,
-    use_vertices: bool,
+    path: Path, stations: dict[str, FloatArray], edges: list[_Edge], rows: FloatArray, fixed: list[str],
+    info: FloatArray, use_vertices: bool,
 ) -> PoseNetwork:  # fmt: skip
     ids = list(dict.fromkeys([*stations, *(x for e in edges for x in (e.i, e.j))]))
     index = {s: k for k, s in enumerate(ids)}
@@ -111,7 +120,7 @@ def _network(
         raise SurveyError(f"{path}: FIX {unknown} names a vertex that the file does not hold")
     given = dict(zip(stations, _poses(np.array(list(stations.values())).reshape(-1, 7)), strict=True))
     held = {index[s]: given[s] for s in fixed} or {0: given.get(ids[0], np.eye(4))}
-    poses = _poses(np.array([e.row for e in edges]))
+    poses = _poses(rows)
     return pose_network(
         ids, _edge_names(edges), [index[e.j] for e in edges], [index[e.i] for e in edges],
         poses[:, :3, :3], poses[:, :3, 3], np.asarray(np.linalg.inv(info), dtype=float), held=held,
@@ -120,13 +129,13 @@ def _network(
 
 
 def _information(
-    path: Path, edges: list[_Edge], information: Information, block_diagonal: bool
+    path: Path, edges: list[_Edge], upper: FloatArray, information: Information, block_diagonal: bool
 ) -> tuple[FloatArray, tuple[str, ...]]:
     """Information matrices (E, 6, 6), rotation first, in the tangent; what was dropped of them."""
     if not edges:
         raise SurveyError(f"{path}: no EDGE_SE3:QUAT in it")
     info = np.zeros((len(edges), 6, 6))
-    info[:, _UPPER[0], _UPPER[1]] = info[:, _UPPER[1], _UPPER[0]] = np.array([e.row[7:] for e in edges])
+    info[:, _UPPER[0], _UPPER[1]] = info[:, _UPPER[1], _UPPER[0]] = upper
     info = info[:, _SWAP][:, :, _SWAP]
     if information == "quaternion":  # the vector part of the quaternion is half the rotation vector
         info[:, :3] *= 0.5

@@ -5,6 +5,7 @@ What Arrow does not read as Python would (or not at all) is left to the readers 
 
 import csv
 import io
+import re
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -22,6 +23,7 @@ from survey.project.tables.reading import LARGEST_ROWS, Columns, Layout, TextCol
 LARGE = 2**20  # bytes of CSV, cells to write / 10: below, loading Arrow (30 ms) costs more than it saves
 _LARGEST_DECODED = 8 * 2**30  # bytes of the columns of a Parquet file
 _BLOCK, _ROWS = 4 * 2**20, 2**17  # bytes read, rows written at a time
+_PLAIN = re.compile(r"[\w.:/+-]+").fullmatch  # names that need no quotes in CSV
 _ALIKE = (1e-4, 1e9)  # between these Arrow writes doubles as Python does, but for whole numbers
 
 
@@ -138,6 +140,8 @@ def _dictionary(column: TextColumn) -> Any:
 
 
 def _quoted(name: str) -> str:
+    if _PLAIN(name):
+        return name
     out = io.StringIO(newline="")
     csv.writer(out, lineterminator="\n").writerow((name, ""))  # a row of one blank would be quoted
     return out.getvalue().removesuffix(",\n")

@@ -7,6 +7,7 @@ from gtsam import Pose3
 
 from adjust.model.observations import Coordinates, Distance, ImageBlock, Pair, TableReading, frame_text, position_text
 from adjust.model.survey import FloatArray, Survey
+from adjust.observations.pairs import pair_arrays
 from survey.folder.units import from_si
 from survey.project.declared.poses import quaternion_wxyz
 from survey.project.project import SpotBlock
@@ -80,23 +81,16 @@ def pair_columns(pairs: Sequence[Pair]) -> Columns:
     """One row per pair: quaternion, translation of poses, sigmas where they are independent, else the covariance."""
     sigma_names = (*SIGMA_COLUMNS["rotation"][3], *SIGMA_COLUMNS["translation"][1])
     names = (*QUATERNION, *TRANSLATION, *sigma_names, *COVARIANCE_COLUMNS)
-    rows = np.full((len(pairs), len(names)), np.nan)
-    for row, pair in zip(rows, pairs, strict=True):
-        is_pose = isinstance(pair.b_from_a, Pose3)
-        rotation = pair.b_from_a.rotation() if isinstance(pair.b_from_a, Pose3) else pair.b_from_a
-        row[:4] = quaternion_wxyz(rotation)
-        if isinstance(pair.b_from_a, Pose3):
-            row[4:7] = from_si(pair.b_from_a.translation(), "mm")
-        k = 6 if is_pose else 3
-        if np.count_nonzero(pair.cov) == k:
-            sigma = np.sqrt(np.diagonal(pair.cov))
-            row[7:10] = from_si(sigma[:3], "arcsec")
-            row[10 : 7 + k] = from_si(sigma[3:], "mm")
-        else:
-            full = np.full((6, 6), np.nan)
-            upper = np.triu_indices(k)
-            full[upper] = pair.cov[upper]
-            row[13:] = full.ravel()
+    measured, rows = pair_arrays(pairs), np.full((len(pairs), len(names)), np.nan)
+    rotations = (p.b_from_a.rotation() if isinstance(p.b_from_a, Pose3) else p.b_from_a for p in pairs)
+    rows[:, :4] = np.array([quaternion_wxyz(rotation) for rotation in rotations]).reshape(-1, 4)
+    rows[:, 4:7] = from_si(measured.translations, "mm")
+    alone = np.count_nonzero(measured.cov, axis=(1, 2)) == 6  # infinite where no translation was measured
+    cov = np.where(np.isinf(measured.cov), np.nan, measured.cov)
+    cov[:, :3, 3:][~measured.is_pose] = np.nan
+    sigma = np.sqrt(np.diagonal(cov[alone], axis1=1, axis2=2))
+    rows[alone, 7:13] = np.concatenate([from_si(sigma[:, :3], "arcsec"), from_si(sigma[:, 3:], "mm")], axis=1)
+    rows[~alone, 13:] = np.where(np.triu(np.ones((6, 6), dtype=np.bool_)), cov[~alone], np.nan).reshape(-1, 36)
     columns = {name: column for name, column in zip(names, rows.T, strict=True) if not np.isnan(column).all()}
     return {
         "pair_id": [pair.pair_id for pair in pairs],
