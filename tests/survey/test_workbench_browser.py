@@ -98,7 +98,7 @@ def test_a_wrong_point_is_found_left_out_and_taken_back(page: Page, folder: Path
     assert "left out by this adjustment" in p.inner_text("#inspector")
     assert p.locator('.row[aria-selected="true"]').inner_text().split()[:4] == ["X", "tX05", "board", "c40"]
     p.keyboard.press("x")
-    page.wait("document.querySelector('dialog p[aria-live]')?.textContent.includes('1 image point')")
+    page.wait("document.querySelector('dialog p[aria-live]')?.textContent.includes('1 image point in 1 image')")
     p.keyboard.type("reflection")
     page.done(lambda: p.keyboard.press("Enter"))
     assert "excluded 1" in page.facts()
@@ -374,7 +374,7 @@ def test_columns_as_the_page_reads_them(page: Page, folder: Path) -> None:
     data = columns(bench.rows, 4.0, 1)
     found = page.page.evaluate(
         """async (bytes) => { const { columns, withImages, pointId, rowsOfImage } = await import("./columns.js");
-        const data = withImages(columns(Uint8Array.from(bytes).buffer)); const k = 1234;
+        const data = withImages(await columns(new Response(Uint8Array.from(bytes)).body)); const k = 1234;
         return [data.n, pointId(data, k), data.u[k], data.images.length, [...rowsOfImage(data, "X/tX05")].length]; }""",
         list(data),
     )
