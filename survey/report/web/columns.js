@@ -10,27 +10,18 @@ const ARRAYS = { u1: Uint8Array, u2: Uint16Array, u4: Uint32Array, i4: Int32Arra
  */
 
 /**
- * Columns: the length of a header (u32), the header (JSON), then the arrays one after the other. Each is filled as its
- * bytes come, so that nowhere all of them are held twice, and one that is replaced keeps no other.
- * @param {ReadableStream<Uint8Array>} body
+ * Columns: the length of a header (u32), the header (JSON, padded to four bytes), then the arrays one after the other.
+ * @param {ArrayBuffer} buffer
  */
-export async function columns(body) {
-  const reader = body.getReader();
-  let rest = new Uint8Array();
-  const filled = async (bytes) => {
-    for (let at = 0; at < bytes.length;) {
-      if (!rest.length) { const { value, done } = await reader.read(); if (done) throw new Error("the answer ended before its last column"); rest = value; }
-      const part = rest.subarray(0, bytes.length - at);
-      bytes.set(part, at);
-      [at, rest] = [at + part.length, rest.subarray(part.length)];
-    }
-    return bytes;
-  };
-  const length = new DataView((await filled(new Uint8Array(4))).buffer).getUint32(0, true);
-  const out = JSON.parse(new TextDecoder().decode(await filled(new Uint8Array(length))));
-  for (const { name, type } of out.columns) {
-    out[name] = new ARRAYS[type](out.n);
-    await filled(new Uint8Array(out[name].buffer));
+export function columns(buffer) {
+  const length = new DataView(buffer).getUint32(0, true);
+  const out = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
+  let at = 4 + length;
+  for (const { name, type: kind } of out.columns) {
+    const type = ARRAYS[kind];
+    at = Math.ceil(at / type.BYTES_PER_ELEMENT) * type.BYTES_PER_ELEMENT;
+    out[name] = new type(buffer, at, out.n);
+    at += out[name].byteLength;
   }
   return out;
 }

@@ -42,7 +42,9 @@ export const post = async (path, body = {}) =>
  * @param {any} known the points of before, null for none @returns {Promise<import("./columns.js").Points>}
  */
 export async function points(known) {
-  const data = await columns((await ask(`/api/points${known ? `?layout=${known.layout}` : ""}`)).body);
+  const answer = await (await ask(`/api/points${known ? `?layout=${known.layout}` : ""}`)).arrayBuffer(), data = columns(answer);
+  for (const { name } of data.columns) data[name] = data[name].slice(); // what stays must not keep what goes
+  answer.transfer?.(0); // given back at once
   return data.whole ? withImages(data) : { ...known, ...data, rows: known.rows };
 }
 
