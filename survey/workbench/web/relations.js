@@ -39,6 +39,7 @@ export class CameraView extends Asked {
   }
 
   async more() {
+    if (!this.bench.state.solved) return;
     const { plots, said } = this, camera = this.camera(), size = this.bench.sizes[camera], path = `camera/${encodeURIComponent(camera)}`;
     const asked = this.distance ? `distance_m=${encodeURIComponent(this.distance)}` : "";
     try {
