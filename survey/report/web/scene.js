@@ -11,6 +11,12 @@ export const NAMES = { plan: "Plan", south: "Elevation from the south", east: "E
 const CIRCLE = Array.from({ length: 33 }, (_, k) => [Math.cos((k * Math.PI) / 16), Math.sin((k * Math.PI) / 16)]);
 const MOST = 1e5; // points drawn at once
 
+/** Between the signs above and the rulers below: how high (px), and its middle. @param {number} height */
+function room(height) {
+  const above = Math.min(26, 0.1 * height), free = height - above - Math.min(48, 0.2 * height);
+  return { free, cy: above + 0.5 * free };
+}
+
 export class SceneView {
   /** @param {any} bench `scene`: shots, spots, outlines, clouds, moves; `shifts` of points @param {string} mode scene, plan, south or east
    *  @param {boolean} [calm] in a page that scrolls: the bare wheel is the page's */
@@ -111,7 +117,7 @@ export class SceneView {
   }
 
   nearer(by, x = this.surface.canvas.clientWidth / 2, y = this.surface.canvas.clientHeight / 2) {
-    const zoom = Math.min(400, Math.max(0.1, this.zoom * by)), real = zoom / this.zoom, cx = this.surface.canvas.clientWidth / 2, cy = this.surface.canvas.clientHeight / 2;
+    const zoom = Math.min(400, Math.max(0.1, this.zoom * by)), real = zoom / this.zoom, cx = this.surface.canvas.clientWidth / 2, { cy } = room(this.surface.canvas.clientHeight);
     this.dx = x - cx - (x - cx - this.dx) * real;
     this.dy = y - cy - (y - cy - this.dy) * real;
     this.zoom = zoom;
@@ -122,9 +128,9 @@ export class SceneView {
 
   /** The function from the world (m) to the screen (px). */
   projection(width, height) {
-    const { middle, reach } = this, cx = width / 2 + this.dx, cy = height / 2 + this.dy;
+    const { middle, reach } = this, { free, cy: half } = room(height), cx = width / 2 + this.dx, cy = half + this.dy;
     if (this.mode !== "scene") {
-      const [a, b] = FLAT[this.mode], scale = 0.8 * this.zoom * Math.min(width / Math.max(1e-3, this.high[a] - this.low[a]), height / Math.max(1e-3, this.high[b] - this.low[b]));
+      const [a, b] = FLAT[this.mode], scale = this.zoom * Math.min((0.88 * width - 24) / Math.max(1e-3, this.high[a] - this.low[a]), (free - 12) / Math.max(1e-3, this.high[b] - this.low[b]));
       this.scale = scale;
       return (x) => [cx + scale * (x[a] - middle[a]), cy - scale * (x[b] - middle[b])];
     }
@@ -137,7 +143,7 @@ export class SceneView {
     const key = `${width}/${height}/${reach}`;
     if (this.fitted !== key) { // as large as everything is in sight; it stays while the scene is turned
       const [across, up] = this.places.map(ray).reduce((most, x) => [Math.max(most[0], Math.abs(x[0])), Math.max(most[1], Math.abs(x[1]))], [1e-9, 1e-9]);
-      [this.fitted, this.unit] = [key, Math.min((0.5 * width - 34) / across, (0.5 * height - 26) / up)];
+      [this.fitted, this.unit] = [key, Math.min((0.5 * width - 34) / across, (0.5 * free - 8) / up)];
     }
     const unit = this.unit * this.zoom;
     return (x) => { const [u, v] = ray(x); return [cx + unit * u, cy - unit * v]; };

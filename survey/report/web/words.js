@@ -42,17 +42,17 @@ export function significant(value, digits = 4) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   if (value === 0) return "0";
   const decimals = digits - 1 - Math.floor(Math.log10(Math.abs(value)));
-  if (decimals > 9) { const [size, power] = value.toExponential(digits - 1).split("e"); return `${number(Number(size), digits - 1)}e${power.replace("-", "−")}`; }
+  if (decimals > 12) { const [size, power] = value.toExponential(digits - 1).split("e"); return `${number(Number(size), digits - 1)}e${power.replace("-", "−")}`; }
   return number(value, Math.max(0, decimals));
 }
 
 /** A value with its unit, a dash alone for none. @param {number|null|undefined} value @param {string} [unit] */
 export const measure = (value, unit = "", digits = 7) => (Number.isFinite(value) ? `${significant(value, digits)} ${unit}`.trim() : "–");
 
-/** A value to the two digits that its sigma leaves it, in full where it has none. @param {{value: number, unit?: string, sigma: number|null, sigma_unit?: string}} of */
-export function estimated({ value, unit, sigma, sigma_unit: small }, digits = 7) {
+/** A value to two digits of its sigma, or as many as asked for; in full where it has none. @param {{value: number, unit?: string, sigma: number|null, sigma_unit?: string}} of */
+export function estimated({ value, unit, sigma, sigma_unit: small }, digits = 2) {
   const own = sigma / (unit === "deg" && small === "arcsec" ? 3600 : 1);
-  return own > 0 && (unit === small || unit === "deg") ? number(value, Math.min(12, Math.max(0, 1 - Math.floor(Math.log10(own))))) : significant(value, digits);
+  return own > 0 && (unit === small || unit === "deg") ? number(value, Math.min(12, Math.max(0, digits - 1 - Math.floor(Math.log10(own))))) : significant(value, 7);
 }
 
 /** A time as people read it. @param {string} iso */

@@ -2,7 +2,7 @@
 
 import { Asked } from "./asked.js";
 import { link, make, plainTable } from "./dom.js";
-import { count, number, significant, t } from "./words.js";
+import { count, estimated, number, significant, t } from "./words.js";
 import { anchor, current, names, select } from "./store.js";
 import { get } from "./source.js";
 import { gridOf, heat, residualField, scatter } from "./plots.js";
@@ -105,7 +105,7 @@ export class LoopsView extends Asked {
   async parts() {
     const found = (await get("loops")).loops, loops = found?.worst_first ?? [];
     if (!loops.length) return [make("p", { class: "quiet" }, t("No loops: the survey measures no pairs."))];
-    const closing = (loop, unit) => (loop[`misclosure_${unit}`] === undefined ? "–" : `${significant(loop[`misclosure_${unit}`], 3)} ± ${significant(loop[`sigma_misclosure_${unit}`], 2)}`);
+    const closing = (loop, unit) => (loop[`misclosure_${unit}`] === undefined ? "–" : `${estimated({ value: loop[`misclosure_${unit}`], sigma: loop[`sigma_misclosure_${unit}`] })} ± ${significant(loop[`sigma_misclosure_${unit}`], 2)}`);
     const rows = loops.map((loop) => [make("div", { class: "wide" }, make("span", { class: loop.closes ? "" : "bad" }, `${loop.closes ? "" : "■ "}${loop.stations.join(" → ")}`), make("div", {}, ...loop.pairs.flatMap((pair) => [link(anchor("reading", `pairs:${pair}`), pair, { class: "whole" }), " "]))), closing(loop, "arcsec"), closing(loop, "mm"), significant(loop.test, 3), significant(loop.p_value, 2)]);
     return [make("h2", {}, t("Loops"), " ", make("span", { class: "quiet" }, count(found.n_loops))), plainTable(t("Loops"), [`${t("loop")}, ${t("Pairs")}`, t("misclosure, arcsec"), t("misclosure, mm"), t("Test"), "p"], rows, [1, 2, 3, 4])];
   }
