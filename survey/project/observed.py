@@ -83,9 +83,10 @@ class Hits:
 
     def text(self) -> str:
         """The counts, for people."""
-        counts = ((len(self.images), "image"), (self.n_image_points, "image point"), (self.n_spots, "spot"),
-                  (self.n_readings, "reading"))  # fmt: skip
-        return ", ".join(f"{n} {what}{'s' * (n != 1)}" for n, what in counts if n) or "nothing"
+        counts = (self.n_readings, "reading"), (self.n_image_points, "image point"), (self.n_spots, "spot")
+        n_images = len(self.images)
+        where = f" in {n_images} image{'s' * (n_images != 1)}" if n_images else ""
+        return ", ".join(f"{n} {what}{'s' * (n != 1)}" for n, what in counts if n) + where or "nothing"
 
 
 class Observed:

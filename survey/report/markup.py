@@ -18,6 +18,7 @@ from survey.report.language import TURNING, esc, known, language, localised, t, 
 from survey.report.modules import looks
 
 MISSING = "–"
+_MOST_IN_FULL = 1e9  # a larger number of unknown size has a power of ten
 MINUS = "−"
 _HERE = Path(__file__).parent
 
@@ -87,8 +88,10 @@ def general(value: float | None, digits: int = 4) -> str:
     """A number of unknown size with its significant digits."""
     if value is None or not math.isfinite(value):
         return MISSING
-    # adding zero takes the sign off a negative one
-    return localised(f"{value + 0.0:.{digits}g}".replace("-", MINUS))
+    text = f"{value + 0.0:.{digits}g}"  # adding zero takes the sign off a negative one
+    if "e+" in text and abs(value) < _MOST_IN_FULL:
+        return fixed(float(text), 0)
+    return localised(text.replace("-", MINUS))
 
 
 def decimals_for(sigma: float | None, most: int = 7) -> int | None:

@@ -17,7 +17,14 @@ from survey.solution.anchors import ANCHORED, anchor, anchors_in
 from survey.solution.earlier.changes import snapshot
 from survey.solution.earlier.runs import list_runs
 from survey.solution.frames import AdjustedFrames
-from survey.solution.quantities import ARCSEC_PER_RAD, sigma_unit_for_people, sigmas_of, status_of, unit_for_people
+from survey.solution.quantities import (
+    ARCSEC_PER_RAD,
+    motion_columns,
+    sigma_unit_for_people,
+    sigmas_of,
+    status_of,
+    unit_for_people,
+)
 from survey.solution.verdict import suspects
 from survey.workbench.jobs import Jobs
 from survey.workbench.places import Places, refs_of
@@ -52,6 +59,7 @@ def state(bench: Jobs) -> dict[str, Any]:
         "warnings": [message(w) for w in _warnings(bench)],
         "failure": None if bench.failure is None or empty else message(str(bench.failure)),
         "empty": empty, "n_looked_at": len(now.everything.detected),
+        "n_pictures": len(now.everything.images),
         "exclusions": [{"name": str(e.name), "what": e.name.what, "id": e.name.id, "reason": e.reason,
                         "author": e.author, "time": e.time, "line": e.line} for e in now.exclusions.values()],
         "tree": _tree(bench),
@@ -121,20 +129,25 @@ def readings(bench: Jobs) -> dict[str, Any]:
 def parameters(bench: Jobs) -> dict[str, Any]:
     """Every component of every parameter: value, sigma and status in the units shown, as columns.
 
+    The turns of a pose are Euler angles (deg) with R = Rz Ry Rx, beside the sigma of a small turn about the same axis.
     A column of texts has each of them once: ``texts``, and by row their places, ``codes``.
     """
     out: dict[str, list[Any]] = {k: [] for k in ("name", "component", "value", "unit", "sigma", "sigma_unit", "status")}
+    poses = {name: e.value for name, e in bench.adjustment.estimates.items() if isinstance(e.value, Pose3)}
+    matrices = np.array([pose.matrix() for pose in poses.values()]).reshape(-1, 4, 4)
+    motions = motion_columns(matrices[:, :3, :3], matrices[:, :3, 3])
+    turned = dict(zip(poses, motions["rotation_euler_xyz_deg"].tolist(), strict=True))
     for name, e in bench.adjustment.estimates.items():
-        pose, sigmas = isinstance(e.value, Pose3), sigmas_of(e, bench.scale)
-        values = [*(3 * [None]), *np.asarray(e.value.translation()).tolist()] if isinstance(e.value, Pose3) \
-            else np.asarray(e.value, dtype=float).tolist()  # fmt: skip
+        sigmas, turns = sigmas_of(e, bench.scale), turned.get(name)
+        values = np.asarray(e.value.translation() if isinstance(e.value, Pose3) else e.value, dtype=float).tolist()
+        values = [*np.radians(turns or []).tolist(), *values]
         one = status_of(e)
         for k, component in enumerate(e.components):
             unit, factor = unit_for_people(component, e.units[k])
             sigma_unit, sigma_factor = sigma_unit_for_people(e.units[k], component)
             status = one if isinstance(one, str) else one[component]
-            row = ("/".join(name), component, None if values[k] is None else values[k] * factor,
-                   sigma_unit if pose else unit, sigmas[k] * sigma_factor, sigma_unit, status)  # fmt: skip
+            row = ("/".join(name), component, values[k] * factor, unit, sigmas[k] * sigma_factor,
+                   sigma_unit, status)  # fmt: skip
             for key, value in zip(out, row, strict=True):
                 out[key].append(value)
     columns = {k: values if k in ("value", "sigma") else _coded(values) for k, values in out.items()}

@@ -244,6 +244,14 @@ def test_digits(value: float, sigma: float | None, text: str, sigma_text: str) -
     assert markup.sigma_text(sigma) == sigma_text
 
 
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [(4583.2, 3, "4580"), (-151.2, 2, "−150"), (0.00012345, 2, "0.00012"), (12.0, 4, "12"), (2.5e12, 3, "2.5e+12")],
+)
+def test_numbers_of_unknown_size(value: float, digits: int, text: str) -> None:
+    assert markup.general(value, digits) == text
+
+
 def test_round_numbers_of_scale_bars() -> None:
     assert [drawing.round_below(x) for x in (1.0, 1.9, 2.0, 4.9, 5.0, 99.0, 0.03)] == pytest.approx(
         [1, 1, 2, 2, 5, 50, 0.02]

@@ -16,7 +16,7 @@ from survey.report.page import report_html
 from survey.report.sections import observations
 from survey.solution.anchors import anchor
 from survey.solution.dictionary import RunInfo
-from tests.browsing import CONTRAST, asked, need_browser
+from tests.browsing import CONTRAST, Page, asked, need_browser
 from tests.survey.accessible import FAULTS
 from tests.survey.adjustments import Lab, lab_adjustment
 
@@ -146,6 +146,18 @@ def test_pictures_use_colours_that_have_a_dark_counterpart(english: str) -> None
     used = set(re.findall(r'(?:fill|stroke)="(#[^"]+)"', english))
     assert {"#1c2733", "#2166ac"} <= used
     assert used <= set(DARK)
+
+
+def test_on_paper_stands_nothing_that_needs_a_hand(browser: Any, english: str, tmp_path: Path) -> None:
+    (tmp_path / "page.html").write_text(english, encoding="utf-8")
+    ready = "document.documentElement.classList.contains('ready')"
+    shown = Page(browser, (tmp_path / "page.html").as_uri(), 1280, ready)
+    displayed = """[...document.querySelectorAll("#all, #space, .screen, .paper")]
+      .map((e) => [e.id || e.className.split(" ").pop(), getComputedStyle(e).display])"""
+    assert {name for name, how in shown.page.evaluate(displayed) if how != "none"} >= {"all", "space", "screen"}
+    shown.page.emulate_media(media="print")
+    assert {name for name, how in shown.page.evaluate(displayed) if how != "none"} == {"paper"}
+    shown.context.close()
 
 
 def test_a_camera_is_one_page_of_paper(german: str, tmp_path: Path) -> None:

@@ -77,6 +77,18 @@ def test_a_decision_gives_what_the_command_line_gives(bench, mine):
     assert "motion blur" in exclusions(mine)[-1]
 
 
+def test_parameters_have_the_angles_of_the_results(bench):
+    columns = views.parameters(bench)["columns"]
+    texts = {k: [columns[k]["texts"][i] for i in columns[k]["codes"]] for k in ("name", "component", "unit")}
+    rows = list(zip(*texts.values(), columns["value"], strict=True))
+    wanted = views.statistics_part(bench, "solution")["solution"]["cameras"]["right"]["station_from_camera"]
+    found = [row[2:] for row in rows if row[0] == "station_from_camera/right"]
+    assert [unit for unit, _ in found] == [*(3 * ["deg"]), *(3 * ["mm"])]
+    expected = [*wanted["rotation_euler_xyz_deg"], *wanted["translation_mm"]]
+    assert [value for _, value in found] == pytest.approx(expected, rel=1e-12, abs=1e-12)
+    assert all(value is not None for value in columns["value"])
+
+
 def test_undone_is_as_before_and_redone_as_decided(bench, mine):
     first = bench.adjustment
     epoch = bench.situation.survey.image_blocks[0].epoch_id

@@ -145,7 +145,7 @@ def budget(c: Context) -> Markup:
     sources = list(dict.fromkeys(line.source for e in entries for line in e.lines))
     kinds = {line.source: line.kind for e in entries for line in e.lines}
     rows = [_budget_row(e, sources) for e in entries[:_MOST_ROWS]]
-    heads = [esc(f"{s} ({kinds[s]}) [%]") for s in sources]
+    heads = [esc(f"{group_name(s)} ({kinds[s]}) [%]") for s in sources]
     columns = ["<Result", "<", "u", "<Unit", *heads, "ν", "k", "U"]
     left_out = len(entries) - _MOST_ROWS
     more = " " + t("{n} more in solution.json.", n=count(left_out)) if left_out > 0 else Markup()

@@ -17,7 +17,7 @@ export class ImageView {
    */
   constructor(bench, picture, steady = false) {
     this.bench = bench;
-    this.picture = picture;
+    this.fetch = picture;
     this.steady = steady;
     this.image = "";
     this.enlarged = 200;
@@ -38,6 +38,9 @@ export class ImageView {
     this.listen(canvas);
     this.follow();
   }
+
+  /** What fetches a picture, where there are any. */
+  get picture() { return this.bench.pictured === false ? null : this.fetch; }
 
   listen(canvas) {
     canvas.addEventListener("wheel", (event) => {
@@ -108,13 +111,12 @@ export class ImageView {
     this.title.textContent = image.replace("/", " · ");
     this.film();
     this.note.textContent = "";
-    if (!this.picture) { this.surface.redraw(); return; }
     const started = performance.now();
     try {
-      const bitmap = await this.picture(image, 1600);
+      const bitmap = await this.picture?.(image, 1600);
       if (this.image !== image) return;
-      this.bitmap = bitmap;
-      this.size ??= [bitmap.width, bitmap.height];
+      this.bitmap = bitmap ?? null;
+      this.size ??= bitmap && [bitmap.width, bitmap.height];
       this.note.textContent = "";
     } catch (error) {
       if (this.image === image) this.note.textContent = t("No picture: {why}", { why: error.message });
@@ -126,7 +128,7 @@ export class ImageView {
   /** Pictures of the same camera, or those of the same moment; only what is in sight is fetched. */
   film() {
     const [camera, epoch] = this.image.split("/");
-    if (!this.picture || this.steady) return;
+    if (this.steady) return;
     const all = this.all.filter((name) => name.startsWith(`${camera}/`)), at = all.indexOf(this.image);
     const k = this.filmed?.indexOf(this.image) ?? -1, cut = (k < 6 && this.filmed?.[0] !== all[0]) || (k > FILM - 6 && this.filmed?.at(-1) !== all.at(-1));
     if (k < 0 || cut || this.filmedOf !== all.length) {

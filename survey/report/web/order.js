@@ -22,6 +22,7 @@ export function orderOf(values, up, size = false) {
   keys.sort();
   const out = new Uint32Array(n);
   for (let i = 0; i < n; i++) out[i] = keys[i] % INDEX;
+  keys.buffer.transfer?.(0); // given back at once: whoever sorts again and again does not wait for the sweep
   return out;
 }
 

@@ -2,10 +2,12 @@
 
 import { rowAt } from "./columns.js";
 import { colour, make, roundBelow, surface } from "./dom.js";
-import { count, significant, t } from "./words.js";
+import { count, number, significant, t } from "./words.js";
 
 /** From dark to bright, also for those who see no red or green (after viridis, eight stops). */
 const RAMP = [[68, 1, 84], [70, 50, 127], [54, 92, 141], [39, 127, 142], [31, 161, 135], [74, 194, 109], [159, 218, 58], [253, 231, 37]];
+
+const ARROW_EDGE = 20; // px about an image whose arrows may lead out of it
 
 /** @param {number} x 0 to 1 */
 export function ramp(x) {
@@ -14,9 +16,9 @@ export function ramp(x) {
 }
 
 /** The place of an image within a canvas: margins for the legend, same scale in both directions. */
-function frame(size, width, height, right = 70) {
-  const scale = Math.min((width - right - 16) / size[0], (height - 24) / size[1]);
-  return { scale, x: 8, y: 8, w: size[0] * scale, h: size[1] * scale };
+function frame(size, width, height, right, edge) {
+  const scale = Math.min((width - right - 2 * edge) / size[0], (height - 8 - 2 * edge) / size[1]);
+  return { scale, x: edge, y: edge, w: size[0] * scale, h: size[1] * scale };
 }
 
 function legend(context, box, low, high, unit) {
@@ -36,21 +38,22 @@ function legend(context, box, low, high, unit) {
  */
 export function heat(label, grid) {
   const known = grid.values.filter((x) => x !== null && Number.isFinite(x)), high = grid.high ?? Math.max(...known, 1e-300), low = grid.low ?? Math.min(...known, high);
+  const scaled = known.length > 0 && high > low;
   const longest = Math.max(...(grid.arrows ?? []).map((a) => Math.hypot(a[2], a[3])), 1e-300);
   const { canvas } = surface(label, (context, width, height) => {
-    const box = frame(grid.size, width, height, high > low ? 70 : 0), dx = box.w / grid.columns, dy = box.h / grid.rows;
+    const box = frame(grid.size, width, height, scaled ? 70 : 0, grid.arrows?.length ? ARROW_EDGE : 8), dx = box.w / grid.columns, dy = box.h / grid.rows;
     grid.values.forEach((value, k) => {
       context.fillStyle = value === null || !Number.isFinite(value) ? colour("sunk") : ramp(high > low ? (value - low) / (high - low) : 0.7);
       context.fillRect(box.x + (k % grid.columns) * dx, box.y + Math.floor(k / grid.columns) * dy, dx + 0.5, dy + 0.5);
     });
     if (grid.arrows) {
-      const grow = (1.6 * Math.min(dx, dy)) / longest;
+      const grow = Math.min(1.6 * Math.min(dx, dy), ARROW_EDGE + 0.5 * Math.min(dx, dy) - 4) / longest; // none leaves the picture
       for (const [u, v, du, dv] of grid.arrows) arrow(context, box.x + (u + 0.5) * box.scale, box.y + (v + 0.5) * box.scale, grow * du, grow * dv);
     }
     context.strokeStyle = colour("edge");
     context.lineWidth = 1;
     context.strokeRect(box.x, box.y, box.w, box.h);
-    if (high > low) legend(context, box, low, high, grid.unit);
+    if (scaled) legend(context, box, low, high, grid.unit);
   });
   const size = grid.counts ? count : (x) => significant(x, 3), arrows = grid.arrows?.length ? `; ${t("longest arrow {size} px", { size: significant(longest, 2) })}` : "";
   const said = grid.said ?? (known.length ? t("from {a} to {b} {unit}", { a: size(low), b: size(high), unit: grid.unit }) + arrows : t("no values"));
@@ -113,11 +116,11 @@ export function residualField(points, camera, size) {
   };
 }
 
-/** Round numbers within bounds, about five of them. @param {number} low @param {number} high */
+/** Round numbers within bounds, about five of them, each with its text. @param {number} low @param {number} high @returns {[number, string][]} */
 function rounds(low, high) {
-  if (!(high > low)) return [low];
-  const step = roundBelow((high - low) / 4), first = Math.ceil(low / step - 1e-9);
-  return Array.from({ length: Math.floor(high / step + 1e-9) - first + 1 }, (_, k) => (first + k) * step);
+  if (!(high > low)) return [[low, significant(low, 3)]];
+  const step = roundBelow((high - low) / 4), first = Math.ceil(low / step - 1e-9), digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
+  return Array.from({ length: Math.floor(high / step + 1e-9) - first + 1 }, (_, k) => [(first + k) * step, digits > 9 ? significant((first + k) * step, 3) : number((first + k) * step, digits)]);
 }
 
 /**
@@ -133,15 +136,15 @@ export function scatter(label, series, how) {
     const left = 52, bottom = 30, to = (x, y) => [left + ((x - x0) / Math.max(1e-300, x1 - x0)) * (width - left - 16), 8 + (0.5 - y / (2 * top)) * (height - bottom - 8)];
     context.font = "11px system-ui, sans-serif";
     context.lineWidth = 1;
-    for (const y of rounds(-top, top)) {
+    for (const [y, text] of rounds(-top, top)) {
       const [, v] = to(x0, y);
       context.strokeStyle = colour(y ? "rule" : "edge");
       context.beginPath(); context.moveTo(left, v); context.lineTo(width - 12, v); context.stroke();
       context.fillStyle = colour("quiet");
-      context.fillText(significant(y, 2), 2, v + 4);
+      context.fillText(text, 2, v + 4);
     }
     context.textAlign = "center";
-    for (const x of rounds(x0, x1)) context.fillText(significant(x, 3), to(x, 0)[0], height - 16);
+    for (const [x, text] of rounds(x0, x1)) context.fillText(text, to(x, 0)[0], height - 16);
     context.textAlign = "left";
     context.fillText(`${how.x}  →      ↑ ${how.y}`, left, height - 3);
     if (how.band) for (const y of [-how.band, how.band]) { const [, v] = to(x0, y); context.strokeStyle = colour("bad"); context.setLineDash([5, 4]); context.beginPath(); context.moveTo(left, v); context.lineTo(width - 12, v); context.stroke(); context.setLineDash([]); }
@@ -163,6 +166,6 @@ export function scatter(label, series, how) {
     const near = places.filter((p) => p[2]).map((p) => [Math.hypot(p[0] - event.offsetX, p[1] - event.offsetY), p[2]]).sort((a, b) => a[0] - b[0])[0];
     if (near && near[0] < 14) how.onpick?.(...near[1]);
   });
-  return figure(label, series.map((s, k) => `${k % 2 ? "■" : "●"} ${s.name} (${count(s.x.length)})`).join("   "), canvas);
+  return figure(label, [...series.map((s, k) => `${k % 2 ? "■" : "●"} ${s.name} (${count(s.x.length)})`), ...(how.band ? [`- - ${t("limit of {y}", { y: how.y })}`] : [])].join("   "), canvas);
 }
 

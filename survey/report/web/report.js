@@ -59,7 +59,7 @@ function everyObservation(found) {
     return ["obs", `image_point:${[...image, names(point, i)].join("/")}`];
   };
   const text = (column) => (i) => (column.values[i] === null ? "–" : String(column.values[i]).replace("-", "−").replace(".", words.decimal));
-  const columns = found.columns.map((c) => ({ ...c, wide: { Where: 9, Point: 5, Component: 5, Residual: 6, Group: 8, Kind: 7 }[c.key], ...(c.values ? { values: Float64Array.from(c.values, (x) => x ?? NaN), text: text(c) } : {}) }));
+  const columns = found.columns.map((c) => ({ ...c, wide: Math.max({ Where: 9, Point: 5, Residual: 6, Group: 8, Kind: 7 }[c.key] ?? 4.6, 0.5 * c.title.length + 1.2), ...(c.values ? { values: Float64Array.from(c.values, (x) => x ?? NaN), text: text(c) } : {}) }));
   columns.splice(3, 0, { key: "state", title: "", label: words.flags.filter(Boolean).join(", "), names: words.flags, codes: found.flags, wide: 7 });
   const rows = { n: found.rows, id: (i) => place(i)[1], state: (i) => ["", "suspect", "out"][found.flags[i]], columns };
   const table = new Table(t("All observations"), rows, { sort: "w", onselect: (chosen, quiet) => select(place(chosen[0])[0], [...new Set(chosen.map((i) => place(i)[1]))], quiet) });

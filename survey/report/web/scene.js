@@ -1,6 +1,6 @@
 // The survey in space: cameras, targets, points with their ellipsoids; in perspective, as a plan and as elevations.
 
-import { button, colour, make, roundBelow, ruler, surface } from "./dom.js";
+import { button, colour, fill, make, roundBelow, ruler, surface } from "./dom.js";
 import { number, significant, t } from "./words.js";
 import { current, names, select } from "./store.js";
 import { rowsOfPoint } from "./columns.js";
@@ -10,6 +10,12 @@ const FLAT = { plan: [0, 1], south: [0, 2], east: [1, 2] };
 export const NAMES = { plan: "Plan", south: "Elevation from the south", east: "Elevation from the east" };
 const CIRCLE = Array.from({ length: 33 }, (_, k) => [Math.cos((k * Math.PI) / 16), Math.sin((k * Math.PI) / 16)]);
 const MOST = 1e5; // points drawn at once
+
+/** Between the signs above and the rulers below: how high (px), and its middle. @param {number} height */
+function room(height) {
+  const above = Math.min(26, 0.1 * height), free = height - above - Math.min(48, 0.2 * height);
+  return { free, cy: above + 0.5 * free };
+}
 
 export class SceneView {
   /** @param {any} bench `scene`: shots, spots, outlines, clouds, moves; `shifts` of points @param {string} mode scene, plan, south or east
@@ -22,11 +28,12 @@ export class SceneView {
     this.surface = surface(t("The survey in space"), (context, width, height) => this.paint(context, width, height));
     this.note = make("p", { class: "note floating", "aria-live": "polite" });
     this.told = make("output", { class: "quiet" });
+    this.legend = make("p", { class: "legend" });
     this.element = make("div", { class: "view scene" },
       make("div", { class: "bar" }, this.told,
         button("−", () => this.enlarge(0.5), "-", { "aria-label": t("smaller ellipsoids") }), button("+", () => this.enlarge(2), "+", { "aria-label": t("larger ellipsoids") }),
         button("⤢", () => this.whole(), "0", { "aria-label": t("Whole") })),
-      make("div", { class: "stage" }, this.surface.canvas, this.note));
+      make("div", { class: "stage" }, this.surface.canvas, this.legend, this.note));
     this.listen(this.surface.canvas);
     this.measure();
   }
@@ -40,17 +47,33 @@ export class SceneView {
   /** Middle and size of everything. */
   measure() {
     const { scene } = this;
-    if (!scene) return;
+    if (!scene) { fill(this.legend, t("Known once the survey is adjusted.")); return; }
     const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
-    const places = [...scene.spots.map((spot) => spot.x), ...scene.shots.map((shot) => [shot.pose[3], shot.pose[7], shot.pose[11]]), ...scene.outlines.flatMap((line) => line.x)];
+    const places = [...this.ends(), ...scene.shots.map((shot) => [shot.pose[3], shot.pose[7], shot.pose[11]]), ...scene.outlines.flatMap((line) => line.x)];
     for (const x of places) for (let k = 0; k < 3; k++) { low[k] = Math.min(low[k], x[k]); high[k] = Math.max(high[k], x[k]); }
+    fill(this.legend, ...this.signs());
     this.low = low;
     this.places = places;
     this.high = high;
     this.middle = low.map((x, k) => (x + high[k]) / 2);
     this.reach = Math.max(1e-3, Math.hypot(...low.map((x, k) => high[k] - x)) / 2);
     const largest = Math.max(1e-12, ...scene.spots.map((spot) => Math.sqrt(Math.max(spot.cov[0][0], spot.cov[1][1], spot.cov[2][2]))));
-    if (this.factor === null) this.factor = 10 ** Math.round(Math.log10(0.08 * this.reach / largest));
+    if (this.factor !== null) return;
+    this.factor = this.first = 10 ** Math.round(Math.log10(0.08 * this.reach / largest));
+    this.measure(); // with the ellipsoids
+  }
+
+  /** Points and stations, and how far their ellipsoids reach along the axes as they are drawn first. */
+  ends() {
+    const reach = (spot, k) => this.first * this.region * Math.sqrt(Math.max(0, spot.cov[k][k]));
+    return this.scene.spots.flatMap((spot) => [spot.x, ...(this.first ? [-1, 1] : []).flatMap((sign) => [0, 1, 2].map((k) => spot.x.map((x, i) => x + (i === k ? sign * reach(spot, k) : 0))))]);
+  }
+
+  /** What is drawn how, of what there is. */
+  signs() {
+    const { scene } = this, kinds = new Set(scene.spots.map((spot) => spot.kind));
+    const found = [["point", "points", kinds.has("point")], ["station", "stations", kinds.has("station")], ["camera", "cameras", scene.shots.length], ["target", "targets", scene.outlines.length || scene.clouds?.length]];
+    return found.filter((one) => one[2]).map(([kind, name]) => make("span", {}, make("i", { class: `sign ${kind}` }), t(name)));
   }
 
   /** Everything in sight again. */
@@ -94,7 +117,7 @@ export class SceneView {
   }
 
   nearer(by, x = this.surface.canvas.clientWidth / 2, y = this.surface.canvas.clientHeight / 2) {
-    const zoom = Math.min(400, Math.max(0.1, this.zoom * by)), real = zoom / this.zoom, cx = this.surface.canvas.clientWidth / 2, cy = this.surface.canvas.clientHeight / 2;
+    const zoom = Math.min(400, Math.max(0.1, this.zoom * by)), real = zoom / this.zoom, cx = this.surface.canvas.clientWidth / 2, { cy } = room(this.surface.canvas.clientHeight);
     this.dx = x - cx - (x - cx - this.dx) * real;
     this.dy = y - cy - (y - cy - this.dy) * real;
     this.zoom = zoom;
@@ -105,9 +128,9 @@ export class SceneView {
 
   /** The function from the world (m) to the screen (px). */
   projection(width, height) {
-    const { middle, reach } = this, cx = width / 2 + this.dx, cy = height / 2 + this.dy;
+    const { middle, reach } = this, { free, cy: half } = room(height), cx = width / 2 + this.dx, cy = half + this.dy;
     if (this.mode !== "scene") {
-      const [a, b] = FLAT[this.mode], scale = 0.8 * this.zoom * Math.min(width / Math.max(1e-3, this.high[a] - this.low[a]), height / Math.max(1e-3, this.high[b] - this.low[b]));
+      const [a, b] = FLAT[this.mode], scale = this.zoom * Math.min((0.88 * width - 24) / Math.max(1e-3, this.high[a] - this.low[a]), (free - 12) / Math.max(1e-3, this.high[b] - this.low[b]));
       this.scale = scale;
       return (x) => [cx + scale * (x[a] - middle[a]), cy - scale * (x[b] - middle[b])];
     }
@@ -120,7 +143,7 @@ export class SceneView {
     const key = `${width}/${height}/${reach}`;
     if (this.fitted !== key) { // as large as everything is in sight; it stays while the scene is turned
       const [across, up] = this.places.map(ray).reduce((most, x) => [Math.max(most[0], Math.abs(x[0])), Math.max(most[1], Math.abs(x[1]))], [1e-9, 1e-9]);
-      [this.fitted, this.unit] = [key, Math.min((0.5 * width - 34) / across, (0.5 * height - 26) / up)];
+      [this.fitted, this.unit] = [key, Math.min((0.5 * width - 34) / across, (0.5 * free - 8) / up)];
     }
     const unit = this.unit * this.zoom;
     return (x) => { const [u, v] = ray(x); return [cx + unit * u, cy - unit * v]; };

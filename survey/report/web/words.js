@@ -22,6 +22,9 @@ export function t(text, values = {}) {
 /** A word that may be data: translated where the language has it. @param {string} text */
 export const known = (text) => texts[text] ?? text;
 
+/** A group of observations: those of a kind in words. @param {string} id */
+export const groupName = (id) => known(id.replaceAll("_", " "));
+
 const formats = new Map();
 /** A number with fixed decimals, a true minus, and a dash for none. @param {number|null|undefined} value @param {number} digits */
 export function number(value, digits = 3) {
@@ -39,15 +42,21 @@ export function significant(value, digits = 4) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   if (value === 0) return "0";
   const decimals = digits - 1 - Math.floor(Math.log10(Math.abs(value)));
-  if (decimals > 9) { const [size, power] = value.toExponential(digits - 1).split("e"); return `${number(Number(size), digits - 1)}e${power.replace("-", "−")}`; }
+  if (decimals > 12) { const [size, power] = value.toExponential(digits - 1).split("e"); return `${number(Number(size), digits - 1)}e${power.replace("-", "−")}`; }
   return number(value, Math.max(0, decimals));
 }
 
 /** A value with its unit, a dash alone for none. @param {number|null|undefined} value @param {string} [unit] */
 export const measure = (value, unit = "", digits = 7) => (Number.isFinite(value) ? `${significant(value, digits)} ${unit}`.trim() : "–");
 
+/** A value to two digits of its sigma, or as many as asked for; in full where it has none. @param {{value: number, unit?: string, sigma: number|null, sigma_unit?: string}} of */
+export function estimated({ value, unit, sigma, sigma_unit: small }, digits = 2) {
+  const own = sigma / (unit === "deg" && small === "arcsec" ? 3600 : 1);
+  return own > 0 && (unit === small || unit === "deg") ? number(value, Math.min(12, Math.max(0, digits - 1 - Math.floor(Math.log10(own))))) : significant(value, 7);
+}
+
 /** A time as people read it. @param {string} iso */
 export function time(iso) {
   const date = new Date(iso);
-  return Number.isNaN(date.getTime()) ? iso : date.toLocaleString(language, { dateStyle: "short", timeStyle: "short" });
+  return Number.isNaN(date.getTime()) ? iso : date.toLocaleString(language, { dateStyle: "medium", timeStyle: "short" });
 }

@@ -71,6 +71,7 @@ function renew(answer, anew = false) {
 /** New values, then every view with them: observations and what is wrong first. */
 async function shown(answer, anew) {
   const fresh = await load(answer, anew);
+  document.body.classList.toggle("beginning", Boolean(bench.beginning));
   if (bench.beginning) { drawBeginning(bench.beginning, actions); return; }
   drawAll(fresh);
   changedOutside(bench.state.changed_files ?? []);
@@ -117,7 +118,7 @@ function ahead(event) {
   const { image, id = "" } = event.target.closest?.("[data-image], [data-id]")?.dataset ?? {}, { what, ids } = names(id);
   const wanted = image ?? (what === "image_point" ? ids.slice(0, 2).join("/") : id);
   clearTimeout(pointed);
-  if (bench.points?.imageIdx.has(wanted) && page.image()) pointed = setTimeout(() => picture(wanted, 1600).catch(() => {}), 40);
+  if (bench.pictured && bench.points?.imageIdx.has(wanted) && page.image()) pointed = setTimeout(() => picture(wanted, 1600).catch(() => {}), 40);
 }
 
 function pressed(event) {

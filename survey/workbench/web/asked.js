@@ -16,6 +16,9 @@ export class Asked {
   /** The content. @returns {Promise<any[]>} */
   async parts() { return []; }
 
+  /** Whether nothing can be said without a solution. */
+  get needs() { return false; }
+
   /** What is added to it once it is shown. */
   async more() {}
 
@@ -26,7 +29,8 @@ export class Asked {
     this.element.setAttribute("aria-busy", "true");
     if (!this.element.childElementCount) this.element.replaceChildren(make("p", { class: "quiet" }, t("computing …")));
     let parts;
-    try { parts = await this.parts(); } catch (error) { parts = [make("p", { class: "warn" }, error.message)]; }
+    if (this.needs && !this.bench.state.solved) parts = [make("p", { class: "quiet" }, t("Known once the survey is adjusted."))];
+    else try { parts = await this.parts(); } catch (error) { parts = [make("p", { class: "warn" }, error.message)]; }
     if (this.key !== key) return;
     this.element.replaceChildren(...parts.flat().filter(Boolean));
     await this.more();

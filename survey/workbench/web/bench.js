@@ -4,7 +4,7 @@ import { get, points } from "./source.js";
 import { findingsOf, leftOut, parametersOf, readingsOf, sceneOf, shiftsOf, sizesOf, stateOf } from "./shapes.js";
 
 export const bench = {
-  state: null, points: null, limit: 1, readings: [], findings: {}, sizes: {}, images: [], leftOut: new Map(), // of the observations
+  state: null, pictured: true, points: null, limit: 1, readings: [], findings: {}, sizes: {}, images: [], leftOut: new Map(), // of the observations
   parameters: [], scene: null, shifts: new Map(), // of the solution
   beginning: null, // instead of them: the state of a folder that is no project yet
   told: {}, toldAt: 0, arrived: [], drawn: null, planned: null, // of the other jobs
@@ -23,7 +23,7 @@ export async function load(answer, anew = false) {
   const fresh = anew || !old || old.version !== state.version || old.folder !== state.folder || (state.failure ?? "") !== (old.failure ?? "");
   if (!fresh) { bench.state = { ...state, changes: old.changes }; return false; }
   const [columns, readings, findings] = await Promise.all([points(old?.folder === state.folder ? bench.points : null), get("readings"), get("findings")]);
-  Object.assign(bench, { state, points: columns, readings: readingsOf(readings), limit: readings.limit, findings: findingsOf(findings, raw), sizes: sizesOf(raw), images: raw.tree.cameras.flatMap((c) => c.images.map((epoch) => `${c.id}/${epoch}`)), leftOut: leftOut(columns) });
+  Object.assign(bench, { state, pictured: raw.n_pictures > 0, points: columns, readings: readingsOf(readings), limit: readings.limit, findings: findingsOf(findings, raw), sizes: sizesOf(raw), images: raw.tree.cameras.flatMap((c) => c.images.map((epoch) => `${c.id}/${epoch}`)), leftOut: leftOut(columns) });
   if (!state.solved) Object.assign(bench, { parameters: [], scene: null, shifts: new Map() });
   state.changes = answer?.changes ?? (state.solved ? (await get("changes")).changes : null);
   return true;

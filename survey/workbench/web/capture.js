@@ -28,9 +28,9 @@ export class CaptureView {
   }
 
   show(status) {
-    const { state, kind, share, epochs, left } = progress(status);
+    const { state, kind, share, epochs, left } = progress(status), idle = status.state === "not started" && !status.total;
     const said = JSON.stringify([state, epochs, left, status.message]);
-    if (said !== this.said) fill(this.head, make("output", { class: kind, "aria-live": "polite" }, state), make("progress", { max: 1, value: share, "aria-label": epochs }), make("span", {}, epochs + left), status.message ? make("p", { class: "warn" }, status.message) : null, status.state === "not started" && !status.total ? make("p", { class: "quiet" }, t("No capture session has written to this folder yet. labcapture run PLAN begins one; its images, their quality and what they cover appear here as they come.")) : null);
+    if (said !== this.said) fill(this.head, make("output", { class: kind, "aria-live": "polite" }, state), ...(idle ? [] : [make("progress", { max: 1, value: share, "aria-label": epochs }), make("span", {}, epochs + left)]), status.message ? make("p", { class: "warn" }, status.message) : null, idle ? make("p", { class: "quiet" }, t("No capture session has written to this folder yet. labcapture run PLAN begins one; its images, their quality and what they cover appear here as they come.")) : null);
     this.said = said;
     this.cameras.show(status);
   }

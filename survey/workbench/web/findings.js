@@ -1,7 +1,7 @@
 // What is wrong, worst first: verdict, warnings, suspects with their probable cause and what may be done about them.
 
 import { button, fill, link, make, plainTable } from "./dom.js";
-import { count, known, number, significant, t, time } from "./words.js";
+import { count, groupName, number, significant, t, time } from "./words.js";
 import { anchor, current, select } from "./store.js";
 import { rowOf, rowsOfImage } from "./columns.js";
 import { post } from "./source.js";
@@ -78,7 +78,7 @@ export class FindingsView {
 
   groups(rows) {
     return plainTable(t("Groups"), [t("group"), t("observations"), t("redundancy"), t("sigmas fit ×")],
-      rows.map((g) => [link(anchor("group", g.id), known(g.id)), count(g.n), number(g.redundancy, 1), number(g.scale, 3)]), [1, 2, 3]);
+      rows.map((g) => [link(anchor("group", g.id), groupName(g.id)), count(g.n), number(g.redundancy, 1), number(g.scale, 3)]), [1, 2, 3]);
   }
 
   exclusions(rows) {

@@ -1,7 +1,7 @@
 // What is known of the thing that is chosen, and what may be done with it.
 
 import { button, by, fill, link, make, plainTable } from "./dom.js";
-import { count, known, measure, number, significant, t } from "./words.js";
+import { count, estimated, groupName, known, measure, number, significant, t } from "./words.js";
 import { anchor, current, names } from "./store.js";
 import { pointId, pointName, rowOf, rowsOfImage, rowsOfPoint, rowsWhere } from "./columns.js";
 
@@ -70,7 +70,7 @@ function sums(data, rows) {
 function parameters(bench, ...starts) {
   const rows = bench.parameters.filter((p) => starts.some((start) => p.name === start || p.name.startsWith(`${start}/`)));
   if (!rows.length) return [];
-  return [make("h3", {}, t("Parameters")), plainTable(t("Parameters"), [t("parameter"), t("value"), t("sigma")], rows.slice(0, MOST).map((p) => [link(anchor("param", p.name), p.name.split("/").slice(2).join("/") || p.name), measure(p.value, p.unit), p.sigma === null ? known(p.treatment ?? "") || "–" : significant(p.sigma, 2)]), [1, 2])];
+  return [make("h3", {}, t("Parameters")), plainTable(t("Parameters"), [t("parameter"), t("value"), t("sigma")], rows.slice(0, MOST).map((p) => [link(anchor("param", p.name), p.name.split("/").slice(2).join("/") || p.name), `${estimated(p)} ${p.unit}`, p.sigma === null ? known(p.treatment ?? "") || "–" : measure(p.sigma, p.sigma_unit, 2)]), [1, 2])];
 }
 
 /** Every observation of one point, worst first. */
@@ -105,8 +105,8 @@ const ABOUT = {
   reading(bench, id) {
     const rows = bench.readings.filter((row) => row.id === id);
     if (!rows.length) return [make("p", { class: "warn" }, t("There is no such observation in this solution."))];
-    return [facts([[t("sort of reading"), known(rows[0].table.replaceAll("_", " "))], [t("group"), link(anchor("group", rows[0].group), known(rows[0].group))], [t("joins"), (rows[0].joins ?? []).join(", ") || undefined], [t("state"), t(WHY[rows[0].why ?? 0])]]),
-      ...rows.map((row) => facts([[row.component || t("component"), ""], [t("observed"), measure(row.observed, row.unit, 8)], [t("adjusted"), measure(row.adjusted, row.unit, 8)], [t("residual"), measure(row.residual, row.sigma_unit, 3)], [t("sigma"), measure(row.sigma, row.sigma_unit, 3)], ["w", number(row.w, 2)], [t("redundancy"), number(row.redundancy, 3)]]))];
+    return [facts([[t("sort of reading"), known(rows[0].table.replaceAll("_", " "))], [t("group"), link(anchor("group", rows[0].group), groupName(rows[0].group))], [t("joins"), (rows[0].joins ?? []).join(", ") || undefined], [t("state"), t(WHY[rows[0].why ?? 0])]]),
+      ...rows.map((row) => facts([[known(row.component) || t("component"), ""], [t("observed"), measure(row.observed, row.unit, 8)], [t("adjusted"), measure(row.adjusted, row.unit, 8)], [t("residual"), measure(row.residual, row.sigma_unit, 3)], [t("sigma"), measure(row.sigma, row.sigma_unit, 3)], ["w", number(row.w, 2)], [t("redundancy"), number(row.redundancy, 3)]]))];
   },
   param(bench, id, actions) {
     const row = bench.parameters.find((p) => p.name === id);

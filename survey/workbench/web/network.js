@@ -19,8 +19,8 @@ export class NetworkView extends SceneView {
     this.mode_ = make("select", { "aria-label": t("projection"), onchange: () => { this.mode = this.mode_.value; this.surface.redraw(); } },
       ...["plan", "south", "east", "scene"].map((mode) => make("option", { value: mode }, t(NAMES[mode] ?? "Scene"))));
     this.element.querySelector(".bar").prepend(this.mode_);
-    this.legend = make("p", { class: "legend quiet" });
-    this.element.querySelector(".stage").append(this.legend);
+    this.readings = make("p", { class: "readings quiet" });
+    this.element.querySelector(".bar").after(this.readings);
     this.load();
   }
 
@@ -30,6 +30,7 @@ export class NetworkView extends SceneView {
     const version = this.bench.state.version;
     if (this.version === version) return;
     this.version = version;
+    if (!this.bench.state.solved) return;
     this.element.setAttribute("aria-busy", "true");
     try { this.network = await get("network"); } catch (error) { this.note.textContent = error.message; }
     this.element.removeAttribute("aria-busy");
@@ -60,8 +61,9 @@ export class NetworkView extends SceneView {
       context.fill();
       context.fillText(setup.id, u + 8, v + 14);
     }
-    this.legend.textContent = t("{n} readings, {k} beyond the limit, {m} of no place", { n: count(lines.length + marks.length), k: count([...lines, ...marks].filter((r) => (r.share ?? 0) > 1).length), m: count(n_nowhere) });
-    this.surface.canvas.setAttribute("aria-label", `${t("Network of readings")}: ${this.legend.textContent}; ${setups.map((s) => `${s.id} (${s.instrument ?? ""}, ${s.n})`).join(", ")}`);
+    this.readings.textContent = [t("{n} readings, {k} beyond the limit", { n: count(lines.length + marks.length), k: count([...lines, ...marks].filter((r) => (r.share ?? 0) > 1).length) }), n_nowhere ? `, ${t("{m} of no place", { m: count(n_nowhere) })}` : "",
+      `. ${t("Lines are readings, circles those of one place: blue from half of the limit, heavy beyond it, dashed what takes no part.")}`].join("");
+    this.surface.canvas.setAttribute("aria-label", `${t("Network of readings")}: ${this.readings.textContent}; ${setups.map((s) => `${s.id} (${s.instrument ?? ""}, ${s.n})`).join(", ")}`);
   }
 
   /** The reading whose line is nearest; points and stations go before lines. */

@@ -2,7 +2,7 @@
 
 import { Asked } from "./asked.js";
 import { link, make, plainTable } from "./dom.js";
-import { count, number, significant, t } from "./words.js";
+import { count, estimated, number, significant, t } from "./words.js";
 import { anchor, current, names, select } from "./store.js";
 import { get } from "./source.js";
 import { gridOf, heat, residualField, scatter } from "./plots.js";
@@ -39,6 +39,7 @@ export class CameraView extends Asked {
   }
 
   async more() {
+    if (!this.bench.state.solved) return;
     const { plots, said } = this, camera = this.camera(), size = this.bench.sizes[camera], path = `camera/${encodeURIComponent(camera)}`;
     const asked = this.distance ? `distance_m=${encodeURIComponent(this.distance)}` : "";
     try {
@@ -56,6 +57,8 @@ export class CameraView extends Asked {
 
 /** The epochs in two halves, each adjusted by itself: lenses that differ by more than expected contradict their sigmas. */
 export class HalvesView extends Asked {
+  get needs() { return true; }
+
   question() { return this.distance ?? ""; }
 
   async follow() { await super.follow(); this.plot(); }
@@ -78,7 +81,7 @@ export class HalvesView extends Asked {
     if (!c || id === this.plotted) return;
     this.plotted = id;
     const size = this.bench.sizes[id], far = c.shift.map((x) => Math.hypot(...x)), sigma = c.sigma.map((x, k) => (c.covered[k] ? x : null)), high = Math.max(...far.filter((_, k) => c.covered[k]), ...sigma);
-    this.plots.replaceChildren(heat(`${id} (${c.n_images.join(" + ")}): ${t("difference of the halves, implied motion taken out")}: ${significant(c.rotation_deg, 2)}°, ${significant(c.translation_mm, 2)} mm`, { ...gridOf(size, c.uv, far.map((x, k) => (c.covered[k] ? x : null)), c.shift.map((x, k) => (c.covered[k] ? x : [NaN, NaN]))), high }),
+    this.plots.replaceChildren(heat(`${id} (${t("{n} images", { n: c.n_images.join(" + ") })}): ${t("difference of the halves, implied motion taken out")}: ${significant(c.rotation_deg, 2)}°, ${significant(c.translation_mm, 2)} mm`, { ...gridOf(size, c.uv, far.map((x, k) => (c.covered[k] ? x : null)), c.shift.map((x, k) => (c.covered[k] ? x : [NaN, NaN]))), high }),
       heat(`${id}: ${t("expected difference, one sigma")}`, { ...gridOf(size, c.uv, sigma), high }));
   }
 }
@@ -97,22 +100,26 @@ export class TableAnglesView extends Asked {
 }
 
 export class LoopsView extends Asked {
+  get needs() { return true; }
+
   async parts() {
     const found = (await get("loops")).loops, loops = found?.worst_first ?? [];
     if (!loops.length) return [make("p", { class: "quiet" }, t("No loops: the survey measures no pairs."))];
-    const closing = (loop, unit) => (loop[`misclosure_${unit}`] === undefined ? "–" : `${significant(loop[`misclosure_${unit}`], 3)} ± ${significant(loop[`sigma_misclosure_${unit}`], 2)}`);
+    const closing = (loop, unit) => (loop[`misclosure_${unit}`] === undefined ? "–" : `${estimated({ value: loop[`misclosure_${unit}`], sigma: loop[`sigma_misclosure_${unit}`] })} ± ${significant(loop[`sigma_misclosure_${unit}`], 2)}`);
     const rows = loops.map((loop) => [make("div", { class: "wide" }, make("span", { class: loop.closes ? "" : "bad" }, `${loop.closes ? "" : "■ "}${loop.stations.join(" → ")}`), make("div", {}, ...loop.pairs.flatMap((pair) => [link(anchor("reading", `pairs:${pair}`), pair, { class: "whole" }), " "]))), closing(loop, "arcsec"), closing(loop, "mm"), significant(loop.test, 3), significant(loop.p_value, 2)]);
     return [make("h2", {}, t("Loops"), " ", make("span", { class: "quiet" }, count(found.n_loops))), plainTable(t("Loops"), [`${t("loop")}, ${t("Pairs")}`, t("misclosure, arcsec"), t("misclosure, mm"), t("Test"), "p"], rows, [1, 2, 3, 4])];
   }
 }
 
 export class CorrelationsView extends Asked {
+  get needs() { return true; }
+
   async parts() {
     const [correlated, weak] = await Promise.all(["correlations", "weak"].map(async (part) => (await get(`statistics/${part}`))[part] ?? []));
     const name = (id) => link(anchor("param", id), id);
-    return [make("h2", {}, t("Correlations"), " ", make("span", { class: "quiet" }, count(correlated.length))),
+    return [make("h2", {}, t("Correlations"), " ", make("span", { class: "quiet" }, count(correlated.length))), make("p", { class: "quiet" }, t("Parameters correlated by more than 95 %, the most first.")),
       plainTable(t("Correlations"), [t("correlation"), t("parameter"), t("parameter")], correlated.slice(0, 300).map((c) => [number(c.correlation, 4), name(c.a), name(c.b)]), [0]),
-      make("h2", {}, t("Weak directions")),
+      make("h2", {}, t("Weak directions")), make("p", { class: "quiet" }, t("So many times weaker together than each alone, and what moves how far.")),
       ...weak.slice(0, 8).map((w) => make("p", {}, make("b", {}, `× ${significant(w.inflation, 3)}`), "  ", Object.entries(w.parts).slice(0, 6).map(([id, share]) => `${id} ${number(share, 3)}`).join("   ")))];
   }
 }

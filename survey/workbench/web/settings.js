@@ -1,7 +1,7 @@
 // What the survey rests on: its datum, the groups of sigmas, and what is held.
 
 import { button, fill, link, make, plainTable } from "./dom.js";
-import { count, known, measure, number, t } from "./words.js";
+import { count, groupName, measure, number, t } from "./words.js";
 import { anchor } from "./store.js";
 
 const MOST = 200;
@@ -42,6 +42,6 @@ export class SettingsView {
 
   groups(groups, state) {
     const field = (g) => { const input = make("input", { type: "number", min: "0", step: "any", value: "1", "aria-label": `${t("sigmas times")} ${g.id}` }); return make("span", {}, input, " ", button(t("Set"), () => this.actions.setting({ group: g.id, factor: Number(input.value) }), "", { "aria-label": `${t("Set")} ${g.id}` })); };
-    return plainTable(t("Groups"), [t("group"), t("observations"), t("sigmas fit ×"), t("sigmas times")], groups.map((g) => [known(g.id), count(g.n), number(g.scale, 3), state.read_only ? "" : field(g)]), [1, 2]);
+    return plainTable(t("Groups"), [t("group"), t("observations"), t("sigmas fit ×"), t("sigmas times")], groups.map((g) => [groupName(g.id), count(g.n), number(g.scale, 3), state.read_only ? "" : field(g)]), [1, 2]);
   }
 }

@@ -42,10 +42,10 @@ export const post = async (path, body = {}) =>
  * @param {any} known the points of before, null for none @returns {Promise<import("./columns.js").Points>}
  */
 export async function points(known) {
-  const data = columns(await (await ask(`/api/points${known ? `?layout=${known.layout}` : ""}`)).arrayBuffer());
-  if (!data.whole) return { ...known, ...data, rows: known.rows };
-  for (const { name } of data.columns) data[name] = data[name].slice(); // else what stays would keep the answer with what goes
-  return withImages(data);
+  const answer = await (await ask(`/api/points${known ? `?layout=${known.layout}` : ""}`)).arrayBuffer(), data = columns(answer);
+  for (const { name } of data.columns) data[name] = data[name].slice(); // what stays must not keep what goes
+  answer.transfer?.(0); // given back at once
+  return data.whole ? withImages(data) : { ...known, ...data, rows: known.rows };
 }
 
 const pictures = new Map(); // the last few only: a picture of 5 MP holds 20 MB

@@ -1,7 +1,7 @@
 // The tables below the views: image points, readings, parameters, what people excluded.
 
 import { by, make } from "./dom.js";
-import { known, measure, significant, t } from "./words.js";
+import { estimated, known, measure, significant, t } from "./words.js";
 import { current, names, select } from "./store.js";
 import { pointId, rowOf } from "./columns.js";
 import { Table, named, numbers } from "./table.js";
@@ -86,13 +86,13 @@ export class Tables {
   readings() {
     const rows = this.bench.readings;
     return { n: rows.length, id: (i) => rows[i].id, state: (i) => (rows[i].used ? (rows[i].share > 1 ? "suspect" : "") : "out"), kind: "reading", sort: "w",
-      columns: [named("table", t("sort of reading"), rows.map((r) => known(r.table.replaceAll("_", " ")))), named("name", t("reading"), rows.map((r) => r.name)), named("component", t("component"), rows.map((r) => r.component), { wide: 5 }),
-        { ...number4("observed", t("observed"), rows), wide: 7, text: (i) => measure(rows[i].observed, rows[i].unit, 6) }, { ...number4("residual", t("residual"), rows, true), wide: 6, text: (i) => measure(rows[i].residual, rows[i].sigma_unit, 3) }, numbers("w", "w", rows.map((r) => r.w), { digits: 2, size: true }), numbers("r", "r", rows.map((r) => r.redundancy), { digits: 3 }), numbers("used", t("used"), rows.map((r) => Number(r.used)), { wide: 3.6, text: (i) => (rows[i].used ? "✓" : "✕") })] };
+      columns: [named("table", t("sort of reading"), rows.map((r) => known(r.table.replaceAll("_", " ")))), named("name", t("reading"), rows.map((r) => r.name)), named("component", t("component"), rows.map((r) => known(r.component)), { wide: 5 }),
+        { ...number4("observed", t("observed"), rows), wide: 7, text: (i) => (Number.isFinite(rows[i].observed) ? `${estimated({ ...rows[i], value: rows[i].observed }, 3)} ${rows[i].unit}` : "–") }, { ...number4("residual", t("residual"), rows, true), wide: 6, text: (i) => measure(rows[i].residual, rows[i].sigma_unit, 3) }, numbers("w", "w", rows.map((r) => r.w), { digits: 2, size: true }), numbers("r", "r", rows.map((r) => r.redundancy), { digits: 3 }), numbers("used", t("used"), rows.map((r) => Number(r.used)), { wide: 3.6, text: (i) => (rows[i].used ? "✓" : "✕") })] };
   }
 
   parameters() {
     const rows = this.bench.parameters;
-    return { n: rows.length, id: (i) => rows[i].name, kind: "param", columns: [named("name", t("parameter"), rows.map((r) => r.name), { wide: 14 }), number4("value", t("value"), rows), named("unit", t("unit"), rows.map((r) => r.unit ?? "")), number4("sigma", t("sigma"), rows), named("unit of sigma", t("unit"), rows.map((r) => r.sigma_unit ?? "")), named("treatment", t("treatment"), rows.map((r) => known(r.treatment ?? "")))] };
+    return { n: rows.length, id: (i) => rows[i].name, kind: "param", columns: [named("name", t("parameter"), rows.map((r) => r.name), { wide: 14 }), { ...number4("value", t("value"), rows), wide: 7, text: (i) => estimated(rows[i]) }, named("unit", t("unit"), rows.map((r) => r.unit ?? "")), number4("sigma", t("sigma"), rows), named("unit of sigma", t("unit"), rows.map((r) => r.sigma_unit ?? "")), named("treatment", t("treatment"), rows.map((r) => known(r.treatment ?? "")))] };
   }
 
   exclusions() {
