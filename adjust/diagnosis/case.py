@@ -171,7 +171,7 @@ class Case:
     @cached_property
     def lenses(self) -> Mapping[str, FloatArray]:
         """The lens (n,) of each camera, from its own images alone; a camera without any is not there."""
-        return own_lenses(self.survey)
+        return own_lenses(self.survey, {} if self.result is None else values_of(self.result).lenses)
 
     def without_each(self, field_name: str) -> Iterator[tuple[str, Altered]]:
         """(id, start values of the survey without its images), where there are any; field_name: target_id, camera_id.

@@ -49,7 +49,7 @@ def _cut(case: Case, alone: Survey) -> int:
     errors = []
     for part in (blocks[:third], blocks[n - third :]):
         try:
-            lenses = own_lenses(replace(alone, image_blocks=part))
+            lenses = own_lenses(replace(alone, image_blocks=part), case.lenses)
         except SurveyError:
             return 0
         found = {v.block_idx: float(v.error_px[0]) for v in single_views(alone, lenses)}
