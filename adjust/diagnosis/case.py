@@ -241,6 +241,11 @@ class Case:
         return self.is_whole and self.linear is not None and not self.is_spoilt
 
     @property
+    def is_lost(self) -> bool:
+        """Whether its images leave no values, or such as are far from where they belong."""
+        return bool(self.survey.image_blocks) and (self.linear is None or self.is_spoilt)
+
+    @property
     def is_spoilt(self) -> bool:
         """Whether its values are far from where they belong, as far as there are any."""
         return self.linear is not None and self.linear.scale >= _FAR

@@ -18,7 +18,7 @@ _KEPT, _ONE = 1.5, 1.0  # adjustments for each of the later families, and for a 
 
 _SCORES = "effects"
 FAMILIES: tuple[tuple[str, ...], ...] = (
-    (_SCORES, "images", "names", "units", "time", "weights"),
+    (_SCORES, "images", "names", "units", "time", "weights", "bodies.lost"),
     ("targets",),
     ("bodies",),
 )

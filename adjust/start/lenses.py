@@ -78,7 +78,7 @@ def start_lens(
 
     Planar targets: Zhang's closed form, or the best of a scan of focal lengths, then lens and poses together on at most
     30 well-spread images. Raises SurveyError naming the camera where nothing determines its focal length.
-    near: values (n,) whose focal length and centre come first where the images miss little with them.
+    near: values (n,) whose focal length and centre are taken where no closed form misses little: nothing is scanned.
     """
     model = lens_model(camera.lens.model)
     if camera.lens.values is not None:
@@ -89,14 +89,14 @@ def start_lens(
         return _LensSearch(camera, model, lent).run(sightings, near)
     key = (camera.camera_id, camera.image_size, id(camera.lens), tuple(lent.items()),
            tuple((s.x.tobytes(), s.uv.tobytes()) for s in sightings))  # fmt: skip
-    before = known[key][1] if key in known else None
-    if before is None or (near is None and not isinstance(before, SurveyError) and not before.refined):
+    if key not in known or (known[key].near and near is None):
         alone = [replace(s, block_idx=i) for i, s in enumerate(sightings)]
         try:
-            known[key] = camera, _LensSearch(camera, model, lent).run(alone, near)
+            start: LensStart | SurveyError = _LensSearch(camera, model, lent).run(alone, near)
         except SurveyError as error:
-            known[key] = camera, error
-    found = known[key][1]
+            start = error
+        known[key] = _Known(camera, start, near is not None and isinstance(start, LensStart) and not start.refined)
+    found = known[key].start
     if isinstance(found, SurveyError):
         raise found
     return replace(found, values=found.values.copy(),
@@ -116,8 +116,16 @@ def remembering() -> Iterator[None]:
         _remembered.reset(token)
 
 
-_remembered: ContextVar[dict[object, tuple[Camera, "LensStart | SurveyError"]] | None]
-_remembered = ContextVar("remembered lenses", default=None)
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """near: whether the search ended at values that were known before, though these led nowhere."""
+
+    camera: Camera
+    start: LensStart | SurveyError
+    near: bool
+
+
+_remembered: ContextVar[dict[object, _Known] | None] = ContextVar("remembered lenses", default=None)
 
 
 def _check_given(camera: Camera, model: LensModel) -> None:
@@ -175,8 +183,7 @@ class _LensSearch:
         start, how = next(starts)
         found = self._refined(start, how, chosen)
         # a closed form that misses little may lead nowhere: few images that are hardly tilted fit any focal length
-        number = 1 if near is not None else _OTHER_STARTS if len(chosen) >= _SEVERAL else 0
-        others = itertools.islice(starts, number)
+        others = itertools.islice(starts, _OTHER_STARTS if len(chosen) >= _SEVERAL else 0)
         found = found or next((f for values, said in others if (f := self._refined(values, said, chosen))), None)
         unrefined = start, f"lens from {len(chosen)} images ({how}; too few to refine it)"
         return LensStart(*(found or unrefined), excluded, found is not None)
@@ -206,15 +213,10 @@ class _LensSearch:
     def _focal_lengths(
         self, maps: Sequence[FloatArray], chosen: Sequence[Sighting], near: FloatArray | None
     ) -> Iterator[tuple[FloatArray, str]]:
-        """Values to begin with and how they were found: near ones or a closed form that miss little, else the least."""
+        """Values to begin with and how they were found: a closed form, or near ones, that miss little, else the least."""
         trials: list[tuple[FloatArray, str]] = []
         errors: list[float] = []
         trial_images = _every(chosen, _SCAN_IMAGES)
-        if near is not None:
-            focal = focal_length_px(self.model, near, self.constants)
-            plain = self._values(focal, centre=principal_point_px(self.model, near, self.constants))
-            if self._error_px(plain, trial_images) < _GOOD_START * max(self.size):
-                yield plain, "known before"
         for variants in (("full",), ("centred", "square")) if maps and self.model.name != "fisheye" else ():
             try:
                 found = pinhole_from_homographies(np.array(maps), self.size, variants)
@@ -230,6 +232,10 @@ class _LensSearch:
             first = int(np.argmin(errors))
             yield trials.pop(first)
             del errors[first]
+        if near is not None:
+            focal = focal_length_px(self.model, near, self.constants)
+            yield self._values(focal, centre=principal_point_px(self.model, near, self.constants)), "known before"
+            return
         low, high = (0.15, 2.0) if self.model.name == "fisheye" else (0.35, 8.0)
         scanned = [self._values(factor * max(self.size)) for factor in np.geomspace(low, high, 16)]
         trials += [(values, "scan of focal lengths") for values in scanned]

@@ -25,7 +25,7 @@ def hypotheses(case: Case) -> Iterable[Hypothesis]:
 
 
 def _steps(case: Case) -> Iterator[Step]:
-    alone, found = list(lens_steps(case)), []  # of single cameras, which cost least
+    alone, found = [] if case.is_lost else list(lens_steps(case)), []  # else they were looked at before
     if case.result is not None:
         every = series_of(case, adjusted_values(case.result))
         found = [step for series in every if (step := step_of(series)) is not None]

@@ -34,16 +34,21 @@ def lens_steps(case: Case) -> Iterator[Step]:
         alone = single_camera_survey(case.survey, camera.camera_id)
         if case.views.keys() >= {*mine} and squares[mine].sum() < _limit(alone):
             continue  # as the search for its lens leaves them already
-        whole = _misfit(case, alone)
+        now = [float(case.views[i].error_px[0]) if i in case.views else np.inf for i in mine]
+        cut = _cut(case, alone, np.array(now))
+        whole = _misfit(case, alone) if cut else 0.0
         if whole < _limit(alone):
             continue
-        best, cost = _split(case, alone, _cut(case, alone))
+        best, cost = _split(case, alone, cut)
         if whole - cost > 0.5 * (whole - _limit(alone)):
             yield Step(("station_from_camera", camera.camera_id), mine[best], whole - cost, n - 2 * _LEAST + 1)
 
 
-def _cut(case: Case, alone: Survey) -> int:
-    """Before which image the lens of the last ones explains them better than that of the first ones does."""
+def _cut(case: Case, alone: Survey, now: FloatArray) -> int:
+    """Before which image the lens of the last ones explains them better than that of the first ones does.
+
+    Zero where these leave more than half of what one lens for all leaves beyond noise: now (n,) px, of each image.
+    """
     n, blocks = len(alone.image_blocks), alone.image_blocks
     third = max(_LEAST, n // 3)
     errors = []
@@ -56,9 +61,11 @@ def _cut(case: Case, alone: Survey) -> int:
         errors.append(np.array([found.get(i, np.inf) for i in range(n)]))
     first, last = errors
     typical = max(float(np.median(np.minimum(first, last))), 1e-3)
-    first, last = (np.minimum((e / typical) ** 2, _BOUND) for e in (first, last))
+    if not np.isfinite(typical):
+        return 0
+    first, last, now = (np.minimum((e / typical) ** 2, _BOUND) for e in (first, last, now))
     costs = np.concatenate([[0.0], np.cumsum(first)]) + np.concatenate([np.cumsum(last[::-1])[::-1], [0.0]])
-    return int(np.argmin(costs))
+    return int(np.argmin(costs)) if costs.min() - n < 0.5 * (now.sum() - n) else 0
 
 
 def _split(case: Case, alone: Survey, cut: int) -> tuple[int, float]:
@@ -73,16 +80,25 @@ def _split(case: Case, alone: Survey, cut: int) -> tuple[int, float]:
     middle = replace(alone, image_blocks=tuple(alone.image_blocks[i] for i in near))
     left, squares = 0.0, list[FloatArray]()
     for part in (alone.image_blocks[: near.start], alone.image_blocks[near.stop :]):
-        try:
-            some = replace(alone, image_blocks=part)
-            result = case.run(some)
-        except SurveyError:
+        omega, lens = _fitted(case, replace(alone, image_blocks=part))
+        if lens is None:
             return 0, np.inf
-        left += misfit_of(result, some).omega
-        squares.append(squares_alone(middle, {camera: np.asarray(result.estimates["lens", camera].value)}))
+        left += omega
+        squares.append(squares_alone(middle, {camera: lens}))
     first, last = squares
     costs = np.concatenate([[0.0], np.cumsum(first)]) + np.concatenate([np.cumsum(last[::-1])[::-1], [0.0]])
     return near.start + int(np.argmin(costs)), left + float(costs.min())
+
+
+def _fitted(case: Case, alone: Survey) -> tuple[float, FloatArray | None]:
+    """What the lens of some images leaves of them, and that lens: as it is started where they are too few for all of it."""
+    camera = alone.cameras[0].camera_id
+    try:
+        result = case.run(alone)
+        return misfit_of(result, alone).omega, np.asarray(result.estimates["lens", camera].value)
+    except SurveyError:
+        lenses = own_lenses(alone, case.lenses)
+        return float(squares_alone(alone, lenses).sum()), lenses.get(camera)
 
 
 def _misfit(case: Case, survey: Survey) -> float:
