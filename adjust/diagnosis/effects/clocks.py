@@ -15,10 +15,11 @@ from gtsam import Pose3, Rot3
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect, Shifts, of_others, of_shifts
 from adjust.diagnosis.hypothesis import Hypothesis, Place
-from adjust.diagnosis.late import Freed, as_unknowns
+from adjust.diagnosis.late import Freed, as_unknowns, keyed
 from adjust.diagnosis.linear import Linear
 from adjust.diagnosis.sequences import hand_poses
 from adjust.model.observations import ImageBlock, TableReading
+from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 from adjust.statistics.score import Score, drift_times
 
@@ -43,7 +44,7 @@ def clocks(case: Case) -> Iterator[Effect]:
 # -- cameras ---------------------------------------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=4)
 def _motion(survey: Survey) -> dict[int, tuple[int, int, FloatArray, FloatArray]]:
     """By block: its number in the course of its camera and target, their length, speed and acceleration (n, 2) px.
 
@@ -142,7 +143,32 @@ def _camera_effect(case: Case, linear: Linear, name: str, weight: Any, cameras: 
     remedy = ("hold still what moves, or take a camera with a global shutter" if name == "rolling shutter" else
               "trigger the cameras together, or hold the target still at every epoch, and measure again")  # fmt: skip
     hypothesis = Hypothesis(name, "", remedy, Place("camera", (worst,), "clock"), case.survey, (), 1.0, 0)
+    if name == "rolling shutter":
+        return _by_rows(case, keyed(case.survey, hypothesis, freed), cameras, first, text)
     return _modelled(case, hypothesis, freed, first, text)
+
+
+def _by_rows(case: Case, hypothesis: Hypothesis, cameras: Sequence[str], first: Score, text: str) -> Effect:
+    """What is read row by row, as its tracks have been at the middle of its rows: their times differ by so little.
+
+    With the line time as an unknown every row would be an observation of a moment of its own.
+    """
+    heights = {c.camera_id: c.image_size[1] for c in case.survey.cameras}
+
+    def mended(_: Adjustment, theta: FloatArray) -> Survey:
+        blocks = list(case.survey.image_blocks)
+        for i, (k, n, speed, bend) in _motion(case.survey).items():
+            camera = blocks[i].camera_id
+            if camera in cameras:
+                late = (theta[cameras.index(camera)] * _with_row(k, n, blocks[i], heights[camera]))[:, None]
+                blocks[i] = replace(blocks[i], uv=blocks[i].uv - late * speed + 0.5 * late**2 * bend)
+        return replace(case.survey, image_blocks=tuple(blocks))
+
+    def said(theta: FloatArray, sigmas: FloatArray) -> str:
+        lines = [f"camera {c}: {t:+.3g} +- {s:.2g}" for c, t, s in zip(cameras, theta, sigmas, strict=True)]
+        return f"{text} ({', '.join(lines)} intervals between epochs from the first row to the last)"
+
+    return Effect(hypothesis, first, lambda at: of_shifts(at, _late(at.result.survey, cameras, _with_row)), mended, said)
 
 
 def _modelled(case: Case, hypothesis: Hypothesis, freed: Freed, first: Score, text: str) -> Effect:
