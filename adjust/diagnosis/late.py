@@ -56,6 +56,12 @@ def interval(survey: Survey) -> float:
     return float(np.median(steps)) if len(steps) else 1.0
 
 
+def spoken(survey: Survey) -> tuple[float, str]:
+    """What a time between epochs is multiplied by for people, and its unit."""
+    timed = epoch_times(survey).unit != INTERVALS
+    return (1e3 * interval(survey), "ms") if timed else (1.0, "intervals between epochs")
+
+
 def edits(survey: Survey, freed: Freed, jitter: float = 0.0) -> tuple[Edit, ...]:
     """The keys of a project that make them so."""
     owners: dict[ParameterName, Clock | None] = {("camera_clock", c.camera_id): c.clock for c in survey.cameras}
