@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 CAP = 50.0
 """The most that one component of an observation counts: what is left out, or cannot be predicted, counts so."""
-MOST = 8.0
+MOST = 6.5
 """Adjustments that scores, starts and trials of a diagnosis may take; other evidence takes one or two more."""
 _LEFT_OUT = 4
 _FAR = 25.0
@@ -238,7 +238,7 @@ class Case:
     @property
     def is_near(self) -> bool:
         """Whether all observations take part in its adjustment, and leave its values near to where they belong."""
-        return self.is_whole and self.linear is not None and not self.is_spoilt
+        return self.linear is not None and not self.is_spoilt
 
     @property
     def is_lost(self) -> bool:

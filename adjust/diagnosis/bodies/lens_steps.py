@@ -19,21 +19,37 @@ _NEAR = 1
 _BOUND = 100.0  # of the misfit of an image, times that of the typical one
 
 
+def misfits(case: Case) -> dict[str, tuple[Survey, list[int]]]:
+    """The cameras that do not fit by themselves, as the search for their lenses leaves them: alone, and their images."""
+    squares, out = squares_of(case.survey, case.views.values()), {}
+    for camera in case.survey.cameras:
+        mine = [i for i, b in enumerate(case.survey.image_blocks)
+                if b.camera_id == camera.camera_id and b.target_id is not None]  # fmt: skip
+        if len(mine) >= 2 * _LEAST and camera.lens.free:
+            alone = single_camera_survey(case.survey, camera.camera_id)
+            if not case.views.keys() >= {*mine} or squares[mine].sum() > _limit(alone):
+                out[camera.camera_id] = alone, mine
+    return out
+
+
+def by_themselves(case: Case) -> bool:
+    """Whether cameras are looked at first: where the values of all are lost, and only some do not fit by themselves.
+
+    Where none of several does, it is what they see that is wrong.
+    """
+    if not case.is_lost:
+        return False
+    cameras = {b.camera_id for b in case.survey.image_blocks if b.target_id is not None}
+    return len(misfits(case)) < max(2, len(cameras))
+
+
 def lens_steps(case: Case) -> Iterator[Step]:
     """For every camera that does not even fit by itself: where two lenses explain its images best.
 
     The lens of its first images and that of its last ones tell which of the others are of either.
     """
-    squares = squares_of(case.survey, case.views.values())
-    for camera in case.survey.cameras:
-        mine = [i for i, b in enumerate(case.survey.image_blocks)
-                if b.camera_id == camera.camera_id and b.target_id is not None]  # fmt: skip
+    for camera_id, (alone, mine) in misfits(case).items():
         n = len(mine)
-        if n < 2 * _LEAST or not camera.lens.free:
-            continue
-        alone = single_camera_survey(case.survey, camera.camera_id)
-        if case.views.keys() >= {*mine} and squares[mine].sum() < _limit(alone):
-            continue  # as the search for its lens leaves them already
         now = [float(case.views[i].error_px[0]) if i in case.views else np.inf for i in mine]
         cut = _cut(case, alone, np.array(now))
         whole = _misfit(case, alone) if cut else 0.0
@@ -41,7 +57,7 @@ def lens_steps(case: Case) -> Iterator[Step]:
             continue
         best, cost = _split(case, alone, cut)
         if whole - cost > 0.5 * (whole - _limit(alone)):
-            yield Step(("station_from_camera", camera.camera_id), mine[best], whole - cost, n - 2 * _LEAST + 1)
+            yield Step(("station_from_camera", camera_id), mine[best], whole - cost, n - 2 * _LEAST + 1)
 
 
 def _cut(case: Case, alone: Survey, now: FloatArray) -> int:

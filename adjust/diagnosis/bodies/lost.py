@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from adjust.diagnosis.bodies.cameras import changed_camera
-from adjust.diagnosis.bodies.lens_steps import lens_steps
+from adjust.diagnosis.bodies.lens_steps import by_themselves, lens_steps
 from adjust.diagnosis.bodies.split import epochs_from
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
@@ -11,7 +11,7 @@ from adjust.diagnosis.hypothesis import Hypothesis
 
 def hypotheses(case: Case) -> Iterator[Hypothesis]:
     """Those whose images two lenses explain; none where scores at values that are near say what changed."""
-    if case.is_lost:
+    if by_themselves(case):
         for step in lens_steps(case):
             epochs = epochs_from(case.survey, "camera_id", step.name[1], step.first)
             if epochs:
