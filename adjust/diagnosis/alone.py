@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 from gtsam import Pose3
@@ -19,23 +20,26 @@ from adjust.start.lenses import Sighting, start_lens
 from adjust.start.views import View, Views, focal_px, joined, make_views, rays_by_block
 
 
-def own_lens(survey: Survey, camera: Camera) -> FloatArray:
-    """Start values (n,) of a lens from the camera's images of targets alone; SurveyError where they give none."""
+def own_lens(survey: Survey, camera: Camera, near: FloatArray | None = None) -> FloatArray:
+    """Start values (n,) of a lens from the camera's images of targets alone; SurveyError where they give none.
+
+    near: see :func:`adjust.start.lenses.start_lens`.
+    """
     points = {t.target_id: deformed(t) for t in survey.targets}
     mine = [
         (i, b) for i, b in enumerate(whole_images(survey).image_blocks)
         if b.camera_id == camera.camera_id and b.target_id is not None
     ]  # fmt: skip
     seen = [Sighting(i, points[str(b.target_id)][b.point_idx[b.mask]], b.uv[b.mask]) for i, b in mine]
-    return start_lens(camera, [s for s in seen if len(s.x)]).values
+    return start_lens(camera, [s for s in seen if len(s.x)], near=near).values
 
 
-def own_lenses(survey: Survey) -> dict[str, FloatArray]:
+def own_lenses(survey: Survey, near: Mapping[str, FloatArray] = MappingProxyType({})) -> dict[str, FloatArray]:
     """:func:`own_lens` of every camera whose images give one."""
     found = {}
     for camera in survey.cameras:
         try:
-            found[camera.camera_id] = own_lens(survey, camera)
+            found[camera.camera_id] = own_lens(survey, camera, near.get(camera.camera_id))
         except SurveyError:
             continue
     return found

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 CAP = 50.0
 """The most that one component of an observation counts: what is left out, or cannot be predicted, counts so."""
-MOST = 8.0
+MOST = 6.5
 """Adjustments that scores, starts and trials of a diagnosis may take; other evidence takes one or two more."""
 _LEFT_OUT = 4
 _FAR = 25.0
@@ -171,7 +171,7 @@ class Case:
     @cached_property
     def lenses(self) -> Mapping[str, FloatArray]:
         """The lens (n,) of each camera, from its own images alone; a camera without any is not there."""
-        return own_lenses(self.survey)
+        return own_lenses(self.survey, {} if self.result is None else values_of(self.result).lenses)
 
     def without_each(self, field_name: str) -> Iterator[tuple[str, Altered]]:
         """(id, start values of the survey without its images), where there are any; field_name: target_id, camera_id.
@@ -238,7 +238,12 @@ class Case:
     @property
     def is_near(self) -> bool:
         """Whether all observations take part in its adjustment, and leave its values near to where they belong."""
-        return self.is_whole and self.linear is not None and not self.is_spoilt
+        return self.linear is not None and not self.is_spoilt
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether its images leave no values, or such as are far from where they belong."""
+        return bool(self.survey.image_blocks) and (self.linear is None or self.is_spoilt)
 
     @property
     def is_spoilt(self) -> bool:

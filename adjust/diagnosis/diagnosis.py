@@ -14,11 +14,12 @@ from adjust.model.errors import SurveyError
 from adjust.start.lenses import remembering
 
 _SHOWN = 3
-_KEPT, _ONE = 1.5, 1.0  # adjustments for each of the later families, and for a trial of what they find
+_KEPT, _ONE = 1.0, 1.0  # adjustments for each of the later families, and for a trial of what they find
+_AGAIN = 0.2  # share of what was given that is given once more where nothing explains enough, and something waits
 
 _SCORES = "effects"
 FAMILIES: tuple[tuple[str, ...], ...] = (
-    (_SCORES, "images", "names", "units", "time", "weights"),
+    (_SCORES, "images", "names", "units", "time", "weights", "bodies.lost"),
     ("targets",),
     ("bodies",),
 )
@@ -88,8 +89,8 @@ def _diagnosed(case: Case, families: Sequence[Family] | None) -> Diagnosis:
     looked_at, cut = 0, list[Family]()
     stages = _all_families(case) if families is None else [families]
     for later, rooms in zip(reversed(range(len(stages))), stages, strict=True):
-        kept = _KEPT * later * bool(case.survey.image_blocks)
-        case.budget.kept = kept + _ONE
+        kept = (_KEPT * later + _ONE) * bool(later and case.survey.image_blocks)
+        case.budget.kept = kept + _ONE * (not kept)
         formed = list[Hypothesis]()
         for family in () if search.done() else rooms:
             case.budget.refused = False
@@ -100,10 +101,12 @@ def _diagnosed(case: Case, families: Sequence[Family] | None) -> Diagnosis:
     found = ranked(search.base, search.told, looked_at)
     again = not found and (search.promising or cut)
     if again or (found and search.refines(found[0].hypothesis)):
-        case.budget.left, case.budget.kept = max(case.budget.left, 0.0) + given, _ONE
-        formed = [h for family in cut if again for h in _formed(family, case) if search.is_new(h)]
-        looked_at += sum(h.looked_at for h in formed)
-        search.over(formed, 0.0)
+        case.budget.left, case.budget.kept = max(case.budget.left, 0.0) + _AGAIN * given, 0.0
+        search.over([], 0.0)
+        for family in cut if again else ():
+            formed = [h for h in _formed(family, case) if search.is_new(h)]
+            looked_at += sum(h.looked_at for h in formed)
+            search.over(formed, 0.0)
         found = ranked(search.base, search.told, looked_at)
     return Diagnosis(found, tuple(dict.fromkeys(search.names)), search.base, search.untried, tuple(case.passed_over))
 

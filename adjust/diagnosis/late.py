@@ -56,6 +56,12 @@ def interval(survey: Survey) -> float:
     return float(np.median(steps)) if len(steps) else 1.0
 
 
+def spoken(survey: Survey) -> tuple[float, str]:
+    """What a time between epochs is multiplied by for people, and its unit."""
+    timed = epoch_times(survey).unit != INTERVALS
+    return (1e3 * interval(survey), "ms") if timed else (1.0, "intervals between epochs")
+
+
 def edits(survey: Survey, freed: Freed, jitter: float = 0.0) -> tuple[Edit, ...]:
     """The keys of a project that make them so."""
     owners: dict[ParameterName, Clock | None] = {("camera_clock", c.camera_id): c.clock for c in survey.cameras}
@@ -102,15 +108,19 @@ def as_unknowns(
     noted: is told of every trial whether it takes most of the misfit away.
     """
     survey = with_clocks(case.survey, freed, jitter)
-    keys = ", ".join(dict.fromkeys(f"{e.path[-1]} = {_toml(e.value)}" for e in edits(case.survey, freed, jitter)
-                                   if isinstance(e, SetKey)))  # fmt: skip
-    owners = ", ".join(map(clock_text, freed))
     return replace(
-        of, survey=survey if survey is not None else lambda: None, edits=edits(case.survey, freed, jitter),
-        change=f"{of.change}; or let the adjustment find it: clock = {{ {keys} }} of {owners}",
+        keyed(case.survey, of, freed, jitter), survey=survey if survey is not None else lambda: None,
         parameters=sum(map(len, freed.values())) + _n_own(survey, freed, jitter),
         follow=_told(case, of, freed, jitter, survey, noted),
     )  # fmt: skip
+
+
+def keyed(survey: Survey, of: Hypothesis, freed: Freed, jitter: float = 0.0) -> Hypothesis:
+    """A hypothesis with the keys of a project that make these clocks unknown for its edits, and in its change."""
+    new = edits(survey, freed, jitter)
+    keys = ", ".join(dict.fromkeys(f"{e.path[-1]} = {_toml(e.value)}" for e in new if isinstance(e, SetKey)))
+    owners = ", ".join(map(clock_text, freed))
+    return replace(of, edits=new, change=f"{of.change}; or let the adjustment find it: clock = {{ {keys} }} of {owners}")
 
 
 def _n_own(survey: Survey | None, freed: Freed, jitter: float) -> int:

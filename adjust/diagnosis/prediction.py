@@ -173,7 +173,7 @@ class Prediction:
         """(4, 4) of a link; None where there is no value of it."""
         if name not in self._poses:
             value = self.values.get(name)
-            moved = self._table_motion(name) if name[0] == "table_motion" else None
+            moved = self._table_motions.get(name) if name[0] == "table_motion" else None
             self._poses[name] = value.matrix() if isinstance(value, Pose3) else moved
         return self._poses[name]
 
@@ -222,18 +222,20 @@ class Prediction:
         return {c.camera_id: c.station_id for c in self.survey.cameras}
 
     @cached_property
-    def _readings(self) -> dict[tuple[str, str], FloatArray]:
-        return {(r.table_id, r.epoch_id): r.angles for r in self.survey.table_readings}
-
-    def _table_motion(self, name: ParameterName) -> FloatArray | None:
-        geometry = self.values.get(("table_geometry", name[1]))
-        said = self.values.get(("table_angles", name[1], name[2]), self._readings.get((name[1], name[2])))
-        if geometry is None or said is None or isinstance(geometry, Pose3) or isinstance(said, Pose3):
-            return None
-        table = next(t for t in self.survey.tables if t.table_id == name[1])
-        g = dict(zip(table.geometry.names, np.asarray(geometry), strict=True))
-        R, t, _ = table_motions(table.axes, g, np.asarray(said, float)[None])
-        return rigid(R[0], t[0])
+    def _table_motions(self) -> dict[ParameterName, FloatArray]:
+        """(4, 4) of every table at every epoch at which its angles are known."""
+        out: dict[ParameterName, FloatArray] = {}
+        for table in self.survey.tables:
+            mine, geometry = [], self.values.get(("table_geometry", table.table_id))
+            for r in self.survey.table_readings if geometry is not None and not isinstance(geometry, Pose3) else ():
+                angles = self.values.get(("table_angles", r.table_id, r.epoch_id), r.angles)
+                if r.table_id == table.table_id and not isinstance(angles, Pose3):
+                    mine.append((("table_motion", r.table_id, r.epoch_id), np.asarray(angles, float)))
+            if mine:
+                g = dict(zip(table.geometry.names, np.asarray(geometry), strict=True))
+                R, t, _ = table_motions(table.axes, g, np.array([angles for _, angles in mine]))
+                out.update(zip([name for name, _ in mine], rigid(R, t), strict=True))
+        return out
 
     def _moved_body(self, block: ImageBlock, pose: FloatArray, altered: Altered) -> FloatArray:
         station = altered.get(("station_body", self._stations[block.camera_id]))

@@ -33,7 +33,8 @@ class Search:
         the last.
         """
         waiting, astray = self.queue if kept else [], list[Trial]()
-        self.queue = _in_turn([*formed] if kept else [*self.queue, *formed], self.case.is_spoilt)
+        queue = [*formed] if kept else [*self.queue, *formed]
+        self.queue = _in_turn(queue, any(h.scored for h in queue) and self.case.is_spoilt)
         self.case.budget.kept = kept
         while self.queue and self.case.budget.lasts:
             before, trial = self.case.budget.kept, tried(self.queue.pop(0), self.case)

@@ -95,21 +95,28 @@ def tried(hypothesis: Hypothesis, case: Case) -> Trial:
     if survey is None:
         return Trial(hypothesis, misfit_of(None, case.survey), None, None, case.budget.refused)
     cut, case.budget.refused = case.budget.refused, False
-    trial = _adjusted(hypothesis, survey, case, case.run if case.starts_afresh else case.warm)
+    trial = _adjusted(hypothesis, survey, case, case.run if _afresh_first(hypothesis, case) else case.warm)
     return replace(trial, untimely=trial.untimely or (cut and not trial.misfit.is_noise()))
+
+
+def _afresh_first(hypothesis: Hypothesis, case: Case) -> bool:
+    """Where there are no values, or a start costs less than finding out that they are far off."""
+    far = case.is_spoilt and not case.survey.image_blocks and not hypothesis.of_variances
+    return case.starts_afresh or (far and not hypothesis.scored)
 
 
 def tried_afresh(trial: Trial, case: Case, base: Misfit) -> Trial | None:
     """The same from its own start, where the values of the case led away or may be spoilt by what it does not explain.
 
-    None where that is no better, and of what is scored at these values. base: what the case leaves unexplained.
+    From these values, where its own start was the first. None where that is no better, and of what is scored at these values. base: what the case leaves unexplained.
     """
     near = trial.misfit.omega < base.omega and (case.is_near or trial.hypothesis.of_variances)
     if trial.result is not None and case.is_near and case.linear is not None:  # a minimum, if not a better one
         near |= trial.result.omega <= case.linear.result.omega
     if trial.survey is None or case.starts_afresh or near or trial.hypothesis.scored:
         return None
-    again = _adjusted(trial.hypothesis, trial.survey, case, case.run)
+    other = case.warm if _afresh_first(trial.hypothesis, case) else case.run
+    again = _adjusted(trial.hypothesis, trial.survey, case, other)
     return again if again.misfit.omega < trial.misfit.omega else None
 
 

@@ -59,20 +59,26 @@ class _Fit:
 
 @dataclass(frozen=True, eq=False)
 class LensStart:
-    """values (n,) of the model, how they were found, and the blocks left out with the reason."""
+    """values (n,) of the model, how they were found, and the blocks left out with the reason.
+
+    refined: whether the images determine them.
+    """
 
     values: FloatArray
     note: str
     excluded: dict[int, str]
+    refined: bool = True
 
 
 def start_lens(
-    camera: Camera, sightings: Sequence[Sighting], lent: Mapping[str, float] = MappingProxyType({})
-) -> LensStart:
+    camera: Camera, sightings: Sequence[Sighting], lent: Mapping[str, float] = MappingProxyType({}),
+    near: FloatArray | None = None,
+) -> LensStart:  # fmt: skip
     """Lens values from the given ones, or from the images of known points; ``lent``: those that another camera tells.
 
     Planar targets: Zhang's closed form, or the best of a scan of focal lengths, then lens and poses together on at most
     30 well-spread images. Raises SurveyError naming the camera where nothing determines its focal length.
+    near: values (n,) whose focal length and centre are taken where no closed form misses little: nothing is scanned.
     """
     model = lens_model(camera.lens.model)
     if camera.lens.values is not None:
@@ -80,16 +86,17 @@ def start_lens(
         return LensStart(np.array(camera.lens.values, dtype=float), "lens as given", {})
     known = _remembered.get()
     if known is None:
-        return _LensSearch(camera, model, lent).run(sightings)
+        return _LensSearch(camera, model, lent).run(sightings, near)
     key = (camera.camera_id, camera.image_size, id(camera.lens), tuple(lent.items()),
            tuple((s.x.tobytes(), s.uv.tobytes()) for s in sightings))  # fmt: skip
-    if key not in known:
+    if key not in known or (known[key].near and near is None):
         alone = [replace(s, block_idx=i) for i, s in enumerate(sightings)]
         try:
-            known[key] = camera, _LensSearch(camera, model, lent).run(alone)
+            start: LensStart | SurveyError = _LensSearch(camera, model, lent).run(alone, near)
         except SurveyError as error:
-            known[key] = camera, error
-    found = known[key][1]
+            start = error
+        known[key] = _Known(camera, start, near is not None and isinstance(start, LensStart) and not start.refined)
+    found = known[key].start
     if isinstance(found, SurveyError):
         raise found
     return replace(found, values=found.values.copy(),
@@ -109,8 +116,16 @@ def remembering() -> Iterator[None]:
         _remembered.reset(token)
 
 
-_remembered: ContextVar[dict[object, tuple[Camera, "LensStart | SurveyError"]] | None]
-_remembered = ContextVar("remembered lenses", default=None)
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """near: whether the search ended at values that were known before, though these led nowhere."""
+
+    camera: Camera
+    start: LensStart | SurveyError
+    near: bool
+
+
+_remembered: ContextVar[dict[object, _Known] | None] = ContextVar("remembered lenses", default=None)
 
 
 def _check_given(camera: Camera, model: LensModel) -> None:
@@ -143,7 +158,7 @@ class _LensSearch:
                     f"camera {camera.camera_id!r}: {name} is held but has no value; give lens values or free it"
                 )
 
-    def run(self, sightings: Sequence[Sighting]) -> LensStart:
+    def run(self, sightings: Sequence[Sighting], near: FloatArray | None) -> LensStart:
         usable = [s for s in sightings if len(s.x) >= 4]
         if any(name in self.prior for name in _FOCAL):
             focal = self.prior.get("fx", self.prior.get("c", self.prior.get("ck", 0.0)))
@@ -164,14 +179,14 @@ class _LensSearch:
                 + next(iter(excluded.values()))
             )
         determined = [m for s in chosen if (m := maps.get(s.block_idx)) is not None]
-        starts = self._focal_lengths(determined, chosen)
+        starts = self._focal_lengths(determined, chosen, near)
         start, how = next(starts)
         found = self._refined(start, how, chosen)
         # a closed form that misses little may lead nowhere: few images that are hardly tilted fit any focal length
         others = itertools.islice(starts, _OTHER_STARTS if len(chosen) >= _SEVERAL else 0)
         found = found or next((f for values, said in others if (f := self._refined(values, said, chosen))), None)
         unrefined = start, f"lens from {len(chosen)} images ({how}; too few to refine it)"
-        return LensStart(*(found or unrefined), excluded)
+        return LensStart(*(found or unrefined), excluded, found is not None)
 
     def _on_plane(self, sighting: Sighting) -> FloatArray | None:
         """Coordinates in the points' plane, asked for once for all images that show the same array of points."""
@@ -196,9 +211,9 @@ class _LensSearch:
         return good, excluded
 
     def _focal_lengths(
-        self, maps: Sequence[FloatArray], chosen: Sequence[Sighting]
+        self, maps: Sequence[FloatArray], chosen: Sequence[Sighting], near: FloatArray | None
     ) -> Iterator[tuple[FloatArray, str]]:
-        """Values to begin with and how they were found: a closed form that misses little, else what misses least."""
+        """Values to begin with and how they were found: a closed form, or near ones, that miss little, else the least."""
         trials: list[tuple[FloatArray, str]] = []
         errors: list[float] = []
         trial_images = _every(chosen, _SCAN_IMAGES)
@@ -217,6 +232,10 @@ class _LensSearch:
             first = int(np.argmin(errors))
             yield trials.pop(first)
             del errors[first]
+        if near is not None:
+            focal = focal_length_px(self.model, near, self.constants)
+            yield self._values(focal, centre=principal_point_px(self.model, near, self.constants)), "known before"
+            return
         low, high = (0.15, 2.0) if self.model.name == "fisheye" else (0.35, 8.0)
         scanned = [self._values(factor * max(self.size)) for factor in np.geomspace(low, high, 16)]
         trials += [(values, "scan of focal lengths") for values in scanned]

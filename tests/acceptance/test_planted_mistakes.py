@@ -114,7 +114,7 @@ def test_diagnosis_keeps_to_its_budget() -> None:
     survey, truth = survey_of("stereo", 3)
     planted = next(m for m in MISTAKES if m.name == "camera moved").plant(survey, truth, 6.0)
     result = adjust.solve(planted)
-    whole, short, cut = (diagnose(Case(planted, result, None, Budget(most))) for most in (20.0, 5.0, 0.0))
+    whole, short, cut = (diagnose(Case(planted, result, None, Budget(most))) for most in (20.0, 6.0, 0.0))
     for enough in (whole, short):
         assert enough.candidates[0].hypothesis.name == "camera moved"
         assert not enough.untried

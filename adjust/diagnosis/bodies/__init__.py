@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator
 
 from adjust.diagnosis.bodies.cameras import changed_camera, turned_images
-from adjust.diagnosis.bodies.lens_steps import lens_steps
+from adjust.diagnosis.bodies.lens_steps import by_themselves, lens_steps
 from adjust.diagnosis.bodies.series import Step, series_of, step_of
 from adjust.diagnosis.bodies.split import epochs_from
 from adjust.diagnosis.bodies.targets import moved_target
@@ -25,7 +25,7 @@ def hypotheses(case: Case) -> Iterable[Hypothesis]:
 
 
 def _steps(case: Case) -> Iterator[Step]:
-    alone, found = list(lens_steps(case)), []  # of single cameras, which cost least
+    alone, found = [] if by_themselves(case) else list(lens_steps(case)), []  # else they were looked at before
     if case.result is not None:
         every = series_of(case, adjusted_values(case.result))
         found = [step for series in every if (step := step_of(series)) is not None]

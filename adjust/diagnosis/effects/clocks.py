@@ -4,7 +4,7 @@ The unit of time is the interval between epochs; speeds are those of the observa
 neighbouring epochs. What is tried are clocks as unknowns (:mod:`adjust.diagnosis.late`).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -15,10 +15,11 @@ from gtsam import Pose3, Rot3
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect, Shifts, of_others, of_shifts
 from adjust.diagnosis.hypothesis import Hypothesis, Place
-from adjust.diagnosis.late import Freed, as_unknowns
+from adjust.diagnosis.late import Freed, as_unknowns, keyed, spoken
 from adjust.diagnosis.linear import Linear
 from adjust.diagnosis.sequences import hand_poses
 from adjust.model.observations import ImageBlock, TableReading
+from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 from adjust.statistics.score import Score, drift_times
 
@@ -43,7 +44,7 @@ def clocks(case: Case) -> Iterator[Effect]:
 # -- cameras ---------------------------------------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=4)
 def _motion(survey: Survey) -> dict[int, tuple[int, int, FloatArray, FloatArray]]:
     """By block: its number in the course of its camera and target, their length, speed and acceleration (n, 2) px.
 
@@ -142,7 +143,38 @@ def _camera_effect(case: Case, linear: Linear, name: str, weight: Any, cameras: 
     remedy = ("hold still what moves, or take a camera with a global shutter" if name == "rolling shutter" else
               "trigger the cameras together, or hold the target still at every epoch, and measure again")  # fmt: skip
     hypothesis = Hypothesis(name, "", remedy, Place("camera", (worst,), "clock"), case.survey, (), 1.0, 0)
-    return _modelled(case, hypothesis, freed, first, text)
+    rows = name == "rolling shutter"
+    unit = "from the first row to the last" if rows else "over all epochs" if drift else "throughout"
+    model = None if rows else lambda h: as_unknowns(case, replace(hypothesis, evidence=h.evidence), freed)
+    return _by_tracks(case, keyed(case.survey, hypothesis, freed), weight, cameras, first, f"{text} ({{}}, {unit})", model)
+
+
+def _by_tracks(
+    case: Case, hypothesis: Hypothesis, weight: Any, cameras: Sequence[str], first: Score, text: str,
+    model: Callable[[Hypothesis], Hypothesis] | None,
+) -> Effect:  # fmt: skip
+    """Image points moved along their tracks to where they were in time: a clock as an unknown costs many times more.
+
+    text: its cause, with a place for the size. model: with such a clock, for what tracks do not tell.
+    """
+    heights = {c.camera_id: c.image_size[1] for c in case.survey.cameras}
+    factor, of_time = spoken(case.survey)
+
+    def mended(_: Adjustment, theta: FloatArray) -> Survey:
+        blocks = list(case.survey.image_blocks)
+        for i, (k, n, speed, bend) in _motion(case.survey).items():
+            camera = blocks[i].camera_id
+            if camera in cameras:
+                late = (theta[cameras.index(camera)] * weight(k, n, blocks[i], heights[camera]))[:, None]
+                blocks[i] = replace(blocks[i], uv=blocks[i].uv - late * speed + 0.5 * late**2 * bend)
+        return replace(case.survey, image_blocks=tuple(blocks))
+
+    def said(theta: FloatArray, sigmas: FloatArray) -> str:
+        sizes = zip(cameras, factor * theta, factor * sigmas, strict=True)
+        return text.format(", ".join(f"camera {c}: {t:+.3g} +- {s:.2g} {of_time}" for c, t, s in sizes))
+
+    return Effect(hypothesis, first, lambda at: of_shifts(at, _late(at.result.survey, cameras, weight)), mended, said,
+                  further=model)  # fmt: skip
 
 
 def _modelled(case: Case, hypothesis: Hypothesis, freed: Freed, first: Score, text: str) -> Effect:

@@ -19,6 +19,7 @@ from adjust.statistics.score import Score
 
 ROUNDS = 6
 _SLOW = 0.5  # share of the last drop, or of the last v'Pv, that the next one is at most, while it is on its way
+_CLEAR_PART = 0.05  # of the misfit beyond noise
 _SMALL = 9.0  # a further drop of v'Pv that is not worth another adjustment
 
 
@@ -30,7 +31,8 @@ class Effect:
     with the values of an adjustment. said: its cause in words, by theta and sigmas. added: theta and a further change.
     known: a size that explains itself near this one, and what that makes of the hypothesis; None where there is none.
     nearer: the same change at another epoch, that an adjustment with the change shows to be the right one, or None.
-    model: the hypothesis with a survey in which the size is an unknown, tried in place of ``mended``.
+    model: the hypothesis with a survey in which the size is an unknown, tried in place of ``mended``; further: the same,
+    tried after it where that leaves a clear part of the misfit.
     """
 
     hypothesis: Hypothesis
@@ -42,6 +44,7 @@ class Effect:
     known: Callable[[FloatArray, FloatArray], tuple[FloatArray, Mapping[str, Any]] | None] = lambda theta, sigmas: None
     nearer: Callable[[Adjustment, FloatArray], "Effect | None"] = lambda result, theta: None
     model: Callable[[Hypothesis], Hypothesis] | None = None
+    further: Callable[[Hypothesis], Hypothesis] | None = None
 
     def value(self, scale: float, n: int) -> float:
         """By how much more it explains than its parameters cost (Schwarz 1978), over a variance factor."""
@@ -67,8 +70,11 @@ class Effect:
             found.append(changes)
             return at.made(result, theta)
 
-        def told(_: Adjustment) -> Sequence[Hypothesis]:
-            return [replace(hypothesis, **found[-1])] if found else []
+        def told(result: Adjustment) -> Sequence[Hypothesis]:
+            named = [replace(hypothesis, **found[-1])] if found else []
+            left, base = misfit_of(result, case.survey), misfit_of(case.result, case.survey)
+            clear = not left.is_noise() and left.excess > _CLEAR_PART * base.excess
+            return [*named, self.further(hypothesis)] if self.further is not None and clear else named
 
         sigmas = np.sqrt(np.maximum(np.diag(self.first.cov), 0.0))
         hypothesis = replace(self.hypothesis, survey=made, cause=self.said(self.first.theta, sigmas),

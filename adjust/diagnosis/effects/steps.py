@@ -72,7 +72,10 @@ def steps(case: Case) -> Iterator[Effect]:
             yield _drift(case, course, linear.drift(course.parts))
 
 
-def _courses(linear: Linear, only: ParameterName | None = None) -> Iterator[_Course]:
+def _courses(
+    linear: Linear, only: ParameterName | None = None, components: tuple[str, ...] | None = None
+) -> Iterator[_Course]:
+    """Of all unknowns, or of one; of a lens by parts of its components, or of some of these alone."""
     survey, columns = linear.result.survey, linear.system.columns
     ptr, row_of = linear.system.ptr, linear.system.row_of
     first_reading = len(ptr) - 1 - len(survey.readings)
@@ -91,7 +94,7 @@ def _courses(linear: Linear, only: ParameterName | None = None) -> Iterator[_Cou
             continue
         rows = linear.rows_of(at)
         if (rows < ptr[linear.system.n_image]).any():
-            yield from _of_images(linear, name, rows)
+            yield from _of_images(linear, name, rows, components)
         elif name[0] == "world_from_station":
             yield course(name, "pair", pairs, rows)
         elif name[0] == "orientation":
@@ -117,7 +120,9 @@ def _standing(survey: Survey) -> list[str]:
     return [t.target_id for t in survey.targets if t.motion == "fixed" and t.station_id is None]
 
 
-def _of_images(linear: Linear, name: ParameterName, rows: IntArray) -> Iterator[_Course]:
+def _of_images(
+    linear: Linear, name: ParameterName, rows: IntArray, only: tuple[str, ...] | None
+) -> Iterator[_Course]:
     blocks = linear.result.survey.image_blocks
     ptr = 2 * linear.result.image_residuals.block_ptr
     epochs = list(dict.fromkeys(b.epoch_id for b in blocks))
@@ -126,7 +131,8 @@ def _of_images(linear: Linear, name: ParameterName, rows: IntArray) -> Iterator[
     images = rows[rows < ptr[-1]]
     known = np.unique(of[images])
     by_epoch = [images[of[images] == k] for k in known]
-    for components in (FOCAL, CENTRE, FOCAL + CENTRE) if name[0] == "lens" else ((),):
+    parts = (FOCAL, CENTRE, FOCAL + CENTRE) if name[0] == "lens" else ((),)
+    for components in parts if only is None else (only,):
         columns = linear.columns(name, components)
         if len(columns):
             labels = tuple(epochs[k] for k in known)
@@ -236,7 +242,7 @@ def _drift(case: Case, course: _Course, first: Score) -> Effect:
 
 def _at(linear: Linear, course: _Course, score: Callable[[Sequence[Part]], Score]) -> Score:
     """The score of the same course at another adjustment; what that has left out is no part of it."""
-    for again in _courses(linear, course.name):
+    for again in _courses(linear, course.name, course.components):
         if again.components == course.components and again.labels == course.labels:
             return score(again.parts)
     return Score(np.zeros(0), np.zeros((0, 0)), 0.0, 0)
