@@ -226,8 +226,11 @@ def _coded(values: Sequence[str]) -> dict[str, Any]:
 def _numeric(name: str, values: FloatArray, digits: IntArray) -> dict[str, Any]:
     power = 10.0 ** np.maximum(digits, 0)
     out: list[Any] = (np.rint(values * power) / power).tolist()
-    for i in np.flatnonzero(~np.isfinite(values) | (digits <= 0)).tolist():
-        out[i] = round(out[i]) if np.isfinite(values[i]) else None
+    finite = np.isfinite(values)
+    for i in np.flatnonzero(finite & (digits <= 0)).tolist():
+        out[i] = int(out[i])
+    for i in np.flatnonzero(~finite).tolist():
+        out[i] = None
     return {"values": out, "size": name in _BY_SIZE}
 
 
