@@ -272,8 +272,10 @@ def _every_other(c: Context, observation: IntArray, component: IntArray) -> _Row
     seen, of = np.unique(observation, return_inverse=True)
     some = [every[k] for k in seen.tolist()]
     said = [(known(o.kind.replace("_", " ")), group_name(o.group), " · ".join(o.ids)) for o in some]
-    units = [(o.components[i], *units_for_people(o.components[i], o.units[i]))
-             for o, i in zip((some[k] for k in of.tolist()), component.tolist(), strict=True)]  # fmt: skip
+    each = zip((some[k] for k in of.tolist()), component.tolist(), strict=True)
+    named = [(o.components[i], o.units[i]) for o, i in each]
+    units_of = {(name, inside): (name, *units_for_people(name, inside)) for name, inside in set(named)}
+    units = [units_of[x] for x in named]
     own, unit, factor, small_unit, small = zip(*units, strict=True) if units else ((),) * 5
     texts = np.empty((len(_NAMES), len(at)), dtype=object)
     texts[:3], texts[3] = np.array(said, dtype=object).reshape(-1, 3)[of].T, ""
