@@ -1,6 +1,6 @@
 """One hypothesis, tried: its survey adjusted, and what is left unexplained."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,7 +8,7 @@ import numpy as np
 from adjust.diagnosis.case import CAP, Case, block_squares
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.model.errors import SurveyError
-from adjust.model.result import Adjustment, ObservationResidual
+from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 
 _NOISE, _CLEARLY = 5.0, 3.0
@@ -142,28 +142,38 @@ def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:
         return Misfit(CAP * (points + n_others), points + n_others, points + n_others, 0)
     images = result.image_residuals
     groups: dict[str, list[FloatArray]] = {}
-    out = _left_out(survey)
-    others = [o for o in result.other_residuals if o.used or not out & {o.ids, o.ids[:1]}]
+    arrays, out = result.other_arrays, _left_out(survey)
+    told = list(_told(result))
+    kept = arrays.used | np.array([not (out and out & {ids, ids[:1]}) for ids, _ in told], dtype=np.bool_)
     joint = _joint_squares(result) if result.survey.reading_covariances else {}
-    alone: dict[str, list[ObservationResidual]] = {}
-    for o in others:
-        if o.ids[:1] in joint:
-            groups.setdefault(o.group, []).append(joint[o.ids[:1]])
+    alone: dict[str, list[int]] = {}
+    for i in np.flatnonzero(kept).tolist():
+        ids, group = told[i]
+        if ids[:1] in joint:
+            groups.setdefault(group, []).append(joint[ids[:1]])
         else:
-            alone.setdefault(o.group, []).append(o)
+            alone.setdefault(group, []).append(i)
+    squares_of = _squares(arrays.residual, arrays.sigma)
     for group, same in alone.items():
-        v, sigma = (np.concatenate(x) for x in zip(*((o.residual, o.sigma) for o in same), strict=True))
-        groups.setdefault(group, []).append(_squares(v, sigma))
+        mine = np.isin(arrays.observation, same)
+        groups.setdefault(group, []).append(squares_of[mine])
     n_adjusted = sum(len(s) for of in groups.values() for s in of)
     for block, squares in zip(survey.image_blocks, block_squares(survey, result), strict=True):
         groups.setdefault(block.group, []).append(np.repeat(0.5 * squares, 2))
     gone = max(0, n_others - n_other_components(result.survey, used_only=False))
     unused = points - 2 * int(images.used.sum()) + gone
-    unused += sum(len(o.residual) for o in others if not o.used)
+    unused += int(arrays.n_components[kept & ~arrays.used].sum())
     every = [np.concatenate(of) for of in groups.values()]
     omega = float(sum(np.minimum(s, CAP).sum() for s in every)) + CAP * gone
     fitted = sum(_at_best_scale(s) for s in every) + CAP * gone
     return Misfit(omega, unused, points + max(n_adjusted, n_others), result.redundancy, fitted=fitted)
+
+
+def _told(result: Adjustment) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Ids and group of all other observations; of readings nothing is made for that."""
+    yield from ((o.ids, o.group) for o in result.single_residuals)
+    if result.reading_residuals is not None:
+        yield from (((r.reading_id,), r.group) for r in result.survey.readings)
 
 
 def _joint_squares(result: Adjustment) -> dict[tuple[str, ...], FloatArray]:
@@ -202,8 +212,8 @@ def _left_out(survey: Survey) -> set[tuple[str, ...]]:
 def _n_components(observed: Sequence[object]) -> int:
     """Of observations of a kind: the finite variances of their covariances, one each where they have sigmas."""
     covs = [cov for o in observed if (cov := getattr(o, "cov", None)) is not None]
-    finite = [np.isfinite(cov.diagonal()) for cov in covs]
-    return len(observed) - len(covs) + int(np.concatenate([np.zeros(0), *finite]).sum())
+    variances = np.concatenate([np.zeros(0), *(cov.diagonal() for cov in covs)])
+    return len(observed) - len(covs) + int(np.isfinite(variances).sum())
 
 
 def _squares(residual: FloatArray, sigma: FloatArray) -> FloatArray:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Literal, Protocol
 
 import numpy as np
@@ -141,6 +141,20 @@ class OtherArrays:
         out = np.zeros(len(self.used))
         np.maximum.at(out, self.observation, np.where(np.isnan(self.standardized), 0.0, np.abs(self.standardized)))
         return out
+
+
+@lru_cache(2)  # those of an adjustment that is given another warning are the same
+def _other_arrays(residuals: Sequence[ObservationResidual], readings: ReadingResiduals | None) -> OtherArrays:
+    first = residuals[: len(residuals) - (0 if readings is None else len(readings.used))]
+    n = np.array([len(o.components) for o in first], dtype=np.int64)
+    columns = [np.concatenate([np.zeros(0), *(getattr(o, name) for o in first)]) for name in _OF_COMPONENTS]
+    redundancy = np.maximum.reduceat(columns[4], np.cumsum(n) - n) if len(n) else np.zeros(0)
+    parts = [(n, np.array([o.used for o in first], dtype=np.bool_), np.array([o.test for o in first]), redundancy,
+              *columns)]  # fmt: skip
+    if readings is not None:
+        one, r = np.ones(len(readings.used), dtype=np.int64), readings
+        parts.append((one, r.used, r.test, r.redundancy, *(getattr(r, name) for name in _OF_COMPONENTS)))
+    return OtherArrays(*(np.concatenate(x) for x in zip(*parts, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -340,17 +354,7 @@ class Adjustment:
     @cached_property
     def other_arrays(self) -> OtherArrays:
         """``other_residuals`` as arrays; of readings none is made for that."""
-        readings, first = self.reading_residuals, self.single_residuals
-        parts = [
-            (np.array([len(o.components) for o in first], dtype=np.int64),
-             np.array([o.used for o in first], dtype=np.bool_), np.array([o.test for o in first]),
-             np.array([float(o.redundancy.max()) for o in first]),
-             *(np.concatenate([np.zeros(0), *(getattr(o, name) for o in first)]) for name in _OF_COMPONENTS))
-        ]  # fmt: skip
-        if readings is not None:
-            one, r = np.ones(len(readings.used), dtype=np.int64), readings
-            parts.append((one, r.used, r.test, r.redundancy, *(getattr(r, name) for name in _OF_COMPONENTS)))
-        return OtherArrays(*(np.concatenate(x) for x in zip(*parts, strict=True)))
+        return _other_arrays(self.other_residuals, self.reading_residuals)
 
     def joint(self, names: Sequence[ParameterName]) -> FloatArray:
         """Joint covariance (n, n), a priori, of all components of these estimates in this order; zero of held ones."""

@@ -118,17 +118,18 @@ class TreeCovariance:
         while left:
             n = max(1, int(np.searchsorted(np.cumsum(self._dims[left]), _COLUMNS, side="right")))
             some, left = left[:n], left[n:]
-            columns = np.concatenate([np.arange(self._first[a], self._first[a + 1]) for a in some])
-            x = np.zeros((int(self._first[-1]), len(columns)))
-            x[columns, np.arange(len(columns))] = 1.0
             others = [b for a in some for b in apart[a]]
             up, down = (self._ancestors(set(self._home[of].tolist())) for of in (some, some + others))
-            self._solve(up, down, x)
-            first = 0
+            first, rows = self._gathered(down)
+            columns = np.concatenate([np.arange(first[a], first[a] + self._dims[a]) for a in some])
+            x = np.zeros((rows, len(columns)))
+            x[columns, np.arange(len(columns))] = 1.0
+            solve_cliques(self.arrays, up, down, first, self._data, x)
+            at = 0
             for a in some:
-                own = slice(first, first := first + int(self._dims[a]))
+                own = slice(at, at := at + int(self._dims[a]))
                 for b in apart[a]:
-                    self._across[a, b] = x[self._first[b] : self._first[b + 1], own].T.copy()
+                    self._across[a, b] = x[first[b] : first[b] + self._dims[b], own].T.copy()
 
     def marginal(self, key: int) -> FloatArray:
         """Covariance (dim, dim) of one unknown."""
@@ -204,7 +205,7 @@ class TreeCovariance:
         """Key of every row in a stacked vector of all unknowns."""
         return np.repeat(np.arange(len(self._dims)), self._dims)
 
-    def _gathered(self, cliques: IntArray, top: int) -> tuple[IntArray, int]:
+    def _gathered(self, cliques: IntArray, top: int = -1) -> tuple[IntArray, int]:
         """Row (K,) at which a key begins where only the own ones of these cliques are kept, and how many these are.
 
         Those of ``top`` come after.

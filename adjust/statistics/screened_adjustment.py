@@ -243,8 +243,9 @@ def component_notes(components: VarianceComponents) -> tuple[str, ...]:
 
 def uncontrolled_pairs(result: Adjustment) -> tuple[str, ...]:
     """Warning of pairs in use that nothing checks."""
-    ids = [o.ids[0] for o in result.single_residuals
-           if o.kind == "pair" and o.used and float(o.redundancy.max()) < _CONTROLLED]  # fmt: skip
+    arrays, single = result.other_arrays, result.single_residuals
+    weak = np.flatnonzero((arrays.used & (arrays.redundancy < _CONTROLLED))[: len(single)])
+    ids = [single[i].ids[0] for i in weak.tolist() if single[i].kind == "pair"]
     if not ids:
         return ()
     what = "pair {} closes no loop: nobody would notice an error in it" if len(ids) == 1 else (

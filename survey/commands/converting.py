@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from survey.commands.common import DONE, require_project, show
+from survey.commands.common import DONE, begin_adjusting, require_project, show
 from survey.commands.parser import Commands, project_folder
 
 FORMATS = (
@@ -47,6 +47,7 @@ def declare_convert(commands: Commands) -> None:
 def _convert(arguments: argparse.Namespace) -> int:
     if arguments.source.is_dir() and ((arguments.source / "survey.toml").exists() or arguments.format is None):
         require_project(arguments.source)
+    begin_adjusting()  # results of a project are adjusted first
     from survey.jobs.converting import convert_job
 
     outcome = convert_job(

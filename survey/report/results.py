@@ -23,6 +23,7 @@ __all__ = [
     "RESULTS",
     "ReportOptions",
     "RunInfo",
+    "begun_tables",
     "make_results",
     "solution_dict",
     "solution_json",
@@ -60,49 +61,70 @@ def write_results(
     Raises SurveyError for a language that there is not, where no PDF can be made, and while a command has the folder;
     nothing has been written then.
     """
-    with changing(folder) as place:
-        made = make_results(place, adjustment, run, solution_dict(adjustment, run, statistics), statistics, options)
+    with changing(folder) as place, Beside() as writing:
+        begun = begun_tables(place, adjustment, run, options, writing)
+        make_results(begun, adjustment, run, solution_dict(adjustment, run, statistics), statistics, options)
         replace_parts(folder)
-    return {name: folder / RESULTS / name for name in made}
+    return {name: folder / RESULTS / name for name in begun.paths}
+
+
+class ResultFiles:
+    """Files of ``place/results`` that are made and written beside each other and beside what comes after.
+
+    place: in the folder whose results these replace.
+    """
+
+    def __init__(self, place: Path, writing: Beside) -> None:
+        self.folder, self._writing = place / RESULTS, writing
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._begun: dict[str, Callable[[], None]] = {}
+
+    def begin(self, makers: Mapping[str, Callable[[], bytes]]) -> None:
+        """Files by name, by what makes them."""
+        for name, make in makers.items():
+            self._begun[name] = self._writing.of(partial(_write, self.folder / name, make))
+
+    @property
+    def paths(self) -> dict[str, Path]:
+        """All that were begun, written; what programs read last."""
+        for written in self._begun.values():
+            written()
+        return {name: self.folder / name for name in sorted(self._begun, key="solution.json".__eq__)}
+
+
+def begun_tables(
+    place: Path, adjustment: Adjustment, run: RunInfo, options: ReportOptions, writing: Beside
+) -> ResultFiles:  # fmt: skip
+    """What needs the adjustment alone: residuals and covariances."""
+    files = ResultFiles(place, writing)
+    parquet = options.parquet or (place.parent / RESULTS / PARQUET).is_file()  # there: not to be old
+    files.begin({
+        "covariance.npz": lambda: covariance_npz(adjustment, run.sigmas),
+        "residuals.csv": lambda: image_residuals_csv(adjustment),
+        **({PARQUET: lambda: image_residuals_parquet(adjustment)} if parquet else {}),
+        "residuals_other.csv": lambda: other_residuals_csv(adjustment),
+    })  # fmt: skip
+    return files
 
 
 def make_results(
-    place: Path,
+    begun: ResultFiles,
     adjustment: Adjustment,
     run: RunInfo,
     solution: dict[str, Any],
     statistics: Statistics | None = None,
     options: ReportOptions = ENGLISH_PAGE,
 ) -> dict[str, Path]:
-    """Make everything in ``place/results``; the paths by file name. Raises as :func:`write_results`.
+    """Make everything else; the paths of all by file name. Raises as :func:`write_results`.
 
-    place: in the folder whose results these replace.
-    solution: of :func:`survey.solution.dictionary.solution_dict`, with the statistics.
+    begun: of :func:`begun_tables`. solution: of :func:`survey.solution.dictionary.solution_dict`, with the statistics.
     """
-    results = place / RESULTS
-    parquet = options.parquet or (place.parent / RESULTS / PARQUET).is_file()  # there: not to be old
-    results.mkdir(parents=True, exist_ok=True)
-    tables: dict[str, Callable[[], bytes]] = {
-        "covariance.npz": lambda: covariance_npz(adjustment, run.sigmas),
-        "residuals.csv": lambda: image_residuals_csv(adjustment),
-        **({PARQUET: lambda: image_residuals_parquet(adjustment)} if parquet else {}),
-        "residuals_other.csv": lambda: other_residuals_csv(adjustment),
-    }
-    with Beside() as writing:
-
-        def begun(makers: Mapping[str, Callable[[], bytes]]) -> list[Callable[[], None]]:
-            return [writing.of(partial(_write, results / name, make)) for name, make in makers.items()]
-
-        done = begun(tables)
-        page = report_html(adjustment, run, solution, statistics, options.language)
-        pages: dict[str, Callable[[], bytes]] = {
-            "report.html": page.encode,
-            **({"report.pdf": lambda: report_pdf(page)} if options.pdf else {}),
-            "solution.json": lambda: solution_json(solution).encode(),
-        }
-        for written in (*done, *begun(pages)):
-            written()
-    return {name: results / name for name in (*tables, *pages)}
+    begun.begin({"solution.json": lambda: solution_json(solution).encode()})
+    page = report_html(adjustment, run, solution, statistics, options.language)
+    begun.begin({
+        "report.html": page.encode, **({"report.pdf": lambda: report_pdf(page)} if options.pdf else {}),
+    })  # fmt: skip
+    return begun.paths
 
 
 def _write(path: Path, make: Callable[[], bytes]) -> None:

@@ -129,6 +129,12 @@ class _Writer:
             self.part(NUMBERS, self.values[-1].shape[1])
             self.text += "]" * (of.ndim == 2)
             return
+        if isinstance(of, np.ndarray) and of.ndim == 1:
+            values, at = np.unique(of, return_inverse=True)
+            number = np.array([self.number(_JSON.encode(x)) for x in values.tolist()], dtype=np.int64)
+            self.of_row.append(number[at])
+            self.part(WORD, len(self.of_row) - 1)
+            return
         said = [encode_basestring(x) if isinstance(x, str) else _JSON.encode(x) for x in
                 (of.tolist() if isinstance(of, np.ndarray) else of)]  # fmt: skip
         self.of_row.append(np.array([self.number(x) for x in said], dtype=np.int64))

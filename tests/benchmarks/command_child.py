@@ -35,12 +35,16 @@ class InTurn:
 
     def __init__(self) -> None:
         self.parts = self.steps = 0.0
-        self.begun: list[float] = []
-        self.entered = (0.0, 0.0)
+        self.open: dict[object, tuple[float, list[float]]] = {}
 
-    def beside(self) -> None:
+    def now(self) -> float:
+        """Time of this thread, less what is saved of it."""
+        return time.thread_time() - self.parts - self.steps
+
+    def beside(self, steps: object) -> object:
         """From here on what this thread does itself is a step beside those that it begins."""
-        self.entered = (time.thread_time(), self.parts)
+        self.open[steps] = self.now(), []
+        return steps
 
     def map(self, function: Callable[[Any], Any], parts: Iterable[Any]) -> list[Any]:
         """As of an executor: parts that are shared out."""
@@ -56,31 +60,34 @@ class InTurn:
         self.parts += saved(seconds)
         return out
 
-    def submit(self, step: Callable[[], Any]) -> "Future[Any]":
-        """As of an executor: a step beside others; its own parts do not count twice."""
-        begin, before = time.thread_time(), self.parts
+    def given(self, steps: object, step: Callable[[], Any]) -> Callable[[], Any]:
+        """As of ``Beside``: a step beside others; its own parts do not count twice."""
+        begin = self.now()
         done: Future[Any] = Future()
+        parallel._here.step = True
         try:
             done.set_result(step())
         except Exception as error:  # the one who waits is told
             done.set_exception(error)
-        self.begun.append(time.thread_time() - begin - (self.parts - before))
-        return done
+        finally:
+            del parallel._here.step
+        self.open[steps][1].append(self.now() - begin)
+        return done.result
 
-    def finished(self) -> None:
+    def finished(self, steps: object) -> None:
         """No more steps beside these."""
-        begin, before = self.entered
-        own = time.thread_time() - begin - (self.parts - before) - sum(self.begun)
-        self.steps += saved([*self.begun, own]) if self.begun else 0.0
-        self.begun = []
+        begin, begun = self.open.pop(steps)
+        self.steps += saved([*begun, self.now() - begin - sum(begun)]) if begun else 0.0
 
 
 def main() -> None:
     """Runs the command of the arguments."""
     pool = InTurn()
-    parallel._pool = parallel._stages = lambda workers: pool
-    parallel.Beside.__enter__ = lambda self: pool.beside() or self
-    parallel.Beside.__exit__ = lambda self, *_: pool.finished()
+    parallel._pool = lambda workers: pool
+    parallel.Beside.__enter__ = lambda self: pool.beside(self)
+    parallel.Beside.__exit__ = lambda self, *_: pool.finished(self)
+    plain = parallel.Beside.of
+    parallel.Beside.of = lambda self, step: plain(self, step) if self._alone else pool.given(self, step)
     from survey.jobs.adjusting import job
 
     job.time = SimpleNamespace(perf_counter=time.process_time)

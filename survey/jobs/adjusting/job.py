@@ -15,13 +15,22 @@ from typing import Any
 
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
+from adjust.native.parallel import Beside
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.detecting import author_name, detect_in, detect_job, remember_images
 from survey.project import Project, read
 from survey.project.project import RESULTS
-from survey.report.results import ENGLISH_PAGE, ReportOptions, RunInfo, make_results, solution_dict, summary_text
+from survey.report.results import (
+    ENGLISH_PAGE,
+    ReportOptions,
+    RunInfo,
+    begun_tables,
+    make_results,
+    solution_dict,
+    summary_text,
+)  # fmt: skip
 from survey.report.unsolved import JSON, PAGE, unsolved_files
 from survey.solution.earlier.runs import record_run, remove_empty
 from survey.solution.quantities import USUAL, scale_of
@@ -180,11 +189,14 @@ def made(
 
         with clock.step("published methods"):
             beside = {"published": published_dict(adjustment, scale_of(adjustment, run.sigmas))}
-    with clock.step("statistics"):
-        found = statistics_of(adjustment, project.options.tolerances, scale_of(adjustment, run.sigmas))
-    with clock.step("report"):
-        solution = solution_dict(adjustment, run, found) | beside
-        paths = make_results(place, adjustment, run, solution, found, report)
+    with Beside() as writing:
+        with clock.step("report"):
+            begun = begun_tables(place, adjustment, run, report, writing)
+        with clock.step("statistics"):
+            found = statistics_of(adjustment, project.options.tolerances, scale_of(adjustment, run.sigmas))
+        with clock.step("report"):
+            solution = solution_dict(adjustment, run, found) | beside
+            paths = make_results(begun, adjustment, run, solution, found, report)
     return AdjustOutcome(adjustment, run, solution, paths, found)
 
 

@@ -226,8 +226,11 @@ def _coded(values: Sequence[str]) -> dict[str, Any]:
 def _numeric(name: str, values: FloatArray, digits: IntArray) -> dict[str, Any]:
     power = 10.0 ** np.maximum(digits, 0)
     out: list[Any] = (np.rint(values * power) / power).tolist()
-    for i in np.flatnonzero(~np.isfinite(values) | (digits <= 0)).tolist():
-        out[i] = round(out[i]) if np.isfinite(values[i]) else None
+    finite = np.isfinite(values)
+    for i in np.flatnonzero(finite & (digits <= 0)).tolist():
+        out[i] = int(out[i])
+    for i in np.flatnonzero(~finite).tolist():
+        out[i] = None
     return {"values": out, "size": name in _BY_SIZE}
 
 
@@ -269,8 +272,10 @@ def _every_other(c: Context, observation: IntArray, component: IntArray) -> _Row
     seen, of = np.unique(observation, return_inverse=True)
     some = [every[k] for k in seen.tolist()]
     said = [(known(o.kind.replace("_", " ")), group_name(o.group), " · ".join(o.ids)) for o in some]
-    units = [(o.components[i], *units_for_people(o.components[i], o.units[i]))
-             for o, i in zip((some[k] for k in of.tolist()), component.tolist(), strict=True)]  # fmt: skip
+    each = zip((some[k] for k in of.tolist()), component.tolist(), strict=True)
+    named = [(o.components[i], o.units[i]) for o, i in each]
+    units_of = {(name, inside): (name, *units_for_people(name, inside)) for name, inside in set(named)}
+    units = [units_of[x] for x in named]
     own, unit, factor, small_unit, small = zip(*units, strict=True) if units else ((),) * 5
     texts = np.empty((len(_NAMES), len(at)), dtype=object)
     texts[:3], texts[3] = np.array(said, dtype=object).reshape(-1, 3)[of].T, ""
