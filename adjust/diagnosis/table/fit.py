@@ -96,14 +96,14 @@ def _improved(
     N, b = np.zeros((n + 2, n + 2)), np.zeros(n + 2)
     by_place = -adjoint(inverse(views.motions(geometry=geometry)))[views.epoch]
     by_geometry = views.by_geometry()[views.epoch] * _free_geometry(views)
+    J = np.concatenate([np.broadcast_to(np.eye(6), W.shape), by_place, by_geometry], axis=2)
+    WJ = W @ J
     for i, p in sorted(set(zip(views.inner.tolist(), place.tolist(), strict=True))):
         rows = (views.inner == i) & (place == p)
         at = np.r_[6 * i : 6 * i + 6, 6 * (len(X) + p) : 6 * (len(X) + p) + 6, n : n + 2]
-        own = np.broadcast_to(np.eye(6), (int(rows.sum()), 6, 6))
-        J = np.concatenate([own, by_place[rows], by_geometry[rows]], axis=2)
-        JW = J.swapaxes(1, 2) @ W[rows]
-        N[np.ix_(at, at)] += (JW @ J).sum(axis=0)
-        b[at] -= np.einsum("nij,nj->i", JW, r[rows])
+        weighted = WJ[rows].reshape(-1, J.shape[2]).T
+        N[np.ix_(at, at)] += weighted @ J[rows].reshape(-1, J.shape[2])
+        b[at] -= weighted @ r[rows].ravel()
     weak = 1.0 / _GEOMETRY_SIGMAS**2
     N[[n, n + 1], [n, n + 1]] += weak
     b[n:] -= weak * (geometry - given_geometry(views.table))
