@@ -64,7 +64,7 @@ def need_playwright() -> Any:
 def launched() -> Iterator[Any]:
     """Debian's Chromium; nothing is downloaded."""
     with need_playwright().sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=need_browser(), args=["--no-sandbox"])
+        found = playwright.chromium.launch(executable_path=need_browser(), args=["--no-sandbox", "--disable-gpu"])
         yield found
         found.close()
 

@@ -1,5 +1,6 @@
 """How the tests run: side by side on all cores, statistical tests at a tenth of their size (``docs/testing.md``)."""
 
+import gc
 import os
 import sys
 from collections.abc import Generator
@@ -81,6 +82,12 @@ def pytest_make_collect_report(collector: pytest.Collector) -> Generator[None, A
         first = int(worker["workerid"][2:]) * len(report.result) // worker["workercount"]
         report.result = report.result[first:] + report.result[:first]
     return report
+
+
+def pytest_collection_finish() -> None:
+    """What was imported stays: no search for cycles looks through it again, as in the command itself."""
+    gc.freeze()
+    gc.set_threshold(20_000)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -178,7 +178,7 @@ def table_angles(direction_in_mount: FloatArray, direction_in_table: FloatArray)
         a2 = face * math.acos(b[0] / reach) - math.atan2(d[1], d[0])
         y = math.sin(a2) * d[0] + math.cos(a2) * d[1]
         a1 = math.atan2(b[2], b[1]) - math.atan2(d[2], y)
-        solutions.append((np.array([a1, a2]) + np.pi) % (2.0 * np.pi) - np.pi)
+        solutions.append(np.array([(a + math.pi) % (2.0 * math.pi) - math.pi for a in (a1, a2)]))
     return solutions
 
 

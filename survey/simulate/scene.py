@@ -7,6 +7,7 @@ there cannot hide by being made twice.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import reduce
 
 import cv2
 import numpy as np
@@ -24,6 +25,7 @@ BROWN = ("fx", "fy", "skew", "u0", "v0", "k1", "k2", "p1", "p2", "k3", "k4", "k5
 _OPENCV_DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _AXIS_NUMBER = {"x": 0, "y": 1, "z": 2}
 _WAVES = {n: tuple(f"{kind}_{n}_" for kind in ("angle", "axial", "radial", "tilt")) for n in (1, 2)}
+_UNIT: FloatArray = np.eye(4)
 _WIDEST_TANGENT = 1.2  # beyond, a Brown polynomial may fold points back into the image
 
 
@@ -31,7 +33,7 @@ def rotation_about(axis: str, angle: float) -> FloatArray:
     """(4, 4) right-handed turn by ``angle`` rad about a named axis."""
     i = _AXIS_NUMBER[axis]
     j, k = (i + 1) % 3, (i + 2) % 3
-    matrix = np.eye(4)
+    matrix = _UNIT.copy()
     matrix[j, j] = matrix[k, k] = math.cos(angle)
     matrix[k, j] = math.sin(angle)
     matrix[j, k] = -matrix[k, j]
@@ -40,7 +42,7 @@ def rotation_about(axis: str, angle: float) -> FloatArray:
 
 def shift_along(axis: str, distance: float) -> FloatArray:
     """(4, 4) shift by ``distance`` m along a named axis."""
-    matrix = np.eye(4)
+    matrix = _UNIT.copy()
     matrix[_AXIS_NUMBER[axis], 3] = distance
     return matrix
 
@@ -73,7 +75,7 @@ def _moving(axis: str, number: int, geometry: Mapping[str, float], angle: float)
     error, along, whirl = 0.0, 0.0, {"radial": 0.0j, "tilt": 0.0j}
     waves = [name for name in geometry if name.startswith(_WAVES[number])]
     if not waves:
-        return np.eye(4)
+        return _UNIT
     for name in waves:
         (kind, *rest), value = name.split("_"), geometry[name]
         order = int(rest[2].replace("m", "-").replace("p", ""))
@@ -139,14 +141,13 @@ class Scene:
             return _moving(table.axes[0], 1, g, angles[0]) @ rotation_about(table.axes[0], angles[0] + g["zero_1"])
         outer, inner = table.axes
         third = next(axis for axis in "xyz" if axis not in (outer, inner))
-        return (
-            _moving(outer, 1, g, angles[0])
-            @ rotation_about(outer, angles[0] + g["zero_1"])
-            @ shift_along(third, g["axis_offset"])
-            @ rotation_about(third, g["non_orthogonality"])
-            @ _moving(inner, 2, g, angles[1])
-            @ rotation_about(inner, angles[1] + g["zero_2"])
-        )
+        a, b = angles.tolist()
+        chain = (
+            _moving(outer, 1, g, a), rotation_about(outer, a + g["zero_1"]), shift_along(third, g["axis_offset"]),
+            rotation_about(third, g["non_orthogonality"]), _moving(inner, 2, g, b),
+            rotation_about(inner, b + g["zero_2"]),
+        )  # fmt: skip
+        return reduce(np.matmul, [m for m in chain if m is not _UNIT])
 
     def world_from_station(self, station_id: str, epoch_id: str | None = None, late: Late = 0.0) -> FloatArray:
         """(4, 4) at an epoch, or a time after it: by the table where it was read then, else the station's own pose."""

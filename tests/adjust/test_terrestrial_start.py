@@ -10,6 +10,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import Distance, PositionRef, Reading
 from adjust.model.survey import Datum, Point, PointParameter, Setup, Survey
 from adjust.start.positions import given_points
+from adjust.start.readings.places import positions, settled
 from adjust.start.readings.start import find_points
 from tests.adjust.terrestrial_networks import P, Truth, measured, polar_network, start_near
 
@@ -153,3 +154,32 @@ def test_convergence_from_coordinates_rounded_to_metres() -> None:
     exact, rough = adjust(survey, start), adjust(survey, rounded)
     assert rough.omega == pytest.approx(exact.omega, rel=1e-9)
     assert rough.iterations < 10
+
+
+def test_places_are_where_the_lines_cross_one_or_two() -> None:
+    """Two circles cross twice, a third decides; two rays cross once; directions from the place: the resection."""
+    z, known = 3.0 + 4.0j, [0j, 10.0 + 1.0j, 2.0 + 9.0j, -4.0 + 7.0j]
+    circles = [(o, abs(z - o)) for o in known]
+    rays = [(o, float(np.angle(z - o))) for o in known]
+    seen = [(o, float(np.angle(o - z)) + 0.7) for o in known]
+    both = sorted(positions([], circles[:2], []), key=lambda p: abs(p - z))
+    mirrored = known[1] / np.conj(known[1]) * np.conj(z)  # on the other side of the line through both centres
+    np.testing.assert_allclose(both, [z, mirrored], atol=1e-9)
+    for asked in (([], circles[:3], []), (rays[:2], [], []), ([], [], [seen]), (rays[:1], circles[1:2], [seen[1:3]])):
+        np.testing.assert_allclose(positions(*asked), [z], atol=1e-9)
+    assert positions([], circles[:1] * 2, []) == []  # all round the circle
+
+
+def test_minima_are_found_where_what_is_missed_stays_large() -> None:
+    """A distance that is wrong by half, from far away: where the derivative of the sum of squares is zero."""
+    centres = np.array([[0.0, 0.0], [10.0, 1.0], [2.0, 9.0]])
+    lengths = np.linalg.norm(np.array([3.0, 4.0]) - centres, axis=1) * [1.0, 1.0, 1.5]
+
+    def evaluate(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        to = x[:, None] - centres
+        length = np.linalg.norm(to, axis=2)
+        return length - lengths, to / length[..., None]
+
+    _, misses, by_x = settled(evaluate, np.array([[40.0, -30.0], [4.0, 4.0], [-500.0, 2.0]]), 60)
+    assert np.linalg.norm(misses, axis=1).min() > 0.5
+    np.testing.assert_allclose(np.einsum("sni,sn->si", by_x, misses), 0.0, atol=1e-7)

@@ -68,8 +68,10 @@ def fit_table(
     if begun is None:
         return None
     X, Z = begun
+    groups = _groups(views, place, len(X), len(Z))
+    by_geometry = (views.by_geometry() * _free_geometry(views))[views.epoch]
     for step in range(iterations + 1):
-        r, cov, _ = residuals(views, views.motions(geometry=geometry), X, Z, place)
+        r, cov, mount_from_table = residuals(views, views.motions(geometry=geometry), X, Z, place)
         if not np.isfinite(r).all():
             return None
         info = _inverse(cov)
@@ -77,8 +79,21 @@ def fit_table(
         scale = max(1.0, float(np.median(chi2)) / _MEDIAN_6)
         if step < iterations:
             weights = (1.0 / (1.0 + chi2 / (_BOUND * _MEDIAN_6 * scale))) ** 2
-            X, Z, geometry = _improved(views, place, X, Z, geometry, r, info * weights[:, None, None])
+            own = np.broadcast_to(np.eye(6), info.shape)
+            J = np.concatenate([own, -adjoint(mount_from_table), by_geometry], axis=2)
+            X, Z, geometry = _improved(views, groups, X, Z, geometry, r, J, info * weights[:, None, None])
     return TableFit(X, Z, geometry, chi2, scale)
+
+
+def _groups(views: TableViews, place: IntArray, n_inner: int, n_places: int) -> list[tuple[IntArray, IntArray]]:
+    """Views (m,) of one inner thing and one place each, and the unknowns (14,) of the two and of the geometry."""
+    pair = views.inner * n_places + place
+    out, step, n = [], np.arange(6), 6 * (n_inner + n_places)
+    for one in np.unique(pair).tolist():
+        inner, outer = divmod(one, n_places)
+        at = np.concatenate([6 * inner + step, 6 * (n_inner + outer) + step, [n, n + 1]])
+        out.append((np.flatnonzero(pair == one), at))
+    return out
 
 
 def _inverse(cov: FloatArray) -> FloatArray:
@@ -89,21 +104,17 @@ def _inverse(cov: FloatArray) -> FloatArray:
 
 
 def _improved(
-    views: TableViews, place: IntArray, X: FloatArray, Z: FloatArray, geometry: FloatArray, r: FloatArray, W: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """One step of Gauss-Newton; W: (n, 6, 6) weights of the residuals."""
+    views: TableViews, groups: list[tuple[IntArray, IntArray]], X: FloatArray, Z: FloatArray, geometry: FloatArray,
+    r: FloatArray, J: FloatArray, W: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    """One step of Gauss-Newton; J: (n, 6, 14) derivatives by the unknowns of each view, W: (n, 6, 6) weights."""
     n = 6 * (len(X) + len(Z))
     N, b = np.zeros((n + 2, n + 2)), np.zeros(n + 2)
-    by_place = -adjoint(inverse(views.motions(geometry=geometry)))[views.epoch]
-    by_geometry = views.by_geometry()[views.epoch] * _free_geometry(views)
-    for i, p in sorted(set(zip(views.inner.tolist(), place.tolist(), strict=True))):
-        rows = (views.inner == i) & (place == p)
-        at = np.r_[6 * i : 6 * i + 6, 6 * (len(X) + p) : 6 * (len(X) + p) + 6, n : n + 2]
-        own = np.broadcast_to(np.eye(6), (int(rows.sum()), 6, 6))
-        J = np.concatenate([own, by_place[rows], by_geometry[rows]], axis=2)
-        JW = J.swapaxes(1, 2) @ W[rows]
-        N[np.ix_(at, at)] += (JW @ J).sum(axis=0)
-        b[at] -= np.einsum("nij,nj->i", JW, r[rows])
+    WJ, k = W @ J, J.shape[2]
+    for rows, at in groups:
+        weighted = WJ[rows].reshape(-1, k).T
+        N[at[:, None], at] += weighted @ J[rows].reshape(-1, k)
+        b[at] -= weighted @ r[rows].ravel()
     weak = 1.0 / _GEOMETRY_SIGMAS**2
     N[[n, n + 1], [n, n + 1]] += weak
     b[n:] -= weak * (geometry - given_geometry(views.table))

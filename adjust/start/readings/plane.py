@@ -12,11 +12,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from adjust.observations.terrestrial.batch import circular_median
+from adjust.start.readings.places import positions
 from adjust.start.readings.sights import Node, Sights, best_of_places
 
 _SURE = 0.15
 """Sine of the angle between two rays below which they do not intersect well."""
-_LOST = 1e-9
 
 
 @dataclass(eq=False)
@@ -243,46 +243,6 @@ class PlaneStart:
                     off = (system.xy[b] - system.xy[a]) * cmath.rect(1.0, -system.turn[name] - angle)
                     total += min(abs(off) * abs(cmath.phase(off)), 0.1 * abs(off))
         return total
-
-
-def positions(
-    rays: list[tuple[complex, float]], circles: list[tuple[complex, float]],
-    sets: list[list[tuple[complex, float]]],
-) -> list[complex]:  # fmt: skip
-    """Points that agree with rays to them, distances, and sets of directions from them; none where it is uncertain.
-
-    One: it is unique. Several: each fits as well. Found from starts all round, as few points are concerned.
-    """
-    from scipy.optimize import least_squares  # here: few surveys come this way, and it takes long to load
-
-    centres = np.array([z for z, _ in rays] + [z for z, _ in circles] + [z for s in sets for z, _ in s])
-    size = max(float(np.abs(centres - centres.mean()).max()), max((d for _, d in circles), default=0.0), 1e-3)
-
-    def misses(p: np.ndarray) -> np.ndarray:
-        z = complex(p[0], p[1])
-        out = [float(np.angle((z - o) * cmath.rect(1.0, -angle))) * size for o, angle in rays]
-        out += [abs(z - o) - d for o, d in circles]
-        for seen in sets:
-            turns = np.array([(o - z) * cmath.rect(1.0, -angle) for o, angle in seen])
-            turns /= np.maximum(np.abs(turns), _LOST * size)
-            mean = turns.sum()
-            out += (np.angle(turns * np.conj(mean)) * size).tolist()
-        return np.array(out)
-
-    around = [cmath.rect(r * size, 2.0 * np.pi * k / 8.0) for r in (0.3, 1.0, 2.5) for k in range(8)]
-    starts = [complex(centres.mean()) + z for z in around] if not circles else [
-        o + cmath.rect(d, 2.0 * np.pi * k / 12.0) for o, d in circles[:2] for k in range(12)
-    ]  # fmt: skip
-    found: list[tuple[float, complex, bool]] = []
-    for start in starts:
-        result = least_squares(misses, [start.real, start.imag], xtol=1e-10, ftol=1e-10, max_nfev=60)
-        z, cost = complex(*result.x), float(np.sqrt(2.0 * result.cost))
-        if not any(abs(z - other) < 1e-3 * size for _, other, _ in found):
-            s = np.linalg.svd(result.jac, compute_uv=False)
-            found.append((cost, z, bool(s[-1] > 0.02 * max(s[0], 1.0) and len(s) > 1)))
-    best = min(cost for cost, _, _ in found)
-    good = [(c, z, sure) for c, z, sure in found if c < 3.0 * best + 2e-3 * size]
-    return [z for _, z, sure in sorted(good, key=lambda g: g[0]) if sure] if all(g[2] for g in good) else []
 
 
 def fit(

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from adjust.model.survey import FloatArray
+from adjust.start.readings.places import settled
 from adjust.start.readings.sights import Node, Sights, best_of_places
 
 
@@ -78,8 +79,6 @@ def _sure(distance: Mapping[Node, Mapping[Node, float]], known: Mapping[Node, Fl
 
 def places(mine: Mapping[Node, float], known: Mapping[Node, FloatArray]) -> list[FloatArray]:
     """Where a point with these distances to known points can be: one place, two mirrored ones, or none certain."""
-    from scipy.optimize import least_squares  # here: few surveys come this way, and it takes long to load
-
     nodes = [n for n in mine if n in known]
     if len(nodes) < 3:
         return []
@@ -90,13 +89,17 @@ def places(mine: Mapping[Node, float], known: Mapping[Node, FloatArray]) -> list
         return []
     flat = s[2] < 0.05 * s[0] if len(s) > 2 else True
     out: list[FloatArray] = []
-    for side in (1.0, -1.0):
-        result = least_squares(
-            lambda x: np.linalg.norm(x - X, axis=1) - d, centre + side * float(np.median(d)) * Vt[2], max_nfev=100
-        )
-        cost = float(np.sqrt(2.0 * result.cost))
-        if cost < 0.02 * float(np.median(d)) and not any(np.linalg.norm(result.x - x) < 0.02 * d.min() for x in out):
-            out.append(result.x)
+
+    def evaluate(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        to = x[:, None] - X
+        length = np.linalg.norm(to, axis=2)
+        return length - d, to / np.maximum(length, np.finfo(float).tiny)[..., None]
+
+    found, misses, _ = settled(evaluate, centre + np.median(d) * np.array([Vt[2], -Vt[2]]), 100)
+    for place, missed in zip(found, misses, strict=True):
+        cost = float(np.linalg.norm(missed))
+        if cost < 0.02 * float(np.median(d)) and not any(np.linalg.norm(place - x) < 0.02 * d.min() for x in out):
+            out.append(place)
     if len(out) == 2 and not flat:
         costs = [float(np.abs(np.linalg.norm(x - X, axis=1) - d).max()) for x in out]
         if min(costs) < 0.2 * max(costs):
