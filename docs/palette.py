@@ -1,4 +1,4 @@
-"""Pictures of pages as PNG of at most 160 colours: a quarter of the size, and no difference that an eye would see."""
+"""Pictures of pages as PNG of at most 136 colours: a quarter of the size, and no difference that an eye would see."""
 
 import struct
 import zlib
@@ -7,11 +7,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-_MOST, _SAMPLE = 160, 40000
+_MOST, _SAMPLE = 136, 40000
 
 
 def write_palette_png(path: Path, png: bytes) -> None:
-    """Write a picture given as PNG with the 160 colours nearest to its own (k-means over different colours)."""
+    """Write a picture given as PNG with the 136 colours nearest to its own (k-means over different colours)."""
     picture = cv2.cvtColor(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
     height, width = picture.shape[:2]
     codes = (picture.astype(np.uint32) * np.array([65536, 256, 1], dtype=np.uint32)).sum(axis=2).ravel()

@@ -36,6 +36,20 @@ def whole_of(request: Request, key: str) -> int | None:
     return int(text) if text.isdecimal() and len(text) < 10 else None
 
 
+def size_of(request: Request) -> int | None:
+    """Pixels of the longer side that a picture is asked for with; None for all."""
+    asked = whole_of(request, "size") or 1600
+    return None if request.query_params.get("size") == "full" else asked if asked <= 4096 else 1600
+
+
+def run_of(request: Request) -> int:
+    """The number of a run in a request's path. Raises SurveyError."""
+    number = whole_of(request, "number")
+    if number is None:
+        raise SurveyError("a run has a number; 'labsurvey runs FOLDER' lists them")
+    return number
+
+
 class BodyError(Exception):
     """What is asked is not understood."""
 

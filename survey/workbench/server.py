@@ -27,7 +27,7 @@ from survey.folder.locking import BusyError
 from survey.folder.text import suggestion
 from survey.report.language import LANGUAGES, message, speaking
 from survey.report.modules import WEB as SHARED
-from survey.workbench.bodies import JOBS, Body, BodyError, distance_of, json_of, whole_of
+from survey.workbench.bodies import JOBS, Body, BodyError, distance_of, json_of, run_of, size_of, whole_of
 from survey.workbench.guard import LONGEST_BODY, Guard, TooLongError
 from survey.workbench.live import Live
 
@@ -305,7 +305,7 @@ class Server:
 
         key = request.path_params["camera"], request.path_params["epoch"]
         project = self.bench.situation.everything
-        size = _size_of(request)
+        size = size_of(request)
         if key not in project.images:
             return JSONResponse({"error": message("no such image")}, 404)
         tag = pictures.etag(project.detected.get(key), project.images[key], size)
@@ -319,7 +319,7 @@ class Server:
         return JSONResponse(await asyncio.to_thread(self.shown.capture_status))
 
     async def _captured(self, request: Request) -> Response:
-        camera, size = request.path_params["camera"], _size_of(request)
+        camera, size = request.path_params["camera"], size_of(request)
         data, kind = await asyncio.to_thread(self.shown.capture_picture, camera, size)
         return Response(data, media_type=kind)
 
@@ -371,11 +371,11 @@ class Server:
         return answering
 
     async def _restore(self, request: Request) -> Response:
-        number, base = _run_of(request), Body(await json_of(request)).base()
+        number, base = run_of(request), Body(await json_of(request)).base()
         return await self._decided(lambda: self.bench.restore(number, base))
 
     async def _pin(self, request: Request) -> Response:
-        number, pinned = _run_of(request), Body(await json_of(request)).flag("pinned")
+        number, pinned = run_of(request), Body(await json_of(request)).flag("pinned")
         run = await self._run("pin", lambda: self.bench.pin(number, pinned))
         return JSONResponse(run.as_dict())
 
@@ -438,16 +438,3 @@ def _in_words(changes: "Changes", most: int | None) -> dict[str, Any]:
 
     found = changes.as_dict(most)
     return found | {k: in_words(found[k]) for k in ("before", "after")}
-
-
-def _size_of(request: Request) -> int | None:
-    """Pixels of the longer side that a picture is asked for with; None for all."""
-    asked = whole_of(request, "size") or 1600
-    return None if request.query_params.get("size") == "full" else asked if asked <= 4096 else 1600
-
-
-def _run_of(request: Request) -> int:
-    number = whole_of(request, "number")
-    if number is None:
-        raise SurveyError("a run has a number; 'labsurvey runs FOLDER' lists them")
-    return number

@@ -41,8 +41,8 @@ export const count = (value) => number(value, 0);
 export function significant(value, digits = 4) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   if (value === 0) return "0";
-  const decimals = digits - 1 - Math.floor(Math.log10(Math.abs(value)));
-  if (decimals > 12) { const [size, power] = value.toExponential(digits - 1).split("e"); return `${number(Number(size), digits - 1)}e${power.replace("-", "−")}`; }
+  const size = Math.floor(Math.log10(Math.abs(value))), decimals = digits - 1 - size;
+  if (size < -7) { const [first, power] = value.toExponential(digits - 1).split("e"); return `${number(Number(first), digits - 1)}e${power.replace("-", "−")}`; }
   return number(value, Math.max(0, decimals));
 }
 

@@ -73,7 +73,7 @@ export class FindingsView {
   suspects(title, rows) {
     return plainTable(title, [t("observation"), "w", t("limit"), t("residual")],
       rows.map((s) => [link(s.anchor, s.kind === "image_point" ? s.text : `${t(`kind ${s.kind}`)} ${s.text}`, { data: { id: s.place[1] }, class: s.why === 0 ? null : "out", title: s.why === 0 ? null : t("left out") }),
-        s.w === null ? t("{k} of {n} points", { k: s.n_points, n: s.n_in_image }) : number(s.w, 2), s.share === null ? "–" : `${number(100 * s.share, 0)}\u00a0%`, s.residual === undefined ? "–" : `${[s.residual].flat().map((x) => significant(x, 2)).join(", ")} ${s.unit}`]), [1, 2, 3]);
+        s.w === null ? t("{k} of {n} points", { k: s.n_points, n: s.n_in_image }) : number(s.w, 2), s.share === null ? "–" : `${number(100 * s.share, 0)}\u00a0%`, s.residual === undefined ? "–" : `${[s.residual].flat().map((x) => significant(x, 2)).join("\u00a0/ ")}\u00a0${s.unit}`]), [1, 2, 3]);
   }
 
   groups(rows) {

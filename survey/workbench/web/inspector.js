@@ -28,7 +28,7 @@ export function drawInspector(bench, actions) {
   const { kind, ids } = current(), id = ids[0];
   if (!kind || id === undefined) { fill(by("inspector"), ...survey(bench)); return; }
   const parts = (ABOUT[kind] ?? (() => []))(bench, id, actions) ?? [];
-  fill(by("inspector"), make("h2", {}, `${t(`kind ${kind}`)} ${id.replace(/^\w+:/, "")}`, ids.length > 1 ? make("span", { class: "pill" }, `+ ${ids.length - 1}`) : null), ...doing(bench, actions), ...parts,
+  fill(by("inspector"), make("h2", {}, `${t(`kind ${kind}`)} ${kind === "group" ? groupName(id) : id.replace(/^\w+:/, "")}`, ids.length > 1 ? make("span", { class: "pill" }, `+ ${ids.length - 1}`) : null), ...doing(bench, actions), ...parts,
     make("p", { class: "quiet anchor" }, anchor(kind, id)));
 }
 
@@ -67,10 +67,12 @@ function sums(data, rows) {
 }
 
 /** The parameters whose name begins like this. */
-function parameters(bench, ...starts) {
-  const rows = bench.parameters.filter((p) => starts.some((start) => p.name === start || p.name.startsWith(`${start}/`)));
+const parameters = (bench, ...starts) => listed(bench.parameters.filter((p) => starts.some((start) => p.name === start || p.name.startsWith(`${start}/`))));
+
+/** Parameters by what of their names is of interest. @param {any[]} rows @param {(parts: string[]) => string[]} [shortly] */
+function listed(rows, shortly = (parts) => parts.slice(2)) {
   if (!rows.length) return [];
-  return [make("h3", {}, t("Parameters")), plainTable(t("Parameters"), [t("parameter"), t("value"), t("sigma")], rows.slice(0, MOST).map((p) => [link(anchor("param", p.name), p.name.split("/").slice(2).join("/") || p.name), `${estimated(p)} ${p.unit}`, p.sigma === null ? known(p.treatment ?? "") || "–" : measure(p.sigma, p.sigma_unit, 2)]), [1, 2])];
+  return [make("h3", {}, t("Parameters")), plainTable(t("Parameters"), [t("parameter"), t("value"), t("sigma")], rows.slice(0, MOST).map((p) => [link(anchor("param", p.name), shortly(p.name.split("/")).join("/") || p.name), `${estimated(p)} ${p.unit}`, p.sigma === null || p.treatment === "held" ? known(p.treatment ?? "") || "–" : measure(p.sigma, p.sigma_unit, 2)]), [1, 2])];
 }
 
 /** Every observation of one point, worst first. */
@@ -131,6 +133,6 @@ const imagesOf = (bench, test) => {
 };
 
 const parametersOfEpoch = (bench, id) => {
-  const starts = [...new Set(bench.parameters.filter((p) => p.name.split("/")[2] === id).map((p) => p.name.split("/").slice(0, 3).join("/")))];
-  return starts.length ? parameters(bench, ...starts) : [];
+  const of = bench.parameters.filter((p) => p.name.split("/")[2] === id);
+  return listed(of, (parts) => parts.slice(1).filter((part) => part !== id));
 };

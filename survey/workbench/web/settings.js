@@ -33,7 +33,7 @@ export class SettingsView {
     const choose = () => { over.hidden = kind.value !== "inner"; this.chosen = { kind: kind.value, points: all(points), stations: all(stations) }; };
     const choices = (title, ids, chosen) => make("select", { multiple: true, size: Math.min(8, Math.max(2, ids.length)), "aria-label": title, onchange: choose }, ...ids.map((id) => make("option", { value: id, selected: chosen.includes(id) }, id)));
     const points = choices(t("Points"), tree.points, datum.points), stations = choices(t("Stations"), tree.stations, datum.stations);
-    const over = make("div", { class: "actions", hidden: datum.kind !== "inner" }, make("label", {}, t("Points"), " ", points), make("label", {}, t("Stations"), " ", stations));
+    const over = make("div", { class: "actions", hidden: datum.kind !== "inner" }, tree.points.length ? make("label", {}, t("Points"), " ", points) : null, tree.stations.length ? make("label", {}, t("Stations"), " ", stations) : null);
     const kind = make("select", { "aria-label": t("Datum"), onchange: choose },
       make("option", { value: "given", selected: datum.kind === "given" }, t("datum given")), make("option", { value: "inner", selected: datum.kind === "inner" }, t("datum inner")));
     const all = (field) => (kind.value === "inner" ? [...field.selectedOptions].map((o) => o.value) : []);
