@@ -14,7 +14,7 @@ from adjust.model.errors import SurveyError
 from adjust.start.lenses import remembering
 
 _SHOWN = 3
-_KEPT, _ONE = 1.0, 1.0  # adjustments for each of the later families, and for a trial of what they find
+_KEPT, _ONE = 0.75, 1.0  # adjustments for each of the later families, and for a trial of what they find
 _AGAIN = 0.2  # share of what was given that is given once more where nothing explains enough, and something waits
 
 _SCORES = "effects"
