@@ -219,7 +219,7 @@ class Case:
             result = self.result
             if result is None:
                 survey = self.survey
-                start = None if survey.pairs or given_starts(survey) and survey.image_blocks else self.start
+                start = None if survey.pairs or (given_starts(survey) and survey.image_blocks) else self.start
                 most = _LOST * CAP * (2 * sum(b.n_used for b in survey.image_blocks) + survey.n_others_used)
                 first = _START * (start is None) + _REST
                 result = self._adjusted(survey, start, _NEAR, first, most=most)
@@ -238,7 +238,7 @@ class Case:
     @property
     def is_near(self) -> bool:
         """Whether all observations take part in its adjustment, and leave its values near to where they belong."""
-        return self.linear is not None and not self.is_spoilt
+        return self.result is not None and self.linear is not None and not self.is_spoilt
 
     @property
     def is_lost(self) -> bool:

@@ -110,7 +110,8 @@ def _afresh_first(hypothesis: Hypothesis, case: Case) -> bool:
 def tried_afresh(trial: Trial, case: Case, base: Misfit) -> Trial | None:
     """The same from its own start, where the values of the case led away or may be spoilt by what it does not explain.
 
-    From these values, where its own start was the first. None where that is no better, and of what is scored at these values. base: what the case leaves unexplained.
+    From these values, where its own start was the first. None where that is no better, and of what is scored at these
+    values. base: what the case leaves unexplained.
     """
     near = trial.misfit.omega < base.omega and (case.is_near or trial.hypothesis.of_variances)
     if trial.result is not None and case.is_near and case.linear is not None:  # a minimum, if not a better one
