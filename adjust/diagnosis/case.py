@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 CAP = 50.0
 """The most that one component of an observation counts: what is left out, or cannot be predicted, counts so."""
 MOST = 6.5
-"""Adjustments that scores, starts and trials of a diagnosis may take; other evidence takes one or two more."""
+"""Adjustments that scores, starts and trials of a diagnosis may take; other evidence takes two or three more."""
 _LEFT_OUT = 4
 _FAR = 25.0
 """Variance factor from which a solution may be another one than that of the observations without their mistake."""

@@ -77,8 +77,8 @@ def diagnose(case: Case, families: Sequence[Family] | None = None) -> Diagnosis:
     """Form the hypotheses of all families, try the likeliest of them, and rank those that explain the misfit.
 
     families: those of ``FAMILIES`` where None. As many are tried as the budget of the case allows, and where none of
-    them explains anything though not all was looked at, or what says the first one more exactly still waits, as many
-    again. Nothing is repaired, nothing is written.
+    them explains anything though not all was looked at, or what says the first one more exactly still waits, a few
+    more. Nothing is repaired, nothing is written.
     """
     with remembering():  # most of what is tried has most of its images in common
         return _diagnosed(case, families)
