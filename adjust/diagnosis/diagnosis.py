@@ -92,7 +92,7 @@ def _diagnosed(case: Case, families: Sequence[Family] | None) -> Diagnosis:
         kept = (_KEPT * later + _ONE) * bool(later and case.survey.image_blocks)
         case.budget.kept = kept + _ONE * (not kept)
         formed = list[Hypothesis]()
-        for family in () if search.done() else rooms:
+        for family in () if search.done() or (case.result is None and search.leaves_noise) else rooms:
             case.budget.refused = False
             formed += _formed(family, case)
             cut += [family] * case.budget.refused
@@ -104,6 +104,8 @@ def _diagnosed(case: Case, families: Sequence[Family] | None) -> Diagnosis:
         case.budget.left, case.budget.kept = max(case.budget.left, 0.0) + _AGAIN * given, 0.0
         search.over([], 0.0)
         for family in cut if again else ():
+            if not case.budget.lasts:
+                break
             formed = [h for h in _formed(family, case) if search.is_new(h)]
             looked_at += sum(h.looked_at for h in formed)
             search.over(formed, 0.0)
