@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 CAP = 50.0
 """The most that one component of an observation counts: what is left out, or cannot be predicted, counts so."""
 MOST = 6.5
-"""Adjustments that scores, starts and trials of a diagnosis may take; other evidence takes one or two more."""
+"""Adjustments that scores, starts and trials of a diagnosis may take; other evidence takes two or three more."""
 _LEFT_OUT = 4
 _FAR = 25.0
 """Variance factor from which a solution may be another one than that of the observations without their mistake."""
@@ -37,8 +37,9 @@ _CLOCKS = 2.5
 _NEAR = AdjustOptions(reject_blocks=False, solve=SolveOptions(max_step=1e-3, max_iterations=20, settled=1e-4))
 _OWN = replace(_NEAR, solve=replace(_NEAR.solve, max_iterations=8))
 """From near values and from own start values: a survey that is right converges soon, and is only compared."""
-_LOST = 1e4
-"""v'Pv over that of observations none of which is explained, from which values that are on their way say nothing."""
+_LOST, _BEGUN = 1e4, 3
+"""v'Pv over that of observations none of which is explained, from which values that are on their way say nothing; steps
+after which those of a survey that is right are not as far off any more."""
 _HOPELESS = 8
 """Steps after which a trial from near values leaves less than the survey as it stands does, or leads nowhere."""
 
@@ -107,13 +108,14 @@ class Case:
 
         def went(iteration: int, omega: float) -> None:
             self.budget.left -= step
-            if iteration >= _HOPELESS and omega > most:
+            if (iteration >= _HOPELESS and omega > most) or (iteration >= _BEGUN and omega > lost):
                 raise SurveyError("it leads away")
 
         clocks = [o.clock for of in (survey.cameras, survey.tables, survey.stations) for o in of]
         if any(clock is not None for clock in clocks):
             first, step = _CLOCKS * first, _CLOCKS * step
         self.budget.spend(first)
+        lost = _LOST * _nothing(survey) if options is _OWN else np.inf
         return adjust(survey, start, options, went)
 
     def warm(self, survey: Survey) -> Adjustment:
@@ -219,8 +221,8 @@ class Case:
             result = self.result
             if result is None:
                 survey = self.survey
-                start = None if survey.pairs or given_starts(survey) and survey.image_blocks else self.start
-                most = _LOST * CAP * (2 * sum(b.n_used for b in survey.image_blocks) + survey.n_others_used)
+                start = None if survey.pairs or (given_starts(survey) and survey.image_blocks) else self.start
+                most = _LOST * _nothing(survey)
                 first = _START * (start is None) + _REST
                 result = self._adjusted(survey, start, _NEAR, first, most=most)
             elif not self.is_whole:
@@ -238,7 +240,7 @@ class Case:
     @property
     def is_near(self) -> bool:
         """Whether all observations take part in its adjustment, and leave its values near to where they belong."""
-        return self.linear is not None and not self.is_spoilt
+        return self.result is not None and self.linear is not None and not self.is_spoilt
 
     @property
     def is_lost(self) -> bool:
@@ -267,6 +269,11 @@ class Case:
         for i, view in self.views.items():
             out[i] = view.error_px[0]
         return out
+
+
+def _nothing(survey: Survey) -> float:
+    """v'Pv, bounded, of observations none of which is explained."""
+    return CAP * (2 * sum(b.n_used for b in survey.image_blocks) + survey.n_others_used)
 
 
 def _is_whole(survey: Survey, result: Adjustment) -> bool:

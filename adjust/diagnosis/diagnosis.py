@@ -14,7 +14,7 @@ from adjust.model.errors import SurveyError
 from adjust.start.lenses import remembering
 
 _SHOWN = 3
-_KEPT, _ONE = 1.0, 1.0  # adjustments for each of the later families, and for a trial of what they find
+_KEPT, _ONE = 0.75, 1.0  # adjustments for each of the later families, and for a trial of what they find
 _AGAIN = 0.2  # share of what was given that is given once more where nothing explains enough, and something waits
 
 _SCORES = "effects"
@@ -77,8 +77,8 @@ def diagnose(case: Case, families: Sequence[Family] | None = None) -> Diagnosis:
     """Form the hypotheses of all families, try the likeliest of them, and rank those that explain the misfit.
 
     families: those of ``FAMILIES`` where None. As many are tried as the budget of the case allows, and where none of
-    them explains anything though not all was looked at, or what says the first one more exactly still waits, as many
-    again. Nothing is repaired, nothing is written.
+    them explains anything though not all was looked at, or what says the first one more exactly still waits, a few
+    more. Nothing is repaired, nothing is written.
     """
     with remembering():  # most of what is tried has most of its images in common
         return _diagnosed(case, families)
@@ -92,7 +92,7 @@ def _diagnosed(case: Case, families: Sequence[Family] | None) -> Diagnosis:
         kept = (_KEPT * later + _ONE) * bool(later and case.survey.image_blocks)
         case.budget.kept = kept + _ONE * (not kept)
         formed = list[Hypothesis]()
-        for family in () if search.done() else rooms:
+        for family in () if search.done() or (case.result is None and search.leaves_noise) else rooms:
             case.budget.refused = False
             formed += _formed(family, case)
             cut += [family] * case.budget.refused
@@ -104,6 +104,8 @@ def _diagnosed(case: Case, families: Sequence[Family] | None) -> Diagnosis:
         case.budget.left, case.budget.kept = max(case.budget.left, 0.0) + _AGAIN * given, 0.0
         search.over([], 0.0)
         for family in cut if again else ():
+            if not case.budget.lasts:
+                break
             formed = [h for h in _formed(family, case) if search.is_new(h)]
             looked_at += sum(h.looked_at for h in formed)
             search.over(formed, 0.0)

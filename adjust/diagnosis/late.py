@@ -120,7 +120,8 @@ def keyed(survey: Survey, of: Hypothesis, freed: Freed, jitter: float = 0.0) -> 
     new = edits(survey, freed, jitter)
     keys = ", ".join(dict.fromkeys(f"{e.path[-1]} = {_toml(e.value)}" for e in new if isinstance(e, SetKey)))
     owners = ", ".join(map(clock_text, freed))
-    return replace(of, edits=new, change=f"{of.change}; or let the adjustment find it: clock = {{ {keys} }} of {owners}")
+    change = f"{of.change}; or let the adjustment find it: clock = {{ {keys} }} of {owners}"
+    return replace(of, edits=new, change=change)
 
 
 def _n_own(survey: Survey | None, freed: Freed, jitter: float) -> int:

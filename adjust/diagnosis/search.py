@@ -65,6 +65,12 @@ class Search:
         best = (t for t in self.trials if t.explains_all_but(_MOST_OF_IT, self.base))
         return any(following < _FAINT * t.hypothesis.evidence for t in best)
 
+    @property
+    def leaves_noise(self) -> bool:
+        """Whether something leads to a solution with all observations and leaves nothing but noise."""
+        good = (t for t in self.trials if t.result is not None and t.misfit.is_noise() and not t.misfit.dropped)
+        return any(t.misfit.unused == 0 and not t.hypothesis.of_variances for t in good)
+
     def is_new(self, h: Hypothesis) -> bool:
         """Whether nothing of that name and place was tried, or waits."""
         known = [*(t.hypothesis for t in self.trials), *self.queue]

@@ -13,7 +13,9 @@ from adjust.model.survey import FloatArray, Survey
 
 _NOISE, _CLEARLY = 5.0, 3.0
 """Sigmas of v'Pv up to which what is left is noise."""
-_LAST = 0.7
+_SETTLED = 1.0
+"""The same up to which a size that was found in a hurry is good enough."""
+_LAST = 0.3
 """Adjustments that finding the size of a change leaves for the one that shows what it explains."""
 _FACTORS = 2.0 ** np.arange(24.0)
 
@@ -96,19 +98,20 @@ def tried(hypothesis: Hypothesis, case: Case) -> Trial:
         return Trial(hypothesis, misfit_of(None, case.survey), None, None, case.budget.refused)
     cut, case.budget.refused = case.budget.refused, False
     trial = _adjusted(hypothesis, survey, case, case.run if _afresh_first(hypothesis, case) else case.warm)
-    return replace(trial, untimely=trial.untimely or (cut and not trial.misfit.is_noise()))
+    return replace(trial, untimely=trial.untimely or (cut and not trial.misfit.is_noise(_SETTLED)))
 
 
 def _afresh_first(hypothesis: Hypothesis, case: Case) -> bool:
     """Where there are no values, or a start costs less than finding out that they are far off."""
-    far = case.is_spoilt and not case.survey.image_blocks and not hypothesis.of_variances
-    return case.starts_afresh or (far and not hypothesis.scored)
+    afresh = not (case.survey.image_blocks or hypothesis.scored or hypothesis.of_variances)
+    return case.starts_afresh or (afresh and case.is_spoilt)
 
 
 def tried_afresh(trial: Trial, case: Case, base: Misfit) -> Trial | None:
     """The same from its own start, where the values of the case led away or may be spoilt by what it does not explain.
 
-    From these values, where its own start was the first. None where that is no better, and of what is scored at these values. base: what the case leaves unexplained.
+    From these values, where its own start was the first. None where that is no better, and of what is scored at these
+    values. base: what the case leaves unexplained.
     """
     near = trial.misfit.omega < base.omega and (case.is_near or trial.hypothesis.of_variances)
     if trial.result is not None and case.is_near and case.linear is not None:  # a minimum, if not a better one

@@ -213,7 +213,7 @@ class _LensSearch:
     def _focal_lengths(
         self, maps: Sequence[FloatArray], chosen: Sequence[Sighting], near: FloatArray | None
     ) -> Iterator[tuple[FloatArray, str]]:
-        """Values to begin with and how they were found: a closed form, or near ones, that miss little, else the least."""
+        """Values to begin with and how they were found: a closed form that misses little, near ones, else the least."""
         trials: list[tuple[FloatArray, str]] = []
         errors: list[float] = []
         trial_images = _every(chosen, _SCAN_IMAGES)

@@ -110,7 +110,7 @@ def test_part_that_can_be_adjusted_is_no_explanation() -> None:
 
 
 def test_diagnosis_keeps_to_its_budget() -> None:
-    """What is spent ends it, once more as much where nothing explains anything; what was not tried any more is told."""
+    """What is spent ends it, a little more where nothing explains anything; what was not tried any more is told."""
     survey, truth = survey_of("stereo", 3)
     planted = next(m for m in MISTAKES if m.name == "camera moved").plant(survey, truth, 6.0)
     result = adjust.solve(planted)

@@ -8,9 +8,10 @@ import pytest
 
 from adjust.adjustment import adjust
 from adjust.diagnosis.case import Case
-from adjust.diagnosis.sequences import Link, links
+from adjust.diagnosis.sequences import Link, links, shifts
 from adjust.diagnosis.time.forgotten_motion import forgotten_motion
 from adjust.diagnosis.time.synchronisation import time_offset, unsynchronised
+from adjust.diagnosis.weights import correlated
 from adjust.diagnosis.weights.sigmas import odd_sigmas, wrong_factors
 from adjust.statistics.scaling import scaled_survey
 from survey.project import read
@@ -38,6 +39,18 @@ def test_the_offset_of_a_camera_is_estimated_from_the_motion(offset: float) -> N
     assert found is not None
     assert found.intervals == pytest.approx(offset, abs=0.15 * abs(offset) + 4.0 * found.sigma)
     assert abs(found.intervals) > 4.0 * found.sigma
+
+
+def test_epochs_are_shifted_only_where_that_joins_what_belongs_together() -> None:
+    """What one of two cameras shows in places of its own is not that of another epoch."""
+    link = moving(0.0)
+    late = replace(link, second=np.roll(link.second, 1, axis=0))
+    assert shifts(late)[0].by == 1
+    assert shifts(late)[0].evidence > 10.0
+    rng = np.random.default_rng(5)
+    spoilt = link.second.copy()
+    spoilt[:, :3, 3] += rng.normal(0.0, 0.3, (len(spoilt), 3))
+    assert not shifts(replace(link, second=spoilt))
 
 
 def test_simultaneous_cameras_have_no_offset() -> None:
@@ -91,6 +104,22 @@ def test_sigmas_of_a_group_wrong_by_a_factor(k: float) -> None:
 @pytest.mark.parametrize("seed", range(4))
 def test_right_sigmas_are_not_blamed(seed: int) -> None:
     assert [*wrong_factors(case_of(hall(seed))), *odd_sigmas(case_of(hall(seed)))] == []
+
+
+@pytest.mark.parametrize("size", [3.0, 10.0])
+def test_the_size_of_a_common_error_is_the_likeliest_one(size: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Found without adjusting: adjusted with other sizes v'Pv and the logarithms of the variances are larger."""
+    common = dict(zip(("S0", "S1", "S2", "S3"), (1.1, -0.8, 0.5, -1.3), strict=True))
+    survey = hall()
+    wrong = replace(survey, readings=tuple(
+        replace(r, value=r.value + size * r.sigma * common.get(r.setup_id, 0.0) * (r.kind == "slope_distance"))
+        for r in survey.readings))  # fmt: skip
+    case, costs = case_of(wrong), []
+    for sizes in (correlated._SIZES, (0.2,), (1.0,), (60.0,)):
+        monkeypatch.setattr(correlated, "_SIZES", sizes)
+        found = next(h for h in correlated.correlated_readings(case) if h.place.ids == ("slope_distance",))
+        costs.append(adjust(found.changed()).omega + found.penalty)
+    assert costs[0] < min(costs[1:]) + 1e-6
 
 
 def test_a_gross_error_is_no_wrong_sigma() -> None:

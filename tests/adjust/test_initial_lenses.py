@@ -7,8 +7,8 @@ import pytest
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import Camera, LensParameter, Point, PointParameter, PoseParameter, Station, Survey, Tie
-from adjust.start import find_start
-from adjust.start.lenses import Sighting, start_lens
+from adjust.start import find_start, lenses
+from adjust.start.lenses import Sighting, remembering, start_lens
 from tests.adjust.test_initial import FREE, SIZE, TRUE, assert_near, board_views, grid, inv, looking_at, pixels
 from tests.data import data_folder
 
@@ -157,3 +157,44 @@ def test_a_real_bundle_starts_from_four_control_points():
     # the sheet is flat
     assert max(abs(x[2]) for x in start.points.values()) < 0.05
     assert max(start.block_rms_px) < 15
+
+
+def test_the_same_images_are_searched_once(monkeypatch):
+    """Also under other numbers, with what was left out by these; what finds nothing is not searched again either."""
+    rng = np.random.default_rng(2)
+    camera = Camera("c", "s", SIZE, LensParameter("brown", FREE))
+    images = sightings(rng, 6, project)
+    images[2] = Sighting(2, images[2].x, images[2].uv[::-1])
+    plain, ran = start_lens(camera, images), []
+    run = lenses._LensSearch.run
+    monkeypatch.setattr(lenses._LensSearch, "run", lambda *a: ran.append(1) or run(*a))
+    with remembering():
+        for first in (0, 10, 20):
+            found = start_lens(camera, [Sighting(first + s.block_idx, s.x, s.uv) for s in images])
+            np.testing.assert_array_equal(found.values, plain.values)
+            assert list(found.excluded) == [first + i for i in plain.excluded]
+            found.values[:] = 0.0
+        assert len(ran) == 1
+        for _ in range(2):
+            with pytest.raises(SurveyError):
+                start_lens(camera, [])
+        assert len(ran) == 2
+    start_lens(camera, images)
+    assert len(ran) == 3
+
+
+def test_values_that_were_known_before_save_the_scan(monkeypatch):
+    """Where no closed form misses little; they are refined by the images as others are."""
+    rng = np.random.default_rng(3)
+    camera, images = Camera("c", "s", SIZE, LensParameter("brown", FREE)), sightings(rng, 8, project)
+    best = start_lens(camera, images).values
+
+    def none(*_):
+        raise SurveyError("no closed form")
+
+    monkeypatch.setattr(lenses, "pinhole_from_homographies", none)
+    near = best.copy()
+    near[:2] *= 1.03
+    found = start_lens(camera, images, near=near)
+    assert "known before" in found.note
+    np.testing.assert_allclose(found.values[:2], best[:2], rtol=2e-3)

@@ -1,6 +1,7 @@
 """Bodies taken for rigid that are not: a camera or target moved, a focus touched, an image cropped or turned later."""
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 from adjust.diagnosis.bodies.cameras import changed_camera, turned_images
 from adjust.diagnosis.bodies.lens_steps import by_themselves, lens_steps
@@ -12,7 +13,7 @@ from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.prediction import adjusted_values
 
 __all__ = ["hypotheses"]
-_MOST = 4
+_MOST, _FAINT = 4, 5.0
 
 
 def hypotheses(case: Case) -> Iterable[Hypothesis]:
@@ -29,6 +30,8 @@ def _steps(case: Case) -> Iterator[Step]:
     if case.result is not None:
         every = series_of(case, adjusted_values(case.result))
         found = [step for series in every if (step := step_of(series)) is not None]
+        if case.is_spoilt:  # what single images say against values that are far off is no measure
+            found = [replace(step, gain=min(step.gain, _FAINT)) for step in found]
     if not found:
         for owner, values in (*case.without_each("target_id"), *case.without_each("camera_id")):
             steps = [step_of(s) for s in series_of(case, values) if s.name[1] == owner]

@@ -20,7 +20,7 @@ _BOUND = 100.0  # of the misfit of an image, times that of the typical one
 
 
 def misfits(case: Case) -> dict[str, tuple[Survey, list[int]]]:
-    """The cameras that do not fit by themselves, as the search for their lenses leaves them: alone, and their images."""
+    """Cameras that do not fit by themselves, as the search for their lenses leaves them: alone, and their images."""
     squares, out = squares_of(case.survey, case.views.values()), {}
     for camera in case.survey.cameras:
         mine = [i for i, b in enumerate(case.survey.image_blocks)
@@ -107,7 +107,7 @@ def _split(case: Case, alone: Survey, cut: int) -> tuple[int, float]:
 
 
 def _fitted(case: Case, alone: Survey) -> tuple[float, FloatArray | None]:
-    """What the lens of some images leaves of them, and that lens: as it is started where they are too few for all of it."""
+    """What the lens of some images leaves of them, and that lens: as it is started where they are too few for it."""
     camera = alone.cameras[0].camera_id
     try:
         result = case.run(alone)

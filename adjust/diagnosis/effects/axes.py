@@ -42,7 +42,7 @@ def unsteady_axes(case: Case) -> Iterator[Hypothesis]:
                     continue
                 drop = _promised(survey, linear.result)
                 if drop > linear.scale * float(chi2.isf(sidak(_ALPHA, found.looked_at), found.parameters)):
-                    yield replace(found, evidence=linear.ratio(drop))
+                    yield replace(found, evidence=linear.ratio(drop), scored=True)
 
 
 def _promised(survey: Survey, result: Adjustment) -> float:

@@ -44,7 +44,7 @@ def bent_targets(case: Case) -> Iterator[Hypothesis]:
             Place("target", (target,), "warp"),
             survey,
             (SetKey(("targets", target, "warp", "free"), True),),
-            evidence=linear.ratio(clear), parameters=2, looked_at=len(flat),
+            evidence=linear.ratio(clear), parameters=2, looked_at=len(flat), scored=True,
         )  # fmt: skip
         yield replace(hypothesis, follow=_sag_told(hypothesis, target))
 

@@ -146,7 +146,8 @@ def _camera_effect(case: Case, linear: Linear, name: str, weight: Any, cameras: 
     rows = name == "rolling shutter"
     unit = "from the first row to the last" if rows else "over all epochs" if drift else "throughout"
     model = None if rows else lambda h: as_unknowns(case, replace(hypothesis, evidence=h.evidence), freed)
-    return _by_tracks(case, keyed(case.survey, hypothesis, freed), weight, cameras, first, f"{text} ({{}}, {unit})", model)
+    said = f"{text} ({{}}, {unit})"
+    return _by_tracks(case, keyed(case.survey, hypothesis, freed), weight, cameras, first, said, model)
 
 
 def _by_tracks(

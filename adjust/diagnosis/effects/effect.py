@@ -31,8 +31,8 @@ class Effect:
     with the values of an adjustment. said: its cause in words, by theta and sigmas. added: theta and a further change.
     known: a size that explains itself near this one, and what that makes of the hypothesis; None where there is none.
     nearer: the same change at another epoch, that an adjustment with the change shows to be the right one, or None.
-    model: the hypothesis with a survey in which the size is an unknown, tried in place of ``mended``; further: the same,
-    tried after it where that leaves a clear part of the misfit.
+    model: the hypothesis with a survey in which the size is an unknown, tried in place of ``mended``. further: the
+    same, tried after it where that leaves a clear part of the misfit.
     """
 
     hypothesis: Hypothesis

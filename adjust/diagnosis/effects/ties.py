@@ -30,7 +30,7 @@ def untied(case: Case) -> Iterator[Hypothesis]:
                 f"give it parameters of its own: parameters = [] in cameras.{camera}.lens.shared",
                 Place("camera", (camera,), "shared"), _freed(case.survey, camera),
                 (SetKey(("cameras", camera, "lens", "shared", "parameters"), ()),),
-                evidence=linear.ratio(score.drop), parameters=score.seen, looked_at=len(shared),
+                evidence=linear.ratio(score.drop), parameters=score.seen, looked_at=len(shared), scored=True,
             )  # fmt: skip
             yield replace(hypothesis, follow=_told(hypothesis, linear.result, camera))
 
