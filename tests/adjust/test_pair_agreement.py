@@ -9,7 +9,7 @@ from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray
 from adjust.pose_network import PoseNetwork, pose_network
 from adjust.pose_network.agreement import _connected, agreeing, disagreeing
-from adjust.pose_network.cycles import short_loops
+from adjust.pose_network.cycles import flat, short_loops
 from adjust.pose_network.loops import evaluate_loops, walked
 from adjust.pose_network.network import survey_of
 from adjust.statistics.outliers import search
@@ -33,7 +33,7 @@ def test_short_loops_are_walks_that_end_where_they_begin() -> None:
     net = simulate(12, 4, seed=2, extra=30, sigma_rad=1e-9, sigma_m=1e-9).network
     every = np.arange(net.n_pairs)
     loops = short_loops(net.n_stations, net.a_idx, net.b_idx, every, every, 100)
-    found = walked(net.a_idx, net.b_idx, loops, [int(net.a_idx[loop[0]]) for loop in loops])
+    found = walked(net.a_idx, net.b_idx, flat(loops), net.a_idx[[loop[0] for loop in loops]])
     assert np.abs(evaluate_loops(found, net.arrays.motions)[0]).max() < 1e-6
     assert {e for loop in loops for e in loop} == set(every.tolist())
     assert len({frozenset(loop) for loop in loops}) == len(loops)

@@ -31,6 +31,7 @@ from survey.folder.units import from_si, to_si
 from survey.project.declared.toml_text import key_lines, read_tables
 from survey.project.tables import files as table_reading
 from survey.project.tables import reading as tables
+from survey.project.tables.observation_columns import pair_columns
 from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList
 from survey.simulate import full_lab
 from tests.survey.faults import write_good_project
@@ -462,3 +463,24 @@ def test_large_table_is_read_in_blocks(good: Path, record_property: Any) -> None
     assert len(blocks) == n_epochs
     assert blocks[123].epoch_id == "s123"
     np.testing.assert_array_equal(blocks[123].uv, [row[4:6] for row in rows[123 * per_block : 124 * per_block]])
+
+
+def test_pairs_as_columns_say_of_each_what_it_has() -> None:
+    """A pose and a rotation, each with sigmas and with a full covariance: blank is what was not measured."""
+    full = np.full((6, 6), 1e-9) + np.diag([4e-8] * 3 + [1e-6] * 3)
+    alone = np.diag(np.diagonal(full))
+    motion = Pose3(Rot3.Rodrigues(np.array([0.1, -0.2, 0.3])), np.array([1.0, 2.0, 3.0]))
+    ends = FrameRef("station", "a"), FrameRef("station", "b")
+    rows = [Pair(str(i), *ends, motion if n == 6 else motion.rotation(), cov[:n, :n])
+            for i, (n, cov) in enumerate(((6, alone), (6, full), (3, alone), (3, full)))]  # fmt: skip
+    found = pair_columns(rows)
+    filled = {name: [not np.isnan(x) for x in column] for name, column in found.items() if not name.endswith("id")}
+    assert filled["qw"] == [True] * 4
+    assert filled["tx_mm"] == [True, True, False, False]
+    assert filled["sigma_rx_arcsec"] == [True, False, True, False]
+    assert filled["sigma_tx_mm"] == [True, False, False, False]
+    assert filled["cov_rx_rx_rad2"] == filled["cov_rx_ry_rad2"] == [False, True, False, True]
+    assert filled["cov_rx_tx_rad_m"] == filled["cov_tx_tx_m2"] == filled["cov_tx_ty_m2"] == [False, True, False, False]
+    assert "cov_ry_rx_rad2" not in found
+    assert "cov_tx_ty_m2" not in pair_columns(rows[2:])
+    np.testing.assert_allclose(np.asarray(found["sigma_tx_mm"])[0], 1e3 * np.sqrt(full[3, 3]), rtol=1e-12)

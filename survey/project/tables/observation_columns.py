@@ -87,7 +87,7 @@ def pair_columns(pairs: Sequence[Pair]) -> Columns:
     rows[:, 4:7] = from_si(measured.translations, "mm")
     alone = np.count_nonzero(measured.cov, axis=(1, 2)) == 6  # infinite where no translation was measured
     cov = np.where(np.isinf(measured.cov), np.nan, measured.cov)
-    cov[:, :3, 3:][~measured.is_pose] = np.nan
+    cov[~measured.is_pose, :, 3:] = np.nan
     sigma = np.sqrt(np.diagonal(cov[alone], axis1=1, axis2=2))
     rows[alone, 7:13] = np.concatenate([from_si(sigma[:, :3], "arcsec"), from_si(sigma[:, 3:], "mm")], axis=1)
     rows[~alone, 13:] = np.where(np.triu(np.ones((6, 6), dtype=np.bool_)), cov[~alone], np.nan).reshape(-1, 36)
