@@ -84,12 +84,13 @@ class Page:
         self.wait(ready)
 
     def wait(self, expression: str) -> None:
-        """Polls from outside: inside the page the content policy forbids evaluating a text."""
-        end = time.monotonic() + SECONDS
+        """Polls from outside: inside the page the content policy forbids evaluating a text. What is slow less often."""
+        end, pause = time.monotonic() + SECONDS, 0.01
         while not self.page.evaluate(expression):
             if time.monotonic() > end:
                 raise TimeoutError(f"{expression}\n{self.page.inner_text('body')[:600]}\n{self.complaints}")
-            time.sleep(0.02)
+            time.sleep(pause)
+            pause = min(1.5 * pause, 0.1)
 
     def done(self, act: Callable[[], Any]) -> None:
         """Does something and waits until the page shows what came of it."""

@@ -38,7 +38,8 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
     if unsaid and not apart and all(Path(a).is_dir() for a in config.args):
         from adjust.native.parallel import cores
 
-        os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")  # of each process
+        for threads in ("LABSURVEY_THREADS", "OPENCV_FOR_THREADS_NUM"):
+            os.environ.setdefault(threads, "1")  # of each process; tests of threads ask for theirs
         option.numprocesses = cores() + (not _daily(config))  # one waits for a table or a camera
         option.dist = "loadfile"  # what a file prepares is made once
         option.loadscopereorder = _daily(config)  # by their number of tests; else by seconds, see below

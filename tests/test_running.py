@@ -1,9 +1,11 @@
 """How the tests themselves run: when side by side, and how long statistical tests are."""
 
+import os
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
+from unittest.mock import Mock, patch
 
 import pytest
 
@@ -13,12 +15,13 @@ from tests import conftest, measuring, sizes
 TESTS = Path(__file__).parent
 
 
-def _asked(*words: str, **said: Any) -> tuple[int | None, str]:
-    """Number of processes and way of sharing after pytest was called with these paths and options."""
+def _asked(*words: str, kept: bool = True, **said: Any) -> tuple[int | None, str]:
+    """Number of processes and way of sharing after pytest was called so; the environment is kept as it was."""
     unsaid: dict[str, Any] = {"numprocesses": None, "dist": "no", "tx": []}
     others = {"usepdb": False, "collectonly": False, "trace": False, "markexpr": ""}
     config: Any = SimpleNamespace(option=SimpleNamespace(**(unsaid | others | said)), args=words)
-    conftest.pytest_cmdline_main(config)
+    with patch.dict(os.environ) if kept else nullcontext():
+        conftest.pytest_cmdline_main(config)
     return config.option.numprocesses, config.option.dist
 
 
@@ -26,6 +29,18 @@ def test_folders_run_side_by_side_and_files_alone() -> None:
     assert _asked(str(TESTS)) == _asked(str(TESTS / "adjust"), str(TESTS / "survey")) == (cores() + 1, "loadfile")
     assert _asked(str(TESTS), markexpr="not slow") == (cores(), "loadfile")
     assert _asked(str(TESTS / "test_docs.py")) == _asked(f"{__file__}::test_a_tenth") == (None, "no")
+
+
+def test_side_by_side_each_computes_with_one_thread_unless_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("LABSURVEY_THREADS", raising=False)
+    with patch.dict(os.environ):
+        _asked(str(TESTS / "test_docs.py"), kept=False)
+        assert "LABSURVEY_THREADS" not in os.environ
+        _asked(str(TESTS), kept=False)
+        assert os.environ["LABSURVEY_THREADS"] == "1"
+        os.environ["LABSURVEY_THREADS"] = "4"
+        _asked(str(TESTS), kept=False)
+        assert os.environ["LABSURVEY_THREADS"] == "4"
 
 
 @pytest.mark.parametrize(

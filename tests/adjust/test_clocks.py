@@ -69,6 +69,7 @@ def test_derivatives_by_every_unknown(name: str) -> None:
                                    err_msg=str(unknown.name))  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(SURVEYS))
 def test_clocks_are_found_within_their_sigmas(name: str) -> None:
     survey, truth = SURVEYS[name]()

@@ -53,6 +53,7 @@ def test_every_model_images_what_the_crop_of_its_image_shows(model: str) -> None
             np.testing.assert_allclose(by[:, j], numeric, rtol=1e-5, atol=1e-7 * max(1.0, np.abs(numeric).max()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("free", [(), ("scale",), CROP])
 @pytest.mark.parametrize("lab", ["boards", "beacons"])
 def test_derivatives_by_lens_and_crop(lab: str, free: tuple[str, ...]) -> None:

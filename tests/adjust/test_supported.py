@@ -24,6 +24,7 @@ def _unused(survey, *blocks):
                                               for i, b in enumerate(survey.image_blocks)))  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_survey_in_use_is_itself(table):
     same, lost = supported(table)
     assert same is table

@@ -182,6 +182,7 @@ def test_pose_outside_the_limits_never_reaches_the_controller(tmp_path):
         assert not (tmp_path / "lab" / "images").exists()
 
 
+@pytest.mark.slow
 def test_interrupt_stops_the_table_within_50_ms(tmp_path):
     """From the signal to the stop that the controller receives, while the table turns slowly.
 
@@ -303,6 +304,7 @@ def test_disk_full_is_said(tmp_path, monkeypatch, step):
     require_complete(plan, 6)
 
 
+@pytest.mark.slow
 def test_clock_that_jumps_is_harmless(tmp_path, monkeypatch):
     """UTC jumps by an hour at every look, back and forth; order and times of waiting do not care."""
     real, n = time.time_ns, [0]
@@ -336,6 +338,7 @@ def test_damaged_image_is_taken_again(tmp_path):
     require_complete(plan, 6)
 
 
+@pytest.mark.slow
 def test_torn_last_line_is_cut_and_what_it_said_is_done_again(tmp_path):
     plan = write_plan(tmp_path)
     run(plan)
@@ -347,6 +350,7 @@ def test_torn_last_line_is_cut_and_what_it_said_is_done_again(tmp_path):
     require_complete(plan, 6)
 
 
+@pytest.mark.slow
 def test_half_an_image_is_removed_and_foreign_ones_stay(tmp_path):
     plan = write_plan(tmp_path)
     images = tmp_path / "lab" / "images" / "X"
@@ -360,6 +364,7 @@ def test_half_an_image_is_removed_and_foreign_ones_stay(tmp_path):
     require_complete(plan, 6)
 
 
+@pytest.mark.slow
 def test_changed_plan_is_refused(tmp_path):
     plan = write_plan(tmp_path)
     run(plan)

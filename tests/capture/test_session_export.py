@@ -14,6 +14,7 @@ from capture.session.run import run_plan
 from tests.capture.session_runs import write_plan
 
 
+@pytest.mark.slow
 def test_export_holds_the_run(tmp_path, capsys):
     plan = write_plan(tmp_path, options="repeats = 2")
     run_plan(read_plan(plan), shown=False)

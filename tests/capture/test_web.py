@@ -214,6 +214,7 @@ def test_nothing_moves_without_flag_and_token(tmp_path):
             assert table.stopped()
 
 
+@pytest.mark.slow
 def test_live_images_and_lock(tmp_path):
     plan = read_plan(write_plan(tmp_path, cameras=("X",)))
     view = LiveView(plan, with_table=True)

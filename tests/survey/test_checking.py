@@ -62,6 +62,7 @@ def test_the_page_names_every_kind_of_finding() -> None:
     assert {k for k in kinds if f"| {k} |" not in page} == set()
 
 
+@pytest.mark.slow
 def test_what_to_measure_next_is_told_without_a_plan(tmp_path: Path) -> None:
     folder = Path(shutil.copytree(data_folder("calibration", "unsynchronised"), tmp_path / "session"))
     outcome = check_job(folder)

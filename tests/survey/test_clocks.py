@@ -111,6 +111,7 @@ def test_clocks_reach_result_report_and_terminal(tmp_path: Path) -> None:
     assert "clock offset" in text
 
 
+@pytest.mark.slow
 def test_without_times_clocks_count_intervals(tmp_path: Path) -> None:
     survey, _ = board_before_cameras(10, {"right": clock(offset=0.02)}, {RIGHT: np.array([0.02])})
     write_project(tmp_path, replace(survey, times={}))

@@ -77,6 +77,7 @@ def test_a_lens_that_changed_is_named(tmp_path: Path) -> None:
     assert min(by["fx"], by["fy"]) > 3.0
 
 
+@pytest.mark.slow
 def test_the_command_says_it_as_text_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_lab(tmp_path / "lab")
     before = sorted(p for p in (tmp_path / "lab").rglob("*"))

@@ -11,6 +11,7 @@ from survey.project.writing import write_project
 from tests.acceptance.planted_surveys import survey_of
 
 
+@pytest.mark.slow
 def test_a_group_that_is_too_good_is_named_and_mended(tmp_path: Path) -> None:
     survey = scaled_survey(survey_of("poses", 5)[0], {"north": 36.0})
     write_project(tmp_path / "lab", survey)

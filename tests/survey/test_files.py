@@ -372,6 +372,7 @@ flag = true
 """
 
 
+@pytest.mark.slow
 def test_plain_documents_are_read_as_by_tomllib() -> None:
     """Line by line or not, right or wrong: the same values and the same complaints."""
     rng, signs = np.random.default_rng(0), list("[]{}=\"',.:# \n\\+-01eE_aln\t")

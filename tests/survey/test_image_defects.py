@@ -92,6 +92,7 @@ def test_good_images_are_not_blamed(board, blur):
         assert image_defect(image_of(turn, blur=blur, seed=i, board=board).astype(np.float32)) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lamps", [0, 4])
 def test_images_of_noise_and_a_few_lamps_are_not_blamed(lamps):
     """Rows of noise fit others no better anywhere: whole pixels between fields are found where something is seen."""
@@ -153,6 +154,7 @@ def project(folder, images):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("make", "kind", "number"), [
     (lambda turn: mosaic(image_of(turn), 0.7, 0.85), "bayer mosaic", "17 %"),
     (lambda turn: fields((2.0, 0.0), turn), "interlaced", "(+"),
@@ -172,6 +174,7 @@ def test_told_by_detect_check_and_adjust(tmp_path, make, kind, number):
     assert f"detection: {line}" in adjust_job(lab, progress=False).adjustment.warnings
 
 
+@pytest.mark.slow
 def test_told_where_nothing_can_be_found(tmp_path):
     """A comb that leaves no corner."""
     lab = project(tmp_path / "lab", [fields((18.0, 0.0), (0.0, 0.0, 0.0))])
@@ -179,6 +182,7 @@ def test_told_where_nothing_can_be_found(tmp_path):
         detect_job(lab, jobs=1, progress=False)
 
 
+@pytest.mark.slow
 def test_blurred_images_are_left_out_and_taken_back(tmp_path, capsys):
     """One of six: offered by number, a row of exclusions.csv, offered no more; of most of them it is no remedy."""
     turns = [(0.1, -0.2, 0.0), *VIEWS, (0.4, -0.1, 0.1), (-0.1, -0.45, -0.2)]

@@ -30,6 +30,7 @@ def models(lab, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("format", ["colmap", "colmap-text"])
 def test_pycolmap_reads_the_model_and_projects_as_the_survey_does(lab, models, format):
     _, values = lab

@@ -46,6 +46,7 @@ def lab(tmp_path: Path) -> Path:
     return tmp_path / "lab"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("has_locks", [True, False])
 def test_a_project_is_adjusted_twice(
     lab: Path, elsewhere: None, has_locks: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -120,6 +120,7 @@ def test_cropped_images_are_written_and_reported(tmp_path: Path, kind: str) -> N
     assert "lens crop" in summary_text(solution.adjustment, solution.run)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("same", [True, False], ids=["same", "another"])
 def test_shared_lenses_are_written_and_tested(tmp_path: Path, same: bool) -> None:
     survey, truth = stereo(3, n_pairs=8)
@@ -181,6 +182,7 @@ def test_lenses_that_cannot_be_meant_are_refused(tmp_path: Path, table: str, sai
         read(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_project_says_what_deviates(tmp_path: Path) -> None:
     survey, _ = uneven()
     write_project(tmp_path / "a", survey)

@@ -9,12 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from adjust.model.errors import NotConvergedError, SurveyError
 from adjust.model.survey import FloatArray
 from adjust.relay.eyes.eyes import EyeAdjustment, EyeOptions, adjust_eye_motions
 from adjust.relay.eyes.sequences import MotionSequence
-from adjust.relay.eyes.solver import EyeProblem, EyeSolution, linearise
+from adjust.relay.eyes.solver import EyeProblem, EyeSolution, Weights, linearise
 from adjust.relay.eyes.trajectories import CommonMotions, Trajectory, common_motions
 from adjust.spatial.rigid_motions import Motions
 from adjust.testing.distributions import norm
@@ -87,10 +88,9 @@ def _components(solution: EyeSolution, k: int) -> tuple[FloatArray, FloatArray]:
     """Variance factors (k, 2) and redundancies (k, 2) of rotation and position of each eye."""
     problem = solution.problem
     n = len(problem.observed) // k
-    Qv = residual_covariance(problem, solution)
     factor, redundancy = np.ones((k, 2)), np.zeros((k, 2))
     variance = np.diagonal(problem.cov, axis1=1, axis2=2)
-    own = np.diag(Qv).reshape(-1, 6) / variance
+    own = _residual_variances(problem, solution) / variance
     square = solution.residuals**2 / variance
     for eye in range(k):
         rows = slice(eye * n, (eye + 1) * n)
@@ -100,21 +100,14 @@ def _components(solution: EyeSolution, k: int) -> tuple[FloatArray, FloatArray]:
     return factor, redundancy
 
 
-def residual_covariance(problem: EyeProblem, solution: EyeSolution) -> FloatArray:
-    """Q_vv (6n, 6n) of the observations' residuals, dense."""
+def _residual_variances(problem: EyeProblem, solution: EyeSolution) -> FloatArray:
+    """The diagonal (n, 6) of Q_vv of the observations' residuals."""
     at = linearise(problem, solution.unknowns, solution.scales, np.zeros((len(problem.observed), 6)))
-    m, n = len(at.f), len(problem.observed)
-    B = np.zeros((m, 6, n, 6))
-    row = np.arange(m)
-    B[row, :, problem.conditions.k_idx] += at.by_k
-    B[row, :, problem.conditions.l_idx] += at.by_l
-    flat = B.reshape(6 * m, 6 * n)
-    Q = np.zeros((n, 6, n, 6))
-    Q[np.arange(n), :, np.arange(n)] = problem.cov
-    QBt = Q.reshape(6 * n, 6 * n) @ flat.T
-    inverse = np.linalg.inv(flat @ QBt)
-    MA = inverse @ at.by
-    return np.asarray(QBt @ (inverse - MA @ solution.cov @ MA.T) @ QBt.T)
+    weights = Weights(problem, at)
+    QBt = csr_array(weights.QBt)
+    by = QBt @ weights.solve(at.by)
+    all_of_it = QBt.multiply(weights.solve(QBt.T.toarray()).T).sum(axis=1)
+    return np.asarray(all_of_it - ((by @ solution.cov) * by).sum(axis=1)).reshape(-1, 6)
 
 
 def _autocorrelation(solution: EyeSolution, k: int) -> tuple[float, float]:

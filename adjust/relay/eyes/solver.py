@@ -181,7 +181,7 @@ def _stretch(pose: Motions) -> FloatArray:
     return np.concatenate([np.zeros_like(turned), turned], axis=1)
 
 
-class _Weights:
+class Weights:
     """M = B Q B' of the conditions, factorised, with Q block diagonal or full."""
 
     def __init__(self, problem: EyeProblem, at: Linearised) -> None:
@@ -226,7 +226,7 @@ def solve_eyes(problem: EyeProblem) -> EyeSolution:
     n_free = 6 * int(problem.free.sum())
     for iteration in range(1, _MOST_STEPS + 1):
         at = linearise(problem, U, scales, v)
-        weights = _Weights(problem, at)
+        weights = Weights(problem, at)
         w = at.f.ravel() - weights.B @ v.ravel()
         MA = weights.solve(at.by)
         N, right = at.by.T @ MA, MA.T @ w
@@ -261,7 +261,7 @@ def _add_known(problem: EyeProblem, U: Motions, N: FloatArray, right: FloatArray
 
 def _finish(problem: EyeProblem, U: Motions, scales: FloatArray, v: FloatArray, iterations: int) -> EyeSolution:
     at = linearise(problem, U, scales, v)
-    weights = _Weights(problem, at)
+    weights = Weights(problem, at)
     w = at.f.ravel() - weights.B @ v.ravel()
     MA = np.asarray(weights.solve(at.by))
     N = at.by.T @ MA
