@@ -40,12 +40,13 @@ class Candidate:
 def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candidate, ...]:
     """The trials that explain the misfit by test, the best first.
 
-    Each drop of v'Pv is tested against chi-square with as many degrees of freedom as the change has parameters, at a
-    level shared by all hypotheses that were looked at (Sidak). Compared with each other by v'Pv plus p ln n
-    (Schwarz 1978), with variances of each group as they suit each best: else wrong sigmas would explain all that a
-    cause leaves. A cause explains the misfit if half of it goes, or if what is left is noise; it leaves no more
-    observations out than before, and none where nothing was adjusted before, save as few as noise hides. It is not
-    named where another one, though it explains less than that, is a hundred times as likely.
+    Each drop of v'Pv is tested against chi-square with as many degrees of freedom as the change has parameters, or as
+    its trial has freed where a simpler change is told, at a level shared by all hypotheses that were looked at (Sidak).
+    Compared with each other by v'Pv plus p ln n (Schwarz 1978), with variances of each group as they suit each best:
+    else wrong sigmas would explain all that a cause leaves. A cause explains the misfit if half of it goes, or if what
+    is left is noise; it leaves no more observations out than before, and none where nothing was adjusted before, save
+    as few as noise hides. It is not named where another one, though it explains less than that, is a hundred times as
+    likely.
     """
     good = [t for t in trials if t.result is not None]
     if not good:
@@ -55,7 +56,8 @@ def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candi
     weight = _probabilities(base, good)
     out = []
     for trial, probability in zip(good, weight, strict=True):
-        critical = float(chi2.isf(sidak(_ALPHA, number), max(1, trial.hypothesis.parameters)))
+        freed = max(1, trial.hypothesis.parameters, _freed(base, trial.misfit))
+        critical = float(chi2.isf(sidak(_ALPHA, number), freed))
         statistic = (base.omega - _cost(trial)) / scale
         share = (base.omega - _cost(trial)) / max(base.excess, 1e-9)
         enough = share > _EXPLAINED or (trial.misfit.is_noise(_NOISE) and not trial.hypothesis.penalty)
@@ -66,6 +68,11 @@ def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candi
             explained = float(np.clip(share, 0.0, 1.0))
             out.append(Candidate(trial.hypothesis, explained, statistic, critical, float(probability), sigma0))
     return tuple(sorted(out, key=lambda c: -c.probability))
+
+
+def _freed(base: Misfit, misfit: Misfit) -> int:
+    """By how many parameters a trial has more than the survey as it stands, by their redundancies; 0 without one."""
+    return (base.redundancy + base.unused - misfit.redundancy - misfit.unused - misfit.dropped) * (base.redundancy > 0)
 
 
 def _cost(trial: Trial) -> float:

@@ -133,6 +133,11 @@ def test_innocent_survey_is_not_blamed(kind: str, smaller: float) -> None:
     assert not diagnosed(replace(survey, image_blocks=blocks)).candidates
 
 
+def test_what_a_whole_camera_gains_says_nothing_of_its_crop() -> None:
+    """Lens and place of a camera free from an epoch on: fourteen numbers, though two of them would tell it all."""
+    assert not diagnosed(survey_of("relay", 80434)[0]).candidates
+
+
 def test_nothing_that_was_given_is_changed() -> None:
     survey, truth = survey_of("stereo", 3)
     planted = next(m for m in MISTAKES if m.name == "camera moved").plant(survey, truth, 6.0)
