@@ -8,9 +8,9 @@ from adjust.model.survey import FloatArray
 
 _LOST = 1e-9
 _SMALL = 1e-10
-"""Of a step to the place itself: it stands."""
-_LEAST = 1e-9
-"""Damping, of the trace: what one ray or circle leaves open keeps its value."""
+"""Of a step to the extent of the starts: it stands."""
+_LEAST, _LARGEST = 1e-9, 1e30
+"""Damping, of the trace: what one ray or circle leaves open keeps its value; without a gain it stays finite."""
 
 Evaluate = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 """Of places (s, k): what the observations miss there (s, n), and its derivatives (s, n, k)."""
@@ -22,7 +22,7 @@ def settled(evaluate: Evaluate, starts: FloatArray, most: int) -> tuple[FloatArr
     Levenberg-Marquardt with a damping for each start, ``most`` steps. Source: Madsen, Nielsen and Tingleff, Methods for
     non-linear least squares problems (2004), section 3.2.
     """
-    x = np.array(starts)
+    x, size = np.array(starts), float(np.linalg.norm(starts - starts.mean(axis=0), axis=1).max())
     misses, by_x = evaluate(x)
     damping, times, moves = np.full(len(x), 1e-3), np.full(len(x), 2.0), np.arange(len(x))
     for _ in range(most):
@@ -37,9 +37,9 @@ def settled(evaluate: Evaluate, starts: FloatArray, most: int) -> tuple[FloatArr
         at = moves[better]
         x[at], misses[at], by_x[at] = x[at] + step[better], missed[better], derived[better]
         damping[moves] *= np.where(better, np.maximum(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), times[moves])
-        damping[moves] = np.maximum(damping[moves], _LEAST)
-        times[moves] = np.where(better, 2.0, 2.0 * times[moves])
-        stands = np.linalg.norm(step, axis=1) <= _SMALL * np.linalg.norm(x[moves], axis=1)
+        damping[moves] = np.clip(damping[moves], _LEAST, _LARGEST)
+        times[moves] = np.where(better, 2.0, np.minimum(2.0 * times[moves], _LARGEST))
+        stands = np.linalg.norm(step, axis=1) <= _SMALL * size
         moves = moves[~stands]
         if not len(moves):
             break
