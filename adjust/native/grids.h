@@ -55,7 +55,7 @@ struct Candidates {
         }
     int most = 0;
     for (int i = 0; i < LANES; ++i) most = largest[i] > most ? largest[i] : most;
-    const int least = int(larger(share * most, above));
+    const int least = int(smaller(larger(share * most, above), 256.0));
     for (int64_t v = RADIUS; v < h - RADIUS; ++v)
         for (int64_t u = RADIUS; u < w - RADIUS; ++u) {
             const uint8_t *at = &response.data[v * w + u];
