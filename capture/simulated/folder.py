@@ -22,7 +22,7 @@ from capture.simulated.laboratory import (
     furnished_lab,
     make_lab,
 )
-from survey.examples.folders import GIVEN, HEAD_ON_TABLE, camera_text, coordinates_text, spots_text, target_text
+from survey.examples.folders import GIVEN, camera_text, coordinates_text, head_on_table, spots_text, target_text
 from survey.examples.truth import truth_json
 from survey.folder.whole import whole_folder
 
@@ -70,7 +70,7 @@ def _survey_toml(lab: SimulatedLab) -> str:
 format = 1
 title = "Simulated laboratory"
 """
-    text += "".join(map(camera_text, draft.cameras)) + HEAD_ON_TABLE.replace("{}", "")
+    text += "".join(map(camera_text, draft.cameras)) + head_on_table()
     text += "".join(target_text(target, draft.kinds[target.target_id]) for target in draft.targets)
     if draft.points:
         text += "\n" + "\n".join(f"[points.{p.point_id}]" for p in draft.points) + "\n"

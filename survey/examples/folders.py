@@ -25,18 +25,6 @@ _LENS = """
 model = "brown"
 free = ["fx", "fy", "u0", "v0", "k1", "k2", "p1", "p2"]
 """
-HEAD_ON_TABLE = f"""
-[stations.head]
-motion = "table"
-table = "turntable"
-mount_from_station = {{ treatment = "held" }}        # the frame of the head is that of the table's inner axis
-{{}}
-[tables.turntable]
-axes = ["x", "z"]                                  # outermost first
-sigma_arcsec = {TABLE_SIGMA_ARCSEC:.1f}
-world_from_table = {{ treatment = "free" }}
-geometry = {{ free = ["non_orthogonality", "axis_offset"] }}
-"""
 GIVEN = """
 [sigmas]
 image_px = 0.1                                     # where the detector gives none
@@ -152,13 +140,29 @@ def _full_lab_toml(draft: Draft) -> str:
 format = 1
 title = "Full lab"
 """
-    text += "".join(map(camera_text, draft.cameras)) + HEAD_ON_TABLE.replace("{}", _RELAY)
+    text += "".join(map(camera_text, draft.cameras)) + head_on_table(_RELAY)
     return text + _targets(draft) + _points(draft) + _spots(draft)
 
 
 _RELAY = """
 [stations.relay]
 motion = "fixed"
+"""
+
+
+def head_on_table(others: str = "") -> str:
+    """A head on a table of two axes. others: stations between the two."""
+    return f"""
+[stations.head]
+motion = "table"
+table = "turntable"
+mount_from_station = {{ treatment = "held" }}        # the frame of the head is that of the table's inner axis
+{others}
+[tables.turntable]
+axes = ["x", "z"]                                  # outermost first
+sigma_arcsec = {TABLE_SIGMA_ARCSEC:.1f}
+world_from_table = {{ treatment = "free" }}
+geometry = {{ free = ["non_orthogonality", "axis_offset"] }}
 """
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -19,6 +20,7 @@ _NEAR = 1
 _BOUND = 100.0  # of the misfit of an image, times that of the typical one
 
 
+@lru_cache(maxsize=2)
 def misfits(case: Case) -> dict[str, tuple[Survey, list[int]]]:
     """Cameras that do not fit by themselves, as the search for their lenses leaves them: alone, and their images."""
     squares, out = squares_of(case.survey, case.views.values()), {}

@@ -72,9 +72,10 @@ class Effect:
 
         def told(result: Adjustment) -> Sequence[Hypothesis]:
             named = [replace(hypothesis, **found[-1])] if found else []
-            left, base = misfit_of(result, case.survey), misfit_of(case.result, case.survey)
-            clear = not left.is_noise() and left.excess > _CLEAR_PART * base.excess
-            return [*named, self.further(hypothesis)] if self.further is not None and clear else named
+            if self.further is None or (left := misfit_of(result, case.survey)).is_noise():
+                return named
+            clear = left.excess > _CLEAR_PART * misfit_of(case.result, case.survey).excess
+            return [*named, self.further(hypothesis)] if clear else named
 
         sigmas = np.sqrt(np.maximum(np.diag(self.first.cov), 0.0))
         hypothesis = replace(self.hypothesis, survey=made, cause=self.said(self.first.theta, sigmas),

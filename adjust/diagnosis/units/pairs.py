@@ -278,8 +278,9 @@ def _by_start(case: Case) -> _Judge | None:
         rows = np.array(list(sets[0]))
         if len(rows) > 1 and np.median(squares[rows]) < _MISSED:
             return [0.0] * len(sets)
-        there = [gain(rows, _read_as(before, new)) for new in sets] if survey.image_blocks or not told(rows) else []
-        if not told(rows):
+        lost = told(rows)
+        there = [gain(rows, _read_as(before, new)) for new in sets] if survey.image_blocks or not lost else []
+        if not lost:
             return there
         still = np.minimum(loops(sets), CAP).sum(axis=1) > max(2.0 * len(squares), 0.5 * opened)
         if there:  # where images tell the poses too, what is meant fits them better than what is read
