@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from adjust.model.survey import Datum, FloatArray, Point, PointParameter, Survey
 from survey.folder.locking import settled
 from survey.folder.text import id_problem, suggestion
 from survey.project.declared.clocks import are_timed, read_times
-from survey.project.declared.declarations import keys_of
 from survey.project.declared.instruments import (
     read_beams,
     read_bearings,
@@ -184,7 +183,7 @@ def _image_news(
 def _observed(definition: Definition, root: Node, tables: dict[str, Table]) -> Project:
     """All that the tables hold."""
     _check_scales(root, definition.sigmas, tables)
-    survey = _with_tie_points(definition, tables, flat_point(root.integer("dimensions", 1, 3)))
+    survey = _with_tie_points(definition, tables, flat_point(root.integer("dimensions")))
     _check_datum_points(root, survey)
     names, sigmas = Names.of(survey), definition.sigmas
     points = tables.get("image_points")
@@ -235,7 +234,7 @@ def _read_definition(folder: Path, text: str | None = None) -> tuple[Definition,
         raise SurveyError(f"{path}: there is no such file; a project folder holds a {DEFINITION_FILE}")
     root, digest = read_toml(path, text)
     _check_format(root)
-    root.allow(*keys_of("root"))
+    root = root.declared_as("root")
     inputs = {DEFINITION_FILE: digest}
     times = read_times(root)
     tables, table_sigmas = read_tables(root, are_timed(times))
@@ -244,7 +243,7 @@ def _read_definition(folder: Path, text: str | None = None) -> tuple[Definition,
     cameras = read_cameras(root, station_ids, are_timed(times))
     camera_ids = tuple(camera.camera_id for camera in cameras)
     targets, kinds, seen_by = read_targets(root, station_ids, camera_ids, inputs)
-    dimensions = root.integer("dimensions", 1, 3)
+    dimensions = root.integer("dimensions")
     if dimensions > 3:
         raise root.error(f"found {dimensions}; a network has 1 (levelling), 2 (plane) or 3 dimensions", "dimensions")
     points = tuple(Point(point_id, read_point(node, dimensions)) for point_id, node in root.tables("points"))
@@ -259,12 +258,12 @@ def _read_definition(folder: Path, text: str | None = None) -> tuple[Definition,
         beams=read_beams(root, station_ids, table_ids), surfaces=read_surfaces(root),
         temperatures={epoch_id: node.number(epoch_id) for epoch_id in node.values}, **times,
     )  # fmt: skip
-    tie_points = root.flag("tie_points", False)
+    tie_points = root.flag("tie_points")
     if not tie_points:
         _check_datum_points(root, survey)
     definition = Definition(
         folder=folder,
-        title=root.text("title", ""),
+        title=root.text("title"),
         tie_points=tie_points,
         survey=survey,
         target_kinds=kinds,
@@ -287,13 +286,12 @@ def _check_format(root: Node) -> None:
 
 
 def _read_datum(node: Node, station_ids: tuple[str, ...]) -> Datum:
-    node.allow(*keys_of("datum"))
-    kind = node.choice("kind", ("given", "inner"), "given")
+    kind: Literal["given", "inner"] = node.choice("kind", ("given", "inner"))
     for key in ("points", "stations"):
         if kind == "given" and node.has(key):
             raise node.error('only the datum of kind "inner" names points and stations; remove this', key)
     stations = node.references("stations", station_ids, "station", ())
-    return Datum("inner" if kind == "inner" else "given", node.names("points", ()), stations)
+    return Datum(kind, node.names("points", ()), stations)
 
 
 def _check_datum_points(root: Node, survey: Survey) -> None:
@@ -302,24 +300,21 @@ def _check_datum_points(root: Node, survey: Survey) -> None:
 
 
 def _read_spots_request(node: Node, camera_ids: tuple[str, ...]) -> SpotsRequest:
-    node.allow(*keys_of("spots"))
     cameras = node.references("cameras", camera_ids, "camera")
     epochs = node.names("epochs") if node.has("epochs") else None
     for i, epoch_id in enumerate(epochs or ()):
         problem = id_problem(epoch_id)
         if problem:
             raise node.error(problem, "epochs", i)
-    smallest, largest = node.numbers("diameter_px", (2,), [2.0, 12.0]).tolist()
+    smallest, largest = node.numbers("diameter_px", (2,)).tolist()
     if not 0 < smallest <= largest:
         raise node.error(f"found [{smallest:g}, {largest:g}]; expected [smallest, largest]", "diameter_px")
-    return SpotsRequest(cameras, epochs, (smallest, largest), node.number("gate_px", 15.0, positive=True))
+    return SpotsRequest(cameras, epochs, (smallest, largest), node.number("gate_px"))
 
 
 def _read_sigmas(node: Node, tables: dict[str, FloatArray]) -> Sigmas:
-    node.allow(*keys_of("sigmas"))
     scale = node.table("scale")
-    image_px = node.number("image_px", positive=True) if node.has("image_px") else None
-    return Sigmas(image_px, {group: scale.number(group, positive=True) for group in scale.values}, tables)
+    return Sigmas(node.si("image_px", None), {group: scale.number(group) for group in scale.values}, tables)
 
 
 def _check_scales(root: Node, sigmas: Sigmas, tables: dict[str, Table]) -> None:

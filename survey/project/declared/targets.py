@@ -10,7 +10,7 @@ from adjust.model.boards import BENT
 from adjust.model.survey import FloatArray, Target, VectorParameter, VectorPrior
 from survey.folder.text import suggestion
 from survey.folder.units import to_si
-from survey.project.declared.declarations import DECLARATIONS, WARP_UNITS, keys_of
+from survey.project.declared.declarations import DECLARATIONS, WARP_UNITS
 from survey.project.declared.node import Node
 from survey.project.declared.owners import read_epochs
 from survey.project.declared.poses import read_pose
@@ -34,9 +34,8 @@ def read_targets(
     targets, kinds, seen_by = [], {}, {}
     for target_id, node in root.tables("targets"):
         kind_name = node.choice("kind", _KINDS)
-        node.allow(*keys_of(f"target_{kind_name}"))
-        name = node.choice("motion", ("fixed", "epoch"), "fixed")
-        motion: Literal["fixed", "epoch"] = "epoch" if name == "epoch" else "fixed"
+        node = node.declared_as(f"target_{kind_name}")
+        motion: Literal["fixed", "epoch"] = node.choice("motion", ("fixed", "epoch"))
         kind = _points(node, inputs) if kind_name == "points" else _READERS[kind_name](node)
         point_ids, x_in_target = kind.points()
         targets.append(
@@ -49,7 +48,7 @@ def read_targets(
                 read_pose(node.table("pose")),
                 read_epochs(node, motion == "fixed"),
                 _warp(node.table("warp"), kind_name) if node.has("warp") else None,
-                node.table("warp").number("reference_degC", 20.0),
+                node.table("warp").number("reference_degC"),
             )
         )
         kinds[target_id] = kind
@@ -142,15 +141,14 @@ def _warp(node: Node, kind_name: str) -> VectorParameter:
     """Its first two components always, the others where they are free or not zero."""
     if kind_name == "marker_block":
         raise node.error(f"a target of kind {kind_name!r} is no flat board and has no warp; remove it")
-    node.allow(*keys_of("warp"))
     free: tuple[str, ...] = BENT
-    if not isinstance(node.value("free", True), bool):
+    if not isinstance(node.value("free"), bool):
         free = node.references("free", WARP_UNITS, "parameter")
-    elif not node.flag("free", True):
+    elif not node.flag("free"):
         free = ()
     asked, keys = (*BENT, *free), {n: key_of(n, WARP_UNITS) for n in WARP_UNITS}
     units = {n: u for n, u in WARP_UNITS.items()
-             if n in asked or keys[n] in node.table("sigma").values or node.number(keys[n], 0.0)}  # fmt: skip
+             if n in asked or keys[n] in node.table("sigma").values or node.number(keys[n])}  # fmt: skip
     found = read_vector(node, units, (), chosen=tuple(n for n in units if n in free))
     sigma = node.sigmas("sigma", ("mm",), 2)
     if sigma is None:
