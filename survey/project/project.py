@@ -19,8 +19,6 @@ from survey.project.targets import TargetKind
 _SEVERAL = {"table_readings": "table readings", "reading_covariances": "covariances of readings",
             "coordinate_differences": "coordinate differences", "laser_spots": "laser spots",
             "on_surfaces": "points on surfaces"}  # fmt: skip
-_OBSERVED = ("table_readings", "pairs", "distances", "coordinates", "readings", "coordinate_differences", "levels",
-             "alignments", "laser_spots", "on_surfaces")  # fmt: skip
 _OWNERS = ("cameras", "stations", "tables", "targets", "points", "instruments", "setups", "beams", "surfaces")
 
 
@@ -28,7 +26,7 @@ def observed(survey: Survey, n_spots: int) -> dict[str, int]:
     """How many observations of each kind there are; n_spots: those that are still to be identified."""
     found = {"image points": sum(len(b.uv) for b in survey.image_blocks), "images": len(
         {(b.camera_id, b.epoch_id) for b in survey.image_blocks})}  # fmt: skip
-    found |= {_SEVERAL.get(name, name): len(getattr(survey, name)) for name in _OBSERVED}
+    found |= {_SEVERAL.get(name, name): len(items) for name, items in survey.others.items()}
     found["spots to identify"] = n_spots
     return {name: n for name, n in found.items() if n}
 

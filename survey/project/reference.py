@@ -7,8 +7,8 @@ from adjust.lenses.models import MODELS
 from survey.project.declared.declarations import DECLARATIONS
 from survey.project.declared.keys import NOTHING, REQUIRED, Declared, Key
 from survey.project.exclusions import EXCLUSIONS
-from survey.project.reading import LAYOUTS
 from survey.project.tables.column_texts import COLUMN_TEXTS, column_text
+from survey.project.tables.kinds import LAYOUTS
 from survey.project.tables.reading import Layout
 
 _HEAD = """\

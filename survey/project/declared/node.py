@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar, overload
@@ -111,6 +111,10 @@ class Node:
         name = ".".join(str(part) for part in path)
         return SurveyError(f"{self.file}:{self.lines.get(at, 1)}: {name + ': ' if name else ''}{problem}")
 
+    def fail(self, *keys: str | int) -> Callable[[str], SurveyError]:
+        """What makes an error of a problem at a key below this table."""
+        return lambda problem: self.error(problem, *keys)
+
     def allow(self, *known: str) -> None:
         """Raise at the first key that is not ``known``."""
         for key in self.values:
@@ -190,9 +194,9 @@ class Node:
     @overload
     def si(self, key: str, default: None, positive: bool = ...) -> float | None: ...
     def si(self, key: str, default: Any = REQUIRED, positive: bool = False) -> float | None:
-        """A finite number in SI, by the unit that the key ends with; ``default`` is in that unit, None stays None."""
-        if default is None and key not in self.values:
-            return None
+        """A finite number in SI, by the unit that the key ends with, as is ``default``; its None, nan or inf stay."""
+        if key not in self.values and (default is None or (isinstance(default, float) and not math.isfinite(default))):
+            return default
         return float(to_si(self.number(key, default, positive), unit_in(key)))
 
     def numbers(

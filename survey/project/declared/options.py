@@ -23,7 +23,7 @@ from survey.project.project import (
     Foot,
     Tolerance,
 )
-from survey.project.tables.references import Names, frame_of
+from survey.project.tables.references import Names, timed_frame
 
 _UNITS = ("mm", "arcsec", "deg", "px", "1")
 _SAID = {POSITION: ("mm",), ROTATION: ("arcsec", "deg")}
@@ -144,7 +144,7 @@ def read_alignment_tasks(root: Node, survey: Survey) -> tuple[AlignmentTask, ...
     names = Names.of(survey)
     tasks = []
     for task_id, node in root.tables("align"):
-        frames = [frame_of(node, key, names) for key in ("body", "onto")]
+        frames = [timed_frame(node.text(key), names, node.fail(key)) for key in ("body", "onto")]
         if frames[0] == frames[1]:
             raise node.error("body and onto are the same; name the frame that the body is to be aligned with", "onto")
         feet_node = node.table("feet_mm")
