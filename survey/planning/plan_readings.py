@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -125,7 +125,7 @@ def with_usual_sigmas(
     out = []
     for r in readings:
         accuracy = project.sigmas.instruments.get(instruments.get(r.setup_id) or "", Accuracy())
-        sigma: float | None = r.sigma if np.isfinite(r.sigma) else _usual(r.kind, accuracy, distance(r))
+        sigma: float | None = r.sigma if np.isfinite(r.sigma) else accuracy.sigma(r.kind, distance(r))
         if sigma is None:
             raise SurveyError(
                 f"{project.folder}/plan.toml: reading {r.reading_id} ({r.kind}) has no sigma; give sigma_arcsec or "
@@ -134,17 +134,6 @@ def with_usual_sigmas(
         scale = project.sigmas.scale.get(r.group, 1.0)
         out.append(replace(r, sigma=scale * sigma, target_centring_sigma=accuracy.target_centring))
     return tuple(out)
-
-
-def _usual(kind: str, accuracy: Accuracy, distance: float) -> float | None:
-    match kind:
-        case "slope_distance" | "horizontal_distance":
-            return None if accuracy.distance is None else accuracy.distance + accuracy.distance_slope * distance
-        case "angle" if accuracy.angle is None and accuracy.direction is not None:
-            return float(np.sqrt(2.0)) * accuracy.direction
-        case "height_difference" if accuracy.levelling is not None:
-            return float(np.hypot(accuracy.height_difference or 0.0, accuracy.levelling * (distance / 1000.0) ** 0.5))
-    return cast("float | None", getattr(accuracy, kind))
 
 
 def _readings(node: Node, names: Names, prefix: str) -> list[Reading]:

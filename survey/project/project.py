@@ -1,14 +1,16 @@
 """What a project folder holds, as frozen values."""
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, get_args
 
+import numpy as np
 from gtsam import Rot3
 
-from adjust.model.observations import Closure, FrameRef
+from adjust.model.observations import Closure, FrameRef, ReadingKind
 from adjust.model.survey import FloatArray, IntArray, Survey
 from survey.folder.locking import OBSERVATIONS_FOLDER as OBSERVATIONS_FOLDER
 from survey.folder.locking import RESULTS as RESULTS
@@ -184,6 +186,19 @@ class Accuracy:
     target_centring: float = 0.0
     centring: float = 0.0
     height: float = 0.0
+
+    def sigma(self, kind: ReadingKind, length: float) -> float | None:
+        """Of one reading. length: m, of a distance, or of the line of a height difference (nan: not known)."""
+        match kind:
+            case "slope_distance" | "horizontal_distance":
+                return None if self.distance is None else self.distance + self.distance_slope * length
+            case "height_difference":
+                if self.levelling is None or np.isnan(length):
+                    return self.height_difference
+                return float(np.hypot(self.height_difference or 0.0, self.levelling * (length / 1000.0) ** 0.5))
+            case "angle" if self.angle is None and self.direction is not None:
+                return self.direction * math.sqrt(2.0)  # the difference of two directions
+        return {"direction": self.direction, "angle": self.angle, "zenith": self.zenith, "azimuth": self.azimuth}[kind]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,8 +1,8 @@
 """Targets of ``survey.toml``, and what of them a program can find."""
 
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Literal
+from dataclasses import fields, replace
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from survey.project.declared.poses import read_pose
 from survey.project.declared.vectors import key_of, read_vector
 from survey.project.tables.files import read_table
 from survey.project.tables.reading import Layout
-from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList, TargetKind
+from survey.project.targets import BOARDS, Board, Charuco, MarkerBlock, PointList, TargetKind
 
 _KINDS = tuple(d.of[1] for d in DECLARATIONS if d.path == "targets.ID" and d.of is not None)
 _MOST_ON_BOARD = 250_000  # squares or markers
@@ -36,7 +36,7 @@ def read_targets(
         kind_name = node.choice("kind", _KINDS)
         node = node.declared_as(f"target_{kind_name}")
         motion: Literal["fixed", "epoch"] = node.choice("motion", ("fixed", "epoch"))
-        kind = _points(node, inputs) if kind_name == "points" else _READERS[kind_name](node)
+        kind = _target_kind(node, kind_name, inputs)
         point_ids, x_in_target = kind.points()
         targets.append(
             Target(
@@ -57,20 +57,10 @@ def read_targets(
     return tuple(targets), kinds, seen_by
 
 
-def _metres(node: Node, key: str) -> float:
-    return float(to_si(node.number(key, positive=True), "mm"))
-
-
-def _counts(node: Node, keys: tuple[str, str], smallest: int) -> tuple[int, int]:
-    """How many there are across and down; refused where no board can have so many."""
-    across, down = (node.integer(key, smallest) for key in keys)
-    if across * down > _MOST_ON_BOARD:
-        raise node.error(f"found {across} x {down}; a board has at most {_MOST_ON_BOARD}", keys[0])
-    return across, down
-
-
-def _checkerboard(node: Node) -> TargetKind:
-    return Checkerboard(*_counts(node, ("columns", "rows"), 2), _metres(node, "square_mm"))
+def _target_kind(node: Node, name: str, inputs: dict[str, str]) -> TargetKind:
+    if name in BOARDS:
+        return _board(node, BOARDS[name])
+    return _points(node, inputs) if name == "points" else _marker_block(node)
 
 
 def _dictionary(node: Node) -> str:
@@ -82,22 +72,23 @@ def _dictionary(node: Node) -> str:
     return name
 
 
-def _charuco(node: Node) -> TargetKind:
-    square, marker = _metres(node, "square_mm"), _metres(node, "marker_mm")
-    if marker >= square:
+def _board(node: Node, kind: type[Board]) -> Board:
+    """A board by the fields of its kind, each under its name, lengths in mm."""
+    read: dict[Any, Callable[[str], Any]] = {int: node.integer, float: node.si, bool: node.flag,
+                                             str: lambda _: _dictionary(node)}  # fmt: skip
+    found = kind(**{field.name: read[field.type](board_key(field.name)) for field in fields(kind)})
+    first, second = (field.name for field in fields(kind)[:2])
+    across, down = getattr(found, first), getattr(found, second)
+    if across * down > _MOST_ON_BOARD:
+        raise node.error(f"found {across} x {down}; a board has at most {_MOST_ON_BOARD}", first)
+    if isinstance(found, Charuco) and found.marker_m >= found.square_m:
         raise node.error("the marker is not smaller than the square; correct marker_mm or square_mm", "marker_mm")
-    columns, rows = _counts(node, ("squares_x", "squares_y"), 2)
-    return Charuco(columns, rows, square, marker, _dictionary(node), node.flag("legacy", False))
+    return found
 
 
-def _marker_grid(node: Node) -> TargetKind:
-    return MarkerGrid(
-        *_counts(node, ("columns", "rows"), 1),
-        _metres(node, "marker_mm"),
-        _metres(node, "gap_mm"),
-        _dictionary(node),
-        node.integer("first_id", 0, 0),
-    )
+def board_key(field: str) -> str:
+    """The key of a field of a board."""
+    return f"{field}m" if field.endswith("_m") else field
 
 
 def _marker_block(node: Node) -> TargetKind:
@@ -110,14 +101,6 @@ def _marker_block(node: Node) -> TargetKind:
     if not corners:
         raise node.error("no markers; write markers = { 7 = [[x, y, z], ... four corners in mm] }", "markers")
     return MarkerBlock(corners, _dictionary(node))
-
-
-_READERS: dict[str, Callable[[Node], TargetKind]] = {
-    "checkerboard": _checkerboard,
-    "charuco": _charuco,
-    "marker_grid": _marker_grid,
-    "marker_block": _marker_block,
-}
 
 
 def _points(node: Node, inputs: dict[str, str]) -> TargetKind:

@@ -70,7 +70,13 @@ def read_readings(table: Table, names: Names, sigmas: Sigmas) -> tuple[Reading, 
         accuracy = sigmas.instruments.get(instrument_id or "", Accuracy())
         sigma = own[row]
         if np.isnan(sigma):
-            sigma = _usual_sigma(table, row, kind, values[row], lengths[row], accuracy, instrument_id)
+            usual = accuracy.sigma(kind, (lengths if kind == "height_difference" else values)[row])
+            if usual is None:
+                what = kind if kind in ANGLES or kind == "height_difference" else "distance"
+                key = f"sigma_{what}_{'arcsec' if kind in ANGLES else 'mm'}"
+                where = f"[instruments.{instrument_id}]" if instrument_id else "the instrument of its setup"
+                raise table.error(row, f"the {kind} has no sigma; add it to the row, or {key} to {where}")
+            sigma = usual
         group = groups[row] or kind
         plumbing = centring[row] if not np.isnan(centring[row]) else accuracy.target_centring
         if plumbing < 0:
@@ -141,43 +147,6 @@ def _own_sigmas(table: Table, kinds: Sequence[ReadingKind]) -> FloatArray:
         unit = "sigma_arcsec, sigma_cc or sigma_mgon" if angle[row] else "sigma_mm"
         raise table.error(row, f"sigma: that of a reading of kind {kinds[row]} stands in {unit}; move it there")
     return np.where(angle, angles, lengths)
-
-
-def _usual_sigma(
-    table: Table,
-    row: int,
-    kind: ReadingKind,
-    value: float,
-    length: float,
-    accuracy: Accuracy,
-    instrument_id: str | None,
-) -> float:
-    """The sigma that the instrument gives; distances a + b d, height differences also by the root of the length."""
-    sigma: float | None
-    key = f"sigma_{kind}_arcsec"
-    match kind:
-        case "direction":
-            sigma = accuracy.direction
-        case "angle":
-            sigma = accuracy.angle
-            if sigma is None and accuracy.direction is not None:
-                sigma = accuracy.direction * 2.0**0.5  # the difference of two directions
-        case "zenith":
-            sigma = accuracy.zenith
-        case "azimuth":
-            sigma = accuracy.azimuth
-        case "height_difference":
-            sigma, key = accuracy.height_difference, "sigma_height_difference_mm"
-            if accuracy.levelling is not None and not np.isnan(length):
-                sigma = float(np.hypot(sigma or 0.0, accuracy.levelling * (length / 1000.0) ** 0.5))
-        case _:
-            sigma, key = accuracy.distance, "sigma_distance_mm"
-            if sigma is not None:
-                sigma += accuracy.distance_slope * value
-    if sigma is None:
-        where = f"[instruments.{instrument_id}]" if instrument_id else "the instrument of its setup"
-        raise table.error(row, f"the {kind} has no sigma; add it to the row, or {key} to {where}")
-    return sigma
 
 
 def _check_setup(table: Table, row: int, kind: ReadingKind, setup_id: str, names: Names) -> None:
