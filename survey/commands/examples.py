@@ -61,7 +61,7 @@ def _schema(arguments: argparse.Namespace) -> int:
 
         text = reference_page()
     else:
-        from survey.project.schema import survey_schema
+        from survey.project.reference import survey_schema
 
         text = json.dumps(survey_schema(), indent=1, ensure_ascii=False) + "\n"
     if arguments.out is None:

@@ -1,7 +1,7 @@
 """How a table of ``survey.toml`` is declared: its keys with their kind, unit, default and meaning.
 
 Readers allow the keys that a declaration names and no others; the reference and the schema for editors are made from
-the same declarations (``survey.project.reference``, ``survey.project.schema``).
+the same declarations (``survey.project.reference``).
 What there is stands in ``survey.project.declared.declarations``.
 """
 
