@@ -18,8 +18,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.names import natural_key
 from survey import project as files
 from survey.cli import FAILED, main
-from survey.detection.gray import read_image
-from survey.detection.image_header import image_size
+from survey.detection.gray import image_size, read_image
 from survey.folder.messages import message
 from survey.folder.replacing import recover
 from survey.folder.text import cell_text, id_problem, read_bytes
