@@ -1,4 +1,4 @@
-"""Corners of boards and markers to a few hundredths of a pixel, each with an honest covariance; whether they are a board.
+"""Corners of boards and markers to a few hundredths of a pixel, each with an honest covariance; whole boards of them.
 
 A whole board has squares beside each other, and ends where it was said to end.
 """
