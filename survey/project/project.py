@@ -14,6 +14,7 @@ from adjust.model.observations import Closure, FrameRef, ReadingKind
 from adjust.model.survey import FloatArray, IntArray, Survey
 from survey.folder.locking import OBSERVATIONS_FOLDER as OBSERVATIONS_FOLDER
 from survey.folder.locking import RESULTS as RESULTS
+from survey.folder.plain import attributes
 from survey.project.detected import DetectedImage
 from survey.project.exclusions import Exclusion
 from survey.project.targets import TargetKind
@@ -236,6 +237,10 @@ class LeftOut:
     n_image_points: int = 0
     n_spots: int = 0
     n_readings: int = 0
+
+    def counts(self) -> dict[str, int]:
+        """How many of each."""
+        return attributes(self, "n_images", "n_image_points", "n_spots", "n_readings")
 
 
 @dataclass(frozen=True, eq=False)
