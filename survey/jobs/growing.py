@@ -112,7 +112,7 @@ class Growing:
     def _stations(self) -> tuple[Station, ...]:
         """New ones, of which nothing is known."""
         path = self.new / DEFINITION_FILE
-        stations = read_stations(read_toml(path)[0], (), False) if path.is_file() else ()
+        stations = read_stations(read_toml(path)[0].declared_as("root"), (), False) if path.is_file() else ()
         known = {station.station_id for station in self.definition.survey.stations}
         for station in stations:
             where = f"{path}: stations.{station.station_id}:"
