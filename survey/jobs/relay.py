@@ -24,7 +24,7 @@ from adjust.relay.eyes.pairs import EyePairs, LoopedPairs, close_loops, pairs_of
 from adjust.relay.eyes.trajectories import CommonMotions, TimeOffset, Trajectory, time_offset
 from adjust.spatial.rigid import rotation_log
 from adjust.spatial.rigid_motions import Motions
-from survey.folder.text import decode, read_bytes
+from survey.folder.text import read_text
 from survey.project import read
 from survey.project.tables.files import write_table
 from survey.project.tables.pairs import pair_columns
@@ -131,7 +131,7 @@ def read_trajectories(paths: Mapping[str, Path]) -> tuple[Trajectory, ...]:
     """Trajectory files by the ids of their eyes. Raises SurveyError naming file and line."""
     out = []
     for eye_id, path in paths.items():
-        out.append(read_trajectory(decode(Path(path), read_bytes(Path(path))[0]), eye_id, str(path)))
+        out.append(read_trajectory(read_text(Path(path)), eye_id, str(path)))
     return tuple(out)
 
 

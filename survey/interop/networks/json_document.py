@@ -1,10 +1,10 @@
 """A network as one JSON document: points, readings, baselines, coordinates, and the adjusted points with covariance."""
 
-import json
 from typing import Any
 
 from adjust.model.observations import PositionRef
 from survey.folder.plain import plain
+from survey.folder.text import json_text
 from survey.interop.networks.values import NetworkValues, between_points, point_of
 from survey.project.tables.terrestrial import ANGLES, HEIGHTS
 
@@ -41,7 +41,7 @@ def network_json(network: NetworkValues) -> str:
         ],
         "adjusted": _adjusted(network),
     }  # fmt: skip
-    return json.dumps(document, ensure_ascii=False, allow_nan=False, indent=1) + "\n"
+    return json_text(document)
 
 
 def _ids(positions: tuple[PositionRef, ...]) -> list[str | None]:

@@ -7,7 +7,6 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
-from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import MappingProxyType
@@ -17,7 +16,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from adjust.native.parallel import Beside
 from survey.folder.replacing import changing, replace_parts
-from survey.folder.text import atomic_write
+from survey.folder.text import atomic_write, time_text
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.detecting import author_name, detect_in, detect_job, remember_images
 from survey.project import Project, read
@@ -210,7 +209,7 @@ def run_info(project: Project, seconds: dict[str, float], command: str = "") -> 
             continue
     chosen = replace(project.options, tolerances=(), identification=())
     options = {k: v for k, v in asdict(chosen).items() if v not in ((), None)} | {"datum": project.survey.datum.kind}
-    date = datetime.now(UTC).isoformat(timespec="seconds")
+    date = time_text()
     name = _plain_name(project.folder)
     said = project.options.identification
     sigmas = project.options.sigmas or USUAL

@@ -23,7 +23,7 @@ from adjust.model.result import Adjustment, Estimate, ParameterName
 from survey.folder.arrays import packed_arrays, read_arrays
 from survey.folder.plain import plain
 from survey.folder.replacing import changing, replace_parts
-from survey.folder.text import atomic_write, decode, read_bytes
+from survey.folder.text import atomic_write, json_text, read_bytes, read_text
 from survey.project.exclusions import Exclusion, Name
 from survey.project.project import DEFINITION_FILE, RESULTS
 from survey.solution.covariances import covariance_arrays
@@ -81,7 +81,7 @@ def record_run(
                tuple(one.exclusion for one in run.left_out), fingerprint)  # fmt: skip
     into = place / RUNS / f"{number:04d}"
     into.mkdir(parents=True)
-    atomic_write(into / _RUN, json.dumps(said.as_dict(), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    atomic_write(into / _RUN, json_text(said.as_dict()))
     atomic_write(into / _SOLUTION, (place / RESULTS / _SOLUTION).read_bytes())
     atomic_write(into / _ESTIMATES, _estimates_npz(adjustment.estimates.values()))
     atomic_write(into / DEFINITION_FILE, read_bytes(folder / DEFINITION_FILE)[0])
@@ -136,7 +136,7 @@ def _read(path: Path) -> Run:
 def definition_of(folder: Path, number: int) -> str:
     """The text of survey.toml at a run."""
     path = folder / RUNS / f"{find_run(folder, number).number:04d}" / DEFINITION_FILE
-    return decode(path, read_bytes(path)[0])
+    return read_text(path)
 
 
 def load_run(folder: Path, number: int) -> Snapshot:
@@ -154,7 +154,7 @@ def pin_run(folder: Path, number: int, pinned: bool = True) -> Run:
         said = find_run(folder, number).as_dict() | {"pinned": pinned}
         into = place / RUNS / f"{number:04d}"
         into.mkdir(parents=True)
-        atomic_write(into / _RUN, json.dumps(said, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+        atomic_write(into / _RUN, json_text(said))
         replace_parts(folder)
     return find_run(folder, number)
 
