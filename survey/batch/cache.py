@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from adjust.model.errors import SurveyError
+from survey.folder.text import NOT_OURS
 from survey.project.detected import read_detected, same_file
 from survey.project.project import IMAGES_FOLDER
 
@@ -30,7 +31,7 @@ def unchanged_solution(folder: Path) -> dict[str, Any] | None:
         same = same_versions(inputs["versions"]) and _digests(folder, inputs["hashes"]) == inputs["hashes"]
         same = same and _tables(folder) <= set(inputs["hashes"]) and _images_are(folder, inputs["images"])
         return dict(solution) if same else None
-    except (SurveyError, OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except (SurveyError, *NOT_OURS):
         return None  # no results, or not ours: adjusting says what is wrong
 
 

@@ -19,6 +19,7 @@ from survey.batch.cluster import on_cluster
 from survey.batch.journal import Journal, entry_of, read_journal
 from survey.batch.record import DONE, FAILED, TEST_FAILED, Record, record_from, solved_record
 from survey.batch.worker import Worker, attempts
+from survey.folder.text import NOT_OURS
 
 Told = Callable[[Record], None]
 
@@ -84,7 +85,7 @@ def _known(folder: str, path: Path, options: BatchOptions, before: Mapping[str, 
     solution = unchanged_solution(path)
     if solution is not None:
         written = {p.name: str(p) for p in sorted((path / "results").iterdir()) if not p.name.startswith(".")}
-        with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError):  # not ours: adjust anew
+        with contextlib.suppress(*NOT_OURS):  # not ours: adjust anew
             return record_from(solved_record(folder, solution, written, origin="unchanged").plain())
     found = before.get(str(path))
     if found is None or found[1].state != FAILED or found[1].cause in MAY_PASS:

@@ -22,6 +22,8 @@ from survey.folder.locking import hold, remove_unheld
 LARGEST_FILE = 4 * 2**30  # bytes; longer observations go into several projects
 LARGEST_NUMBER = 1e15  # its square and what is made of it stay finite
 FORBIDDEN_IN_IDS = set('/\\:@,;"|<>*?')
+NOT_OURS = (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, RecursionError, OSError)
+"""What a file raises that is taken for one of this program and is none, or was damaged."""
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what spreadsheets take for the beginning of a formula
 _ASKING = threading.Lock()
 _LONGEST_ID = 120  # bytes: an id with a prefix and an ending is still the name of a file

@@ -23,7 +23,7 @@ from adjust.model.result import Adjustment, Estimate, ParameterName
 from survey.folder.arrays import packed_arrays, read_arrays
 from survey.folder.plain import plain
 from survey.folder.replacing import changing, replace_parts
-from survey.folder.text import atomic_write, json_text, read_bytes, read_text
+from survey.folder.text import NOT_OURS, atomic_write, json_text, read_bytes, read_text
 from survey.project.exclusions import Exclusion, Name
 from survey.project.project import DEFINITION_FILE, RESULTS
 from survey.solution.covariances import covariance_arrays
@@ -36,7 +36,6 @@ RUNS, MOST = "runs", 50
 _RUN, _ESTIMATES, _SOLUTION = "run.json", "estimates.npz", "solution.json"
 _FILES = (_RUN, _ESTIMATES, _SOLUTION, DEFINITION_FILE)
 _ARRAYS = ("parameters", "names", "units", "status", "start", "block", "covariance", "value_start", "values")
-_BROKEN = (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, RecursionError, OSError)
 
 
 @dataclass(frozen=True)
@@ -129,7 +128,7 @@ def _read(path: Path) -> Run:
         hashes = {str(k): str(v) for k, v in found["hashes"].items()}
         return Run(number=int(path.parent.name), pinned=found["pinned"] is True, summary=dict(found["summary"]),
                    hashes=hashes, exclusions=left, **texts)  # fmt: skip
-    except _BROKEN as error:
+    except NOT_OURS as error:
         raise SurveyError(f"{path}: cannot be read as a run ({error}); remove its folder") from error
 
 
@@ -144,7 +143,7 @@ def load_run(folder: Path, number: int) -> Snapshot:
     run, path = find_run(folder, number), folder / RUNS / f"{number:04d}" / _ESTIMATES
     try:
         return Snapshot({e.name: e for e in _estimates(read_arrays(path, _ARRAYS))}, run.summary)
-    except _BROKEN as error:
+    except NOT_OURS as error:
         raise SurveyError(f"{path}: cannot be read as a run ({error}); remove its folder") from error
 
 
