@@ -5,7 +5,6 @@ from the corner of the first pixel, half a pixel off ours. Lenses: OPENCV (k1 k2
 """
 
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 from gtsam import Pose3
@@ -105,14 +104,14 @@ def nerf_files(values: CameraValues, station: str | None) -> tuple[dict[str, str
     frames = []
     for camera_id, epoch in seen:
         pose = values.world_from(FrameRef("camera", camera_id, epoch)) * _OPENGL
-        frame: dict[str, Any] = {"file_path": f"images/{camera_id}/{epoch}.png"}
+        frame: dict[str, object] = {"file_path": f"images/{camera_id}/{epoch}.png"}
         frame |= _lens_keys(lenses[camera_id], cameras[camera_id].image_size)
         frames.append(frame | {"transform_matrix": [[float(v) for v in row] for row in pose.matrix()]})
     text = json_text({"frames": frames})
     return {"": text}, tuple(lens.note for lens in lenses.values() if lens.note)
 
 
-def _lens_keys(lens: MappedLens, size: tuple[int, int]) -> dict[str, Any]:
+def _lens_keys(lens: MappedLens, size: tuple[int, int]) -> dict[str, object]:
     fisheye = lens.model == "fisheye"
     fx, fy, u0, v0 = lens.array("fx", "fy", "u0", "v0").tolist()
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
