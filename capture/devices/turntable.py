@@ -1,8 +1,7 @@
-"""What a turntable is to the session: one small protocol, its axes with their limits, and the ways in which it fails.
+"""What turntables are made of: axes with their limits, moves, controllers, and the ways in which they fail.
 
-The shape is bluesky's (name, position, limits, set -> status, stop, locate), without the dependency. Angles are
-radians, one per axis, outermost first; they count whole turns, because a cable does. Drivers are in
-``capture.devices.turntables``.
+Angles are radians, one per axis, outermost first; they count whole turns, because a cable does. Drivers are in
+``capture.devices.turntables``, over which ``MovingTable`` is the turntable of a session.
 """
 
 import math
@@ -118,61 +117,6 @@ class Settle:
     stall_s: float = 1.0
     timeout_s: float = 120.0
     poll_s: float = 0.01
-
-
-class Turntable(Protocol):
-    """A turntable of any driver; usable from several threads."""
-
-    @property
-    def name(self) -> str:
-        """For messages."""
-        ...
-
-    @property
-    def axes(self) -> tuple[Axis, ...]:
-        """The axes, outermost first."""
-        ...
-
-    @property
-    def position(self) -> FloatArray:
-        """The readback, (n,) rad. Raises TableDisconnectedError."""
-        ...
-
-    def check(self, angles: Sequence[float]) -> None:
-        """Raise LimitError where a position cannot be reached; sends nothing."""
-        ...
-
-    def set(self, angles: Sequence[float] | FloatArray) -> "MoveStatus":
-        """Start to turn to ``angles`` (n,) rad. Raises LimitError before anything is sent."""
-        ...
-
-    def home(self) -> "MoveStatus":
-        """Look for the reference of every axis."""
-        ...
-
-    def stop(self) -> None:
-        """Stop all axes now; a move under way ends with StoppedError."""
-        ...
-
-    def emergency_stop(self) -> None:
-        """Stop, and refuse to move until ``release``."""
-        ...
-
-    def release(self) -> None:
-        """Allow moves again after an emergency stop."""
-        ...
-
-    def locate(self) -> Location:
-        """Setpoint and readback."""
-        ...
-
-    def reopen(self) -> None:
-        """Connect anew, after a cable was pulled."""
-        ...
-
-    def close(self) -> None:
-        """Let go of the controller; an axis that still turns is stopped. Never raises."""
-        ...
 
 
 class MoveStatus:
