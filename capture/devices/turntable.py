@@ -6,7 +6,7 @@ Angles are radians, one per axis, outermost first; they count whole turns, becau
 
 import math
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -124,23 +124,12 @@ class MoveStatus:
 
     def __init__(self) -> None:
         self._finished = threading.Event()
-        self._lock = threading.Lock()
         self._exception: BaseException | None = None
-        self._callbacks: list[Callable[[MoveStatus], None]] = []
 
     @property
     def done(self) -> bool:
         """Whether it is over, well or not."""
         return self._finished.is_set()
-
-    @property
-    def success(self) -> bool:
-        """Whether it is over and well."""
-        return self.done and self._exception is None
-
-    def exception(self) -> BaseException | None:
-        """Why it failed; None while it lasts and when it went well."""
-        return self._exception
 
     def wait(self, timeout_s: float | None = None) -> None:
         """Wait for the end; raises what went wrong, or NotSettledError after ``timeout_s``."""
@@ -149,24 +138,10 @@ class MoveStatus:
         if self._exception is not None:
             raise self._exception
 
-    def add_callback(self, callback: "Callable[[MoveStatus], None]") -> None:
-        """Call with this status at the end, at once if it is over."""
-        with self._lock:
-            if not self.done:
-                self._callbacks.append(callback)
-                return
-        callback(self)
-
     def finish(self, exception: BaseException | None = None) -> None:
-        """For the table: the end; a second one changes nothing."""
-        with self._lock:
-            if self.done:
-                return
-            self._exception = exception
-            self._finished.set()
-            callbacks = list(self._callbacks)
-        for callback in callbacks:
-            callback(self)
+        """For the table, once: the end, and why where it went wrong."""
+        self._exception = exception
+        self._finished.set()
 
 
 @dataclass(frozen=True)

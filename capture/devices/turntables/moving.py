@@ -30,7 +30,7 @@ _LEAST = 3  # readings that tell rest from motion
 class MovingTable:
     """The turntable of a session, over a ``Controller``; usable from several threads, one more watches each move.
 
-    The shape is bluesky's (name, position, limits, set -> status, stop, locate), without the dependency.
+    The shape is bluesky's (name, position, set -> status, stop, locate), without the dependency.
     near: (n,) rad, where the table was last, for controllers whose readback does not count turns.
     """
 
@@ -60,11 +60,6 @@ class MovingTable:
     def address(self) -> str:
         """How the controller is reached."""
         return self._controller.address
-
-    @property
-    def limits(self) -> tuple[tuple[float, float], ...]:
-        """Lower and upper limit of every axis, rad."""
-        return tuple((axis.lower, axis.upper) for axis in self._axes)
 
     @property
     def position(self) -> FloatArray:
