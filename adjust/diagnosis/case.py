@@ -3,14 +3,13 @@
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from gtsam import Pose3
 
 from adjust.adjustment import AdjustOptions, adjust, start_values
 from adjust.diagnosis.alone import completed, own_lenses, single_views
-from adjust.diagnosis.prediction import Altered, adjusted_values, started_values
+from adjust.diagnosis.prediction import Altered, Linear, adjusted_values, started_values
 from adjust.graph.assembly import StartValues, values_of
 from adjust.graph.solver import SolveOptions
 from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
@@ -19,9 +18,6 @@ from adjust.model.survey import FloatArray, Survey
 from adjust.start import find_start
 from adjust.start.given import given_starts
 from adjust.start.views import View
-
-if TYPE_CHECKING:
-    from adjust.diagnosis.linear import Linear
 
 CAP = 50.0
 """The most that one component of an observation counts: what is left out, or cannot be predicted, counts so."""
@@ -206,13 +202,11 @@ class Case:
         return sorted(ids, key=lambda owner: -share[owner])
 
     @cached_property
-    def linear(self) -> "Linear | None":
+    def linear(self) -> Linear | None:
         """The adjustment with all images in use, as a linear system; None where there is none.
 
         One that did not converge may have settled: what it still changes is nothing to v'Pv.
         """
-        from adjust.diagnosis.linear import Linear  # here: what fails as a whole needs none
-
         if self.result is None and not isinstance(self.error, NotConvergedError):
             return None
         if self.result is not None and not self.result.redundancy > 0:

@@ -23,6 +23,7 @@ from adjust.model.survey import Camera, Clock, FloatArray, Survey, Target
 from adjust.native.lenses import FISHEYE
 from adjust.observations.clocks import between, nearest
 from adjust.spatial.rigid import inverse, rigid, transform
+from adjust.statistics.score import LinearScores
 
 Altered = Mapping[ParameterName, Pose3 | FloatArray]
 Links = tuple[tuple[ParameterName, bool], ...]
@@ -267,3 +268,13 @@ class Prediction:
             return self._on_target(self._targets[block.target_id], block.epoch_id)[block.point_idx]
         found = [self._value(("point", self.survey.points[int(i)].point_id), altered) for i in block.point_idx]
         return np.array([np.full(3, np.nan) if x is None else x for x in found])
+
+
+@dataclass(frozen=True, eq=False)
+class Linear(LinearScores):
+    """The adjustment that is diagnosed as a linear system: scores of changes of things whose images it predicts."""
+
+    @cached_property
+    def prediction(self) -> Prediction:
+        """What the adjustment says that its images show."""
+        return Prediction(self.result.survey, adjusted_values(self.result))

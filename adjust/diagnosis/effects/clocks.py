@@ -16,7 +16,7 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect, Shifts, of_others, of_shifts
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.late import Freed, as_unknowns, keyed, spoken
-from adjust.diagnosis.linear import Linear
+from adjust.diagnosis.prediction import Linear
 from adjust.diagnosis.sequences import hand_poses
 from adjust.model.observations import ImageBlock, TableReading
 from adjust.model.result import Adjustment
@@ -31,11 +31,8 @@ _STEP = 1e-3  # intervals
 _CLEAR = 4.0  # sigmas
 
 
-def clocks(case: Case) -> Iterator[Effect]:
+def clocks(case: Case, linear: Linear) -> Iterator[Effect]:
     """Of cameras, of tables, of measured poses of stations; gear ratios of tables."""
-    linear = case.linear
-    if linear is None:
-        return
     yield from _of_cameras(case, linear)
     yield from _of_tables(case, linear)
     yield from _of_hands(case, linear)
