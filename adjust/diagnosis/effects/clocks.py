@@ -115,13 +115,12 @@ def _of_cameras(case: Case, linear: Linear) -> Iterator[Effect]:
 
 def _late(survey: Survey, cameras: Sequence[str], weight: Any) -> Shifts:
     """By block the shifts (n, 2, k) px that an interval of each of k cameras makes."""
-    heights = {c.camera_id: c.image_size[1] for c in survey.cameras}
     out = {}
     for i, (k, n, speed, _) in _motion(survey).items():
         block = survey.image_blocks[i]
         if block.camera_id in cameras:
             D = np.zeros((len(speed), 2, len(cameras)))
-            w = weight(k, n, block, heights[block.camera_id])
+            w = weight(k, n, block, survey.cameras_by_id[block.camera_id].image_size[1])
             D[:, :, cameras.index(block.camera_id)] = w[:, None] * speed
             out[i] = D
     return out

@@ -38,7 +38,7 @@ def _of(case: Case, linear: Linear, given: Target, name: str, by: FloatArray, wh
     target = given.target_id
 
     def scored(at: Linear) -> Score:
-        now = next(t for t in at.result.survey.targets if t.target_id == target)
+        now = at.result.survey.targets_by_id[target]
         return of_shape(at, target, (now.x_in_target @ by.T)[:, :, None])
 
     def known(theta: FloatArray, sigmas: FloatArray) -> tuple[FloatArray, Mapping[str, Any]] | None:
