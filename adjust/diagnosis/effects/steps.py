@@ -66,7 +66,7 @@ def steps(case: Case, linear: Linear) -> Iterator[Effect]:
     """The best step of every unknown that is the same for several epochs, and the drift of every lens."""
     n, tree = len(linear.system.columns), linear.system.precision.tree
     # columns of the covariance matrix: as many as it has, or as cost no more than some adjustments
-    room = min(float(n), tree.columns_for(_ELIMINATIONS)) if n > DENSE else np.inf
+    room = min(float(n), tree.cliques.columns_for(_ELIMINATIONS)) if n > DENSE else np.inf
     for course in _courses(linear):
         room -= sum(B.shape[1] for _, B in course.parts)
         if not case.few("what moved from some epoch on, of things that fit better than others", int(room < 0.0), 0):
