@@ -35,7 +35,7 @@ from adjust.relay.loops import loop_basis
 from adjust.relay.network import topology
 from adjust.start import find_start
 from survey.detection import SpotOptions, detect_image, detect_spots
-from survey.detection.extent import grown
+from survey.detection.corners import grown
 from survey.project.targets import Checkerboard
 from survey.simulate import head_on_table
 from survey.simulate.rendering import Beacons, BrownCamera, PlacedTarget, render
