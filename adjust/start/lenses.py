@@ -385,8 +385,12 @@ def _thinned(images: Sequence[Sighting]) -> list[Sighting]:
     most, parts = max(ENOUGH, _MOST_POINTS // max(1, min(len(images), _MOST_IMAGES))), dict[int, FloatArray]()
     out = []
     for s in images:
-        few = few_of(len(s.x), most)
-        out.append(Sighting(s.block_idx, parts.setdefault(id(s.x), s.x[few]), s.uv[few]) if len(few) < len(s.x) else s)
+        if len(s.x) > most:
+            few = few_of(len(s.x), most)
+            if id(s.x) not in parts:
+                parts[id(s.x)] = s.x[few]
+            s = Sighting(s.block_idx, parts[id(s.x)], s.uv[few])
+        out.append(s)
     return out
 
 
@@ -403,10 +407,11 @@ def spread_out(images: Sequence[Sighting], n: int = _MOST_IMAGES) -> list[Sighti
     features = _features(images)
     features = (features - features.mean(axis=0)) / np.maximum(features.std(axis=0), 1e-9)
     squares = ((features[:, None] - features) ** 2).sum(axis=2)  # of at most _MOST_SCREENED images
-    chosen = [int(np.argmax([len(s.x) for s in images]))]
+    sizes = [len(s.x) for s in images]
+    chosen = [sizes.index(max(sizes))]
     nearest = squares[chosen[0]]
     while len(chosen) < n:
-        chosen.append(int(np.argmax(nearest)))
+        chosen.append(int(nearest.argmax()))
         nearest = np.minimum(nearest, squares[chosen[-1]])
     return [images[i] for i in sorted(chosen)]
 
