@@ -13,12 +13,12 @@ _label_chords = Function("label_chords", "rows[L,W] kept[L] label[L]")
 
 
 def horton_loops(
-    walks: tuple[IntArray, ...], sets: tuple[IntArray, IntArray, IntArray, BoolArray], labels: tuple[IntArray, IntArray],
-    roots: IntArray, budget: int, work: IntArray, found: IntArray, start: IntArray,
+    walks: tuple[IntArray, ...], sets: tuple[IntArray, IntArray, IntArray, BoolArray],
+    labels: tuple[IntArray, IntArray], roots: IntArray, budget: int, work: IntArray, found: IntArray, start: IntArray,
 ) -> int:  # fmt: skip
     """Loops of one length at the roots, those independent of all before into ``found`` (m, length); how many.
 
-    walks: adjacency, and room (V,) for depths (-1 everywhere), parents, pairs, branches, the order of a search and sums.
+    walks: adjacency, and room (V,) for depths (-1 everywhere), parents, pairs, branches, the order of a search, sums.
     sets: chord number of each pair, and the elimination so far: room, rows, and which of these there are. labels: (E,)
     bits that cancel over every loop found, and where few are missing the chord of each bit. work: steps so far, counted
     on; no root is begun above the budget. start: (m,) stations at which the loops begin.
