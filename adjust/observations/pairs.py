@@ -68,7 +68,7 @@ class PairArrays:
 
     @cached_property
     def doubtful(self) -> BoolArray:
-        """Which pairs (E,) have a covariance that is not finite, symmetric and positive definite, by its correlations."""
+        """Which pairs (E,) have a covariance that is not finite, symmetric, positive definite, by its correlations."""
         wrong = np.zeros(len(self.used), dtype=np.bool_)
         for rows, k in ((self.is_pose, 6), (~self.is_pose, 3)):
             C = self.cov[rows][:, :k, :k]
@@ -107,7 +107,7 @@ class PairArrays:
 
 
 def pair_arrays(pairs: Sequence[Pair]) -> PairArrays:
-    """Pairs as arrays, which are not to be changed: those of the same measurements are made once, whichever are used."""
+    """Pairs as arrays, which are not to be changed: those of the same measurements are made once, used or not."""
     found, used = _arrays(_Measured(tuple(pairs))), np.array([p.used for p in pairs], dtype=np.bool_)
     return found if np.array_equal(found.used, used) else found.with_used(used)
 

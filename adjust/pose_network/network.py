@@ -46,8 +46,9 @@ class Topology:
 class PoseNetwork(Topology):
     """N stations and E measured pairs ``b_from_a``; made by :func:`network_of`, which checks everything.
 
-    arrays: the pairs; those out of use are predicted and tested only. station_rotations (N, 3, 3), station_translations (N, 3): ``world_from_station`` of the held ones
-    and of those with a prior, start of the others, nan where nothing is known. prior_cov: (6, 6) by station position.
+    arrays: the pairs; those out of use are predicted and tested only. station_rotations (N, 3, 3), station_translations
+    (N, 3): ``world_from_station`` of the held ones and of those with a prior, start of the others, nan where nothing is
+    known. prior_cov: (6, 6) by station position.
     inner: positions of the stations that carry inner constraints (free network), empty where the datum is given.
     survey: that it is of, None where there is only the network.
     """
@@ -172,8 +173,9 @@ def pose_network(
     Q = _full_cov(np.asarray(cov, dtype=float), t, n_pairs)
     use = np.ones(n_pairs, dtype=np.bool_) if used is None else np.asarray(used, dtype=np.bool_)
     measured = PairArrays(np.array(rotations, dtype=float).reshape(n_pairs, 3, 3), t, Q, use)
-    return network_of(Topology(tuple(station_ids), tuple(pair_ids), *(
-        np.asarray(x, dtype=np.int64).ravel() for x in (a_idx, b_idx))), measured, held, start, prior, inner)  # fmt: skip
+    a, b = (np.asarray(x, dtype=np.int64).ravel() for x in (a_idx, b_idx))
+    who = Topology(tuple(station_ids), tuple(pair_ids), a, b)
+    return network_of(who, measured, held, start, prior, inner)
 
 
 def network_of(
