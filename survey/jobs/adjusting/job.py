@@ -26,9 +26,8 @@ from survey.report.results import (
     ENGLISH_PAGE,
     ReportOptions,
     RunInfo,
-    begun_tables,
-    make_results,
-    solution_dict,
+    begun_results,
+    finished_results,
     summary_text,
 )  # fmt: skip
 from survey.report.unsolved import JSON, PAGE, unsolved_files
@@ -191,12 +190,11 @@ def made(
             beside = {"published": published_dict(adjustment, scale_of(adjustment, run.sigmas))}
     with Beside() as writing:
         with clock.step("report"):
-            begun = begun_tables(place, adjustment, run, report, writing)
+            begun = begun_results(place, adjustment, run, report, writing, beside)
         with clock.step("statistics"):
             found = statistics_of(adjustment, project.options.tolerances, scale_of(adjustment, run.sigmas))
         with clock.step("report"):
-            solution = solution_dict(adjustment, run, found) | beside
-            paths = make_results(begun, adjustment, run, solution, found, report)
+            solution, paths = finished_results(begun, adjustment, run, found, report)
     return AdjustOutcome(adjustment, run, solution, paths, found)
 
 

@@ -116,16 +116,16 @@ def _poses(thing_id: str, entries: Mapping[str, dict[str, Any]]) -> Iterator[_Po
     """All poses of a thing, also those per epoch."""
     for key in keys_of(entries, thing_id):
         if key == "epochs":
-            for epoch, poses in entries[thing_id][key].items():
-                for name, pose in poses.items():
-                    if "_from_" in name and isinstance(pose, dict):
-                        yield thing_id, name, epoch, partial(dict, pose)
+            poses = entries[thing_id][key]
+            for epoch in poses:
+                names = (name for name in keys_of(poses, epoch) if "_from_" in name)
+                yield from ((thing_id, name, epoch, partial(_part_of, poses, epoch, name)) for name in names)
         elif "_from_" in key:
             yield thing_id, key, "", partial(_part_of, entries, thing_id, key)
 
 
-def _part_of(entries: Mapping[str, dict[str, Any]], thing_id: str, key: str) -> dict[str, Any]:
-    return dict(entries[thing_id][key])
+def _part_of(entries: Mapping[str, dict[str, Any]], name: str, key: str) -> dict[str, Any]:
+    return dict(entries[name][key])
 
 
 def _limited(columns: Sequence[str], things: Sequence[T], row: Callable[[T], list[str]]) -> Markup:
