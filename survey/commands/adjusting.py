@@ -86,7 +86,7 @@ def _adjust_one(folder: Path, arguments: argparse.Namespace) -> int:
     begin_adjusting()
     require_project(folder, arguments.out)
     from survey.jobs.adjusting.job import adjust_job
-    from survey.report.results import ReportOptions
+    from survey.report.language import ReportOptions
 
     if arguments.candidate is not None:
         from survey.jobs.adjusting.trying import try_job

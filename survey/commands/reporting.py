@@ -29,7 +29,7 @@ def _report(arguments: argparse.Namespace) -> int:
     begin_adjusting()
     require_project(arguments.folder, arguments.out)
     from survey.jobs.adjusting.job import adjust_job, command_line
-    from survey.report.results import ReportOptions
+    from survey.report.language import ReportOptions
 
     language = arguments.language if arguments.language != "en" else None
     flags = {"language": language, "pdf": arguments.pdf, "check": arguments.check, "out": arguments.out}

@@ -85,7 +85,7 @@ def report_html(
 
 
 def begun_page(adjustment: Adjustment, run: RunInfo, solution: dict[str, Any], in_language: str) -> BegunPage:
-    """What can be made before there are statistics, from a ``solution`` that may lack them; else :func:`report_html`."""
+    """What can be made before there are statistics; the ``solution`` may lack them."""
     limit = solution["summary"]["suspects"]["image_test_limit"]
     images = adjustment.image_residuals
     c = Context(

@@ -12,6 +12,7 @@ from adjust.native.parallel import Beside
 from survey.folder.replacing import changing, replace_parts
 from survey.project import atomic_write
 from survey.project.project import RESULTS
+from survey.report.language import ENGLISH_PAGE, ReportOptions
 from survey.report.page import BegunPage, begun_page, finished_page, report_pdf
 from survey.report.terminal import summary_text
 from survey.solution.covariances import covariance_npz
@@ -33,20 +34,6 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True)
-class ReportOptions:
-    """How results are written.
-
-    language: of report.html, "en" or "de". pdf: report.pdf too. parquet: residuals.parquet too, which is written again
-    as long as it is there.
-    """
-
-    language: str = "en"
-    pdf: bool = False
-    parquet: bool = False
-
-
-ENGLISH_PAGE = ReportOptions()
 PARQUET = "residuals.parquet"
 
 

@@ -108,7 +108,9 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
     return solution
 
 
-def with_statistics(solution: dict[str, Any], adjustment: Adjustment, run: RunInfo, found: Statistics) -> dict[str, Any]:
+def with_statistics(
+    solution: dict[str, Any], adjustment: Adjustment, run: RunInfo, found: Statistics
+) -> dict[str, Any]:
     """The solution of :func:`solution_dict`, with its statistics before what went in, and judged by them.
 
     Its warnings: causes that were tried first, then what tests of parts found, then the rest.
