@@ -1,4 +1,4 @@
-"""The main job: read, detect, adjust, write. What comes after reading is loaded while the tables are read."""
+"""The main job: read, detect, adjust, write. What comes after reading is loaded while tables become observations."""
 
 import os
 import shlex
@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from adjust.model.errors import SurveyError
-from adjust.native.parallel import Beside
+from adjust.native.parallel import Beside, workers
 from survey.folder.replacing import changing, replace_parts
 from survey.jobs.detecting import detect_in, detect_job, remember_images
 from survey.project import read
@@ -66,10 +66,8 @@ def adjust_job(
                 else:
                     detect_job(folder, progress=progress, everything=redetect)
 
-        with Beside() as loading:
-            loading.of(_load)
-            with clock.step("read"):
-                project = read(folder)
+        with Beside() as loading, clock.step("read"):
+            project = read(folder, (lambda: loading.of(_load)) if workers() > 1 else lambda: None)
         nothing_yet = bool(project.images) and not (project.survey.image_blocks or project.spots)
         if redetect or project.to_detect or (nothing_yet and not project.detected):
             detected()
@@ -95,8 +93,8 @@ def adjust_job(
 
 
 def _load() -> None:
-    """What a project that was read is adjusted and tested with."""
-    for name in ("scipy.special", "survey.jobs.adjusting.outcome", "survey.jobs.adjusting.steps"):
+    """What a project is adjusted and tested with; with one thread that is loaded when it is asked for."""
+    for name in ("scipy.special", "scipy.linalg", "survey.jobs.adjusting.outcome", "survey.jobs.adjusting.steps"):
         import_module(name)
 
 
