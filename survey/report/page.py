@@ -20,7 +20,7 @@ from survey.report.modules import WEB, bundled
 from survey.report.sections import diagnosis, loops, observations, overview, published, statistics, unknowns
 from survey.solution.dictionary import RunInfo, solution_dict
 from survey.solution.quantities import scale_of
-from survey.solution.residual_tables import image_rows
+from survey.solution.residual_tables import ImageRows, image_rows
 from survey.solution.statistics import Statistics
 
 _SECTIONS = (
@@ -81,15 +81,17 @@ def report_html(
     found: the statistics, where they are to be shown. in_language: "en" or "de"; raises SurveyError for others.
     """
     solution = solution_dict(adjustment, run) if solution is None else solution
-    return finished_page(begun_page(adjustment, run, solution, in_language), solution, found)
+    return finished_page(begun_page(adjustment, run, solution, image_rows(adjustment), in_language), solution, found)
 
 
-def begun_page(adjustment: Adjustment, run: RunInfo, solution: dict[str, Any], in_language: str) -> BegunPage:
+def begun_page(
+    adjustment: Adjustment, run: RunInfo, solution: dict[str, Any], rows: ImageRows, in_language: str
+) -> BegunPage:
     """What can be made before there are statistics; the ``solution`` may lack them."""
     limit = solution["summary"]["suspects"]["image_test_limit"]
     images = adjustment.image_residuals
     c = Context(
-        adjustment, run, solution, scale_of(adjustment, run.sigmas), image_rows(adjustment),
+        adjustment, run, solution, scale_of(adjustment, run.sigmas), rows,
         images.used & (images.test > limit),
     )  # fmt: skip
     with speaking(in_language):

@@ -18,7 +18,12 @@ from survey.report.terminal import summary_text
 from survey.solution.covariances import covariance_npz
 from survey.solution.dictionary import RunInfo, solution_dict, with_statistics
 from survey.solution.records import solution_json
-from survey.solution.residual_tables import image_residuals_csv, image_residuals_parquet, other_residuals_csv
+from survey.solution.residual_tables import (
+    image_residuals_csv,
+    image_residuals_parquet,
+    image_rows,
+    other_residuals_csv,
+)
 from survey.solution.statistics import Statistics
 
 __all__ = [
@@ -97,11 +102,14 @@ def begun_results(
     more: what else ``solution.json`` is to hold.
     """
     files = ResultFiles(place, writing)
-    page = writing.of(lambda: begun_page(adjustment, run, solution_dict(adjustment, run) | more, options.language))
+    rows = writing.of(lambda: image_rows(adjustment))
+    page = writing.of(
+        lambda: begun_page(adjustment, run, solution_dict(adjustment, run) | more, rows(), options.language)
+    )
     parquet = options.parquet or (place.parent / RESULTS / PARQUET).is_file()  # there: not to be old
     files.begin({
         "covariance.npz": lambda: covariance_npz(adjustment, run.sigmas),
-        "residuals.csv": lambda: image_residuals_csv(adjustment),
+        "residuals.csv": lambda: image_residuals_csv(adjustment, rows()),
         **({PARQUET: lambda: image_residuals_parquet(adjustment)} if parquet else {}),
         "residuals_other.csv": lambda: other_residuals_csv(adjustment),
     })  # fmt: skip
