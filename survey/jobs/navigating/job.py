@@ -18,7 +18,7 @@ from adjust.model.names import natural_key
 from adjust.navigation import EpochPose, Motion, NavigateOptions, Trajectory, head_and_beacons, navigate
 from survey.folder.plain import attributes
 from survey.folder.replacing import changing, replace_parts
-from survey.jobs.adjusting.job import run_info
+from survey.jobs.adjusting.outcome import run_info
 from survey.jobs.adjusting.probable_causes import explaining, with_probable_causes
 from survey.jobs.navigating.calibration import Calibration, digest, keep, kept
 from survey.jobs.navigating.lenses import lenses_taken
