@@ -3,14 +3,16 @@
 import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
 
 from adjust.model.errors import SurveyError
 from adjust.model.names import natural_key
+from adjust.model.observations import ImageBlock
 from adjust.model.subsets import in_use, points_read, with_points
-from adjust.model.survey import ImageBlock, Survey
+from adjust.model.survey import Survey
 from adjust.navigation import NavigationEpoch, Spots, head_of
 from adjust.statistics.outliers.supported import supported
 from survey.folder.text import decode, read_bytes
@@ -182,7 +184,7 @@ def observed_epochs(
     readings = {r.epoch_id: (r.angles, r.cov) for r in reversed(survey.table_readings) if r.table_id == carried}
     return [
         NavigationEpoch(e, tuple(spots[e]), time_s, *readings.get(e, (None, None)))
-        for e, time_s in zip(epochs, times or [None] * len(epochs), strict=True)
+        for e, time_s in zip(epochs, times or repeat(None, len(epochs)), strict=True)
     ]
 
 
