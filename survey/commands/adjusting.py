@@ -88,7 +88,7 @@ def _adjust_one(folder: Path, arguments: argparse.Namespace) -> int:
     begin_adjusting()
     require_project(folder, arguments.out)
     from survey.jobs.adjusting.job import adjust_job
-    from survey.report.results import ReportOptions
+    from survey.report.language import ReportOptions
 
     if arguments.candidate is not None:
         from survey.jobs.adjusting.trying import try_job
@@ -162,7 +162,7 @@ def _report(arguments: argparse.Namespace) -> int:
     begin_adjusting()
     require_project(arguments.folder, arguments.out)
     from survey.jobs.adjusting.job import adjust_job, command_line
-    from survey.report.results import ReportOptions
+    from survey.report.language import ReportOptions
 
     language = arguments.language if arguments.language != "en" else None
     flags = {"language": language, "pdf": arguments.pdf, "check": arguments.check, "out": arguments.out}

@@ -107,14 +107,15 @@ def grown(gray: Gray32, grid: FloatArray, contrast: float) -> FloatArray:
     grid puts it. Margins, backgrounds and boards of another pitch do not; nor do places outside the image.
     """
     # on most images the board ends on all sides; half of what a next row needs is enough to look closer
-    size = 0 if may_go_on(gray, grid, 0.5 * _CONTRAST * contrast, 0.5 * _SEEN) else grid.size
-    while size < grid.size and max(grid.shape) < _MOST:
+    turns = np.flatnonzero(may_go_on(gray, grid, 0.5 * _CONTRAST * contrast, 0.5 * _SEEN)).tolist()
+    while turns and max(grid.shape) < _MOST:
         size = grid.size
-        for turn in range(4):  # a wider side may go on where a narrow one lacked a corner
+        for turn in turns:
             side = np.rot90(grid, turn)
             while max(side.shape) < _MOST and (row := _next_row(gray, side, contrast)) is not None:
                 side = np.concatenate([row[None], side])
             grid = np.rot90(side, -turn)
+        turns = list(range(4)) if size < grid.size else []  # a wider side may go on where a narrow one lacked a corner
     return np.asarray(grid)
 
 

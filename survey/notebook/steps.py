@@ -7,7 +7,7 @@ from typing import Any
 from adjust.model.errors import SurveyError
 from adjust.model.survey import Survey
 from survey.folder.text import suggestion
-from survey.jobs.adjusting.job import run_info
+from survey.jobs.adjusting.outcome import run_info
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.cross_validation import CrossValidation
 from survey.jobs.cross_validation import cross_validate as cross_validate_project

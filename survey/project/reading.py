@@ -1,7 +1,7 @@
 """Reading a project folder."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
@@ -57,17 +57,19 @@ def read_definition(folder: Path) -> Definition:
         return _read_definition(Path(folder))[0]
 
 
-def read(folder: Path) -> Project:
+def read(folder: Path, then: Callable[[], object] = lambda: None) -> Project:
     """Read a whole project folder; tables of observations that are not there yet are empty. Raises SurveyError.
 
     What ``exclusions.csv`` leaves out is not used. ``notes`` say which of its rows name nothing, ``image_notes``
-    which images are not those any more that the points come from.
+    which images are not those any more that the points come from. then: called when all files are read.
     """
-    project = read_all(folder)
+    project = read_all(folder, then=then)
     return leaving_out(project, in_force(read_exclusions(project.folder / OBSERVATIONS_FOLDER)[0]).values())
 
 
-def read_all(folder: Path, texts: Mapping[str, str] = MappingProxyType({})) -> Project:
+def read_all(
+    folder: Path, texts: Mapping[str, str] = MappingProxyType({}), then: Callable[[], object] = lambda: None
+) -> Project:
     """:func:`read`, with what is excluded as if it were not.
 
     texts: what is to stand in files of the folder, not yet written, by their paths in it.
@@ -79,6 +81,7 @@ def read_all(folder: Path, texts: Mapping[str, str] = MappingProxyType({})) -> P
         _, digest = read_exclusions(place)
         known = read_detected(place)
         images = _image_news(definition, tables, known)
+    then()
     project = _observed(definition, root, tables)
     hashes = dict(sorted({**project.inputs, f"{OBSERVATIONS_FOLDER}/{EXCLUSIONS_FILE}": digest}.items()))
     if digest:

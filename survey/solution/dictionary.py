@@ -66,13 +66,15 @@ class RunInfo:
 
 def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None = None) -> dict[str, Any]:
     """The whole solution as plain values, floats in full, None where there is no number; ``found``: its statistics."""
+    if found is not None:
+        return with_statistics(solution_dict(adjustment, run), adjustment, run, found)
     scale = scale_of(adjustment, run.sigmas)
     columns = pose_columns(adjustment.estimates.values(), scale)
     poses = _poses(columns)
     solution: dict[str, Any] = plain(
         {
             "format": 1,
-            "summary": _summary(adjustment, run, scale, found),
+            "summary": _summary(adjustment, run, scale, None),
             "conventions": CONVENTIONS,
             "cameras": _cameras(adjustment, poses, scale),
             "stations": _stations(adjustment, poses, columns, scale),
@@ -85,9 +87,8 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
             **_free_datum(adjustment),
             "groups": {g.group: _group(g) for g in adjustment.groups},
             **left_out_dict(adjustment, run.left_out, run.n_left_out, run.n_unused_in_files),
-            "warnings": _warnings(adjustment, found),
+            "warnings": list(adjustment.warnings),
             **({"diagnosis": adjustment.diagnosis.told()} if adjustment.diagnosis is not None else {}),
-            **(statistics_dict(adjustment, found, scale) if found is not None else {}),
             "inputs": {
                 "folder": run.folder,
                 "identification": dict(run.identification),
@@ -107,11 +108,23 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
     return solution
 
 
-def _warnings(adjustment: Adjustment, found: Statistics | None) -> list[str]:
-    """Causes that were tried first, then what tests of parts found, then the rest."""
+def with_statistics(
+    solution: dict[str, Any], adjustment: Adjustment, run: RunInfo, found: Statistics
+) -> dict[str, Any]:
+    """The solution of :func:`solution_dict`, with its statistics before what went in, and judged by them.
+
+    Its warnings: causes that were tried first, then what tests of parts found, then the rest.
+    """
+    scale, warnings = scale_of(adjustment, run.sigmas), adjustment.warnings
     tried = len(adjustment.diagnosis.lines) if adjustment.diagnosis is not None else 0
-    return [*adjustment.warnings[:tried], *findings(found.consistency if found else None),
-            *adjustment.warnings[tried:]]  # fmt: skip
+    told = {
+        "summary": _summary(adjustment, run, scale, found),
+        "warnings": [*warnings[:tried], *findings(found.consistency), *warnings[tried:]],
+        **statistics_dict(adjustment, found, scale),
+    }
+    out: dict[str, Any] = solution | plain(told)
+    names = list(solution)
+    return out | {name: out.pop(name) for name in names[names.index("inputs") :]}
 
 
 def _free_datum(adjustment: Adjustment) -> dict[str, Any]:

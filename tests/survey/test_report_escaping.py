@@ -18,7 +18,7 @@ from survey.batch.trends import trends_of
 from survey.cli import main
 from survey.examples import write_example
 from survey.examples.alignment import alignment_files
-from survey.jobs.adjusting.job import run_info
+from survey.jobs.adjusting.outcome import run_info
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.aligning import align_job
 from survey.notebook.names import heading, html_table

@@ -1,6 +1,5 @@
 """A network as one JSON document: points, readings, baselines, coordinates, and the adjusted points with covariance."""
 
-
 from adjust.model.observations import PositionRef, Reading
 from adjust.model.survey import Point
 from survey.folder.plain import plain
@@ -51,7 +50,7 @@ def _ids(positions: tuple[PositionRef, ...]) -> list[str | None]:
 def _point(network: NetworkValues, point: Point) -> dict[str, object]:
     x = network.x.get(point.point_id)
     parameter = point.x_in_world
-    out = {"treatment": parameter.treatment, "held": list(parameter.held)}
+    out: dict[str, object] = {"treatment": parameter.treatment, "held": list(parameter.held)}
     if x is not None:
         out["x_m"] = plain(x)
     if parameter.prior_cov is not None:
@@ -61,7 +60,7 @@ def _point(network: NetworkValues, point: Point) -> dict[str, object]:
 
 def _reading(r: Reading) -> dict[str, object]:
     unit = "rad" if r.kind in ANGLES else "m"
-    out = {"id": r.reading_id, "kind": r.kind, "from": r.at.point_id, "to": r.to.point_id}
+    out: dict[str, object] = {"id": r.reading_id, "kind": r.kind, "from": r.at.point_id, "to": r.to.point_id}
     out |= {"second": r.second.point_id} if r.second else {}
     out |= {"setup": r.setup_id} if r.setup_id else {}
     out |= {f"value_{unit}": r.value, f"sigma_{unit}": r.sigma, "group": r.group, "used": r.used}

@@ -141,11 +141,12 @@ def _measured(
             row = first_row(cameras.codes == code)
             raise table.error(row, f"camera_id: unknown camera {name!r}; {suggestion(name, sizes)}")
     uv = np.stack([table.numbers("u_px"), table.numbers("v_px")], axis=1)
-    size = np.array([sizes[name] for name in cameras.names], dtype=float).reshape(-1, 2)[cameras.codes]
-    outside = ((uv < -0.5) | (uv > size - 0.5)).any(axis=1)
+    size = np.array([sizes[name] for name in cameras.names], dtype=float).reshape(-1, 2)
+    out_u, out_v = ((x < -0.5) | (x > most[cameras.codes]) for x, most in zip(uv.T, size.T - 0.5, strict=True))
+    outside = out_u | out_v
     if outside.any():
         row = first_row(outside)
-        width, height = size[row].astype(int)
+        width, height = size[cameras.codes[row]].astype(int)
         problem = f"the point ({uv[row, 0]:g}, {uv[row, 1]:g}) px is outside the image of {width} x {height} px"
         raise table.error(row, f"{problem}; correct the table or image_size_px")
     scale = np.array([sigmas.scale.get(name, 1.0) for name in groups.names])[groups.codes]
@@ -155,16 +156,15 @@ def _measured(
 def _covariances(table: Table, default_px: float | None, scale: FloatArray) -> FloatArray:
     """Covariances (n, 2, 2) px^2, from the sigma columns or, where a row has none, from ``default_px``."""
     sigma = np.stack([table.positive("sigma_u_px"), table.positive("sigma_v_px")], axis=1)
-    rho = table.numbers("rho_uv")
     blank = np.isnan(sigma)
-    half = blank.any(axis=1) & (~blank.all(axis=1) | ~np.isnan(rho))
+    half = (blank[:, 0] != blank[:, 1]) | (blank[:, 0] & ~np.isnan(table.numbers("rho_uv")))
     if half.any():
         raise table.error(first_row(half), "sigma_u_px, sigma_v_px: one is missing; give both or leave all blank")
     filled = table_correlations(table, ("rho_uv",))
     if blank.any():
         if default_px is None:
             problem = "the row has no sigma; fill in sigma_u_px, sigma_v_px, or give [sigmas] image_px in survey.toml"
-            raise table.error(first_row(blank.any(axis=1)), problem)
+            raise table.error(first_row(blank[:, 0]), problem)
         sigma[blank] = default_px
     return covariance_from_sigmas(sigma * scale[:, None], filled)
 
