@@ -105,13 +105,13 @@ def _counts(records: Iterable[Record]) -> str:
     return ", ".join(f"{n} {word}" for n, word in words if n)
 
 
-def _run(tasks: Mapping[int, Mapping[str, Any]], options: BatchOptions) -> Iterator[tuple[int, Record]]:
+def _run(tasks: Mapping[int, Mapping[str, object]], options: BatchOptions) -> Iterator[tuple[int, Record]]:
     if options.scheduler:
         return on_cluster(tasks, options.scheduler, options.retries)
     return _here(tasks, options)
 
 
-def _here(tasks: Mapping[int, Mapping[str, Any]], options: BatchOptions) -> Iterator[tuple[int, Record]]:
+def _here(tasks: Mapping[int, Mapping[str, object]], options: BatchOptions) -> Iterator[tuple[int, Record]]:
     """Each of ``jobs`` threads owns a worker process and waits for it."""
     jobs = max(1, min(options.jobs or cores(), len(tasks)))
     own, workers = threading.local(), []
@@ -123,7 +123,7 @@ def _here(tasks: Mapping[int, Mapping[str, Any]], options: BatchOptions) -> Iter
     pool = ThreadPoolExecutor(jobs, "batch", initializer=prepare)
     try:
 
-        def run(task: Mapping[str, Any]) -> Record:
+        def run(task: Mapping[str, object]) -> Record:
             return attempts(own.worker, task, options.retries)
 
         futures = {pool.submit(run, task): i for i, task in tasks.items()}

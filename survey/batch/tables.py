@@ -1,7 +1,6 @@
 """A batch as text: the table on the screen, ``overview.json``, ``folders.csv`` and ``trends.csv``."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -19,9 +18,9 @@ STATES = {DONE: "done", FAILED: "error", TEST_FAILED: "does not fit"}
 _MOST_TOLD = 8
 
 
-def row_of(record: Record) -> dict[str, Any]:
+def row_of(record: Record) -> dict[str, object]:
     """What ``--json`` says of a folder: its summary, or why it failed."""
-    row: dict[str, Any] = {"folder": record.folder, "exit_code": record.exit_code, "origin": record.origin,
+    row: dict[str, object] = {"folder": record.folder, "exit_code": record.exit_code, "origin": record.origin,
                            "tries": record.tries, "seconds": round(record.seconds, 3)}  # fmt: skip
     if record.state == FAILED:
         return row | {"cause": record.cause, "error": record.error}
@@ -108,7 +107,7 @@ def overview_json(records: Sequence[Record], trends: Trends) -> str:
     return json_text(plain(value))
 
 
-def _chart(trends: Trends, c: Chart, records: Sequence[Record], names: Sequence[str]) -> dict[str, Any]:
+def _chart(trends: Trends, c: Chart, records: Sequence[Record], names: Sequence[str]) -> dict[str, object]:
     at = [names[int(i)] for i in c.series.epoch]
 
     def named(mask: BoolArray) -> list[str]:

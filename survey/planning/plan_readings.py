@@ -116,7 +116,7 @@ def terrestrial_candidates(part: Terrestrial) -> list[Candidate]:
 def lengths_between(survey: Survey, start: StartValues) -> Callable[[Reading], float]:
     """Distances (m) between the ends of readings; 0 where one of them is no point of the world."""
     held = {p.point_id: p.x_in_world.value for p in survey.points if p.x_in_world.treatment == "held"}
-    places: dict[str, Any] = {**held, **start.points}
+    places: dict[str, object] = {**held, **start.points}
 
     def length(r: Reading) -> float:
         a, b = (places.get(x.point_id or "") if x.frame is None else None for x in (r.at, r.to))

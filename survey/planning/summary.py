@@ -61,7 +61,7 @@ class PlanningOutcome:
     budget: Budget | None
     tolerances: tuple[Tolerance, ...]
     trials: Trials | None
-    network: dict[str, Any] | None
+    network: dict[str, object] | None
     navigation: NavigationOutcome | None
     seconds: dict[str, float] = field(default_factory=dict)
     paths: dict[str, Path] = field(default_factory=dict)
@@ -73,7 +73,7 @@ class PlanningOutcome:
         return tuple(Met(c, r, s, *sigma_unit_for_people(c.unit))
                      for (c, r), s in zip(self.required.items(), planned, strict=self.budget is not None))  # fmt: skip
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """As plain values."""
         return plan_summary(self)
 
@@ -97,9 +97,9 @@ def _sigma_of(component: Component, sigma: float) -> str:
     return f"{factor * sigma:.3g} {unit}".strip()
 
 
-def plan_summary(o: PlanningOutcome) -> dict[str, Any]:
+def plan_summary(o: PlanningOutcome) -> dict[str, object]:
     """All figures by name, units in the keys."""
-    out: dict[str, Any] = {
+    out: dict[str, object] = {
         "folder": str(o.folder),
         "title": o.title,
         "observations": o.expected.n_observations,
@@ -143,7 +143,7 @@ def plan_summary(o: PlanningOutcome) -> dict[str, Any]:
     return out
 
 
-def _selection(s: Selection) -> dict[str, Any]:
+def _selection(s: Selection) -> dict[str, object]:
     gain = ("name", "kind", "ln_det", "ln_det_all", "mean_variance")
     wanted = {}
     for c, before, after in zip(s.wanted, s.sigmas.tolist(), s.after.tolist(), strict=True):
@@ -158,7 +158,7 @@ def _selection(s: Selection) -> dict[str, Any]:
     }
 
 
-def _tolerances(o: PlanningOutcome) -> dict[str, Any]:
+def _tolerances(o: PlanningOutcome) -> dict[str, object]:
     return {
         "met": all(r.met for r in o.requirements),
         "groups": {t.group: {"factor_alone": plain(t.alone), "factor_together": plain(t.together),
@@ -181,7 +181,7 @@ def pose_sigmas(n: NavigationOutcome) -> tuple[FloatArray, FloatArray]:
     return np.degrees(n.sigmas[:, :3].max(axis=1)), 1e3 * n.sigmas[:, 3:].max(axis=1)
 
 
-def _navigation(n: NavigationOutcome) -> dict[str, Any]:
+def _navigation(n: NavigationOutcome) -> dict[str, object]:
     turn, shift = pose_sigmas(n)
     out: dict[str, Any] = {
         "station": n.station_id,
