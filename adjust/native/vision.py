@@ -43,7 +43,7 @@ _draw_facets = Function(
 _of_neighbours = Function("of_neighbours", "image[*,*] grid[r,c,2] contrast")
 _first_is_dark = Function("first_is_dark", "image[*,*] grid[r,c,2]")
 _squares_follow = Function("squares_follow", "image[*,*] corners[n,2] places[n,2] edges[n,2,2] step follow[n]")
-_may_go_on = Function("may_go_on", "image[*,*] grid[r,c,2] step share")
+_may_go_on = Function("may_go_on", "image[*,*] grid[r,c,2] step share sides[4]")
 _off_grid = Function("off_grid", "grid[r,c,2] off[r,c] work[*]")
 _find_grid = Function("find_grid", "image[h,w] response[h,w] grid[r,c,2]")
 MOST_CROSSINGS = 600  # that are counted, as in grids.h
@@ -143,12 +143,15 @@ def squares_follow(image: Gray, corners: FloatArray, places: FloatArray, edges: 
     return follow
 
 
-def may_go_on(image: Gray, grid: FloatArray, step: float, share: float) -> bool:
-    """Whether more than a share of a next row's squares follow a grid (rows, columns, 2) px on any of its four sides.
+def may_go_on(image: Gray, grid: FloatArray, step: float, share: float) -> BoolArray:
+    """Whether more than a share of a next row's squares follow a grid (rows, columns, 2) px on each side (4,).
 
-    By places of a parabola through the last corners: near enough for squares, not for corners. True below 3 x 3.
+    Side k is that of the first row after k quarter turns (``numpy.rot90``). By places of a parabola through the last
+    corners: near enough for squares, not for corners. True below 3 x 3.
     """
-    return bool(_may_go_on(image, np.ascontiguousarray(grid), step, share))
+    sides = np.empty(4, bool)
+    _may_go_on(image, np.ascontiguousarray(grid), step, share, sides)
+    return sides
 
 
 def off_grid(grid: FloatArray) -> FloatArray:

@@ -109,11 +109,14 @@ class TreeCovariance:
     def _apart(self, numbers: list[int]) -> FloatArray:
         """Joint covariance of unknowns of different cliques: columns of the inverse, on their ways to the root only.
 
-        Of the last one none: its own covariance is known, and the rest is in the columns of the others.
+        Of the last one none: its own covariance is known, and the rest is in the columns of the others. Of most unknowns
+        the whole matrix is less work.
         """
         c = self.cliques
         rows = [np.arange(c.first[k], c.first[k + 1]) for k in numbers]
         every, asked = np.concatenate(rows), np.concatenate(rows[:-1])
+        if 2 * len(every) > self.n:
+            return np.asarray(self.full()[np.ix_(every, every)])
         x = np.zeros((self.n, len(asked)))
         x[asked, np.arange(len(asked))] = 1.0
         home = c.home[numbers].tolist()

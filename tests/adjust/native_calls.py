@@ -35,7 +35,7 @@ from adjust.relay.loops import loop_basis
 from adjust.relay.network import topology
 from adjust.start import find_start
 from survey.detection import SpotOptions, detect_image, detect_spots
-from survey.detection.extent import grown
+from survey.detection.corners import grown
 from survey.project.targets import Checkerboard
 from survey.simulate import head_on_table
 from survey.simulate.rendering import Beacons, BrownCamera, PlacedTarget, render
@@ -132,7 +132,8 @@ def _images() -> None:
     solved = solve_network(pose_networks.simulate(3, 2).network)
     solved.pairs  # noqa: B018  # is computed when asked for
     solved.precision.tree.among(sparse.csr_array(np.eye(solved.precision.tree.n)[:2]))
-    loop_basis(topology([(a + b, a, b) for a, b in ("AB", "BC", "CA", "CD", "DA")]))
+    ring = [(chr(65 + i), chr(65 + (i + step) % 12)) for step in (1, 2) for i in range(0, 12, step)]
+    loop_basis(topology([(a + b, a, b) for a, b in ring]))  # triangles, then a loop through the stations of one pair
     survey, truth = head_on_table(1, n_cameras=2, n_table_epochs=3, n_free_epochs=2)
     graph, done = h.solved(survey, near(truth))  # nothing to reduce: every block is condensed for itself
     graph.prepare(done.values, jacobians=False)

@@ -9,8 +9,8 @@ from scipy.stats import chi2
 from adjust.model.errors import SurveyError
 from adjust.native.vision import corner_rows, count_crossings, find_grid, refine_corners
 from survey.detection import detect_image, markers
+from survey.detection.batch import detect_targets
 from survey.detection.corners import CROSSING_FLOOR_PX, MARKER_FLOOR_PX
-from survey.detection.detect import detect_targets
 from survey.detection.gray import gray_values, reduced, saturation_level
 from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid
 from survey.simulate.rendering import BrownCamera, Imaging, PlacedTarget, render
