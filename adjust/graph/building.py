@@ -33,7 +33,8 @@ from adjust.observations.factors import (
 )
 from adjust.observations.geometry.building import GeometryFactors, position_refs
 from adjust.observations.images.batch import ImageBatch
-from adjust.observations.images.bundles import BundleBatch, may_be_hidden
+from adjust.observations.images.bundle_layout import may_be_hidden
+from adjust.observations.images.bundles import BundleBatch
 from adjust.observations.images.helmert_blocks import helmert_blocks
 from adjust.observations.images.reduction import reduction
 from adjust.observations.terrestrial.building import build_batch, reading_refs
