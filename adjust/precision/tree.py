@@ -109,8 +109,8 @@ class TreeCovariance:
     def _apart(self, numbers: list[int]) -> FloatArray:
         """Joint covariance of unknowns of different cliques: columns of the inverse, on their ways to the root only.
 
-        Of the last one none: its own covariance is known, and the rest is in the columns of the others. Where most
-        unknowns are asked for the whole matrix is less work.
+        Of the last one none: its own covariance is known, and the rest is in the columns of the others. Of most
+        unknowns the whole matrix is less work.
         """
         c = self.cliques
         rows = [np.arange(c.first[k], c.first[k + 1]) for k in numbers]

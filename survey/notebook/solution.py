@@ -17,7 +17,8 @@ from survey.notebook.names import components, heading, html_table, rows_in_joint
 from survey.notebook.plots import Plot
 from survey.notebook.plots import plot as plot_by_name
 from survey.project import Project
-from survey.report.language import ReportOptions, RunInfo, summary_text, write_results
+from survey.report.language import ReportOptions
+from survey.report.results import RunInfo, summary_text, write_results
 from survey.solution.dictionary import solution_dict
 from survey.solution.quantities import Scale, scale_of
 from survey.solution.statistics import Statistics, statistics_of

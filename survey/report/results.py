@@ -104,7 +104,7 @@ def begun_results(
     files = ResultFiles(place, writing)
     rows = writing.of(lambda: image_rows(adjustment))
     page = writing.of(
-        lambda: begun_page(adjustment, run, solution_dict(adjustment, run) | more, rows(), options.language)
+        lambda: begun_page(adjustment, run, solution_dict(adjustment, run) | dict(more), rows(), options.language)
     )
     parquet = options.parquet or (place.parent / RESULTS / PARQUET).is_file()  # there: not to be old
     files.begin({

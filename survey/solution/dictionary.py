@@ -122,7 +122,8 @@ def with_statistics(
         "warnings": [*warnings[:tried], *findings(found.consistency), *warnings[tried:]],
         **statistics_dict(adjustment, found, scale),
     }
-    out, names = solution | plain(told), list(solution)
+    out: dict[str, Any] = solution | plain(told)
+    names = list(solution)
     return out | {name: out.pop(name) for name in names[names.index("inputs") :]}
 
 

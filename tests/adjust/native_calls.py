@@ -156,8 +156,7 @@ def _bundles() -> None:
         graph, done = h.solved(survey, h.shaken(h.start_at(truth), 1, 0.003, 0.003))
         precision = Precision(graph, done)
         image_residuals(precision)
-        names = list(graph.unknowns.by_name)
-        precision.products({graph.unknowns.by_name[n].key: np.eye(graph.unknowns.by_name[n].dim) for n in names[:1]})
+        precision.products({key: np.ones((1, u.dim)) for key, u in graph.unknowns.by_key.items()})
 
 
 def _navigation() -> None:

@@ -28,7 +28,7 @@ from survey.jobs.navigating.task import (
     chosen_epochs,
     chosen_station,
     chosen_times,
-    observed_epoch,
+    observed_epochs,
     others_to_navigate,
     require_one_time,
 )
@@ -143,10 +143,9 @@ def _navigated(folder: Path, request: NavigateRequest, there: Path, place: Path,
     calibration = _calibrate(project, station, epochs, there / CALIBRATION, place / CALIBRATION)
     calibrated = time.perf_counter()
     named = set(calibration.beacons.beacon_ids)
-    order = range(len(epochs)) if times is None else sorted(range(len(epochs)), key=times.__getitem__)
-    observed = [
-        observed_epoch(project, station, epochs[i], None if times is None else times[i], request, named) for i in order
-    ]
+    if times is not None:
+        times, epochs = map(list, zip(*sorted(zip(times, epochs, strict=True)), strict=True))
+    observed = observed_epochs(project, station, epochs, times, request, named)
     motion = Motion() if times is not None else None
     options = NavigateOptions(motion=motion, use_table=request.use_table, alpha=min(project.options.alpha, 1e-3))
     with tqdm(total=len(epochs), desc="navigating", unit="epoch", disable=not progress, file=sys.stderr) as bar:
