@@ -20,7 +20,7 @@ import scipy
 from scipy import sparse
 
 from adjust.model.survey import FloatArray, IntArray
-from adjust.statistics.normal import Normal
+from adjust.statistics.normal import Normal, inverse_of_factor
 from adjust.statistics.system import LinearSystem
 
 _SMALL = 500
@@ -133,9 +133,7 @@ def _inverse(N: FloatArray) -> FloatArray:
     half = scipy.linalg.lapack.dpotrf(np.asfortranarray(N * np.outer(scale, scale)))
     if half[1] != 0:
         raise np.linalg.LinAlgError("the normal matrix of the groups is not positive definite")
-    upper = scipy.linalg.lapack.dpotri(half[0])[0]
-    full = np.triu(upper) + np.triu(upper, 1).T
-    return np.asarray(full * np.outer(scale, scale))
+    return inverse_of_factor(half[0], lower=False) * np.outer(scale, scale)
 
 
 def _own_trace(N: Matrix, Q: FloatArray) -> float:
