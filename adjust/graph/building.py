@@ -382,12 +382,12 @@ class GraphBuilder:
         elif name[0] == "lens_drift":
             full = np.zeros(len(vector.names))
         elif name[0] == "lens_crop":
-            lens = next(c.lens for c in self.survey.cameras if c.camera_id == name[1])
+            lens = self.survey.cameras_by_id[name[1]].lens
             full = lens.crops[name[2]].parameters.values
         elif name[0] in ("vertical", "instrument", "orientation", "centring"):
             full = full_start(name, self.survey)
         elif name[0] == "table_geometry":
-            full = next(t.geometry.values for t in self.survey.tables if t.table_id == name[1])
+            full = self.survey.tables_by_id[name[1]].geometry.values
         elif name[0] in CLOCKS:
             full = next((c.parameters.values for owner, c in clocks_of(self.survey) if owner == name), np.zeros(1))
         else:
