@@ -66,12 +66,11 @@ class GroupSums:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """At given factors: q (G,), r (G,), S (G, G) and the step dx (n,)."""
+    """At given factors: q (G,), r (G,) and S (G, G)."""
 
     q: FloatArray
     r: FloatArray
     S: FloatArray
-    dx: FloatArray
 
 
 def group_sums(
@@ -125,7 +124,7 @@ def moments(sums: GroupSums, theta: FloatArray) -> Moments:
     S += _products(X, K, Q, bool(sums.mixed))
     for m, P in zip(sums.mixed, whitened, strict=True):
         _add_mixed(m, P, Q, dx, q, r, S)
-    return Moments(q, r, 0.5 * (S + S.T), dx)
+    return Moments(q, r, 0.5 * (S + S.T))
 
 
 def _inverse(N: FloatArray) -> FloatArray:
