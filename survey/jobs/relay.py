@@ -17,7 +17,7 @@ from adjust.model.observations import FrameRef, Pair
 from adjust.model.result import Adjustment
 from adjust.model.subsets import in_use
 from adjust.model.survey import FloatArray, Survey
-from adjust.relay.eyes.drift import DriftModel, choose_interval, growth, rescaled, sequences
+from adjust.relay.eyes.drift import DriftModel, choose_interval, growth, sequences
 from adjust.relay.eyes.eyes import EyeAdjustment, EyeOptions, adjust_eyes
 from adjust.relay.eyes.images import eye_sequences
 from adjust.relay.eyes.pairs import EyePairs, LoopedPairs, close_loops, pairs_of
@@ -90,7 +90,7 @@ def tracker_pairs(found: RelayTrackers) -> EyePairs:
 def one_metre(found: RelayTrackers) -> CommonMotions:
     """The motions with all lengths in those of the first tracker."""
     common, scales = found.common, found.joint.scales
-    motions = (rescaled(m, scales.get(e.frame_id, 1.0)) for e, m in zip(common.eyes, common.motions, strict=True))
+    motions = (m.rescaled(scales.get(e.frame_id, 1.0)) for e, m in zip(common.eyes, common.motions, strict=True))
     return replace(common, motions=tuple(motions))
 
 
