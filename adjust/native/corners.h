@@ -212,16 +212,6 @@ inline FittedCorner fit_corner(In<float, 2> image, const double *start, const do
     o.status = magnitude(o.p[0] - start[0]) + magnitude(o.p[1] - start[1]) > max_shift ? AWAY : GOOD;
     return o;
 }
-// Every corner (``fit_corner``): p (n, 9); cov (n, 2, 2) of u, v; pixels, rms, status (n,).
-inline void fit_corners(In<float, 2> image, In<double, 2> start, In<double, 2> angles, Vector blur, In<double, 2> shapes, int64_t crossing,
-                        double max_shift, double tolerance, int64_t enough, Out<double, 2> out, Out<double, 3> cov,
-                        Out<int64_t, 1> pixels, Out<double, 1> rms, Out<int64_t, 1> status) {
-    for (int64_t c = 0; c < start.n[0]; ++c) {
-        const FittedCorner o = fit_corner(image, &start(c, 0), &angles(c, 0), blur[c], &shapes(c, 0), crossing, max_shift, tolerance, enough);
-        std::memcpy(&out(c, 0), o.p, sizeof o.p), std::memcpy(&cov(c, 0, 0), o.cov, sizeof o.cov);
-        pixels.data[c] = o.n, rms.data[c] = o.rms, status.data[c] = o.status;
-    }
-}
 
 constexpr double ROUGH_PX = 1e-2, FINE_PX = 2e-5;  // steps after which the first and the second fit of a corner may stop
 constexpr double NEAR_PX = 5.0;  // from a crossing, as far as the first fit looks where the edges' blur ends before that

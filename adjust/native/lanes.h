@@ -16,6 +16,12 @@ typedef double Unaligned __attribute__((vector_size(8 * W), aligned(8), may_alia
 
 inline V load(const double *p) { return *reinterpret_cast<const Unaligned *>(p); }
 inline void store(double *p, V v) { *reinterpret_cast<Unaligned *>(p) = v; }
+inline void store(double *p, double x) { *p = x; }
+// W numbers; of a plain number one.
+template <class S> inline S loaded(const double *p) {
+    if constexpr (std::is_same_v<S, double>) return *p;
+    else return load(p);
+}
 inline double sum(V v) {
     double s = 0;
     for (int i = 0; i < W; ++i) s += v[i];

@@ -8,8 +8,7 @@ import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.native.vision import MOST_CROSSINGS, count_crossings, find_grid, first_is_dark, of_neighbours, off_grid
-from survey.detection.corners import CornerFit, refine_corners, unbent
-from survey.detection.extent import grown
+from survey.detection.corners import CornerFit, grown, refine_corners, unbent
 from survey.detection.gray import Gray8, Gray32, halved, reduced
 from survey.detection.results import Detection, nothing_found
 from survey.project.targets import Checkerboard
