@@ -177,8 +177,8 @@ class TreeCovariance:
     def _apart(self, numbers: list[int]) -> FloatArray:
         """Joint covariance of unknowns of different cliques: columns of the inverse, on their ways to the root only.
 
-        Of the last one none: its own covariance is known, and the rest is in the columns of the others. Of most unknowns
-        the whole matrix is less work.
+        Of the last one none: its own covariance is known, and the rest is in the columns of the others. For most
+        unknowns the whole matrix is less work.
         """
         rows = [np.arange(self._first[k], self._first[k + 1]) for k in numbers]
         every, asked = np.concatenate(rows), np.concatenate(rows[:-1])
