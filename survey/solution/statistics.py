@@ -83,7 +83,7 @@ def statistics_of(adjustment: Adjustment, tolerances: tuple[Tolerance, ...], sca
     condensed = condensed_system(precision_of(adjustment))
     system, components = condensed.system, adjustment.variance_components
     names = _budgeted(adjustment)
-    _ = system.normal.structured, system.sigmas  # all of these ask for them
+    _ = system.structured, system.sigmas  # all of these ask for them
     with Beside() as made:
         consistent = made.of(lambda: consistency(adjustment, condensed, alpha))
         reliable = made.of(lambda: reliability(adjustment, system=condensed))
@@ -189,8 +189,8 @@ def correlation_matrix(adjustment: Adjustment) -> CorrelationMatrix | None:
     names: list[ParameterName] = []
     components: list[tuple[str, ...]] = []
     for name, estimate in adjustment.estimates.items():
-        free = _unknown_components(estimate)
-        if free and len(name) < 3 and name[0] != "table_angles":
+        free = _unknown_components(estimate) if len(name) < 3 and name[0] != "table_angles" else ()
+        if free:
             if sum(map(len, components)) + len(free) > MOST_CORRELATED:
                 break
             names.append(name)
