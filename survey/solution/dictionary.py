@@ -266,7 +266,7 @@ def _images(adjustment: Adjustment, camera_id: str, sums: tuple[IntArray, FloatA
 
 def _sums_of_blocks(found: ImageResiduals) -> tuple[IntArray, FloatArray]:
     """Points in use and their residuals squared, of every image block (B,)."""
-    squares = np.where(found.used, (found.residuals**2).sum(axis=1), 0.0)
+    squares = np.where(found.used, np.square(found.residuals) @ np.ones(2), 0.0)
     B = len(found.block_ptr) - 1
     block = np.repeat(np.arange(B), np.diff(found.block_ptr))
     n: IntArray = np.bincount(block[found.used], minlength=B)

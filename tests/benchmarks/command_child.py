@@ -17,7 +17,11 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from adjust.native import parallel
+from survey.commands.common import begin_adjusting
+
+begin_adjusting()  # as the command does, before NumPy is loaded
+
+from adjust.native import parallel  # noqa: E402
 
 WORKERS = 2
 
