@@ -117,12 +117,12 @@ def with_statistics(
     """
     scale, warnings = scale_of(adjustment, run.sigmas), adjustment.warnings
     tried = len(adjustment.diagnosis.lines) if adjustment.diagnosis is not None else 0
-    told = {
+    told: dict[str, Any] = plain({
         "summary": _summary(adjustment, run, scale, found),
         "warnings": [*warnings[:tried], *findings(found.consistency), *warnings[tried:]],
         **statistics_dict(adjustment, found, scale),
-    }
-    out, names = solution | plain(told), list(solution)
+    })  # fmt: skip
+    out, names = solution | told, list(solution)
     return out | {name: out.pop(name) for name in names[names.index("inputs") :]}
 
 

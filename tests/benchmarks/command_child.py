@@ -92,9 +92,9 @@ def main() -> None:
     parallel.Beside.__exit__ = lambda self, *_: pool.finished(self)
     plain = parallel.Beside.of
     parallel.Beside.of = lambda self, step: plain(self, step) if self._alone else pool.given(self, step)
-    from survey.jobs.adjusting import job
+    from survey.solution.earlier import runs
 
-    job.time = SimpleNamespace(perf_counter=time.process_time)
+    runs.time = SimpleNamespace(perf_counter=time.process_time)
     from survey.cli import program
 
     sys.argv = ["labsurvey", *sys.argv[1:]]
