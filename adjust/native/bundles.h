@@ -279,34 +279,46 @@ inline void between_poses(In<double, 2> S, Ints at, In<double, 3> J, int64_t inw
         }
 }
 
-// Steps dX (P, 3) of the reduced points from the step d of the local unknowns.
-inline void back_substitute(const Bundle &b, In<double, 3> Vi, In<double, 3> weights, In<double, 3> WL, In<double, 2> h, Vector d,
-                            Out<double, 2> dX) {
-    for (int64_t j = 0; j < b.points(); ++j) {
-        double s[3] = {h(j, 0), h(j, 1), h(j, 2)}, o[3];
-        for (int64_t i = b.pc_ptr[j]; i < b.pc_ptr[j + 1]; ++i)
-            for (int a = 0; a < 3; ++a)
-                for (int64_t q = 0; q < b.n_of_pair(i); ++q) s[a] += WL(i, a, q) * d[b.at_pair(i) + q];
-        for (int64_t k = b.ptr[j]; k < b.ptr[j + 1]; ++k)
-            for (int a = 0; a < 3; ++a)
-                for (int q = 0; q < 6; ++q) s[a] += weights(k, a, q) * d[b.pose_at[k] + q];
-        times3(&Vi(j, 0, 0), s, o);
-        for (int a = 0; a < 3; ++a) dX(j, a) = -o[a];
-    }
+// All of a reduced point j that is not its own: f(weights, their rows' length, where, how many) of its pairs and images.
+template <class F> inline void through_point(const Bundle &b, int64_t j, In<double, 3> weights, In<double, 3> WL, F f) {
+    for (int64_t i = b.pc_ptr[j]; i < b.pc_ptr[j + 1]; ++i) f(&WL(i, 0, 0), int64_t(MAX_LENS), b.at_pair(i), b.n_of_pair(i));
+    for (int64_t k = b.ptr[j]; k < b.ptr[j + 1]; ++k) f(&weights(k, 0, 0), int64_t(6), b.pose_at[k], int64_t(6));
+}
+// f(c, none) of columns 0 .. m - 1: of W from c on together where none is a vector, one by one where it is a number.
+template <class F> inline void by_columns(int64_t m, F f) {
+    int64_t c = 0;
+    for (; c + W <= m; c += W) f(c, V{});
+    for (; c < m; ++c) f(c, 0.0);
 }
 
-// Subtract W' v from out (n_local, k), for v (P, 3, k): what reduced points carry over to the others.
+// Steps dX (P, 3, m) of the reduced points from steps d (n_local, m) of the local unknowns; h: their own part.
+inline void back_substitute(const Bundle &b, In<double, 3> Vi, In<double, 3> weights, In<double, 3> WL, In<double, 3> h, In<double, 2> d,
+                            Out<double, 3> dX) {
+    for (int64_t j = 0; j < b.points(); ++j)
+        by_columns(d.n[1], [&](int64_t c, auto none) {
+            using S = decltype(none);
+            S s[3] = {loaded<S>(&h(j, 0, c)), loaded<S>(&h(j, 1, c)), loaded<S>(&h(j, 2, c))};
+            through_point(b, j, weights, WL, [&](const double *w, int64_t ld, int64_t at, int64_t n) {
+                for (int64_t q = 0; q < n; ++q) {
+                    const S x = loaded<S>(&d(at + q, c));
+                    for (int a = 0; a < 3; ++a) s[a] += w[ld * a + q] * x;
+                }
+            });
+            for (int a = 0; a < 3; ++a) store(&dX(j, a, c), -(Vi(j, a, 0) * s[0] + Vi(j, a, 1) * s[1] + Vi(j, a, 2) * s[2]));
+        });
+}
+
+// Subtract W' v from out (n_local, m), for v (P, 3, m): what reduced points carry over to the others.
 inline void of_points(const Bundle &b, In<double, 3> weights, In<double, 3> WL, In<double, 3> v, Out<double, 2> out) {
-    const int64_t m = out.n[1];
-    for (int64_t j = 0; j < b.points(); ++j) {
-        const double *x = v.data + 3 * m * j;
-        const auto subtract = [&](const double *w, int64_t ld, int64_t at, int64_t n) {
-            for (int64_t q = 0; q < n; ++q)
-                for (int64_t c = 0; c < m; ++c) out(at + q, c) -= w[q] * x[c] + w[ld + q] * x[m + c] + w[2 * ld + q] * x[2 * m + c];
-        };
-        for (int64_t i = b.pc_ptr[j]; i < b.pc_ptr[j + 1]; ++i) subtract(&WL(i, 0, 0), MAX_LENS, b.at_pair(i), b.n_of_pair(i));
-        for (int64_t k = b.ptr[j]; k < b.ptr[j + 1]; ++k) subtract(&weights(k, 0, 0), 6, b.pose_at[k], 6);
-    }
+    for (int64_t j = 0; j < b.points(); ++j)
+        by_columns(out.n[1], [&](int64_t c, auto none) {
+            using S = decltype(none);
+            const S x[3] = {loaded<S>(&v(j, 0, c)), loaded<S>(&v(j, 1, c)), loaded<S>(&v(j, 2, c))};
+            through_point(b, j, weights, WL, [&](const double *w, int64_t ld, int64_t at, int64_t n) {
+                for (int64_t q = 0; q < n; ++q)
+                    store(&out(at + q, c), loaded<S>(&out(at + q, c)) - (w[q] * x[0] + w[ld + q] * x[1] + w[2 * ld + q] * x[2]));
+            });
+        });
 }
 
 // -V^-1 W by poses, Y (K, 3, 6), and by lenses, YL (pairs, 3, MAX_LENS).

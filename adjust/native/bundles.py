@@ -27,7 +27,7 @@ _pose_rows = Function("pose_rows", f"run[*] {_BUNDLE} {_ROWS} {_REDUCED} S[n,n] 
 _fill_upper = Function("fill_upper", "S[n,n]")
 _symmetric_rows = Function("symmetric_rows", "S[n,n] rows[r] out[r,n]")
 _between_poses = Function("between_poses", "S[*,*] at[a] J[a,6,6] inward lower out[*,*]")
-_back_substitute = Function("back_substitute", f"{_BUNDLE} {_REDUCED} h[P,3] d[*] dX[P,3]")
+_back_substitute = Function("back_substitute", f"{_BUNDLE} {_REDUCED} h[P,3,k] d[*,k] dX[P,3,k]")
 _of_points = Function("of_points", f"{_BUNDLE} W[K,3,6] WL[pairs,3,14] v[P,3,k] out[*,k]")
 _point_from_local = Function("point_from_local", f"{_BUNDLE} {_REDUCED} Y[K,3,6] YL[pairs,3,14]")
 _with_poses = Function("with_poses", f"run[*] {_BUNDLE} Q[n,n] Y[K,3,6] YL[pairs,3,14] B[K,3,6] P[n,8]")
@@ -140,7 +140,7 @@ def between_poses(S: FloatArray, at: IntArray, J: FloatArray, inward: bool, lowe
 def back_substitute(
     bundle: BundleArrays, reduced: ReducedArrays, h: FloatArray, d: FloatArray, dX: FloatArray
 ) -> None:
-    """Steps dX (P, 3) of the reduced points from the step d of the local unknowns; h: their own part."""
+    """Steps dX (P, 3, k) of the reduced points from those of the local unknowns d (n_local, k); h: their own part."""
     _back_substitute(*bundle, *reduced, h, d, dX)
 
 

@@ -5,14 +5,16 @@ Q_vv P. For an image point both components are tested together: v' Q_vv^-1 v, ch
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
 from gtsam import Pose3, Rot3
+from scipy import sparse
 
 from adjust.frames.unknowns import Unknowns
 from adjust.graph.assembly import AdjustmentGraph
@@ -39,6 +41,9 @@ from adjust.testing.distributions import chi2
 
 if TYPE_CHECKING:
     from adjust.observations.pairs import PairStatistics
+
+_PAIRS = 24
+"""Pairs of unknowns that are brought together in one go."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +118,8 @@ class Precision(Covariances):
         dims = {key: unknown.dim for key, unknown in graph.unknowns.by_key.items()}
         self.tree = TreeCovariance(solved.tree, dims, solved.leaves)
         self.hidden: dict[int, FloatArray] = {}
+        self._together: dict[tuple[int, int], FloatArray] = {}
+        """Joint covariances, as solved, of pairs of keys that were brought together, one of them hidden."""
         self.bundle_influence: list[FloatArray] = []
         """Whitened A Q A' (K, 3) of the image points of every bundle, in its sorted order."""
         self._hidden = [BundleHidden(bundle) for bundle in graph.bundles]
@@ -125,35 +132,88 @@ class Precision(Covariances):
             motions = survey_motions(graph, solved.values, solved.datum.directions)
             self.transformation = s_transformation(solved.datum.rows, motions, self.products)
 
+    @cached_property
+    def places(self) -> dict[int, slice]:
+        """Rows of every key in a stacked vector of all unknowns: those of the tree, then what each bundle hides."""
+        keys = [key for below in self._hidden for key in below.keys]
+        ends = self.tree.n + np.cumsum([0, *(self.unknowns.by_key[key].dim for key in keys)])
+        return self.tree.places() | {k: slice(a, b) for k, (a, b) in zip(keys, pairwise(ends.tolist()), strict=True)}
+
+    @property
+    def n(self) -> int:
+        """Length of a stacked vector of all unknowns."""
+        return self.tree.n + sum(below.n for below in self._hidden)
+
+    @cached_property
+    def _parts(self) -> list[tuple[BundleHidden, slice, IntArray]]:
+        """What every bundle hides, its rows in a stacked vector, and the rows of its interface."""
+        ends = np.cumsum([self.tree.n, *(below.n for below in self._hidden)]).tolist()
+        return [(below, slice(a, b), self.tree.rows(below.batch.interface))
+                for below, (a, b) in zip(self._hidden, pairwise(ends), strict=True)]  # fmt: skip
+
+    def times(self, right: FloatArray) -> FloatArray:
+        """Covariance, as solved, times columns (n, k) stacked as :attr:`places` says."""
+        tree = np.array(right[: self.tree.n])
+        on_poses = [below.on_poses(right[mine]) if right[mine].any() else None for below, mine, _ in self._parts]
+        for (below, _, interface), some in zip(self._parts, on_poses, strict=True):
+            if some is not None:
+                tree[interface] += below.on_interface(some)
+        found = self.tree.times(tree)
+        hidden = (below.products(found[interface], right[mine], some)
+                  for (below, mine, interface), some in zip(self._parts, on_poses, strict=True))  # fmt: skip
+        return np.concatenate([found, *hidden])
+
+    def times_in_datum(self, right: FloatArray) -> FloatArray:
+        """The same of the covariance in the survey's datum: S Q S' times columns."""
+        out = self.times(right)
+        if self._stacked_datum is None:
+            return out
+        G, W, core = self._stacked_datum
+        moved = G.T @ right
+        out += G @ (core @ moved - W.T @ right)
+        out -= W @ moved
+        return out
+
+    @cached_property
+    def _stacked_datum(self) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """Motions G (n, d), spread W (n, d) and core (d, d) of the transformation, over all unknowns."""
+        t = self.transformation
+        if t is None:
+            return None
+        G, W = (np.concatenate([of[key] for key in self.places]) for of in (t.motions, t.spread))
+        return G, W, t.core
+
+    def among(self, A: sparse.csr_array) -> FloatArray:
+        """A Q A' (m, m) of the rows of A (m, n), stacked as :attr:`places` says: in any datum."""
+        out, n = np.zeros((A.shape[0],) * 2), self.tree.n
+        in_tree = A[:, :n]
+        for below, mine, interface in self._parts:
+            hidden = A[:, mine]
+            rows = np.flatnonzero(np.diff(hidden.indptr))
+            if not len(rows):
+                continue
+            own, over = below.among(hidden[rows].toarray())
+            out[np.ix_(rows, rows)] += own
+            places = np.repeat(rows, len(interface)), np.tile(interface, len(rows))
+            in_tree = in_tree + sparse.csr_array((over.ravel(), places), in_tree.shape)
+        return out + self.tree.among(in_tree)
+
     def products(self, rows: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
         """Covariance, as solved, times the transpose of ``rows`` (k, dim per key): (dim, k) for every unknown."""
-        tree = self.tree
-        k = next(iter(rows.values())).shape[0]
-        right = np.zeros((tree.n, k))
-        hidden = {}
-        for key, row in rows.items():
-            if key in self.hidden:
-                hidden[key] = row.T
-            else:
-                right[tree.rows([key])] += row.T
-        for below in self._hidden if hidden else ():
-            right[tree.rows(below.batch.interface)] += below.transposed(hidden, k)
-        product = tree.times(right)
-        at = tree.places()
-        out = {key: product[place] for key, place in at.items()}
-        for below in self._hidden:
-            out |= below.products(product[tree.rows(below.batch.interface)], hidden)
-        return out
+        return self._by_key(rows, self.times)
 
     def datum_products(self, rows: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
         """The same as :meth:`products`, of the covariance in the survey's datum: S Q S' times rows."""
-        found, t = self.products(rows), self.transformation
-        if t is None:
-            return found
-        moved = np.sum([row @ t.motions[key] for key, row in rows.items()], axis=0)
-        spread = np.sum([row @ t.spread[key] for key, row in rows.items()], axis=0)
-        return {key: H - t.motions[key] @ spread.T - t.spread[key] @ moved.T + t.motions[key] @ t.core @ moved.T
-                for key, H in found.items()}  # fmt: skip
+        return self._by_key(rows, self.times_in_datum)
+
+    def _by_key(
+        self, rows: Mapping[int, FloatArray], times: Callable[[FloatArray], FloatArray]
+    ) -> dict[int, FloatArray]:
+        right = np.zeros((self.n, len(next(iter(rows.values())))))
+        for key, row in rows.items():
+            right[self.places[key]] = row.T
+        found = times(right)
+        return {key: found[place] for key, place in self.places.items()}
 
     def _add_hidden(self, hidden: BundleHidden) -> None:
         bundle = hidden.batch
@@ -178,6 +238,8 @@ class Precision(Covariances):
         """See :class:`Covariances`."""
         keys = [self.graph.unknowns.by_name[name].key for name in names]
         below = [(b, hidden) for b in self._hidden if (hidden := [k for k in keys if b.hides(k)])]
+        if tuple(keys) in self._together:
+            return _in_datum(self.transformation, keys, self._together[keys[0], keys[1]])
         if not below:
             return _in_datum(self.transformation, keys, self.tree.joint(keys))
         seen = [k for k in keys if k not in self.hidden]
@@ -197,8 +259,19 @@ class Precision(Covariances):
     def bring_together(self, pairs: Iterable[tuple[ParameterName, ParameterName]]) -> None:
         """See :class:`Covariances`."""
         by_name = self.graph.unknowns.by_name
-        keys = ((by_name[a].key, by_name[b].key) for a, b in pairs)
+        keys = [(by_name[a].key, by_name[b].key) for a, b in pairs]
         self.tree.bring_together((a, b) for a, b in keys if a not in self.hidden and b not in self.hidden)
+        below = [(a, b) for a, b in keys if a in self.hidden or b in self.hidden]
+        for k in range(0, len(below), _PAIRS):
+            first = {a: self.places[a] for a, _ in below[k : k + _PAIRS]}
+            columns = np.concatenate([np.arange(place.start, place.stop) for place in first.values()])
+            right = np.zeros((self.n, len(columns)))
+            right[columns, np.arange(len(columns))] = 1.0
+            found = self.times(right)
+            for a, b in below[k : k + _PAIRS]:
+                across = found[self.places[b]][:, np.isin(columns, np.r_[first[a]])].T
+                Qa, Qb = (self.hidden[x] if x in self.hidden else self.tree.marginal(x) for x in (a, b))
+                self._together[a, b] = np.block([[Qa, across], [across.T, Qb]])
 
     def rows(self, item: ObservationFactor) -> ObservationRows:
         """An observation that is neither image point nor reading, linearised at the solution: built once, and kept."""

@@ -22,7 +22,6 @@ from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import side_by_side
 from adjust.precision.precision import noise_of
 from adjust.statistics.condensed import CondensedSystem
-from adjust.statistics.normal import Normal
 from adjust.statistics.result import Change, ChangeShift
 from adjust.statistics.system import LinearSystem
 from adjust.testing.distributions import chi2, fisher, norm
@@ -31,8 +30,8 @@ from adjust.testing.quadratic_forms import pseudo_squares
 _SEEN = 1e-4
 """Share of a column that no unknown takes over, below which it is not told from rounding."""
 _MOST_RUNS = 256
-_WORK, _ROOM = 1e10, 2e7
-"""Multiplications that possible changes may cost, and numbers that they may need."""
+_ROOM = 2e7
+"""Numbers that all possible changes may need."""
 _MOST, _MOST_OF_ONE = 20, 2
 """Changes that are named: in all, and of the same kind of one camera, target or table, which may drift without end."""
 _SHAPES = {True: (("width", "1"), ("height", "1"), ("sag along x", "m"), ("sag along y", "m")),
@@ -92,15 +91,21 @@ class ChangeSearch:
         self.system: LinearSystem = condensed.system
         s = self.system
         rows = s.used[s.row_of]
-        step = s.normal.solve(np.asarray(s.A.T @ np.where(rows, s.e, 0.0)))
+        step = s.times_covariance(np.asarray(s.A.T @ np.where(rows, s.e, 0.0)))
         self.A, self.e = s.A, s.e - s.A @ step
         self.epoch, self.epochs = _coded([b.epoch_id for b in adjustment.survey.image_blocks])
         self.owners = list(self._owners())
         units, self.runs = list(self._units(_MOST_RUNS)), _MOST_RUNS
-        sums = s.normal.structured
-        most = min(_WORK / s.normal.cost, _ROOM / max(len(s.columns), 1)) if sums is None else _ROOM / len(sums.U)
-        if sum(u.B.shape[1] * len(u.epochs) for u in units) > most:
-            self.runs = int(np.clip(most / sum(u.B.shape[1] for u in units), 2, _MOST_RUNS))
+        shared = None if s.structured is None else len(s.structured.U)
+
+        def numbers(runs: Sequence[int]) -> float:
+            """That M of every unit needs, or what it is made of."""
+            columns = [u.B.shape[1] * n for u, n in zip(units, runs, strict=True)]
+            return float(sum(k * (k if shared is None else shared) for k in columns))
+
+        if numbers([len(u.epochs) for u in units]) > _ROOM:
+            share = _ROOM / numbers([1] * len(units))
+            self.runs = int(np.clip(share if shared is not None else np.sqrt(share), 2, _MOST_RUNS))
             units = list(self._units(self.runs))
         self.candidates = side_by_side(lambda u: self._candidates(_by_runs(u)), units)
         self.n_tests = sum(len(c.g) for c in self.candidates)
@@ -214,7 +219,7 @@ class ChangeSearch:
         X = (self.A.T @ wide).tocsr()
         P = _from_runs_on(_by_run(u, u.B))
         g = _from_runs_on(_by_run(u, self.e[u.rows, None]))[:, :, 0]
-        taken = _taken(self.system.normal, X, J)[1 if J > 1 else 0 :]
+        taken = _taken(self.system, X, J)[1 if J > 1 else 0 :]
         size = np.sqrt(np.einsum("jqq->jq", P))
         scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
         M = (P - taken) * scale[:, :, None] * scale[:, None, :]
@@ -226,7 +231,7 @@ class ChangeSearch:
         mine = u.run >= (j + 1 if len(u.epochs) > 1 else 0)
         B[u.rows[mine]] = u.B[mine] * c.scale[j]
         X = np.asarray(self.A.T @ B)
-        Y = self.system.normal.solve(X)
+        Y = self.system.times_covariance(X)
         shares = [x.inverse @ (x.B.T @ B - x.X.T @ Y) for x in before]
         for x, share in zip(before, shares, strict=True):
             B, X, Y = B - x.B @ share, X - x.X @ share, Y - x.Y @ share
@@ -236,17 +241,15 @@ class ChangeSearch:
         return _Chosen(B @ V, X @ V, Y @ V, inverse, inverse @ (V.T @ c.g[j]))
 
 
-def _taken(normal: Normal, X: sparse.csr_matrix, J: int) -> FloatArray:
+def _taken(system: LinearSystem, X: sparse.csr_matrix, J: int) -> FloatArray:
     """X'QX of the runs from j on together (J, q, q); X (n, J q) of the runs by themselves."""
-    q, sums = X.shape[1] // J, normal.structured
+    q, sums = X.shape[1] // J, system.structured
     if sums is None:
-        Y, out = normal.solve(X.toarray()), np.empty((J, q, q))
-        X_on, Y_on = np.zeros((2, len(Y), q))
-        for j in reversed(range(J)):
-            X_on += X[:, j * q : (j + 1) * q].toarray()
-            Y_on += Y[:, j * q : (j + 1) * q]
-            out[j] = X_on.T @ Y_on
-        return out
+        M, out = system.among(X.T.tocsr()).reshape(J, q, J, q), np.empty((J, q, q))
+        for j in range(J):
+            later = M[j, :, j + 1 :].sum(axis=1)
+            out[j] = M[j, :, j] + later + later.T
+        return np.cumsum(out[::-1], axis=0)[::-1]
     own = (X.T @ (sums.own @ X)).tocoo()
     (a, i), (b, k) = np.divmod(own.row, q), np.divmod(own.col, q)
     of_run = np.bincount((np.minimum(a, b) * q + i) * q + k, own.data, J * q * q).reshape(J, q, q)

@@ -203,7 +203,6 @@ def _rows(system: LinearSystem, part: Part) -> IntArray:
 
 def eigenvalues(system: LinearSystem, rows: IntArray, n: int) -> FloatArray:
     """Eigenvalues (n,) of I - A Q A' of the n components that stand in these rows (condensed: in fewer)."""
-    A = system.A[rows]
-    influence = A @ system.normal.solve(A.T.toarray())
+    influence = system.among(system.A[rows])
     taken = np.sort(np.linalg.eigvalsh(0.5 * (influence + influence.T)))[::-1][:n]
     return np.concatenate([np.clip(1.0 - taken, 0.0, 1.0), np.ones(n - len(taken))])

@@ -30,7 +30,7 @@ def shifts(condensed: CondensedSystem, rows: Sequence[int], bias: Mapping[int, F
             right[columns, i] = A.T @ bias[row]
         else:
             right[:, i] = system.bias_column(row - n_points + system.n_image, bias[row])
-    return system.normal.solve(right)
+    return system.times_covariance(right)
 
 
 def influences(
@@ -40,7 +40,6 @@ def influences(
     system = condensed.system
     c, sigmas = system.columns, np.where(system.sigmas > 0.0, system.sigmas, np.inf)
     places, coordinates = _positions(system)
-    _ = system.normal  # factored before the threads ask for it
 
     def of(first: int) -> list[Influence]:
         part, out = rows[first : first + _CHUNK], list[Influence]()

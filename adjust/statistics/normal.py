@@ -16,7 +16,7 @@ DENSE = 3000
 """Unknowns up to which the normal matrix is factored as a full one."""
 FEW = 200
 """Unknowns up to which it is inverted at once."""
-_PLAIN = 600
+PLAIN = 600
 """Unknowns up to which nothing is gained by their structure."""
 _SMALL_SET = 100
 """Unknowns of one epoch, or one point, up to which they are eliminated by themselves."""
@@ -71,7 +71,6 @@ class Arrow:
         for p in pieces:
             head -= p.across.T @ p.own(p.across)
         self.lower = np.linalg.cholesky(head)
-        self.cost = 2.0 * (self.n - len(core)) * len(core) + len(core) ** 2
 
     def solve(self, b: FloatArray) -> FloatArray:
         """The solution (n, k) or (n,), some columns in one go."""
@@ -141,22 +140,22 @@ def _blocks(N: sparse.csr_matrix, sets: IntArray) -> FloatArray:
     return out
 
 
-Solver = tuple[Callable[[FloatArray], FloatArray], float, Callable[[], FloatArray] | None]
-"""Of a normal matrix with a unit diagonal: solution, multiplications that one takes, inverse where there is a way."""
+Solver = tuple[Callable[[FloatArray], FloatArray], Callable[[], FloatArray] | None]
+"""Of a normal matrix with a unit diagonal: solution, inverse where there is a way."""
 
 
 def _solver(scaled: sparse.csc_matrix) -> Solver:
     n = scaled.shape[0]
     if n <= FEW:  # its inverse: SciPy's linear algebra takes longer to load
         inverse = np.linalg.inv(scaled.toarray())
-        return lambda b: inverse @ b, float(n**2), lambda: inverse
+        return lambda b: inverse @ b, lambda: inverse
     if n <= DENSE or scaled.nnz > n**2 // 4:  # as the rows of a free datum over all points fill it
         factor = scipy.linalg.cho_factor(scaled.toarray())
-        return lambda b: np.asarray(scipy.linalg.cho_solve(factor, b)), float(n**2), lambda: _inverse(*factor)
+        return lambda b: np.asarray(scipy.linalg.cho_solve(factor, b)), lambda: _inverse(*factor)
     from scipy.sparse.linalg import splu  # here: as above
 
     lu = splu(scaled, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-    return lu.solve, 2.0 * lu.L.nnz, None
+    return lu.solve, None
 
 
 def _inverse(factor: FloatArray, lower: bool) -> FloatArray:
@@ -167,35 +166,35 @@ def _inverse(factor: FloatArray, lower: bool) -> FloatArray:
 
 
 class Normal:
-    """A normal matrix (n, n), factored: solutions, and its inverse in the datum of the survey.
-
-    cost: multiplications of a solution.
-    """
+    """A normal matrix (n, n), factored: solutions, and its inverse in the datum of the survey."""
 
     def __init__(self, N: sparse.csc_matrix, motions: FloatArray) -> None:
         self.N, self.motions, self.n = N, motions, N.shape[0]
         self.scale = 1.0 / np.sqrt(np.maximum(N.diagonal(), 1e-300))
-        scaled = N.copy()
-        scaled.data *= self.scale[N.indices] * np.repeat(self.scale, np.diff(N.indptr))
-        self._arrow = _arrow(scaled) if self.n > _PLAIN else None
-        found: Solver = _solver(scaled) if self._arrow is None else (self._arrow.solve, self._arrow.cost, None)
-        self._of_scaled, self.cost, self._inverse = found
+        self._scaled = N.copy()
+        self._scaled.data *= self.scale[N.indices] * np.repeat(self.scale, np.diff(N.indptr))
+        self._arrow = _arrow(self._scaled) if self.n > PLAIN else None
+
+    @cached_property
+    def _of_scaled(self) -> Solver:
+        return _solver(self._scaled) if self._arrow is None else (self._arrow.solve, None)
 
     def solve(self, right: FloatArray) -> FloatArray:
         """The solution (n, k) or (n,) of N x = right, with the datum's rows fulfilled where ``right`` is seen."""
         if (sums := self.structured) is not None:
             return np.asarray(sums.own @ right + sums.U.T @ (sums.U @ right))
         scale = self.scale if right.ndim == 1 else self.scale[:, None]
-        out = self._of_scaled(scale * right)
+        out = self._of_scaled[0](scale * right)
         out *= scale
         return out
 
     @cached_property
     def inverse(self) -> FloatArray:
         """Inverse (n, n) of the matrix with its datum rows."""
-        if self._inverse is None:
+        inverse = self._of_scaled[1]
+        if inverse is None:
             return self.solve(np.eye(self.n))
-        return np.asarray(self._inverse() * self.scale * self.scale[:, None])
+        return np.asarray(inverse() * self.scale * self.scale[:, None])
 
     @cached_property
     def structured(self) -> Inverse | None:

@@ -16,7 +16,6 @@ from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.statistics.normal import DENSE
 from adjust.statistics.system import LinearSystem, linear_system
-from adjust.statistics.weakness import among, one_solution
 from adjust.testing.distributions import chi2, fisher
 from adjust.testing.quadratic_forms import pseudo_half
 from adjust.testing.significance import LEVEL, Significance
@@ -71,7 +70,7 @@ class LinearScores:
     def e(self) -> FloatArray:
         """(m,) at the minimum, zero for what is not in use: what is left to go of an adjustment is gone from here."""
         e = self._used * self.system.e
-        return np.asarray(e - self.A @ one_solution(self.system, self.A.T @ e))
+        return np.asarray(e - self.A @ self.system.times_covariance(np.asarray(self.A.T @ e)))
 
     @cached_property
     def _used(self) -> FloatArray:
@@ -187,7 +186,7 @@ class LinearScores:
             near = np.unique(BA.indices)
             few = BA[:, near].toarray()
             return np.asarray(few @ self.system.covariance[np.ix_(near, near)] @ few.T)
-        return among(self.system, BA)
+        return self.system.among(BA)
 
 
 def ratio(omega: float, n: float, drop: float) -> float:

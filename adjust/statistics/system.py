@@ -19,11 +19,16 @@ from adjust.graph.datum import gauge
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.lenses import MAX_LENS
+from adjust.native.parallel import side_by_side
 from adjust.observations.factors import ObservationFactor
 from adjust.observations.images.bundles import BundleBatch
 from adjust.observations.terrestrial.layout import Chunk
 from adjust.precision.precision import Precision, precision_of
-from adjust.statistics.normal import Normal
+from adjust.precision.s_transformation import without_datum_rows
+from adjust.statistics.normal import PLAIN, Inverse, Normal
+
+AT_ONCE = 64
+"""Columns that the covariance matrix is multiplied by in one go."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,11 +105,36 @@ class LinearSystem:
         return np.repeat(np.arange(len(self.used)), np.diff(self.ptr))
 
     @cached_property
-    def tree_rows(self) -> IntArray:
-        """Rows (n,) of the columns in a stacked vector of the tree's unknowns; there are none of hidden ones."""
-        by_name, tree = self.precision.graph.unknowns.by_name, self.precision.tree
-        rows = [tree.rows([by_name[name].key])[free] for name, free in self.columns.free.items()]
+    def _stacked(self) -> IntArray:
+        """Rows (n,) of the columns in a stacked vector of the precision's unknowns."""
+        by_name, places = self.precision.unknowns.by_name, self.precision.places
+        rows = [places[by_name[name].key].start + free for name, free in self.columns.free.items()]
         return np.concatenate(rows or [np.zeros(0, dtype=np.int64)])
+
+    def times_covariance(self, right: FloatArray) -> FloatArray:
+        """The covariance matrix of all unknowns, a priori, in the survey's datum, times (n,) or (n, k)."""
+        if len(self.columns) <= PLAIN or self.structured is not None:
+            out = self.normal.solve(right)
+            if not self.motions.shape[1]:
+                return out
+            return without_datum_rows(out, self.motions, self.datum @ self.motions, right)
+        columns = right.reshape(len(right), -1)
+        parts = [columns[:, i : i + AT_ONCE] for i in range(0, columns.shape[1], AT_ONCE)]
+        found = side_by_side(self.through_tree, parts)
+        return np.asarray(found[0] if len(found) == 1 else np.concatenate(found, axis=1)).reshape(right.shape)
+
+    def through_tree(self, right: FloatArray) -> FloatArray:
+        """The same of some columns (n, k) in one go, as the sigmas are found: fast where many are wanted."""
+        stacked = np.zeros((self.precision.n, right.shape[1]))
+        stacked[self._stacked] = right
+        return self.precision.times_in_datum(stacked)[self._stacked]
+
+    def among(self, rows: sparse.csr_matrix) -> FloatArray:
+        """``R Q R'`` (c, c) of sparse rows R (c, n) of the normal equations, or of what is observed: in any datum."""
+        if len(self.columns) <= PLAIN:
+            return np.asarray(rows @ self.normal.solve(rows.T.toarray()))
+        shape = (rows.shape[0], self.precision.n)
+        return self.precision.among(sparse.csr_array((rows.data, self._stacked[rows.indices], rows.indptr), shape))
 
     @cached_property
     def normal(self) -> Normal:
@@ -112,9 +142,15 @@ class LinearSystem:
         return self.normal_of(self.used[self.row_of].astype(float))
 
     @cached_property
+    def structured(self) -> Inverse | None:
+        """The inverse of :attr:`normal` as a sum, of surveys of many epochs before known targets; None of others."""
+        return None if self.precision.hidden or not self.n_image else self.normal.structured
+
+    @cached_property
     def covariance(self) -> FloatArray:
         """A priori covariance (n, n) of the unknowns in the survey's datum, of systems that are solved as a whole."""
-        return self.normal.covariance(self.datum)
+        n = len(self.columns)
+        return self.normal.covariance(self.datum) if n <= PLAIN else self.times_covariance(np.eye(n))
 
     def normal_of(self, weights: FloatArray) -> Normal:
         """The normal matrix with weights (m,) of the rows."""

@@ -1,6 +1,6 @@
 """What is badly determined, by name: correlations, unknowns that replace each other, the weakest deformation."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,54 +9,28 @@ from scipy import sparse
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import side_by_side
-from adjust.precision.s_transformation import without_datum_rows
 from adjust.statistics.normal import DENSE, FEW, Inverse
 from adjust.statistics.result import Correlation, WeakDirection, WeakPart
-from adjust.statistics.system import LinearSystem, linear_system
+from adjust.statistics.system import AT_ONCE, LinearSystem, linear_system
 
 _MOST = 200
 _SHARE = 0.1
-_AT_A_TIME = 64
-"""Columns of the covariance matrix that are compared in one go: as many as a solution takes at once."""
 _WHOLE = 10_000
-"""Unknowns up to which the whole covariance matrix is taken from the tree, of which 800 MB are the most."""
+"""Unknowns up to which all are compared with all."""
 _WORK = 20_000_000
-"""Correlations that are looked at in surveys of still more unknowns, or of hidden ones."""
+"""Correlations that are looked at in surveys of still more."""
 _KRYLOV, _RESTARTS = 40, 50
 
 
 def covariance_columns(system: LinearSystem, columns: IntArray) -> FloatArray:
     """Columns (n, k) of the covariance matrix of all unknowns, a priori, in the survey's datum."""
-    right = np.zeros((len(system.columns), len(columns)))
-    right[columns, np.arange(len(columns))] = 1.0
-    return times_covariance(system, right)
+    return system.times_covariance(_units(system, columns))
 
 
-def times_covariance(system: LinearSystem, right: FloatArray) -> FloatArray:
-    """The covariance matrix of all unknowns, a priori, in the survey's datum, times (n,) or (n, k)."""
-    out = system.normal.solve(right)
-    if not system.motions.shape[1]:
-        return out
-    return without_datum_rows(out, system.motions, system.datum @ system.motions, right)
-
-
-def among(system: LinearSystem, rows: sparse.csr_matrix) -> FloatArray:
-    """``R Q R'`` (c, c) of sparse rows R (c, n) of the normal equations, or of what observations see: in any datum."""
-    if system.precision.hidden:
-        return np.asarray(rows @ times_covariance(system, rows.T.toarray()))
-    tree = system.precision.tree
-    entries = rows.data, system.tree_rows[rows.indices], rows.indptr
-    return tree.among(sparse.csr_array(entries, (rows.shape[0], tree.n)))
-
-
-def one_solution(system: LinearSystem, right: FloatArray) -> FloatArray:
-    """A solution (n,) of the normal equations: of those that differ by what no observation sees, any one."""
-    if len(system.columns) <= DENSE or system.precision.hidden:
-        return times_covariance(system, right[:, None])[:, 0]
-    tree = system.precision.tree
-    x = np.zeros((tree.n, 1))
-    x[system.tree_rows, 0] = right
-    return np.asarray(tree.times(x)[system.tree_rows, 0])
+def _units(system: LinearSystem, columns: IntArray) -> FloatArray:
+    out = np.zeros((len(system.columns), len(columns)))
+    out[columns, np.arange(len(columns))] = 1.0
+    return out
 
 
 def compared_columns(system: LinearSystem) -> IntArray:
@@ -65,36 +39,12 @@ def compared_columns(system: LinearSystem) -> IntArray:
     What is there at one epoch alone comes after, and points last; as many as ``_WORK`` allows.
     """
     n, columns = len(system.columns), system.columns
-    if n <= DENSE or _in_tree(system) or _structure(system) is not None:
+    if n <= _WHOLE or _structure(system) is not None:
         return np.arange(n)
     epochs = {b.epoch_id for b in system.precision.graph.survey.image_blocks}
     rank = {name: 2 if len(name) == 3 and name[2] in epochs else 1 if name[0] == "point" else 0 for name in columns.at}
     ordered = columns.of(sorted(columns.at, key=lambda name: rank[name]))
     return ordered[: max(_WORK // n, 1)]
-
-
-def _in_tree(system: LinearSystem) -> bool:
-    """Whether the whole covariance matrix can be had from the tree."""
-    return system.precision.tree.n <= _WHOLE and not system.precision.hidden
-
-
-def _some_columns(system: LinearSystem) -> Callable[[IntArray], FloatArray]:
-    """What gives some columns (n, k) of the covariance matrix where very many are wanted."""
-    if len(system.columns) <= DENSE:
-        whole = system.covariance
-        return lambda part: whole[:, part]
-    if not _in_tree(system):
-        _ = system.normal  # factored before threads ask for it
-        return lambda part: covariance_columns(system, part)
-    precision, c = system.precision, system.columns
-    by_name, t = precision.graph.unknowns.by_name, precision.transformation
-    keys = {name: by_name[name].key for name in c.at}
-    rows, Q = system.tree_rows, precision.tree.full()
-    if t is None:
-        return lambda part: Q[rows[part]][:, rows].T
-    G, W = (np.concatenate([of[key][c.free[name]] for name, key in keys.items()]) for of in (t.motions, t.spread))
-    out = G @ t.core - W
-    return lambda part: Q[rows[part]][:, rows].T + out @ G[part].T - G @ W[part].T
 
 
 def correlations(
@@ -112,24 +62,27 @@ def correlations(
     among = np.arange(len(c)) if names is None else index
     number = np.full(len(c), -1)
     number[index] = np.arange(len(index))
-    sigma = np.sqrt(np.maximum(_variances(system, np.arange(len(c))), 1e-300))
-    structure = _structure(system, limit) if names is None and len(c) > DENSE and not _in_tree(system) else None
+    whole = system.covariance if len(c) <= DENSE else None
+    sigma = np.maximum(system.sigmas if whole is None else np.sqrt(np.maximum(np.diag(whole), 0.0)), 1e-150)
+    structure = _structure(system, limit) if names is None and len(c) > _WHOLE else None
     if structure is not None:
         return _named(system, _of_structure(structure, sigma, limit))
-    columns = _some_columns(system)
 
     def above(first: int) -> list[tuple[int, int, float]]:
-        part = index[first : first + _AT_A_TIME]
-        C = columns(part)[among]
-        C /= sigma[among, None]
+        part = index[first : first + AT_ONCE]
+        rows = among if len(among) > len(index) else index[: first + len(part)]
+        C = (system.through_tree(_units(system, part)) if whole is None else whole[:, part])[rows]
+        C /= sigma[rows, None]
         C /= sigma[part]
-        high = np.abs(C) >= limit
-        a, b = np.nonzero(high) if high.any() else np.zeros((2, 0), dtype=np.int64)
-        i, j = among[a], part[b]
-        kept = np.where(number[i] < 0, True, number[i] < number[j])  # each pair once, nothing with itself
-        return list(zip(i[kept].tolist(), j[kept].tolist(), C[a, b][kept].tolist(), strict=True))
+        size = np.abs(C)
+        size[number[rows][:, None] >= number[part]] = 0.0  # each pair once, nothing with itself
+        high = size >= limit
+        if (n := int(np.count_nonzero(high))) > _MOST:
+            high = size >= np.partition(size[high], n - _MOST)[n - _MOST]
+        a, b = np.nonzero(high) if n else np.zeros((2, 0), dtype=np.int64)
+        return list(zip(rows[a].tolist(), part[b].tolist(), C[a, b].tolist(), strict=True))
 
-    found = [x for part in side_by_side(above, range(0, len(index), _AT_A_TIME)) for x in part]
+    found = [x for part in side_by_side(above, range(0, len(index), AT_ONCE)) for x in part]
     if names is None and len(index) < len(c):
         found += _within(system, number, limit)
     return _named(system, found)
@@ -157,10 +110,10 @@ def _structure(system: LinearSystem, limit: float = 0.95) -> _Structure | None:
 
     Components of different sets have a covariance U' U alone: a correlation is at most the product of two lengths.
     """
-    Q = system.normal.structured if not system.motions.shape[1] else None
+    Q = system.structured if not system.motions.shape[1] else None
     if Q is None:
         return None
-    V = Q.U / np.sqrt(np.maximum(system.sigmas**2, 1e-300))
+    V = Q.U / np.maximum(system.sigmas, 1e-150)
     lengths = np.sqrt(np.einsum("cn,cn->n", V, V))
     sharing = np.flatnonzero(lengths * lengths.max(initial=0.0) >= limit)
     return _Structure(Q, V, sharing) if len(sharing) <= _WHOLE else None
@@ -175,20 +128,13 @@ def _of_structure(found: _Structure, sigma: FloatArray, limit: float) -> _Found:
     out: _Found = list(zip(own.row[high].tolist(), own.col[high].tolist(), C[high].tolist(), strict=True))
 
     def above(first: int) -> _Found:
-        i = sharing[first : first + _AT_A_TIME]
+        i = sharing[first : first + AT_ONCE]
         C = V[:, i].T @ V[:, sharing]
         other = (i[:, None] < sharing) & ((Q.member[i][:, None] != Q.member[sharing]) | (Q.member[sharing] < 0))
         a, b = np.nonzero((np.abs(C) >= limit) & other)
         return list(zip(i[a].tolist(), sharing[b].tolist(), C[a, b].tolist(), strict=True))
 
-    return out + [x for part in side_by_side(above, range(0, len(sharing), _AT_A_TIME)) for x in part]
-
-
-def _variances(system: LinearSystem, index: IntArray) -> FloatArray:
-    """Of these columns (k,): as they are solved in small surveys, as the tree has them in large ones."""
-    if len(system.columns) > DENSE:
-        return np.asarray(system.sigmas[index] ** 2)
-    return np.diag(system.covariance)[index]
+    return out + [x for part in side_by_side(above, range(0, len(sharing), AT_ONCE)) for x in part]
 
 
 def _within(system: LinearSystem, number: IntArray, limit: float) -> list[tuple[int, int, float]]:
@@ -260,7 +206,7 @@ def _largest(system: LinearSystem, index: IntArray, scale: FloatArray, most: int
 
     def times(x: FloatArray) -> FloatArray:
         inside[index] = scale * x.ravel()
-        return np.asarray(scale * times_covariance(system, inside)[index])
+        return np.asarray(scale * system.times_covariance(inside)[index])
 
     operator = LinearOperator((n, n), matvec=times, dtype=np.float64)
     first = 1.0 + 0.1 * np.cos(np.arange(n))  # the same every time, at right angles to nothing in particular

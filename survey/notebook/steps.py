@@ -13,7 +13,7 @@ from survey.jobs.cross_validation import CrossValidation
 from survey.jobs.cross_validation import cross_validate as cross_validate_project
 from survey.jobs.detecting import DetectOutcome, detect_job
 from survey.jobs.excluding import ExcludeOutcome, exclude_job, include_job
-from survey.notebook.html import heading, html_table
+from survey.notebook.names import heading, html_table
 from survey.notebook.solution import Solution
 from survey.project import AdjustmentOptions, Project
 from survey.project import read as read_project

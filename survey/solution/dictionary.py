@@ -14,7 +14,7 @@ from adjust.precision.precision import in_conditions
 from adjust.statistics.score import SharedLens, shared_lenses
 from adjust.testing.distributions import norm
 from adjust.testing.significance import Significance, significance_of_changes, significances
-from survey.folder.plain import plain
+from survey.folder.plain import attributes, plain
 from survey.project.detected import DetectedImage
 from survey.project.project import LeftOut
 from survey.solution.instruments import instrument_entries
@@ -95,8 +95,8 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
                 "command": run.command,
                 "hashes": dict(run.input_hashes),
                 "images": {
-                    name: {"file": i.file, "sha256": i.sha256, "points": i.status, "n_image_points": i.n_image_points,
-                           "n_spots": i.n_spots}
+                    name: attributes(i, "file", "sha256") | {"points": i.status}
+                    | attributes(i, "n_image_points", "n_spots")
                     for name, i in run.images.items()
                 },
                 "options": dict(run.options),
@@ -146,35 +146,23 @@ def _summary(adjustment: Adjustment, run: RunInfo, scale: Scale, statistics: Sta
         "reason": reason,
         "fit": fit_of(adjustment, tested),
         "sigma0": adjustment.sigma0 if adjustment.redundancy > 0 else None,
-        "redundancy": adjustment.redundancy,
-        "n_observations": adjustment.n_observations,
-        "n_unknowns": adjustment.n_unknowns,
+        **attributes(adjustment, "redundancy", "n_observations", "n_unknowns"),
         "datum": adjustment.survey.datum.kind,
         "datum_defect": adjustment.datum_defect,
         "n_tolerances_not_met": n_unmet,
-        "converged": adjustment.converged,
-        "iterations": adjustment.iterations,
+        **attributes(adjustment, "converged", "iterations"),
         "last_step_sigmas": adjustment.max_step,
         "sigmas": scale.sigmas,
         "sigma_factor": scale.factor,
         "omega": adjustment.omega,
         "global_test": test
-        and {
-            "omega": test.omega,
-            "redundancy": test.redundancy,
-            "alpha": test.alpha,
-            "lower": test.lower,
-            "upper": test.upper,
-            "passed": test.passed,
-            "status": test.status,
-        },
+        and attributes(test, "omega", "redundancy", "alpha", "lower", "upper", "passed", "status"),
         "suspects": {
             "alpha": found.alpha,
             "image_test_limit": found.image_limit,
             "standardized_limit": found.w_limit,
             "n_image_points": found.n_image,
-            "n_other": found.n_other,
-            "n_not_used": found.n_not_used,
+            **attributes(found, "n_other", "n_not_used"),
         },
     }
 
@@ -183,9 +171,7 @@ def _group(group: GroupSummary) -> dict[str, Any]:
     """``deviation``: of omega from its expectation r, in units of its own sigma sqrt(2 r), as chi-square has it."""
     factor, r = group.factor, group.redundancy
     return {
-        "n_observations": group.n_observations,
-        "redundancy": group.redundancy,
-        "omega": group.omega,
+        **attributes(group, "n_observations", "redundancy", "omega"),
         "variance_factor": factor,
         "sigma_scale": float(np.sqrt(factor)) if factor >= 0.0 else float("nan"),
         "deviation": (group.omega - r) / float(np.sqrt(2.0 * r)) if factor >= 0.0 else float("nan"),

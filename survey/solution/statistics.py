@@ -83,7 +83,7 @@ def statistics_of(adjustment: Adjustment, tolerances: tuple[Tolerance, ...], sca
     condensed = condensed_system(precision_of(adjustment))
     system, components = condensed.system, adjustment.variance_components
     names = _budgeted(adjustment)
-    _ = system.normal.structured, system.sigmas  # all of these ask for them
+    _ = system.structured, system.sigmas  # all of these ask for them
     with Beside() as made:
         consistent = made.of(lambda: consistency(adjustment, condensed, alpha))
         reliable = made.of(lambda: reliability(adjustment, system=condensed))

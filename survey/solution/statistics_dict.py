@@ -8,6 +8,7 @@ import numpy as np
 from adjust.model.result import Adjustment, Component, ParameterName
 from adjust.statistics.reliability import observation_name
 from adjust.statistics.result import BudgetEntry, Consistency, Influence, PartTest, RelativePrecision
+from survey.folder.plain import attributes
 from survey.solution.quantities import Scale, key_of, sigma_unit_for_people
 from survey.solution.records import Form, Records
 from survey.solution.statistics import Statistics
@@ -66,8 +67,7 @@ def _consistency(x: Consistency) -> dict[str, Any]:
         "changes": [
             {"kind": c.kind, "name": c.name, "what": c.what, "from_epoch": c.epoch or None, "test": c.statistic,
              "freedom": c.freedom, "p_value": c.p,
-             "shifts": [{"component": s.component, "unit": s.unit, "amount": s.amount, "sigma": s.sigma}
-                        for s in c.shifts]}
+             "shifts": [attributes(s, "component", "unit", "amount", "sigma") for s in c.shifts]}
             for c in x.changes
         ],
     }  # fmt: skip
@@ -96,8 +96,8 @@ def _verdict(v: Verdict) -> dict[str, Any]:
 
 def _component(x: Component) -> dict[str, Any]:
     return {
-        "factor": x.factor, "sigma": x.sigma, "n": x.n, "redundancy": x.redundancy, "omega": x.omega,
-        "freedom": x.freedom, "p_value": x.p, "lower": x.lower, "upper": x.upper, "status": x.status,
+        **attributes(x, "factor", "sigma", "n", "redundancy", "omega", "freedom"), "p_value": x.p,
+        **attributes(x, "lower", "upper", "status"),
     }  # fmt: skip
 
 

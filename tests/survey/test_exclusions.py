@@ -18,7 +18,7 @@ from survey.jobs.adjusting.job import adjust_job
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.adjusting.warm_start import WARM, survey_start, warm_adjustment
 from survey.jobs.excluding import exclude_job, include_job
-from survey.jobs.navigating.task import NavigateRequest, observed_epoch
+from survey.jobs.navigating.task import NavigateRequest, observed_epochs
 from survey.jobs.removing import remove_job
 from survey.project import read
 from survey.project.exclusions import Exclusion, Name
@@ -296,7 +296,8 @@ def test_navigation_does_not_see_what_is_left_out(mine):
     out = Exclusion(Name("image_point", f"{block.camera_id}/{block.epoch_id}/{names[0]}"))
     station = project.survey.stations[0].station_id
     seen = [
-        sum(len(s.uv) for s in observed_epoch(p, station, block.epoch_id, None, NavigateRequest(), set(names)).spots)
+        sum(len(s.uv) for epoch in observed_epochs(p, station, [block.epoch_id], None, NavigateRequest(), set(names))
+            for s in epoch.spots)
         for p in (project, leaving_out(project, [out]))
     ]
     assert seen[1] == seen[0] - 1

@@ -14,7 +14,6 @@ from adjust.diagnosis.screen import Screen, at_best
 from adjust.model.observations import Reading
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.statistics.system import linear_system
-from adjust.statistics.weakness import times_covariance
 
 _CLEARLY = 3.0
 _MOST = 4
@@ -76,7 +75,7 @@ def _by_scores(case: Case, constants: list[_Constant]) -> list[tuple[float, floa
         B[first + c.rows, k] = c.by / sigma[c.rows]
     g = B.T @ system.e
     AtB = np.asarray(system.A.T @ B)
-    m = np.einsum("ij,ij->j", B, B) - np.einsum("ij,ij->j", AtB, times_covariance(system, AtB))
+    m = np.einsum("ij,ij->j", B, B) - np.einsum("ij,ij->j", AtB, system.times_covariance(AtB))
     sure = m > _SEEN * np.einsum("ij,ij->j", B, B)
     metres = np.where(sure, -g / np.where(sure, m, 1.0), 0.0)
     drop = np.where(sure, g**2 / np.where(sure, m, 1.0), 0.0)

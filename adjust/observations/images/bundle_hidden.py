@@ -1,6 +1,6 @@
 """What follows from the interface of a bundle: poses and points that its batch has reduced, and their covariances."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import scipy
@@ -29,12 +29,18 @@ class BundleHidden:
     def __init__(self, batch: BundleBatch) -> None:
         self.batch = batch
         self._given_interface: tuple[FloatArray, FloatArray] | None = None
-
-        self._keys = {*batch.hidden_poses, *(batch.point_key[i] for i in batch.reduced)}
+        self.keys = [*batch.hidden_poses, *(batch.point_key[i] for i in batch.reduced)]
+        """What is hidden, in the order of stacked vectors of it: poses, then points."""
+        self._keys = set(self.keys)
 
     def hides(self, key: int) -> bool:
         """Whether an unknown is one of those hidden here."""
         return key in self._keys
+
+    @property
+    def n(self) -> int:
+        """Length of a stacked vector of what is hidden."""
+        return self.batch.n_hidden + 3 * len(self.batch.reduced)
 
     def rows_along(self, V: FloatArray) -> FloatArray:
         """Whitened Jacobian times directions V (n_interface, k) as rows (2K, k), what is hidden following best.
@@ -49,7 +55,7 @@ class BundleHidden:
             d[:nh] = -scipy.linalg.lapack.dtrtrs(b.C, right, lower=0)[0] / b.scale[:nh, None]
         local = np.asarray(b.G @ d)
         points = np.zeros((len(b.point_ids), 3, k))
-        points[b.reduced] = b.points_following(local)
+        points[b.reduced] = b.points_following(local, np.zeros((len(b.reduced), 3, k)))
         for i, at in b.tied_at.items():
             points[i] = local[at : at + 3]
         poses = local[b.first_pose : b.first_pose + 6 * len(b.blocks)].reshape(-1, 6, k)
@@ -120,47 +126,44 @@ class BundleHidden:
         direct_influence(b.n_reduced, len(b.point), b.arrays, b.A, Q, influence)
         return points.C, influence
 
-    def transposed(self, rows: Mapping[int, FloatArray], k: int) -> FloatArray:
-        """Rows on hidden unknowns, transposed (dim, k) per key, as rows on the interface (n_interface, k)."""
-        nh, u = self.batch.n_hidden, self._by_keys(rows, k)
-        out = u[nh:]
-        return out + self._hidden_poses_given_interface()[0].T @ u[:nh] if nh else out
+    def on_poses(self, right: FloatArray) -> FloatArray:
+        """Right-hand sides of what is hidden (n, k) as such (n_keys, k) on its poses and the interface."""
+        b = self.batch
+        nh, k = b.n_hidden, right.shape[1]
+        local = np.zeros((b.n_local, k))
+        of_points(b.arrays, b.of_reduced, b.Vi @ right[nh:].reshape(-1, 3, k), local)
+        out = np.asarray(b.G.T @ local)
+        out[:nh] += right[:nh]
+        return out
 
-    def products(self, interface: FloatArray, rows: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
-        """Covariance times rows of every hidden unknown (dim, k), from that of the interface (n_interface, k).
+    def on_interface(self, on_poses: FloatArray) -> FloatArray:
+        """The same on the interface alone (n_interface, k)."""
+        nh = self.batch.n_hidden
+        return on_poses[nh:] + self._hidden_poses_given_interface()[0].T @ on_poses[:nh] if nh else on_poses
 
-        rows: what the rows are on hidden unknowns, transposed (dim, k) per key. The batch must be prepared.
+    def products(self, interface: FloatArray, right: FloatArray, on_poses: FloatArray | None) -> FloatArray:
+        """Covariance times right-hand sides, of what is hidden (n, k), from that of the interface (n_interface, k).
+
+        right: (n, k) on what is hidden, which they are :meth:`on_poses`; None where they are zero. The batch must be
+        prepared.
         """
         b = self.batch
         nh, k = b.n_hidden, interface.shape[1]
-        d = np.zeros((b.n_keys, k))
-        d[nh:] = interface
+        d = np.vstack([np.zeros((nh, k)), interface])
         if nh:
             T, P = self._hidden_poses_given_interface()
-            d[:nh] = T @ interface + P @ self._by_keys(rows, k)[:nh]
-        dX = b.points_following(np.asarray(b.G @ d)) + b.Vi @ self._of_points(rows, k)
-        out = {key: d[b.key_at[key] : b.key_at[key] + 6] for key in b.hidden_poses}
-        return out | {b.point_key[i]: dX[j] for j, i in enumerate(b.reduced)}
+            d[:nh] = T @ interface if on_poses is None else T @ interface + P @ on_poses[:nh]
+        dX = b.points_following(np.asarray(b.G @ d), -right[nh:].reshape(-1, 3, k))
+        return np.concatenate([d[:nh], dX.reshape(-1, k)])
 
-    def _of_points(self, rows: Mapping[int, FloatArray], k: int) -> FloatArray:
-        b = self.batch
-        out = np.zeros((len(b.reduced), 3, k))
-        for j, i in enumerate(b.reduced):
-            if b.point_key[i] in rows:
-                out[j] = rows[b.point_key[i]]
-        return out
-
-    def _by_keys(self, rows: Mapping[int, FloatArray], k: int) -> FloatArray:
-        """Rows on hidden unknowns, transposed, as rows (n_keys, k) on the poses and the interface, points reduced."""
-        b = self.batch
-        g = b.Vi @ self._of_points(rows, k)
-        local = np.zeros((b.n_local, k))
-        of_points(b.arrays, b.of_reduced, g, local)
-        out = np.asarray(b.G.T @ local)
-        for key in b.hidden_poses:
-            if key in rows:
-                out[b.key_at[key] : b.key_at[key] + 6] += rows[key]
-        return out
+    def among(self, A: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Of rows A (m, n) over what is hidden: A Q A' (m, m) were the interface held, and what they are over it."""
+        b, right = self.batch, np.ascontiguousarray(A.T)
+        nh, u = b.n_hidden, self.on_poses(right)
+        own = A[:, nh:] @ (b.Vi @ right[nh:].reshape(-1, 3, len(A))).reshape(-1, len(A))
+        if nh:
+            own += u[:nh].T @ (self._hidden_poses_given_interface()[1] @ u[:nh])
+        return own, self.on_interface(u).T
 
     def from_interface(self, keys: Sequence[int]) -> tuple[FloatArray, FloatArray]:
         """How hidden poses and points follow from the interface, stacked: M (n, n_interface), and their own scatter.

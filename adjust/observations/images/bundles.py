@@ -465,17 +465,14 @@ class BundleBatch:
             d[:nh] = -scipy.linalg.lapack.dtrtrs(self.C, right, lower=0)[0] / self.scale[:nh]
             for key in self.hidden_poses:
                 delta.insert(key, d[self.key_at[key] : self.key_at[key] + 6])
-        dX = self.points_following((self.G @ d)[:, None], self.h)[:, :, 0]
+        dX = self.points_following((self.G @ d)[:, None], self.h[:, :, None])[:, :, 0]
         for j, i in enumerate(self.reduced):
             delta.insert(self.point_key[i], dX[j])
 
-    def points_following(self, local: FloatArray, h: FloatArray | None = None) -> FloatArray:
+    def points_following(self, local: FloatArray, h: FloatArray) -> FloatArray:
         """Steps (P, 3, k) of the reduced points from those of the local unknowns (n_local, k); h: their own part."""
         out = np.empty((len(self.reduced), 3, local.shape[1]))
-        own, one = np.zeros_like(self.h) if h is None else h, np.empty((len(self.reduced), 3))
-        for i in range(local.shape[1]):
-            back_substitute(self.arrays, self.of_reduced, own, np.ascontiguousarray(local[:, i]), one)
-            out[:, :, i] = one
+        back_substitute(self.arrays, self.of_reduced, h, np.ascontiguousarray(local), out)
         return out
 
     def residuals_px(self) -> FloatArray:

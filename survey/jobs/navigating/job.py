@@ -16,6 +16,7 @@ from adjust.diagnosis.trajectory import OfTrajectory, causes_of_trajectory
 from adjust.model.errors import IndeterminateError, SurveyError, listed
 from adjust.model.names import natural_key
 from adjust.navigation import EpochPose, Motion, NavigateOptions, Trajectory, head_and_beacons, navigate
+from survey.folder.plain import attributes
 from survey.folder.replacing import changing, replace_parts
 from survey.jobs.adjusting.outcome import run_info
 from survey.jobs.adjusting.probable_causes import explaining, with_probable_causes
@@ -27,7 +28,7 @@ from survey.jobs.navigating.task import (
     chosen_epochs,
     chosen_station,
     chosen_times,
-    observed_epoch,
+    observed_epochs,
     others_to_navigate,
     require_one_time,
 )
@@ -70,17 +71,8 @@ class NavigateOutcome:
             "calibration_sigma0": self.calibration.sigma0,
             "sigmas": self.sigmas,
             "diagnosis": [
-                {
-                    "name": c.name,
-                    "cause": c.cause,
-                    "change": c.change,
-                    "kind": c.kind,
-                    "ids": list(c.ids),
-                    "explained": c.explained,
-                    "statistic": c.statistic,
-                    "critical": c.critical,
-                }
-                for c in self.causes
+                attributes(c, "name", "cause", "change", "kind") | {"ids": list(c.ids)}
+                | attributes(c, "explained", "statistic", "critical") for c in self.causes
             ],
             "notes": list(self.notes),
             "written": {name: str(path) for name, path in self.paths.items()},
@@ -151,10 +143,9 @@ def _navigated(folder: Path, request: NavigateRequest, there: Path, place: Path,
     calibration = _calibrate(project, station, epochs, there / CALIBRATION, place / CALIBRATION)
     calibrated = time.perf_counter()
     named = set(calibration.beacons.beacon_ids)
-    order = range(len(epochs)) if times is None else sorted(range(len(epochs)), key=times.__getitem__)
-    observed = [
-        observed_epoch(project, station, epochs[i], None if times is None else times[i], request, named) for i in order
-    ]
+    if times is not None:
+        times, epochs = map(list, zip(*sorted(zip(times, epochs, strict=True)), strict=True))
+    observed = observed_epochs(project, station, epochs, times, request, named)
     motion = Motion() if times is not None else None
     options = NavigateOptions(motion=motion, use_table=request.use_table, alpha=min(project.options.alpha, 1e-3))
     with tqdm(total=len(epochs), desc="navigating", unit="epoch", disable=not progress, file=sys.stderr) as bar:

@@ -3,12 +3,14 @@
 import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
 
 from adjust.model.errors import SurveyError
 from adjust.model.names import natural_key
+from adjust.model.observations import ImageBlock
 from adjust.model.subsets import in_use, points_read, with_points
 from adjust.model.survey import Survey
 from adjust.navigation import NavigationEpoch, Spots, head_of
@@ -164,23 +166,32 @@ def with_known_points(survey: Survey) -> Survey:
     return with_points(survey, keep)
 
 
-def observed_epoch(
-    project: Project, station: str, epoch_id: str, time_s: float | None, request: NavigateRequest, named: set[str]
-) -> NavigationEpoch:
-    """One epoch's spots, named or not, and its table reading; what is not used is not navigated from."""
+def observed_epochs(
+    project: Project, station: str, epochs: Sequence[str], times: Sequence[float] | None, request: NavigateRequest,
+    named: set[str],
+) -> list[NavigationEpoch]:  # fmt: skip
+    """Of each epoch its spots, named or not, and its table reading; what is not used is not navigated from."""
     survey = in_use(project.survey)
-    own = [c.camera_id for c in survey.cameras if c.station_id == station]
-    spots = [Spots(s.camera_id, s.uv, s.cov) for s in project.spots if s.camera_id in own and s.epoch_id == epoch_id]
+    own = {c.camera_id for c in survey.cameras if c.station_id == station}
+    spots: dict[str, list[Spots]] = {e: [] for e in epochs}
+    for s in project.spots:
+        if s.camera_id in own and s.epoch_id in spots:
+            spots[s.epoch_id].append(Spots(s.camera_id, s.uv, s.cov))
     for b in survey.image_blocks:
-        if b.target_id is None and b.camera_id in own and b.epoch_id == epoch_id:
-            ids = [survey.points[int(i)].point_id for i in b.point_idx]
-            if request.unnamed:
-                spots.append(Spots(b.camera_id, b.uv, b.cov))
-                continue
-            rows = [i for i, p in enumerate(ids) if p in named]
-            spots.append(Spots(b.camera_id, b.uv[rows], b.cov[rows], tuple(ids[i] for i in rows)))
+        if b.target_id is None and b.camera_id in own and b.epoch_id in spots:
+            spots[b.epoch_id].append(_spots_of(b, survey, None if request.unnamed else named))
     carried = next(s for s in survey.stations if s.station_id == station).table_id
-    reading = next((r for r in survey.table_readings if (r.table_id, r.epoch_id) == (carried, epoch_id)), None)
-    if reading is None:
-        return NavigationEpoch(epoch_id, tuple(spots), time_s)
-    return NavigationEpoch(epoch_id, tuple(spots), time_s, reading.angles, reading.cov)
+    readings = {r.epoch_id: (r.angles, r.cov) for r in reversed(survey.table_readings) if r.table_id == carried}
+    return [
+        NavigationEpoch(e, tuple(spots[e]), time_s, *readings.get(e, (None, None)))
+        for e, time_s in zip(epochs, times or repeat(None, len(epochs)), strict=True)
+    ]
+
+
+def _spots_of(b: ImageBlock, survey: Survey, named: set[str] | None) -> Spots:
+    """The image points of these names; of all, and without names, where it is None."""
+    if named is None:
+        return Spots(b.camera_id, b.uv, b.cov)
+    ids = [survey.points[i].point_id for i in b.point_idx.tolist()]
+    rows = [i for i, p in enumerate(ids) if p in named]
+    return Spots(b.camera_id, b.uv[rows], b.cov[rows], tuple(ids[i] for i in rows))

@@ -10,11 +10,11 @@ import numpy as np
 from adjust.lenses.crops import possible_sizes
 from adjust.model.names import natural_key
 from adjust.model.observations import ImageBlock
-from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from survey.folder.text import suggestion
 from survey.project.project import ImagePointsWhere, Sigmas, SpotBlock
-from survey.project.tables.covariance import covariance_from_sigmas, table_correlations
-from survey.project.tables.reading import Layout, Table, TextColumn, checked_groups, first_row
+from survey.project.tables.covariance import covariance_from_sigmas, sigmas_and_correlations, table_correlations
+from survey.project.tables.reading import Columns, Layout, Table, TextColumn, checked_groups, first_row
 from survey.project.tables.references import Names
 
 _SIGMAS = ("sigma_u_px", "sigma_v_px", "rho_uv")
@@ -213,3 +213,47 @@ def _refuse_duplicates(table: Table, column: str, *codes: IntArray) -> None:
         line = table.lines[order[i]]
         problem = f"{name!r} stands already in line {line} for this camera, epoch and target; remove one"
         raise table.error(int(order[i + 1]), f"{column}: {problem}")
+
+
+def image_point_columns(blocks: Sequence[ImageBlock], survey: Survey) -> Columns:
+    """One row per image point; ``group`` and ``used`` only where they are not as usual."""
+    names: dict[str | None, tuple[str, ...]] = {target.target_id: target.point_ids for target in survey.targets}
+    names[None] = tuple(point.point_id for point in survey.points)
+    index: dict[str, int] = {}
+    codes = {owner: np.array([index.setdefault(n, len(index)) for n in ids], int) for owner, ids in names.items()}
+    sizes = [len(block.uv) for block in blocks]
+    used = [block.mask for block in blocks]
+    flags = np.concatenate([np.zeros(0, bool), *used])
+    points = [codes[block.target_id][np.asarray(block.point_idx, int)] for block in blocks]
+    return {
+        "epoch_id": _repeat([block.epoch_id for block in blocks], sizes),
+        "camera_id": _repeat([block.camera_id for block in blocks], sizes),
+        "target_id": _repeat([block.target_id or "" for block in blocks], sizes),
+        "point_id": TextColumn(tuple(index), np.concatenate([np.zeros(0, int), *points])),
+        **_measured_columns(blocks),
+        **({"group": _repeat([b.group for b in blocks], sizes)} if any(b.group != "image" for b in blocks) else {}),
+        **({} if flags.all() else {"used": TextColumn(("false", "true"), flags.astype(int))}),
+    }
+
+
+def spot_columns(spots: Sequence[SpotBlock]) -> Columns:
+    """One row per unidentified spot."""
+    sizes = [len(block.uv) for block in spots]
+    return {
+        "epoch_id": _repeat([block.epoch_id for block in spots], sizes),
+        "camera_id": _repeat([block.camera_id for block in spots], sizes),
+        "spot_id": [spot_id for block in spots for spot_id in block.spot_ids],
+        **_measured_columns(spots),
+    }
+
+
+def _measured_columns(blocks: Sequence[ImageBlock] | Sequence[SpotBlock]) -> dict[str, FloatArray]:
+    uv = np.concatenate([np.zeros((0, 2)), *(block.uv for block in blocks)])
+    sigma, rho = sigmas_and_correlations(np.concatenate([np.zeros((0, 2, 2)), *(block.cov for block in blocks)]))
+    columns = np.column_stack([uv, sigma, rho])
+    return dict(zip(("u_px", "v_px", "sigma_u_px", "sigma_v_px", "rho_uv"), columns.T, strict=True))
+
+
+def _repeat(values: Sequence[str], sizes: Sequence[int]) -> TextColumn:
+    index = {name: i for i, name in enumerate(dict.fromkeys(values))}
+    return TextColumn(tuple(index), np.repeat(np.array([index[name] for name in values], int), sizes))
