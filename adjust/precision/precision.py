@@ -465,7 +465,7 @@ def _image_sums(
         return np.asarray(np.bincount(of_point, of_points[which], len(names)), dtype=np.float64)
 
     squares = whitened_squares(images.residuals, graph.square_roots())
-    return total(np.full(len(squares), 2.0)), total(images.redundancy.sum(axis=1)), total(squares)
+    return total(np.full(len(squares), 2.0)), total(images.redundancy @ np.ones(2)), total(squares)
 
 
 def global_test(omega: float, redundancy: int, alpha: float) -> GlobalTest | None:

@@ -181,8 +181,8 @@ class Normal:
 
     def solve(self, right: FloatArray) -> FloatArray:
         """The solution (n, k) or (n,) of N x = right, with the datum's rows fulfilled where ``right`` is seen."""
-        if right.ndim == 1 and (sums := self.structured) is not None:
-            return np.asarray(sums.own @ right + (sums.U @ right) @ sums.U)
+        if (sums := self.structured) is not None:
+            return np.asarray(sums.own @ right + sums.U.T @ (sums.U @ right))
         scale = self.scale if right.ndim == 1 else self.scale[:, None]
         out = self._of_scaled[0](scale * right)
         out *= scale

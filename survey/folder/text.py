@@ -101,7 +101,12 @@ def _umask() -> int:
 
 
 def read_bytes(path: Path, largest: int = LARGEST_FILE) -> tuple[bytes, str]:
-    """Content of a file and its sha256; raises SurveyError where it cannot be read, is no file, or over ``largest``."""
+    """:func:`content` of a file and its sha256."""
+    return with_digest(content(path, largest))
+
+
+def content(path: Path, largest: int = LARGEST_FILE) -> bytes:
+    """Bytes of a file; raises SurveyError where it cannot be read, is no file, or over ``largest``."""
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):  # a pipe would never end
@@ -109,10 +114,9 @@ def read_bytes(path: Path, largest: int = LARGEST_FILE) -> tuple[bytes, str]:
         if status.st_size > largest:
             found = f"{status.st_size / 1e6:.0f} MB, more than the {largest / 1e6:.0f} MB that are read"
             raise SurveyError(f"{path}: the file has {found}; check whether it is the right one, or split it")
-        data = path.read_bytes()
+        return path.read_bytes()
     except OSError as error:
         raise SurveyError(f"{path}: cannot be read ({error.strerror}); check the name and the permissions") from error
-    return with_digest(data)
 
 
 def with_digest(data: bytes) -> tuple[bytes, str]:

@@ -11,14 +11,13 @@ from adjust.model.result import Adjustment
 from adjust.native.parallel import Beside
 from survey.folder.replacing import replace_parts
 from survey.folder.text import atomic_write, time_text
-from survey.jobs.adjusting.job import Clock, plain_name
 from survey.jobs.detecting import author_name
 from survey.project import Project
 from survey.project.project import RESULTS
 from survey.report.language import ENGLISH_PAGE, ReportOptions
 from survey.report.results import RunInfo, begun_results, finished_results, summary_text
 from survey.report.unsolved import JSON, PAGE, unsolved_files
-from survey.solution.earlier.runs import record_run
+from survey.solution.earlier.runs import Clock, plain_name, record_run
 from survey.solution.quantities import USUAL, scale_of
 from survey.solution.statistics import Statistics, statistics_of
 

@@ -8,11 +8,15 @@ Images are never kept.
 
 import hashlib
 import json
+import os
 import re
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+import shlex
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,6 +40,36 @@ RUNS, MOST = "runs", 50
 _RUN, _ESTIMATES, _SOLUTION = "run.json", "estimates.npz", "solution.json"
 _FILES = (_RUN, _ESTIMATES, _SOLUTION, DEFINITION_FILE)
 _ARRAYS = ("parameters", "names", "units", "status", "start", "block", "covariance", "value_start", "values")
+
+
+class Clock:
+    """How long each step took."""
+
+    def __init__(self, seconds: Mapping[str, float] = MappingProxyType({})) -> None:
+        self.seconds: dict[str, float] = dict(seconds)
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        """Time what is done inside."""
+        begin = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+
+
+def command_line(command: str, folder: Path, *words: str | Path, **flags: object) -> str:
+    """A command as it can be given again, with its options; folders by their names, as results may be moved."""
+    said = [f"--{name}" if value is True else f"--{name} {_shown(value)}" for name, value in flags.items() if value]
+    return " ".join(["labsurvey", command, _shown(folder), *map(_shown, words), *said])
+
+
+def _shown(value: object) -> str:
+    return shlex.quote(plain_name(value) if isinstance(value, Path) else
+                       str(value).encode("utf-8", "surrogateescape").decode("utf-8", "replace"))  # fmt: skip
+
+
+def plain_name(folder: Path) -> str:
+    """The name alone: results of a copied folder stay the same; by its bytes: a terminal without UTF-8 garbles it."""
+    return os.fsencode(folder.resolve().name).decode("utf-8", "replace")
 
 
 @dataclass(frozen=True)
