@@ -42,6 +42,8 @@ from adjust.testing.distributions import chi2
 if TYPE_CHECKING:
     from adjust.observations.pairs import PairStatistics
 
+_SAME = 1e-6
+"""Share of the longest motion below which one is told from another."""
 _PAIRS = 24
 """Pairs of unknowns that are brought together in one go."""
 
@@ -182,6 +184,26 @@ class Precision(Covariances):
             return None
         G, W = (np.concatenate([of[key] for key in self.places]) for of in (t.motions, t.spread))
         return G, W, t.core
+
+    def most_correlated(self, sigmas: FloatArray) -> FloatArray:
+        """Bounds (n,): components of two unknowns correlate no more than the larger of theirs, in the survey's datum.
+
+        An unknown is ``T s + e``, s what stands between it and all that is eliminated later, e its own: with that it
+        correlates no more than ``T s`` may make it. sigmas: (n,) in the survey's datum. inf where nothing is known.
+        """
+        none = np.zeros((self.n, 0))
+        G, W = (none, none) if self._stacked_datum is None else self._stacked_datum[:2]
+        d, columns = G.shape[1], np.hstack([G, W])
+        left, own = self.tree.given_separators(columns[: self.tree.n])
+        hidden = [below.given_interface(columns[mine], columns[at]) for below, mine, at in self._parts]
+        left, own = (np.concatenate(x) for x in zip((left, own), *hidden, strict=True))
+        scale = np.where(sigmas > 0.0, sigmas, np.inf)[:, None]
+        # the datum moves all, and what is left of its motions is nothing but where it was chosen; e moves the datum
+        moved = (np.abs(left[:, :d]) > _SAME * np.abs(G).max(axis=0)).any(axis=1)
+        most = np.abs(left[:, d:] / scale) @ np.abs(G / scale).max(axis=0)
+        through = sigmas**2 - own + 2.0 * np.einsum("ij,ij->i", G, left[:, d:])
+        bound = np.sqrt(np.maximum(through, 0.0)) / scale[:, 0] + most
+        return np.where(moved | np.isinf(own), np.inf, bound)
 
     def among(self, A: sparse.csr_array) -> FloatArray:
         """A Q A' (m, m) of the rows of A (m, n), stacked as :attr:`places` says: in any datum."""

@@ -302,32 +302,23 @@ class TreeCovariance:
                 left.insert(at, parent)
         return -1
 
-    def full(self) -> FloatArray:
-        """The whole covariance matrix (n, n) of all unknowns, rows as :meth:`places` says, parents before children.
+    def given_separators(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What does not follow from the separator of its clique, as all between it and the cliques that are not below.
 
-        From the roots down: with Q of all that comes before, Q_f, = T Q_s, and Q_ff = R^-1 R^-T + T Q_sf. Costs the
-        size of the factor times n, by matrix products.
+        Of columns (n, k) that part, and of every unknown the variance (n,) that is left: inf where a clique has others
+        of its own, with which it may share anything.
         """
-        Q = np.zeros((self.n, self.n))
-        keys, ptr, first, dims = self._keys, self._key_ptr, self._first, self._dims
-        for c in range(len(self._front)):
-            nf, n = int(self._front[c]), int(self._width[c])
-            mine = keys[ptr[c] : ptr[c + 1]]
-            start = np.repeat(first[mine], dims[mine])
-            step = np.arange(n) - np.repeat(np.cumsum(dims[mine]) - dims[mine], dims[mine])
-            rows = start + step
-            done = int(rows[0])  # frontal keys are numbered where they first appear, cliques in their order
-            A = self._data[self._at[c] : self._at[c] + nf * n].reshape(nf, n)
-            own = slice(done, done + nf)
-            inverse = np.triu(A[:, :nf])
-            Q[own, own] = inverse @ inverse.T
-            if n > nf:
-                T = A[:, nf:]
-                across = T @ Q[rows[nf:], :done]
-                Q[own, :done] = across
-                Q[:done, own] = across.T
-                Q[own, own] += across[:, rows[nf:]] @ T.T
-        return Q
+        left, own = np.array(columns), np.full(self.n, np.inf)
+        rows = self._first[self._keys] - np.cumsum(self._dims[self._keys]) + self._dims[self._keys]
+        ends = np.cumsum(self._width)
+        rows = np.repeat(rows, self._dims[self._keys]) + np.arange(ends[-1] if len(ends) else 0)
+        for c, (nf, n, at, end) in enumerate(zip(*(x.tolist() for x in (self._front, self._width, self._at, ends)),
+                                                 strict=True)):  # fmt: skip
+            A, mine = self._data[at : at + nf * n].reshape(nf, n), rows[end - n : end]
+            left[mine[:nf]] -= A[:, nf:] @ columns[mine[nf:]]
+            if self._n_front[c] == 1:
+                own[mine[:nf]] = (np.triu(A[:, :nf]) ** 2).sum(axis=1)
+        return left, own
 
     def pairs(self, first: IntArray, second: IntArray, dim: int) -> FloatArray:
         """Joint covariances (p, 2 dim, 2 dim) of pairs of keys that share a factor; -1 stands for a constant.

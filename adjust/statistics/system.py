@@ -137,6 +137,13 @@ class LinearSystem:
         return self.precision.among(sparse.csr_array((rows.data, self._stacked[rows.indices], rows.indptr), shape))
 
     @cached_property
+    def most_correlated(self) -> FloatArray:
+        """Of the components of two unknowns the larger of their bounds (n,) is one of their correlation; or inf."""
+        sigmas = np.zeros(self.precision.n)
+        sigmas[self._stacked] = self.sigmas
+        return self.precision.most_correlated(sigmas)[self._stacked]
+
+    @cached_property
     def normal(self) -> Normal:
         """The normal matrix of the used observations and the datum."""
         return self.normal_of(self.used[self.row_of].astype(float))
