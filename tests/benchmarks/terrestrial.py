@@ -86,7 +86,7 @@ def whole(precision: Precision) -> FloatArray:
     n, at_once = precision.n, 64
     out = np.empty((n, n))
     for i in range(0, n, at_once):
-        out[i : i + at_once] = precision.times(np.eye(n, min(at_once, n - i), -i)).T
+        out[:, i : i + at_once] = precision.times(np.eye(n, min(at_once, n - i), -i))
     return out
 
 
