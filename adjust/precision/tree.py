@@ -181,14 +181,20 @@ class TreeCovariance:
         """
         rows = [np.arange(self._first[k], self._first[k + 1]) for k in numbers]
         every, asked = np.concatenate(rows), np.concatenate(rows[:-1])
-        x = np.zeros((int(self._first[-1]), len(asked)))
-        x[asked, np.arange(len(asked))] = 1.0
-        home = self._home[numbers].tolist()
-        self._solve(self._ancestors(set(home[:-1])), self._ancestors(set(home)), x)
-        out, n = np.empty((len(every),) * 2), len(asked)
-        out[:, :n], out[:n, n:] = x[every], x[rows[-1]].T
+        home, n = self._home[numbers].tolist(), len(asked)
+        up, down = self._ancestors(set(home[:-1])), self._ancestors(set(home))
+        out = np.empty((len(every),) * 2)
+        for i in range(0, n, _COLUMNS):
+            some = asked[i : i + _COLUMNS]
+            x = np.zeros((self.n, len(some)))
+            x[some, np.arange(len(some))] = 1.0
+            self._solve(up, down, x)
+            out[:, i : i + len(some)] = x[every]
+        out[:n, n:] = out[n:, :n].T
         out[n:, n:] = self._block(numbers[-1], numbers[-1])
-        return np.asarray(0.5 * (out + out.T))
+        out += out.T.copy()
+        out *= 0.5
+        return out
 
     def _ancestors(self, cliques: set[int], top: int = -1) -> IntArray:
         """These and all above them, but for those from ``top`` on, which is on the way of all."""
