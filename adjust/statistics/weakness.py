@@ -9,9 +9,10 @@ from scipy import sparse
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import side_by_side
+from adjust.precision.stacked import AT_ONCE
 from adjust.statistics.normal import DENSE, FEW, PLAIN, Inverse
 from adjust.statistics.result import Correlation, WeakDirection, WeakPart
-from adjust.statistics.system import AT_ONCE, LinearSystem, linear_system
+from adjust.statistics.system import LinearSystem, linear_system
 
 _MOST = 200
 _SHARE = 0.1

@@ -83,10 +83,10 @@ def rough(survey: Survey) -> dict[str, FloatArray]:
 
 def whole(precision: Precision) -> FloatArray:
     """The whole covariance matrix (n, n)."""
-    n, at_once = precision.n, 64
+    n, at_once = precision.stacked.n, 64
     out = np.empty((n, n))
     for i in range(0, n, at_once):
-        out[:, i : i + at_once] = precision.times(np.eye(n, min(at_once, n - i), -i))
+        out[:, i : i + at_once] = precision.stacked.times(np.eye(n, min(at_once, n - i), -i))
     return out
 
 
