@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -115,9 +116,11 @@ def _adjusted(
 
 def with_used(survey: Survey, used: BoolArray) -> Survey:
     """The survey with these image points (N,) in use."""
-    ptr = np.cumsum([0] + [len(b.uv) for b in survey.image_blocks])
-    blocks = tuple(replace(b, used=used[ptr[i] : ptr[i + 1]]) for i, b in enumerate(survey.image_blocks))
-    return replace(survey, image_blocks=blocks)
+    ptr = np.cumsum([0] + [len(b.uv) for b in survey.image_blocks]).tolist()
+    out = np.diff(np.concatenate([[0], np.cumsum(~used)])[ptr]).tolist()
+    parts = zip(survey.image_blocks, pairwise(ptr), out, strict=True)
+    blocks = (b if b.used is None and not n else replace(b, used=used[i:j]) for b, (i, j), n in parts)
+    return replace(survey, image_blocks=tuple(blocks))
 
 
 def rejections(survey: Survey, given: Survey) -> tuple[str, ...]:

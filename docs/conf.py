@@ -40,7 +40,10 @@ MODULES = {
         "adjust.model.result",
         "adjust.model.errors",
     ),
-    "survey": ("survey.jobs.adjusting.job", "survey.project.project", "survey.simulate", "survey.report.results"),
+    "survey": (
+        "survey.jobs.adjusting.job", "survey.jobs.adjusting.outcome", "survey.project.project", "survey.simulate",
+        "survey.report.results",
+    ),
     "capture": (
         "capture.devices.camera",
         "capture.devices.turntable",

@@ -10,20 +10,18 @@ from collections.abc import Sequence
 from functools import partial
 from typing import NoReturn
 
-from survey.commands.adjusting import declare_adjust
+from survey.commands.adjusting import declare_adjust, declare_report
 from survey.commands.common import DONE, FAILED, INTERRUPTED, TEST_FAILED, USAGE, run_as_program, run_command
 from survey.commands.comparing import declare_compare, declare_cross_validate
 from survey.commands.completion import declare_completion
 from survey.commands.converting import declare_convert
-from survey.commands.examples import declare_example, declare_schema
 from survey.commands.excluding import declare_exclude, declare_include
 from survey.commands.navigating import declare_align, declare_navigate
 from survey.commands.networks import declare_add, declare_pairs, declare_remove, declare_trackers
 from survey.commands.opening import declare_open, declare_runs
 from survey.commands.parser import program_parser
 from survey.commands.planning import declare_check, declare_plan
-from survey.commands.reporting import declare_report
-from survey.commands.starting import declare_detect, declare_init
+from survey.commands.starting import declare_detect, declare_example, declare_init, declare_schema
 
 __all__ = ["DONE", "FAILED", "INTERRUPTED", "TEST_FAILED", "USAGE", "build_parser", "main"]
 

@@ -3,14 +3,13 @@
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
-from gtsam import Pose3
 
-from adjust.adjustment import AdjustOptions, adjust, start_values
+from adjust.adjustment import AdjustOptions, start_values
 from adjust.diagnosis.alone import completed, own_lenses, single_views
-from adjust.diagnosis.prediction import Altered, adjusted_values, started_values
+from adjust.diagnosis.budget import REST, SCORES, START, STEP, Budget
+from adjust.diagnosis.prediction import Altered, Linear, adjusted_values, started_values
 from adjust.graph.assembly import StartValues, values_of
 from adjust.graph.solver import SolveOptions
 from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
@@ -20,52 +19,17 @@ from adjust.start import find_start
 from adjust.start.given import given_starts
 from adjust.start.views import View
 
-if TYPE_CHECKING:
-    from adjust.diagnosis.linear import Linear
-
 CAP = 50.0
 """The most that one component of an observation counts: what is left out, or cannot be predicted, counts so."""
-MOST = 6.5
-"""Adjustments that scores, starts and trials of a diagnosis may take; other evidence takes two or three more."""
 _LEFT_OUT = 4
 _FAR = 25.0
 """Variance factor from which a solution may be another one than that of the observations without their mistake."""
-_SCORES, _START, _REST, _STEP, _LOST_ROUNDS = 1.5, 0.5, 0.4, 0.07, 3
-"""What all scores, start values, a graph built and judged, and a step of its solution cost, in adjustments."""
-_CLOCKS = 2.5
-"""How many times more that costs with clocks: what moves is predicted between epochs."""
+_LOST_ROUNDS = 3
 _NEAR = AdjustOptions(reject_blocks=False, solve=SolveOptions(max_step=1e-3, max_iterations=20, settled=1e-4))
 _OWN = replace(_NEAR, solve=replace(_NEAR.solve, max_iterations=8))
 """From near values and from own start values: a survey that is right converges soon, and is only compared."""
-_LOST, _BEGUN = 1e4, 3
-"""v'Pv over that of observations none of which is explained, from which values that are on their way say nothing; steps
-after which those of a survey that is right are not as far off any more."""
-_HOPELESS = 8
-"""Steps after which a trial from near values leaves less than the survey as it stands does, or leads nowhere."""
-
-
-@dataclass
-class Budget:
-    """What a diagnosis may still adjust, in adjustments of its survey; a part of it counts as its share of images.
-
-    kept: of that for later. refused: whether something was.
-    """
-
-    left: float = MOST
-    kept: float = 0.0
-    refused: bool = False
-
-    @property
-    def lasts(self) -> bool:
-        """Whether something is left for now."""
-        return self.left > self.kept
-
-    def spend(self, share: float) -> None:
-        """SurveyError where nothing is."""
-        if not self.lasts:
-            self.refused = True
-            raise SurveyError("the time of the diagnosis is spent")
-        self.left -= share
+_LOST = 1e4
+"""v'Pv over that of observations none of which is explained, from which values that are on their way say nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,33 +54,22 @@ class Case:
         blocks = len(survey.image_blocks), len(self.survey.image_blocks)
         share = blocks[0] / blocks[1] if blocks[0] and blocks[1] else 1.0
         if blocks[0] or survey.pairs:
-            return self._adjusted(survey, None, _OWN, (_START + _REST) * share, _STEP * share)
-        return self._adjusted(survey, start_values(find_start(survey)), _OWN, _START + _REST)
+            return self._adjusted(survey, None, _OWN, (START + REST) * share, STEP * share)
+        return self._adjusted(survey, start_values(find_start(survey)), _OWN, START + REST)
 
     def _near(
         self, survey: Survey, result: Adjustment, most: float = np.inf, options: AdjustOptions = _NEAR
     ) -> Adjustment:
         """From the values of another adjustment. most: v'Pv that it has to come below."""
-        rest = _REST if survey.image_blocks else _START + _REST
+        rest = REST if survey.image_blocks else START + REST
         return self._adjusted(survey, completed(survey, values_of(result, survey)), options, rest, most=most)
 
     def _adjusted(
-        self, survey: Survey, start: StartValues | None, options: AdjustOptions, first: float, step: float = _STEP,
+        self, survey: Survey, start: StartValues | None, options: AdjustOptions, first: float, step: float = STEP,
         most: float = np.inf,
     ) -> Adjustment:  # fmt: skip
-        """Paid for as it goes: it begins where something is left, and every step costs."""
-
-        def went(iteration: int, omega: float) -> None:
-            self.budget.left -= step
-            if (iteration >= _HOPELESS and omega > most) or (iteration >= _BEGUN and omega > lost):
-                raise SurveyError("it leads away")
-
-        clocks = [o.clock for of in (survey.cameras, survey.tables, survey.stations) for o in of]
-        if any(clock is not None for clock in clocks):
-            first, step = _CLOCKS * first, _CLOCKS * step
-        self.budget.spend(first)
         lost = _LOST * _nothing(survey) if options is _OWN else np.inf
-        return adjust(survey, start, options, went)
+        return self.budget.adjusted(survey, start, options, first, step, most, lost)
 
     def warm(self, survey: Survey) -> Adjustment:
         """A survey that is much like this one, with all images, adjusted from the values of this one.
@@ -162,7 +115,7 @@ class Case:
         return self._started(self.survey)
 
     def _started(self, survey: Survey) -> StartValues:
-        self.budget.spend(_START if survey.image_blocks else 0.1)
+        self.budget.spend(START if survey.image_blocks else 0.1)
         return start_values(find_start(survey))
 
     @cached_property
@@ -206,13 +159,11 @@ class Case:
         return sorted(ids, key=lambda owner: -share[owner])
 
     @cached_property
-    def linear(self) -> "Linear | None":
+    def linear(self) -> Linear | None:
         """The adjustment with all images in use, as a linear system; None where there is none.
 
         One that did not converge may have settled: what it still changes is nothing to v'Pv.
         """
-        from adjust.diagnosis.linear import Linear  # here: what fails as a whole needs none
-
         if self.result is None and not isinstance(self.error, NotConvergedError):
             return None
         if self.result is not None and not self.result.redundancy > 0:
@@ -223,11 +174,11 @@ class Case:
                 survey = self.survey
                 start = None if survey.pairs or (given_starts(survey) and survey.image_blocks) else self.start
                 most = _LOST * _nothing(survey)
-                first = _START * (start is None) + _REST
+                first = START * (start is None) + REST
                 result = self._adjusted(survey, start, _NEAR, first, most=most)
             elif not self.is_whole:
                 result = self._near(self.survey, result, options=_OWN)
-            self.budget.spend(_SCORES)
+            self.budget.spend(SCORES)
             return Linear(result)
         except SurveyError:
             return None
@@ -255,7 +206,11 @@ class Case:
     @cached_property
     def is_whole(self) -> bool:
         """Whether every image point and observation in use takes part in the adjustment."""
-        return self.result is not None and _is_whole(self.survey, self.result)
+        if self.result is None:
+            return False
+        given = sum(int(b.mask.sum()) for b in self.survey.image_blocks)
+        images = given == int(self.result.image_residuals.used.sum())
+        return images and self.survey.n_others_used == self.result.survey.n_others_used
 
     @cached_property
     def block_misfit(self) -> FloatArray:
@@ -274,12 +229,6 @@ class Case:
 def _nothing(survey: Survey) -> float:
     """v'Pv, bounded, of observations none of which is explained."""
     return CAP * (2 * sum(b.n_used for b in survey.image_blocks) + survey.n_others_used)
-
-
-def _is_whole(survey: Survey, result: Adjustment) -> bool:
-    """Whether every image point and observation in use takes part."""
-    given = sum(int(b.mask.sum()) for b in survey.image_blocks)
-    return given == int(result.image_residuals.used.sum()) and survey.n_others_used == result.survey.n_others_used
 
 
 def without(survey: Survey, field_name: str, owner: str) -> Survey:
@@ -311,12 +260,3 @@ def block_squares(survey: Survey, result: Adjustment | None) -> list[FloatArray]
         if i is not None:
             out[i] = np.where(np.isfinite(squares), squares, np.inf)
     return out
-
-
-def with_lenses(survey: Survey, result: Adjustment) -> Survey:
-    """The survey whose lenses start from those of an adjustment."""
-    cameras = []
-    for camera in survey.cameras:
-        value = result.estimates[("lens", camera.camera_id)].value
-        cameras.append(camera if isinstance(value, Pose3) else replace(camera, lens=replace(camera.lens, values=value)))
-    return replace(survey, cameras=tuple(cameras))

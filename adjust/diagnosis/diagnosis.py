@@ -1,9 +1,9 @@
 """The way of a diagnosis: hypotheses from cheap evidence, the likeliest tried, those that explain the misfit ranked."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
@@ -13,22 +13,12 @@ from adjust.diagnosis.trial import Misfit, misfit_of
 from adjust.model.errors import SurveyError
 from adjust.start.lenses import remembering
 
+if TYPE_CHECKING:
+    from adjust.diagnosis.families import Family
+
 _SHOWN = 3
 _KEPT, _ONE = 0.75, 1.0  # adjustments for each of the later families, and for a trial of what they find
 _AGAIN = 0.2  # share of what was given that is given once more where nothing explains enough, and something waits
-
-_SCORES = "effects"
-FAMILIES: tuple[tuple[str, ...], ...] = (
-    (_SCORES, "images", "names", "units", "time", "weights", "bodies.lost"),
-    ("targets",),
-    ("bodies",),
-)
-"""Rooms of this one, each with ``hypotheses(case) -> Iterable[Hypothesis]``: what cheap evidence makes worth a try.
-
-The later ones adjust to find theirs: they are asked where what the first ones found does not explain everything.
-"""
-
-Family = Callable[[Case], Iterable[Hypothesis]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,21 +63,21 @@ class Diagnosis:
         ]  # fmt: skip
 
 
-def diagnose(case: Case, families: Sequence[Family] | None = None) -> Diagnosis:
+def diagnose(case: Case, families: "Sequence[Family] | None" = None) -> Diagnosis:
     """Form the hypotheses of all families, try the likeliest of them, and rank those that explain the misfit.
 
-    families: those of ``FAMILIES`` where None. As many are tried as the budget of the case allows, and where none of
-    them explains anything though not all was looked at, or what says the first one more exactly still waits, a few
-    more. Nothing is repaired, nothing is written.
+    families: those of :mod:`adjust.diagnosis.families` where None. As many are tried as the budget of the case allows,
+    and where none of them explains anything though not all was looked at, or what says the first one more exactly still
+    waits, a few more. Nothing is repaired, nothing is written.
     """
+    stages = [families] if families is not None else import_module("adjust.diagnosis.families").families(case)
     with remembering():  # most of what is tried has most of its images in common
-        return _diagnosed(case, families)
+        return _diagnosed(case, stages)
 
 
-def _diagnosed(case: Case, families: Sequence[Family] | None) -> Diagnosis:
+def _diagnosed(case: Case, stages: "Sequence[Sequence[Family]]") -> Diagnosis:
     search, given = Search(case, misfit_of(case.result, case.survey)), case.budget.left
-    looked_at, cut = 0, list[Family]()
-    stages = _all_families(case) if families is None else [families]
+    looked_at, cut = 0, list["Family"]()
     for later, rooms in zip(reversed(range(len(stages))), stages, strict=True):
         kept = (_KEPT * later + _ONE) * bool(later and case.survey.image_blocks)
         case.budget.kept = kept + _ONE * (not kept)
@@ -113,15 +103,7 @@ def _diagnosed(case: Case, families: Sequence[Family] | None) -> Diagnosis:
     return Diagnosis(found, tuple(dict.fromkeys(search.names)), search.base, search.untried, tuple(case.passed_over))
 
 
-def _all_families(case: Case) -> list[list[Family]]:
-    """By stage; scores come last where the values at which they are taken would have to be looked for first."""
-    stages = list(FAMILIES)
-    if case.result is None and not case.survey.image_blocks:
-        stages = [*(tuple(n for n in rooms if n != _SCORES) for rooms in stages), (_SCORES,)]
-    return [[import_module(f"adjust.diagnosis.{name}").hypotheses for name in rooms] for rooms in stages]
-
-
-def _formed(family: Family, case: Case) -> list[Hypothesis]:
+def _formed(family: "Family", case: Case) -> list[Hypothesis]:
     """The hypotheses of one family; none where the observations do not even suffice to form them."""
     try:
         return list(family(case))

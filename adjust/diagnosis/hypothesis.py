@@ -1,7 +1,7 @@
 """What may be wrong with a survey: one cause, the one change that would mend it, and where a project says it."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
@@ -123,6 +123,10 @@ class Hypothesis:
     penalty: float = 0.0
     scored: bool = False
     of_variances: bool = False
+
+    def told(self, words: Callable[[Adjustment], str]) -> "Hypothesis":
+        """With its cause as the adjustment that shows it says it; as it stands where that has no words."""
+        return replace(self, follow=lambda result: [replace(self, cause=said)] if (said := words(result)) else [])
 
     def changed(self) -> Survey | None:
         """The survey to be tried; None where the change turns out not to be possible."""

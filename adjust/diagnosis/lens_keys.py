@@ -4,12 +4,12 @@ from collections.abc import Sequence
 
 from adjust.diagnosis.hypothesis import Edit, SetKey
 from adjust.lenses.models import MODELS
-from adjust.model.survey import Camera, FloatArray, Survey
+from adjust.model.survey import FloatArray, Survey
 
 
 def block_keys(survey: Survey, camera_id: str, names: Sequence[str], begins: Sequence[str]) -> tuple[Edit, ...]:
     """``lens.drift``: parameters in blocks that begin at these epochs; none where it is there, or none is free."""
-    lens = _camera(survey, camera_id).lens
+    lens = survey.cameras_by_id[camera_id].lens
     changing = tuple(x for x in names if x in lens.free)
     if lens.drift is not None or not changing:
         return ()
@@ -24,7 +24,7 @@ def crop_keys(
 
     None where images are cropped already, or the lens is in mm.
     """
-    camera = _camera(survey, camera_id)
+    camera = survey.cameras_by_id[camera_id]
     if camera.lens.crops or MODELS[camera.lens.model].in_mm:
         return ()
     path = ("cameras", camera_id, "lens", "crops", epoch_id)
@@ -40,7 +40,3 @@ def crop_keys(
 def key_text(keys: Sequence[Edit]) -> str:
     """The table of ``survey.toml`` that the first of these keys stands in."""
     return next(".".join(key.path[:-1]) for key in keys if isinstance(key, SetKey))
-
-
-def _camera(survey: Survey, camera_id: str) -> Camera:
-    return next(c for c in survey.cameras if c.camera_id == camera_id)

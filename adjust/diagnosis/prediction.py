@@ -19,10 +19,11 @@ from adjust.model.clocks import epoch_times
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment, ParameterName
-from adjust.model.survey import Camera, Clock, FloatArray, Survey, Target
+from adjust.model.survey import Clock, FloatArray, Survey, Target
 from adjust.native.lenses import FISHEYE
 from adjust.observations.clocks import between, nearest
 from adjust.spatial.rigid import inverse, rigid, transform
+from adjust.statistics.score import LinearScores
 
 Altered = Mapping[ParameterName, Pose3 | FloatArray]
 Links = tuple[tuple[ParameterName, bool], ...]
@@ -85,7 +86,7 @@ class Prediction:
         """Its points (n, 3) m on their target, ``camera_from_target``, (n, 2, 3) px/m by places in the camera."""
         if block.place not in self._places:
             pose, x, lens = self.pose(block, {}), self._points(block, {}), self._lens(block, {})
-            camera, found = self._cameras[block.camera_id], None
+            camera, found = self.survey.cameras_by_id[block.camera_id], None
             if pose is not None and x is not None and lens is not None:
                 model, q = MODELS[camera.lens.model], np.ascontiguousarray(transform(pose, x))
                 if model.kind == FISHEYE or not (q[:, 2] <= 0.0).any():
@@ -194,21 +195,13 @@ class Prediction:
     def _poses(self) -> dict[ParameterName, FloatArray | None]:
         return {}
 
-    @cached_property
-    def _cameras(self) -> dict[str, Camera]:
-        return {c.camera_id: c for c in self.survey.cameras}
-
-    @cached_property
-    def _targets(self) -> dict[str, Target]:
-        return {t.target_id: t for t in self.survey.targets}
-
     def _on_target(self, target: Target, epoch_id: str) -> FloatArray:
         """(n, 3) m of its points, with the warp that was found."""
         return deformed(target, self._value(("warp", target.target_id), {}), warming_of(self.survey, target, epoch_id))
 
     def _lens(self, block: ImageBlock, altered: Altered) -> FloatArray | None:
         """The lens (n,) at the epoch of a block."""
-        camera = self._cameras[block.camera_id]
+        camera = self.survey.cameras_by_id[block.camera_id]
         if self._value(("lens", block.camera_id), altered) is None:
             return None
         return self._times.lens(camera, block.epoch_id, lambda name: self._value(name, altered))
@@ -216,10 +209,6 @@ class Prediction:
     @cached_property
     def _times(self) -> LensTimes:
         return LensTimes(self.survey)
-
-    @cached_property
-    def _stations(self) -> dict[str, str]:
-        return {c.camera_id: c.station_id for c in self.survey.cameras}
 
     @cached_property
     def _table_motions(self) -> dict[ParameterName, FloatArray]:
@@ -238,7 +227,7 @@ class Prediction:
         return out
 
     def _moved_body(self, block: ImageBlock, pose: FloatArray, altered: Altered) -> FloatArray:
-        station = altered.get(("station_body", self._stations[block.camera_id]))
+        station = altered.get(("station_body", self.survey.cameras_by_id[block.camera_id].station_id))
         if isinstance(station, Pose3):
             own = self.link(("station_from_camera", block.camera_id))
             own = np.eye(4) if own is None else own
@@ -247,7 +236,7 @@ class Prediction:
         return pose @ target.matrix() if isinstance(target, Pose3) else pose
 
     def _project(self, block: ImageBlock, x_in_camera: FloatArray, altered: Altered) -> FloatArray | None:
-        lens, camera = self._lens(block, altered), self._cameras[block.camera_id]
+        lens, camera = self._lens(block, altered), self.survey.cameras_by_id[block.camera_id]
         if lens is None:
             return None
         model, constants = MODELS[camera.lens.model], camera_constants(camera)
@@ -264,6 +253,16 @@ class Prediction:
 
     def _points(self, block: ImageBlock, altered: Altered) -> FloatArray | None:
         if block.target_id is not None:
-            return self._on_target(self._targets[block.target_id], block.epoch_id)[block.point_idx]
+            return self._on_target(self.survey.targets_by_id[block.target_id], block.epoch_id)[block.point_idx]
         found = [self._value(("point", self.survey.points[int(i)].point_id), altered) for i in block.point_idx]
         return np.array([np.full(3, np.nan) if x is None else x for x in found])
+
+
+@dataclass(frozen=True, eq=False)
+class Linear(LinearScores):
+    """The adjustment that is diagnosed as a linear system: scores of changes of things whose images it predicts."""
+
+    @cached_property
+    def prediction(self) -> Prediction:
+        """What the adjustment says that its images show."""
+        return Prediction(self.result.survey, adjusted_values(self.result))

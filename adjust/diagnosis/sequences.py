@@ -214,6 +214,12 @@ def _inside(n: int, by: int) -> IntArray:
     return np.arange(max(0, -by), n - max(0, by))
 
 
+def costs_of_cuts(before: FloatArray, after: FloatArray) -> FloatArray:
+    """(n + 1,): what is left where the first so many of n cost what ``before`` (n,) says, the others as ``after``."""
+    whole = np.concatenate([[0.0], np.cumsum(before)]) + np.concatenate([np.cumsum(after[::-1])[::-1], [0.0]])
+    return np.asarray(whole)
+
+
 def _best_border(link: Link, fit: Fit, by: int, base: float) -> Shift | None:
     n, inside = len(link.epochs), _inside(len(link.epochs), by)
     as_is = fit.misses(link.first, link.second)
@@ -221,7 +227,6 @@ def _best_border(link: Link, fit: Fit, by: int, base: float) -> Shift | None:
     moved[inside] = fit.misses(link.first[inside], link.second[inside + by])
     bound = 50.0 * max(float(np.median(np.minimum(as_is, moved))), 1e-6)
     before, after = np.minimum(as_is, bound), np.minimum(moved, bound)
-    costs = np.concatenate([[0.0], np.cumsum(before)]) + np.concatenate([np.cumsum(after[::-1])[::-1], [0.0]])
-    begin = int(np.argmin(costs))
+    begin = int(np.argmin(costs_of_cuts(before, after)))
     rest = np.concatenate([as_is[:begin], moved[inside[inside >= begin]]])
     return Shift(begin, by, base / typical(rest)) if begin < n - 1 and link.joins(rest) else None

@@ -190,7 +190,8 @@ def _change(
     owner = np.repeat(np.arange(len(names)), before.sizes)
     component = np.concatenate([before.components(n) for n in names])
     nowhere = frozenset(names[int(i)] for i in owner[~np.isfinite(d)])
-    change = _Change(names, d[known], Q[np.ix_(known, known)], G[known], owner[known], component[known],
+    Q_known = Q if known.all() else Q[np.ix_(known, known)]
+    change = _Change(names, d[known], Q_known, G[known], owner[known], component[known],
                      np.ones(int(known.sum())), np.zeros((int(known.sum()), 0)), nowhere)  # fmt: skip
     return replace(change, weight=_weights(change))
 

@@ -69,7 +69,7 @@ def lenders(survey: Survey) -> dict[str, tuple[str, tuple[str, ...]]]:
     Where the camera that is named is not part of the survey, the first of those that name it takes its place. Raises
     SurveyError for a lens that cannot be shared.
     """
-    cameras, out = {c.camera_id: c for c in survey.cameras}, dict[str, tuple[str, tuple[str, ...]]]()
+    cameras, out = survey.cameras_by_id, dict[str, tuple[str, tuple[str, ...]]]()
     stands_for: dict[str, str] = {}
     for camera in survey.cameras:
         sharing = camera.lens.shared

@@ -272,10 +272,8 @@ class FrameTree:
 
     def __init__(self, survey: Survey, unknowns: Unknowns) -> None:
         self.unknowns = unknowns
-        self.cameras = {c.camera_id: c for c in survey.cameras}
-        self.stations = {s.station_id: s for s in survey.stations}
-        self.tables = {t.table_id: t for t in survey.tables}
-        self.targets = {t.target_id: t for t in survey.targets}
+        self.cameras, self.stations = survey.cameras_by_id, survey.stations_by_id
+        self.tables, self.targets = survey.tables_by_id, survey.targets_by_id
         self.on_table = {(r.table_id, r.epoch_id) for r in survey.table_readings}
         still = {s.station_id for s in survey.stations if s.motion == "fixed"}
         self._still_cameras = {c.camera_id for c in survey.cameras if c.station_id in still}

@@ -58,7 +58,6 @@ class GraphBuilder:
         self.frames = FrameTree(survey, self.unknowns)
         self.point_ids = [p.point_id for p in survey.points]
         self.known_ids = set(self.point_ids)
-        self.targets = {t.target_id: t for t in survey.targets}
         self.others: list[ObservationFactor] = []
         self.vector_starts: dict[ParameterName, FloatArray] = {}
         self.simple: tuple[IntArray, ...] = ()
@@ -225,7 +224,7 @@ class GraphBuilder:
         pose = ChainPose(self.unknowns, state, chain)
         if ref.point_id is None or ref.frame is None:
             return Position(pose, np.zeros(3))
-        target = self.targets[ref.frame.frame_id]
+        target = self.survey.targets_by_id[ref.frame.frame_id]
         if ref.point_id not in target.point_ids:
             raise SurveyError(f"target {target.target_id!r} has no point {ref.point_id!r}")
         i = target.point_ids.index(ref.point_id)

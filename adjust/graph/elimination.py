@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TypeVar
 
 import gtsam
@@ -54,13 +55,21 @@ def pose_cliques(
     alone: poses that something else tells of. last: those that are eliminated last. The order is COLAMD's or, in large
     networks, that of METIS (nested dissection; Karypis and Kumar 1998): the one that is less work.
     """
+    return _pose_cliques(tuple(alone), a.tobytes(), b.tobytes(), tuple(last), _LARGE)
+
+
+@lru_cache(4)  # a search solves the same network many times over
+def _pose_cliques(
+    alone: tuple[int, ...], ends_a: bytes, ends_b: bytes, last: tuple[int, ...], large: int
+) -> tuple[IntArray, CliquePattern]:
+    a, b = (np.frombuffer(ends, dtype=np.int64) for ends in (ends_a, ends_b))
     symbolic = gtsam.SymbolicFactorGraph()
     for key in alone:
         symbolic.push_factor(key)
     for ends in zip(b.tolist(), a.tolist(), strict=True):
         symbolic.push_factor(*(k for k in ends if k >= 0))
     orders = [gtsam.Ordering.ColamdConstrainedLastSymbolicFactorGraph(symbolic, list(last))]
-    if orders[0].size() > _LARGE:
+    if orders[0].size() > large:
         orders.append(gtsam.Ordering.MetisSymbolicFactorGraph(symbolic))
     found = list[tuple[IntArray, CliquePattern]]()
     for order in orders:

@@ -291,7 +291,7 @@ def _forward_rays(model: LensModel, values: FloatArray, constants: FloatArray, u
         runs = split_blocks(np.arange(len(uv) + 1))
         run_split(kernels.tangents_of, runs, kernels.Lens(model.kind, lens, constants), uv, _NEWTON, tangents, found)
         if np.isfinite(profile.limit):
-            found &= np.hypot(tangents[:, 0], tangents[:, 1]) * scale <= profile.limit * most
+            found &= np.einsum("ij,ij->i", tangents, tangents) <= (profile.limit * most / scale) ** 2
         return found
 
     tangents = np.ascontiguousarray(distorted / scale)

@@ -10,7 +10,7 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.model.errors import Explanation
-from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, Survey
+from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, Survey, VectorParameter
 
 # ("lens", camera) ("station_from_camera", camera) ("world_from_station", station[, epoch])
 # ("mount_from_station", station) ("world_from_table", table) ("table_geometry", table) ("table_angles", table, epoch)
@@ -47,6 +47,16 @@ def adjusted_pose(
         value = estimates[name].value
         return value if isinstance(value, Pose3) else None
     return Pose3() if parameter.value is None and parameter.treatment == "held" else parameter.value
+
+
+def adjusted_numbers(
+    estimates: Mapping[ParameterName, Estimate], name: ParameterName, parameter: VectorParameter
+) -> dict[str, float]:
+    """The components by name: those that are unknowns as estimated, the others as they are given."""
+    found = estimates.get(name)
+    if found is None or isinstance(found.value, Pose3):
+        return parameter.by_name
+    return parameter.by_name | dict(zip(found.components, map(float, found.value), strict=True))
 
 
 @dataclass(frozen=True, eq=False)

@@ -97,6 +97,11 @@ class VectorParameter:
     prior: VectorPrior | None = None
     ties: tuple[Tie, ...] = ()
 
+    @property
+    def by_name(self) -> dict[str, float]:
+        """The values by their names."""
+        return dict(zip(self.names, map(float, self.values), strict=True))
+
 
 @dataclass(frozen=True, eq=False)
 class LensDrift:
@@ -439,6 +444,26 @@ class Survey:
     def n_others_used(self) -> int:
         """How many of them are in use."""
         return sum(o.used for kind in self.others.values() for o in kind)
+
+    @cached_property
+    def cameras_by_id(self) -> Mapping[str, Camera]:
+        """Its cameras."""
+        return {c.camera_id: c for c in self.cameras}
+
+    @cached_property
+    def stations_by_id(self) -> Mapping[str, Station]:
+        """Its stations."""
+        return {s.station_id: s for s in self.stations}
+
+    @cached_property
+    def tables_by_id(self) -> Mapping[str, Table]:
+        """Its tables."""
+        return {t.table_id: t for t in self.tables}
+
+    @cached_property
+    def targets_by_id(self) -> Mapping[str, Target]:
+        """Its targets."""
+        return {t.target_id: t for t in self.targets}
 
     @cached_property
     def is_pose_network(self) -> bool:

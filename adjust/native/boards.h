@@ -64,15 +64,17 @@ inline bool follows(In<float, 2> image, const double *corner, const double *plac
 inline void squares_follow(In<float, 2> image, In<double, 2> corners, In<double, 2> places, In<double, 3> edges, double step, Out<bool, 1> follow) {
     for (int64_t i = 0; i < corners.n[0]; ++i) follow.data[i] = follows(image, &corners(i, 0), &places(i, 0), &edges(i, 0, 0), step);
 }
-// Whether, on any of the four sides of a grid, more than a share of the places of a next row follow it. The places are
-// those of a parabola through the last corners: near enough for squares, not for corners.
-inline bool may_go_on(In<float, 2> image, Grid grid, double step, double share) {
+// Whether, on each of the four sides of a grid, more than a share of the places of a next row follow it: before the first
+// row, behind the last column, the last row, before the first column. The places are those of a parabola through the last
+// corners: near enough for squares, not for corners.
+inline void may_go_on(In<float, 2> image, Grid grid, double step, double share, Out<bool, 1> sides) {
     const int64_t rows = grid.n[0], columns = grid.n[1];
-    if (rows < 3 || columns < 3) return true;
     for (int side = 0; side < 4; ++side) {
-        const int64_t n = side < 2 ? columns : rows;
+        sides.data[side] = rows < 3 || columns < 3;
+        if (sides[side]) continue;
+        const int64_t n = side % 2 ? rows : columns;
         const auto corner = [&](int64_t k, int64_t j) {
-            return side == 0 ? &grid(k, j, 0) : side == 1 ? &grid(rows - 1 - k, j, 0) : side == 2 ? &grid(j, k, 0) : &grid(j, columns - 1 - k, 0);
+            return side == 0 ? &grid(k, j, 0) : side == 1 ? &grid(j, columns - 1 - k, 0) : side == 2 ? &grid(rows - 1 - k, j, 0) : &grid(j, k, 0);
         };
         int64_t seen = 0;
         for (int64_t j = 0; j < n; ++j) {
@@ -84,9 +86,8 @@ inline bool may_go_on(In<float, 2> image, Grid grid, double step, double share) 
             }
             seen += follows(image, corner(0, j), place, edges, step);
         }
-        if (double(seen) > share * double(n)) return true;
+        sides.data[side] = double(seen) > share * double(n);
     }
-    return false;
 }
 
 // Second differences (rows, columns) of a grid, the larger of both ways, in squares; corners that are no number count for

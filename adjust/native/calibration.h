@@ -165,7 +165,7 @@ inline void fit_lens(int64_t kind, Out<double, 1> values, Vector constants, In<d
     const int64_t N = x.n[0], B = c.views(), n_values = values.n[0];
     const int free = c.n_free();
     double *weights = work.data, *room = weights + N, *next = room + N, *trial = next + N, *blocks = trial + 16 * B, *solved = blocks + 6 * B * c.row();
-    double sum[MAX_ROW][MAX_ROW], left[MAX_ROW][MAX_ROW], inverse[MAX_ROW][MAX_ROW], lens[MAX_LENS], step[MAX_LENS], damping = 1e-4;
+    double sum[MAX_ROW][MAX_ROW], left[MAX_ROW][MAX_ROW], inverse[MAX_ROW][MAX_ROW], lens[MAX_LENS], step[MAX_LENS], damping = 1e-6;
     c.squares(values.data, poses.data, squares.data);
     for (int64_t n = 0; n <= iterations; ++n) {
         huber(squares.data, N, weights, room);
@@ -196,7 +196,7 @@ inline void fit_lens(int64_t kind, Out<double, 1> values, Vector constants, In<d
             std::memcpy(squares.data, next, sizeof(double) * N);
             break;
         }
-        if (n == iterations || gain < 1e-6 * cost) break;
+        if (n == iterations || gain < 1e-4 * cost) break;
     }
     const bool whole = c.reduced(blocks, sum, 0.0, solved, left) && inverted(left, free, 1e-15, inverse);
     for (int i = 0; i < free; ++i)

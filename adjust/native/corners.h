@@ -20,6 +20,7 @@ template <class S> [[gnu::always_inline]] inline void normal(S x, S &p, S &g) {
     const S far = all<S>(37.0), z = where(magnitude(x) < far, magnitude(x), far), t = 1.0 / (1.0 + 0.32 * z);
     g = 0.3989422804014327 * exponential(-0.5 * z * z);
     S ratio = all<S>(c[0]);
+#pragma GCC unroll 10
     for (int i = 1; i < 11; ++i) ratio = ratio * t + c[i];
     p = where(x > 0.0, 1.0 - g * ratio, g * ratio);
 }
@@ -100,7 +101,8 @@ struct Collected {
 // first: the others need no integral (``Wedge``). shape: radius of the disc, half width of the strips, length of strip 1,
 // length of strip 2, in px.
 inline int corner_window(In<float, 2> image, int64_t u0, int64_t v0, const double *p, const double *shape, bool crossing, Collected &out) {
-    static thread_local Collected far;
+    static thread_local Collected room;
+    Collected &far = room;  // where it is is asked for once, not for every pixel
     const double radius = shape[0], width = shape[1], c[2] = {std::cos(p[2]), std::cos(p[3])}, s[2] = {std::sin(p[2]), std::sin(p[3])};
     const double extent = larger(radius, larger(shape[2], shape[3]) + width), bent = FAR * std::exp(p[6]);
     if (!(magnitude(extent) < LARGEST_WINDOW)) return -1;
@@ -114,7 +116,7 @@ inline int corner_window(In<float, 2> image, int64_t u0, int64_t v0, const doubl
         for (int i = from; i <= to; ++i) {
             const double dx = i - p[0], across[2] = {c[0] * dy - s[0] * dx, c[1] * dy - s[1] * dx};
             bool inside = disc && magnitude(dx) <= half;
-            for (int a = 0; a < 2 && !inside; ++a) {
+            for (int a = 0; a < 2 && !inside && strips; ++a) {
                 const double along = c[a] * dx + s[a] * dy;
                 inside = magnitude(across[a]) <= width && (crossing ? -shape[2 + a] : -width) <= along && along <= shape[2 + a];
             }
@@ -195,18 +197,8 @@ inline FittedCorner fit_corner(In<float, 2> image, const double *start, const do
     o.status = magnitude(o.p[0] - start[0]) + magnitude(o.p[1] - start[1]) > max_shift ? AWAY : GOOD;
     return o;
 }
-// Every corner (``fit_corner``): p (n, 9); cov (n, 2, 2) of u, v; pixels, rms, status (n,).
-inline void fit_corners(In<float, 2> image, In<double, 2> start, In<double, 2> angles, Vector blur, In<double, 2> shapes, int64_t crossing,
-                        double max_shift, double tolerance, int64_t enough, Out<double, 2> out, Out<double, 3> cov,
-                        Out<int64_t, 1> pixels, Out<double, 1> rms, Out<int64_t, 1> status) {
-    for (int64_t c = 0; c < start.n[0]; ++c) {
-        const FittedCorner o = fit_corner(image, &start(c, 0), &angles(c, 0), blur[c], &shapes(c, 0), crossing, max_shift, tolerance, enough);
-        std::memcpy(&out(c, 0), o.p, sizeof o.p), std::memcpy(&cov(c, 0, 0), o.cov, sizeof o.cov);
-        pixels.data[c] = o.n, rms.data[c] = o.rms, status.data[c] = o.status;
-    }
-}
 
-constexpr double ROUGH_PX = 1e-2, FINE_PX = 2e-5;  // where the first and the second fit of a corner may stop
+constexpr double ROUGH_PX = 1e-2, FINE_PX = 1e-3;  // steps after which the first and the second fit of a corner may stop
 constexpr double NEAR_PX = 5.0;  // from a crossing, as far as the first fit looks where the edges' blur ends before that
 
 // The window of a corner: it keeps clear of the neighbouring edges, blurred as those are. edges: both, px, to where they

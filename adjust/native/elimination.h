@@ -112,8 +112,9 @@ struct Cliques {
     Out<double, 1> data;
 
     int64_t width(int64_t c) const { return POSE * (key_ptr[c + 1] - key_ptr[c]); }
-    int64_t place(int64_t c, int64_t key) const {
-        int64_t i = key_ptr[c];
+    int64_t place(int64_t c, int64_t key) const {  // what is eliminated in a clique is numbered one after the other
+        if (home[key] == c) return POSE * (key - keys[key_ptr[c]]);
+        int64_t i = key_ptr[c] + n_front[c];
         while (keys[i] != key) ++i;
         return POSE * (i - key_ptr[c]);
     }
@@ -125,9 +126,13 @@ struct Cliques {
 
 // to += A'B, or g -= A' e, of six rows.
 inline void add_product(const double *A, const double *B, double *to, int64_t ld) {
-    for (int64_t i = 0; i < POSE; ++i)
+    for (int64_t i = 0; i < POSE; ++i) {
+        double sum[POSE] = {};
         for (int64_t k = 0; k < POSE; ++k)
-            for (int64_t j = 0; j < POSE; ++j) to[i * ld + j] += A[k * POSE + i] * B[k * POSE + j];
+#pragma GCC unroll 6
+            for (int64_t j = 0; j < POSE; ++j) sum[j] += A[k * POSE + i] * B[k * POSE + j];
+        for (int64_t j = 0; j < POSE; ++j) to[i * ld + j] += sum[j];
+    }
 }
 inline void add_gradient(const double *A, const double *e, double *g) {
     for (int64_t k = 0; k < POSE; ++k)
@@ -182,7 +187,6 @@ inline int64_t eliminate(const Cliques &t, Ints rank, Ints first, Ints second, I
             std::memcpy(F + i * ld, A + i * n, sizeof(double) * n);
             std::memset(F + i * ld + n, 0, sizeof(double) * (ld - n));
         }
-        // nodes eliminated in a clique are numbered one after the other
         const int64_t lost = factor_rows(F, nf, n, ld, diagonal.data + POSE * t.keys[begin]);
         if (lost >= 0) return t.keys[begin] + lost / POSE;
         for (int64_t i = 0; i < nf; ++i) {
@@ -198,9 +202,11 @@ inline int64_t eliminate(const Cliques &t, Ints rank, Ints first, Ints second, I
                 for (int64_t k = t.key_ptr[h]; k < t.key_ptr[h + 1]; ++k) where.data[t.keys[k]] = POSE * (k - t.key_ptr[h]);
             last = h;
             double *to = t.data.data + t.at[h] + where[t.keys[i]] * wide;
-            for (int64_t j = i, y = x; j < t.key_ptr[c + 1]; ++j, y += POSE)
-                for (int64_t r = 0; r < POSE; ++r)
-                    for (int64_t s = 0; s < POSE; ++s) to[r * wide + where[t.keys[j]] + s] += U[(x + r) * ldu + y + s];
+            for (int64_t j = i, some; j < t.key_ptr[c + 1]; j += some) {  // as many at once as stand side by side there
+                const int64_t place = where[t.keys[j]], y = x + POSE * (j - i);
+                for (some = 1; j + some < t.key_ptr[c + 1] && where[t.keys[j + some]] == place + POSE * some;) ++some;
+                for (int64_t r = 0; r < POSE; ++r) add_multiple(1.0, U + (x + r) * ldu + y, to + r * wide + place, POSE * some);
+            }
         }
     }
     return -1;

@@ -13,7 +13,7 @@ template <int N> struct Normals {  // of N parameters: matrix, right side, sum o
 // (H + damping diag(H)) X = B solved in place for the leading n rows, B (n, K), scaled to a unit diagonal; false where the
 // matrix is not positive definite.
 template <int N, int K> inline bool scaled_solve(const double (&H)[N][N], int n, double damping, double (&B)[N][K]) {
-    double d[N], A[N][N];
+    double d[N], A[N][N], inverse[N];  // of the factor's diagonal
     for (int i = 0; i < n; ++i) d[i] = H[i][i] > 0.0 ? 1.0 / root(H[i][i]) : 0.0;
     for (int i = 0; i < n; ++i) {
         for (int j = 0; j <= i; ++j) A[i][j] = H[i][j] * d[i] * d[j];
@@ -25,16 +25,17 @@ template <int N, int K> inline bool scaled_solve(const double (&H)[N][N], int n,
             double total = A[i][j];
             for (int k = 0; k < j; ++k) total -= A[i][k] * A[j][k];
             if (i == j && !(total > 1e-14)) return false;
-            A[i][j] = i == j ? root(total) : total / A[j][j];
+            if (i == j) inverse[i] = 1.0 / root(total);
+            else A[i][j] = total * inverse[j];
         }
     for (int c = 0; c < K; ++c) {
         for (int i = 0; i < n; ++i) {
             for (int k = 0; k < i; ++k) B[i][c] -= A[i][k] * B[k][c];
-            B[i][c] /= A[i][i];
+            B[i][c] *= inverse[i];
         }
         for (int i = n - 1; i >= 0; --i) {
             for (int k = i + 1; k < n; ++k) B[i][c] -= A[k][i] * B[k][c];
-            B[i][c] = B[i][c] / A[i][i];
+            B[i][c] *= inverse[i];
         }
     }
     for (int i = 0; i < n; ++i)

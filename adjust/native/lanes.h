@@ -66,14 +66,15 @@ inline V exponential(V x) {
     const V shifted = x * 1.4426950408889634 + shift, n = shifted - shift;
     const V r = (x - n * 0x1.62e42fefa3800p-1) - n * 0x1.ef35793c76730p-45;  // log(2) in two parts (Cody and Waite 1980)
     V sum = all<V>(c[0]);
+#pragma GCC unroll 12
     for (int i = 1; i < 13; ++i) sum = sum * r + c[i];
     return sum * V((Bits(shifted) << 52) + (int64_t(1023) << 52));
 }
 inline bool any(bool mask) { return mask; }
-template <class M> inline bool any(M mask) {
-    bool found = false;
-    for (int i = 0; i < W; ++i) found |= mask[i] != 0;
-    return found;
+template <int H = W / 2> [[gnu::always_inline]] inline bool any_lane(V found) {
+    if constexpr (H == 0) return found[0] > 0.0;
+    else return any_lane<H / 2>(folded<H>(found, found, std::make_integer_sequence<int, W>{}));
 }
+template <class M> [[gnu::always_inline]] inline bool any(M mask) { return any_lane(mask ? all<V>(1.0) : V{}); }
 
 }  // namespace

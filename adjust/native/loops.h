@@ -6,9 +6,32 @@ namespace {
 
 // A network by compressed adjacency, and room for the shortest ways from one station; depth -1: no way led there yet.
 struct Walks {
-    explicit Walks(Reader &r) : ptr(r), neighbour(r), pair(r), depth(r), parent(r), by(r), branch(r), order(r) {}
+    explicit Walks(Reader &r) : ptr(r), neighbour(r), pair(r), depth(r), parent(r), by(r), branch(r), order(r), sum(r) {}
     Ints ptr, neighbour, pair;
-    Out<int64_t, 1> depth, parent, by, branch, order;
+    Out<int64_t, 1> depth, parent, by, branch, order, sum;
+
+    // Shortest ways from a root to depth `half`; closed(v, e, w, length, sum of labels) of each pair e that closes a loop with two.
+    template <class Closed> void from(int64_t root, const int64_t &half, const Out<int64_t, 1> &label, int64_t &work, Closed closed) const {
+        int64_t reached = 1;
+        order.data[0] = branch.data[root] = root, depth.data[root] = sum.data[root] = 0;
+        for (int64_t k = 0; k < reached && depth[order[k]] <= half; ++k) {
+            const int64_t v = order[k], here = depth[v];
+            work += ptr[v + 1] - ptr[v];
+            for (int64_t i = ptr[v]; i < ptr[v + 1]; ++i) {
+                const int64_t w = neighbour[i], e = pair[i], there = depth[w];
+                if (there < 0) {
+                    if (here >= half) continue;
+                    depth.data[w] = here + 1, parent.data[w] = v, by.data[w] = e, branch.data[w] = here ? branch[v] : w;
+                    sum.data[w] = sum[v] ^ label[e];
+                    order.data[reached++] = w;
+                } else if (branch[v] != branch[w] && (here > there || (here == there && v < w)) && e != by[v] && (there == 0 || e != by[w])) {
+                    // each closing pair once: from its deeper end, or from the lower number among equals
+                    if (sum[v] ^ sum[w] ^ label[e]) closed(v, e, w, here + there + 1);
+                }
+            }
+        }
+        while (reached) depth.data[order[--reached]] = -1;
+    }
 
     // Pairs of "way to v, pair e, way back from w", in the order of the walk.
     void write(int64_t v, int64_t e, int64_t w, int64_t *out) const {
@@ -50,38 +73,55 @@ struct Sets {
     }
 };
 
-// Horton's loops of one length at every root, the independent ones into found (m, length), the stations at which they
-// begin into start (m,). work: elementary steps so far; no root is begun once they reach the budget. Returns how many.
-inline int64_t horton_loops(const Walks &walks, const Sets &sets, Ints roots, int64_t budget, Out<int64_t, 1> work, Out<int64_t, 2> found,
-                            Out<int64_t, 1> start) {
-    const int64_t most = found.n[0], length = found.n[1], half = length / 2;
-    const auto &[ptr, neighbour, pair, depth, parent, by, branch, order] = walks;
-    int64_t n = 0;
-    for (int64_t r = 0; r < roots.n[0] && n < most && work[0] < budget; ++r) {
-        const int64_t root = roots[r];
-        int64_t reached = 1;
-        order.data[0] = branch.data[root] = root, depth.data[root] = 0;
-        for (int64_t k = 0; k < reached; ++k) {
-            const int64_t v = order[k], here = depth[v];
-            work.data[0] += ptr[v + 1] - ptr[v];
-            for (int64_t i = ptr[v]; i < ptr[v + 1]; ++i) {
-                const int64_t w = neighbour[i], e = pair[i], there = depth[w];
-                if (there < 0) {
-                    if (here == half) continue;
-                    depth.data[w] = here + 1, parent.data[w] = v, by.data[w] = e, branch.data[w] = here ? branch[v] : w;
-                    order.data[reached++] = w;
-                } else if (n < most && here + there + 1 == length && branch[v] != branch[w] && (here > there || (here == there && v < w)) &&
-                           e != by[v] && (there == 0 || e != by[w])) {
-                    // each closing pair once: from its deeper end, or from the lower number among equals
-                    int64_t *loop = found.data + n * length;
-                    walks.write(v, e, w, loop);
-                    if (sets.add(loop, length, work.data[0])) start.data[n++] = root;
-                }
-            }
-        }
-        while (reached) depth.data[order[--reached]] = -1;
+// Labels (L,) of the chords that lead no set, to those that do: so that the sum over each set is zero, as over all loops found.
+inline void label_chords(In<int64_t, 2> rows, In<bool, 1> kept, Out<int64_t, 1> label) {
+    for (int64_t lead = 0; lead < kept.n[0]; ++lead) {
+        if (!kept[lead]) continue;
+        label.data[lead] = 0;
+        int64_t sum = 0;
+        for (int64_t k = 0; 64 * k <= lead; ++k)
+            for (uint64_t bits = uint64_t(rows(lead, k)); bits; bits &= bits - 1) sum ^= label[64 * k + std::countr_zero(bits)];
+        label.data[lead] = sum;
     }
+}
+
+// Horton's loops of one length at every root, the independent ones into found (m, length), the stations at which they
+// begin into start (m,). A loop whose labels cancel depends on those found. free: of few that are missing the chord of each bit,
+// else none; the labels then follow what is found, and need no elimination. work: elementary steps so far; no root is begun
+// once they reach the budget. Returns how many.
+inline int64_t horton_loops(const Walks &walks, const Sets &sets, Out<int64_t, 1> label, Ints free, Ints roots, int64_t budget,
+                            Out<int64_t, 1> work, Out<int64_t, 2> found, Out<int64_t, 1> start) {
+    const int64_t most = found.n[0], length = found.n[1], half = length / 2;
+    int64_t n = 0;
+    for (int64_t r = 0; r < roots.n[0] && n < most && work[0] < budget; ++r)
+        walks.from(roots[r], half, label, work.data[0], [&](int64_t v, int64_t e, int64_t w, int64_t closed) {
+            if (n == most || closed != length) return;
+            int64_t *loop = found.data + n * length;
+            walks.write(v, e, w, loop);
+            if (!free.n[0]) {
+                if (!sets.add(loop, length, work.data[0])) return;
+            } else {
+                const int64_t sum = walks.sum[v] ^ walks.sum[w] ^ label[e], bit = sum & -sum;
+                for (const Out<int64_t, 1> &x : {label, walks.sum})
+                    for (int64_t i = 0; i < x.n[0]; ++i) x.data[i] ^= x.data[i] & bit ? sum : 0;
+                sets.kept.data[free[std::countr_zero(uint64_t(bit))]] = true;
+                work.data[0] += label.n[0];
+            }
+            start.data[n++] = roots[r];
+        });
     return n;
+}
+
+// The length of the shortest loop whose labels do not cancel, among those that meet the roots; 0 where the budget does not last.
+inline int64_t shortest_loop(const Walks &walks, Out<int64_t, 1> label, Ints roots, int64_t budget, Out<int64_t, 1> work) {
+    int64_t shortest = walks.depth.n[0] + 1, half = shortest;
+    for (int64_t r = 0; r < roots.n[0]; ++r) {
+        if (work[0] >= budget) return 0;
+        walks.from(roots[r], half, label, work.data[0], [&](int64_t, int64_t, int64_t, int64_t closed) {
+            shortest = smaller(shortest, closed), half = (shortest - 1) / 2;
+        });
+    }
+    return shortest;
 }
 
 }  // namespace

@@ -196,13 +196,5 @@ inline int64_t three_point_problem(In<double, 2> o, In<double, 2> d, In<double, 
     std::memcpy(R.data, turns, sizeof(Mat) * n), std::memcpy(t.data, shifts, sizeof(Vec) * n);
     return n;
 }
-inline int64_t roots_of_octic(Vector c, double lo, double hi, Out<double, 1> out) {
-    Polynomial<9> p;
-    double found[18];
-    std::memcpy(p.data(), c.data, sizeof p);
-    const int n = real_roots<9>(p, lo, hi, found);
-    std::memcpy(out.data, found, sizeof(double) * n);
-    return n;
-}
 
 }  // namespace

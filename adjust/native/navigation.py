@@ -27,7 +27,6 @@ _gauss_newton = Function(
     "M[k,r] C[6,6] gain[6,k] numbers[4] work[*]",
 )
 _some_pose = Function("some_pose", f"{_SYSTEM} start[4,4] {_SPOTS} pose[4,4] work[*]")
-_real_roots = Function("real_roots", "coefficients[9] lo hi out[18]")
 _three_point_poses = Function("three_point_poses", "o[3,3] d[3,3] x[3,3] nearest farthest R[8,3,3] t[8,3]")
 _search = Function(
     "search",
@@ -138,12 +137,6 @@ def some_pose(system: SystemArrays, start: FloatArray, spots: SpotArrays, pose: 
     """Fill pose (4, 4) with one of the many that explain too few spots, nearest to a start in a way (damped steps)."""
     n = 2 * len(spots.camera)
     _some_pose(*system, start, *spots, pose, np.empty(n * (n + 14 + system.F.shape[1])))
-
-
-def real_roots(coefficients: FloatArray, lo: float, hi: float) -> FloatArray:
-    """Roots of a polynomial of degree 8 (9 coefficients, lowest first) between lo and hi, and near-touching extrema."""
-    out = np.empty(18)
-    return out[: _real_roots(coefficients, lo, hi, out)]
 
 
 def three_point_poses(

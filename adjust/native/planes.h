@@ -32,7 +32,10 @@ struct Unit {
     Unit(const double *p, int64_t n) {
         for (int64_t i = 0; i < 2 * n; ++i) mean[i % 2] += p[i] / double(n);
         double total = 0.0;
-        for (int64_t i = 0; i < n; ++i) total += std::hypot(p[2 * i] - mean[0], p[2 * i + 1] - mean[1]);
+        for (int64_t i = 0; i < n; ++i) {
+            const double du = p[2 * i] - mean[0], dv = p[2 * i + 1] - mean[1];
+            total += root(du * du + dv * dv);
+        }
         scale = total > 0.0 ? std::sqrt(2.0) * double(n) / total : 1.0;
     }
     void at(const double *p, Vec &out) const { out[0] = scale * (p[0] - mean[0]), out[1] = scale * (p[1] - mean[1]), out[2] = 1.0; }

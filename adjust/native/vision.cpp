@@ -7,7 +7,7 @@
 
 extern "C" __attribute__((visibility("default"))) const Entry *vision() {
     static constexpr Entry table[] = {
-        entry<fit_corners>("fit_corners"), entry<refine_corners>("refine_corners"), entry<corner_rows>("corner_rows"), entry<fit_spots>("fit_spots"),
+        entry<refine_corners>("refine_corners"), entry<corner_rows>("corner_rows"), entry<fit_spots>("fit_spots"),
         entry<spot_profile>("spot_rows_of_profile"), entry<pixel_corner_rays>("pixel_corner_rays"),
         entry<draw_facets>("draw_facets"), entry<spread_and_sum>("spread_and_sum"), entry<of_neighbours>("of_neighbours"),
         entry<first_is_dark>("first_is_dark"), entry<squares_follow>("squares_follow"), entry<may_go_on>("may_go_on"),

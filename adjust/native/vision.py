@@ -21,11 +21,6 @@ ENOUGH_FOR_SLOPES = 45
 GAUSSIAN, DISC = 0, 1
 _LANES, _BAND = 8, 8  # of the widest vectors; rows that spread_and_sum makes together
 
-_fit_corners = Function(
-    "fit_corners",
-    "image[*,*] start[n,2] angles[n,2] blur[n] shapes[n,4] crossing max_shift tolerance enough "
-    "p[n,9] cov[n,2,2] pixels[n] rms[n] status[n]",
-)
 _refine_corners = Function(
     "refine_corners",
     "image[*,*] start[n,2] edges[n,2,2] free[n] crossing enough floor blurs[k] displaced[k] "
@@ -48,7 +43,7 @@ _draw_facets = Function(
 _of_neighbours = Function("of_neighbours", "image[*,*] grid[r,c,2] contrast")
 _first_is_dark = Function("first_is_dark", "image[*,*] grid[r,c,2]")
 _squares_follow = Function("squares_follow", "image[*,*] corners[n,2] places[n,2] edges[n,2,2] step follow[n]")
-_may_go_on = Function("may_go_on", "image[*,*] grid[r,c,2] step share")
+_may_go_on = Function("may_go_on", "image[*,*] grid[r,c,2] step share sides[4]")
 _off_grid = Function("off_grid", "grid[r,c,2] off[r,c] work[*]")
 _find_grid = Function("find_grid", "image[h,w] response[h,w] grid[r,c,2]")
 MOST_CROSSINGS = 600  # that are counted, as in grids.h
@@ -70,27 +65,6 @@ class Facets(NamedTuple):
     x_edges: FloatArray
     y_edges: FloatArray
     cells: FloatArray
-
-
-def fit_corners(
-    image: Gray, start: FloatArray, angles: FloatArray, blur: FloatArray, shapes: FloatArray, crossing: bool,
-    max_shift: float, tolerance: float,
-) -> tuple[FloatArray, FloatArray, IntArray, FloatArray, IntArray]:  # fmt: skip
-    """Fit two blurred edges to every corner.
-
-    start: (n, 2) px. angles: (n, 2) of the two edges, the second clockwise (in the image) of the first. blur: (n,) px.
-    shapes: (n, 4) px, radius of the disc around the corner, half width of the strips along its edges, their lengths.
-    crossing: the edges go on behind the corner (four quadrants); otherwise they end there. tolerance: px, where the fit
-    may stop. Returns p (n, 9) with absolute u, v; covariance (n, 2, 2) of u, v; number of pixels; residual rms; status
-    (n,): 0 good, 1 at the border, 2 too few pixels, 3 no convergence, 4 more than ``max_shift`` px from the start.
-    """
-    n = len(start)
-    p, cov, rms = np.zeros((n, CORNER_PARAMETERS)), np.zeros((n, 2, 2)), np.zeros(n)
-    pixels, status = np.zeros(n, np.int64), np.zeros(n, np.int64)
-    given = (np.ascontiguousarray(a, dtype=np.float64) for a in (start, angles, blur, shapes))
-    _fit_corners(np.ascontiguousarray(image), *given, crossing, max_shift, tolerance, ENOUGH_FOR_SLOPES, p, cov,
-                 pixels, rms, status)  # fmt: skip
-    return p, cov, pixels, rms, status
 
 
 def refine_corners(
@@ -169,12 +143,15 @@ def squares_follow(image: Gray, corners: FloatArray, places: FloatArray, edges: 
     return follow
 
 
-def may_go_on(image: Gray, grid: FloatArray, step: float, share: float) -> bool:
-    """Whether more than a share of a next row's squares follow a grid (rows, columns, 2) px on any of its four sides.
+def may_go_on(image: Gray, grid: FloatArray, step: float, share: float) -> BoolArray:
+    """Whether more than a share of a next row's squares follow a grid (rows, columns, 2) px on each side (4,).
 
-    By places of a parabola through the last corners: near enough for squares, not for corners. True below 3 x 3.
+    Side k is that of the first row after k quarter turns (``numpy.rot90``). By places of a parabola through the last
+    corners: near enough for squares, not for corners. True below 3 x 3.
     """
-    return bool(_may_go_on(image, np.ascontiguousarray(grid), step, share))
+    sides = np.empty(4, bool)
+    _may_go_on(image, np.ascontiguousarray(grid), step, share, sides)
+    return sides
 
 
 def off_grid(grid: FloatArray) -> FloatArray:

@@ -67,6 +67,21 @@ class PairArrays:
         return out
 
     @cached_property
+    def doubtful(self) -> BoolArray:
+        """Which pairs (E,) have a covariance that is not finite, symmetric, positive definite, by its correlations."""
+        wrong = np.zeros(len(self.used), dtype=np.bool_)
+        for rows, k in ((self.is_pose, 6), (~self.is_pose, 3)):
+            C = self.cov[rows][:, :k, :k]
+            scale = np.sqrt(np.maximum(np.diagonal(C, axis1=1, axis2=2), 1e-300))
+            correlation = C / scale[:, :, None] / scale[:, None, :]
+            finite = np.asarray(np.isfinite(correlation).all(axis=(1, 2)), dtype=np.bool_)
+            whole = np.where(finite[:, None, None], correlation, -1.0)
+            fine = np.asarray(np.linalg.eigvalsh(whole).min(axis=1, initial=1.0) > 1e-12)
+            fine = fine & (np.abs(whole - np.swapaxes(whole, 1, 2)).max(axis=(1, 2), initial=0.0) < 1e-6)
+            wrong[np.flatnonzero(rows)[~fine]] = True
+        return wrong
+
+    @cached_property
     def shifts(self) -> FloatArray:
         """Translations (E, 3), zero where none was measured."""
         return np.nan_to_num(self.translations)
@@ -92,12 +107,30 @@ class PairArrays:
 
 
 def pair_arrays(pairs: Sequence[Pair]) -> PairArrays:
-    """Pairs as arrays, which are not to be changed: those of the same pairs are made once."""
-    return _arrays(tuple(pairs))
+    """Pairs as arrays, which are not to be changed: those of the same measurements are made once, used or not."""
+    found, used = _arrays(_Measured(tuple(pairs))), np.array([p.used for p in pairs], dtype=np.bool_)
+    return found if np.array_equal(found.used, used) else found.with_used(used)
+
+
+class _Measured:
+    """Pairs that are equal to others where these have the same measurements and covariances, by identity."""
+
+    def __init__(self, pairs: tuple[Pair, ...]) -> None:
+        self.pairs = pairs
+
+    def __hash__(self) -> int:
+        return len(self.pairs)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Measured) and len(self.pairs) == len(other.pairs) and all(
+            p is q or (p.b_from_a is q.b_from_a and p.cov is q.cov)
+            for p, q in zip(self.pairs, other.pairs, strict=True)
+        )  # fmt: skip
 
 
 @lru_cache(2)  # of a survey as it was given, and as it is solved
-def _arrays(pairs: tuple[Pair, ...]) -> PairArrays:
+def _arrays(of: _Measured) -> PairArrays:
+    pairs = of.pairs
     cov, size = np.zeros((len(pairs), 6, 6)), np.array([len(p.cov) for p in pairs], dtype=np.int64)
     cov[size == 3, 3:, 3:] = np.diag([np.inf] * 3)
     for k in (3, 6):
@@ -113,21 +146,6 @@ def _arrays(pairs: tuple[Pair, ...]) -> PairArrays:
     return PairArrays(M[:, :3, :3].copy(), M[:, :3, 3].copy(), cov, np.array([p.used for p in pairs], dtype=np.bool_))
 
 
-def doubtful(pairs: PairArrays) -> BoolArray:
-    """Which pairs (E,) have a covariance that is not finite, symmetric and positive definite, by its correlations."""
-    wrong = np.zeros(len(pairs.used), dtype=np.bool_)
-    for rows, k in ((pairs.is_pose, 6), (~pairs.is_pose, 3)):
-        C = pairs.cov[rows][:, :k, :k]
-        scale = np.sqrt(np.maximum(np.diagonal(C, axis1=1, axis2=2), 1e-300))
-        correlation = C / scale[:, :, None] / scale[:, None, :]
-        finite = np.asarray(np.isfinite(correlation).all(axis=(1, 2)), dtype=np.bool_)
-        whole = np.where(finite[:, None, None], correlation, -1.0)
-        fine = np.asarray(np.linalg.eigvalsh(whole).min(axis=1, initial=1.0) > 1e-12)
-        fine = fine & (np.abs(whole - np.swapaxes(whole, 1, 2)).max(axis=(1, 2), initial=0.0) < 1e-6)
-        wrong[np.flatnonzero(rows)[~fine]] = True
-    return wrong
-
-
 def checked_arrays(pairs: Sequence[Pair]) -> PairArrays:
     """Pairs as arrays; raises SurveyError for the first whose covariance cannot be."""
     for p in pairs:
@@ -135,7 +153,7 @@ def checked_arrays(pairs: Sequence[Pair]) -> PairArrays:
         if np.shape(p.cov) != (n, n):
             raise SurveyError(f"{_said(p)}: its covariance has shape {np.shape(p.cov)}, expected ({n}, {n})")
     found = pair_arrays(pairs)
-    wrong = np.flatnonzero(doubtful(found) | ~np.array([np.isfinite(p.cov).all() for p in pairs], dtype=np.bool_))
+    wrong = np.flatnonzero(found.doubtful | ~np.array([np.isfinite(p.cov).all() for p in pairs], dtype=np.bool_))
     if len(wrong):
         raise SurveyError(
             f"{_said(pairs[int(wrong[0])])}: its covariance is not symmetric and positive definite; give every "

@@ -7,6 +7,10 @@ Horton (1987, SIAM J. Comput. 16, 358-366): the loops "shortest way from v to x,
 all stations v and pairs (x, y) contain a minimal cycle basis; taken shortest first, those independent over GF(2) of the
 ones before are one. His proof asks of v only that it lies on the loop, so v need run through a set of stations that
 meets every loop (Mehlhorn and Michail 2009, ACM J. Exp. Algorithmics 14).
+
+Whether a loop depends on those found is told by labels of the pairs, sums over GF(2) that vanish for all of these (de
+Pina 1995; Kavitha, Mehlhorn, Michail and Paluch 2008, Algorithmica 52): random ones while many are missing, where what
+does not cancel is eliminated, and then one for each of the missing, which tell what is left to be searched as well.
 """
 
 import heapq
@@ -17,7 +21,12 @@ from itertools import pairwise
 import numpy as np
 
 from adjust.model.survey import BoolArray, IntArray
-from adjust.native.loops import horton_loops
+from adjust.native.loops import horton_loops, label_chords, shortest_loop
+
+_FEW = 63
+"""Loops that are missing, from which each has a label of its own: as many as an integer has bits."""
+_FEWER = 2
+"""How many times fewer stations must be to search from them: near ends of a search others are found, as short."""
 
 
 def adjacency(n: int, a: IntArray, b: IntArray) -> tuple[IntArray, IntArray, IntArray]:
@@ -143,25 +152,40 @@ def shortest_loops(
     elimination: the loops that the other chords close with the forest are what is missing.
     """
     n, n_loops = len(walk[0]) - 1, len(chords)
-    chord = np.full(len(walk[1]) // 2, -1, dtype=np.int64)
+    chord, led = np.full(len(walk[1]) // 2, -1, dtype=np.int64), np.zeros(n_loops, dtype=np.bool_)
     chord[chords] = np.arange(n_loops)
     words = -(-n_loops // 64)
-    depth, room = np.full(n, -1, dtype=np.int64), [np.zeros(n, dtype=np.int64) for _ in range(4)]
-    bits, rows = np.zeros(words, dtype=np.int64), np.empty((n_loops, words), dtype=np.int64)
-    sets = chord, bits, rows, np.zeros(n_loops, dtype=np.bool_)
-    roots, work = np.array(meeting_stations(*walk[:2]), dtype=np.int64), np.zeros(1, dtype=np.int64)
+    sets = chord, np.zeros(words, dtype=np.int64), np.empty((n_loops, words), dtype=np.int64), led
+    walks = *walk, np.full(n, -1, dtype=np.int64), *(np.zeros(n, dtype=np.int64) for _ in range(5))
+    every, work = np.array(meeting_stations(*walk[:2]), dtype=np.int64), np.zeros(1, dtype=np.int64)
+    drawn = np.random.default_rng(0).integers(1, 2**63 - 1, size=n_loops, dtype=np.int64)
+    label, free, length = np.zeros_like(chord), np.zeros(0, dtype=np.int64), 1
     found, start, lengths = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], [0]
-    missing = n_loops
-    for length in range(2, n + 1):
-        if not missing or work[0] >= budget:
-            break
+    while (missing := n_loops - int(led.sum())) and work[0] < budget and length <= n:
+        if not len(free):
+            if missing <= _FEW:
+                free = np.flatnonzero(~led)
+                drawn[free] = np.left_shift(1, np.arange(missing))
+            label_chords(sets, drawn)
+            label[chords] = drawn
+        roots = _through(walk, label, every)
+        length = length + 1 if roots is every else shortest_loop(walks, label, roots, budget, work)
         loops, begin = np.empty((missing, length), dtype=np.int64), np.empty(missing, dtype=np.int64)
-        more = horton_loops((*walk, depth, *room), sets, roots, budget, work, loops, begin)
+        more = horton_loops(walks, sets, (label, free), roots, budget, work, loops, begin) if length else 0
         found.append(loops[:more].ravel())
         start.append(begin[:more])
         lengths += [length] * more
-        missing -= more
-    return (np.cumsum(lengths), np.concatenate(found)), np.concatenate(start), sets[-1]
+    return (np.cumsum(lengths), np.concatenate(found)), np.concatenate(start), led
+
+
+def _through(walk: tuple[IntArray, IntArray, IntArray], label: IntArray, every: IntArray) -> IntArray:
+    """Stations that meet all loops whose labels do not cancel: those that meet every loop, or clearly fewer."""
+    ptr, others, pair = walk
+    rows = np.flatnonzero(label[pair])
+    ends, others = np.repeat(np.arange(len(ptr) - 1), np.diff(ptr))[rows], others[rows]
+    rank = len(ptr) * np.bincount(ends, minlength=len(ptr)) - np.arange(len(ptr))  # of each pair the busier end
+    few = np.unique(np.where(rank[ends] > rank[others], ends, others))
+    return few if _FEWER * len(few) < len(every) else every
 
 
 def forest_loops(a: IntArray, b: IntArray, forest: Forest, chords: IntArray) -> tuple[IntArray, IntArray, IntArray]:

@@ -7,7 +7,7 @@ import numpy as np
 from adjust.model.errors import IndeterminateError, SurveyError, listed
 from adjust.model.survey import FloatArray, PoseParameter, Survey
 from adjust.observations.pairs import pair_arrays
-from adjust.pose_network.network import PoseNetwork, check_determined, pose_network
+from adjust.pose_network.network import PoseNetwork, Topology, check_determined, network_of
 
 _BESIDE = ("distances", "coordinates", "coordinate_differences", "levels", "alignments")
 """What may be observed between stations beside their pairs: it brings no unknown of its own."""
@@ -77,15 +77,15 @@ def network_from_survey(survey: Survey, any_datum: bool = False) -> PoseNetwork:
         raise IndeterminateError(
             "the datum: no station is held or has a prior; hold a station or set the datum to inner constraints"
         )
-    return pose_network(
-        ids, [p.pair_id for p in survey.pairs],
-        [index[p.a.frame_id] for p in survey.pairs], [index[p.b.frame_id] for p in survey.pairs],
-        measured.rotations, measured.translations, np.nan_to_num(measured.cov, posinf=0.0),
+    a = np.array([index[p.a.frame_id] for p in survey.pairs], dtype=np.int64)
+    b = np.array([index[p.b.frame_id] for p in survey.pairs], dtype=np.int64)
+    return network_of(
+        Topology(tuple(ids), tuple(p.pair_id for p in survey.pairs), a, b), measured,
         held={i: _matrix(p) for i, p in given.items() if p.treatment == "held"},
         prior={i: (_matrix(p), _prior(p, ids[i])) for i, p in given.items() if p.treatment == "prior"},
         start={i: _matrix(p) for i, p in given.items() if p.treatment == "free" and p.value is not None},
         inner=[index[s] for s in survey.datum.stations or ids if s in index] if inner else None,
-        used=measured.used, survey=survey,
+        survey=survey,
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from gtsam import Pose3, Rot3
 from adjust.model.errors import IndeterminateError, SurveyError, listed
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import BoolArray, Datum, FloatArray, IntArray, PoseParameter, Station, Survey, Treatment
-from adjust.observations.pairs import PairArrays, doubtful
+from adjust.observations.pairs import PairArrays
 from adjust.pose_network.cycles import connected_parts
 from adjust.spatial.rigid import nearest_rotation
 
@@ -44,20 +44,16 @@ class Topology:
 
 @dataclass(frozen=True, eq=False)
 class PoseNetwork(Topology):
-    """N stations and E measured pairs ``b_from_a``; made by :func:`pose_network`, which checks everything.
+    """N stations and E measured pairs ``b_from_a``; made by :func:`network_of`, which checks everything.
 
-    rotations (E, 3, 3), translations (E, 3) m, nan where only the rotation was measured. cov: (E, 6, 6) in the tangent
-    of the frame on the right (a), infinite variance where nothing was measured. used: (E,), the others are predicted
-    and tested only. station_rotations (N, 3, 3), station_translations (N, 3): ``world_from_station`` of the held ones
-    and of those with a prior, start of the others, nan where nothing is known. prior_cov: (6, 6) by station position.
+    arrays: the pairs; those out of use are predicted and tested only. station_rotations (N, 3, 3), station_translations
+    (N, 3): ``world_from_station`` of the held ones and of those with a prior, start of the others, nan where nothing is
+    known. prior_cov: (6, 6) by station position.
     inner: positions of the stations that carry inner constraints (free network), empty where the datum is given.
     survey: that it is of, None where there is only the network.
     """
 
-    rotations: FloatArray
-    translations: FloatArray
-    cov: FloatArray
-    used: BoolArray
+    arrays: PairArrays
     station_rotations: FloatArray
     station_translations: FloatArray
     held: IntArray
@@ -65,10 +61,25 @@ class PoseNetwork(Topology):
     inner: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     survey: Survey | None = None
 
-    @cached_property
-    def arrays(self) -> PairArrays:
-        """The pairs alone."""
-        return PairArrays(self.rotations, self.translations, self.cov, self.used)
+    @property
+    def rotations(self) -> FloatArray:
+        """Of the pairs (E, 3, 3)."""
+        return self.arrays.rotations
+
+    @property
+    def translations(self) -> FloatArray:
+        """Of the pairs (E, 3) m, nan where only the rotation was measured."""
+        return self.arrays.translations
+
+    @property
+    def cov(self) -> FloatArray:
+        """Of the pairs (E, 6, 6), as :class:`PairArrays` has them."""
+        return self.arrays.cov
+
+    @property
+    def used(self) -> BoolArray:
+        """Which pairs (E,) are in use."""
+        return self.arrays.used
 
     @property
     def is_pose(self) -> BoolArray:
@@ -129,11 +140,10 @@ class PoseNetwork(Topology):
 
     def with_used(self, used: BoolArray) -> "PoseNetwork":
         """The same network with other pairs in use; nothing else is computed again."""
-        out = replace(self, used=np.asarray(used, dtype=np.bool_))
+        out = replace(self, arrays=self.arrays.with_used(np.asarray(used, dtype=np.bool_)))
         for name in ("rotation_only", "index_of", "as_survey"):
             if name in self.__dict__:
                 out.__dict__[name] = self.__dict__[name]
-        out.__dict__["arrays"] = self.arrays.with_used(out.used)
         return out
 
     def components(self, used: BoolArray | None = None, poses_only: bool = False) -> IntArray:
@@ -149,7 +159,7 @@ def pose_network(
     rotations: FloatArray, translations: FloatArray | None, cov: FloatArray, *,
     held: Mapping[int, FloatArray] | None = None, start: Mapping[int, FloatArray] | None = None,
     prior: Mapping[int, tuple[FloatArray, FloatArray]] | None = None,
-    inner: Sequence[int] | None = None, used: BoolArray | None = None, survey: Survey | None = None,
+    inner: Sequence[int] | None = None, used: BoolArray | None = None,
 ) -> PoseNetwork:  # fmt: skip
     """A checked network from arrays.
 
@@ -158,10 +168,23 @@ def pose_network(
     prior: the same with covariance (6, 6). inner: station positions for inner constraints; a network without held,
     prior or inner stations takes all of them. Raises SurveyError naming the first pair or station that is wrong.
     """
-    n, n_pairs = len(station_ids), len(pair_ids)
-    a, b = np.asarray(a_idx, dtype=np.int64).ravel(), np.asarray(b_idx, dtype=np.int64).ravel()
+    n_pairs = len(pair_ids)
     t = np.full((n_pairs, 3), np.nan) if translations is None else np.array(translations, dtype=float)
     Q = _full_cov(np.asarray(cov, dtype=float), t, n_pairs)
+    use = np.ones(n_pairs, dtype=np.bool_) if used is None else np.asarray(used, dtype=np.bool_)
+    measured = PairArrays(np.array(rotations, dtype=float).reshape(n_pairs, 3, 3), t, Q, use)
+    a, b = (np.asarray(x, dtype=np.int64).ravel() for x in (a_idx, b_idx))
+    who = Topology(tuple(station_ids), tuple(pair_ids), a, b)
+    return network_of(who, measured, held, start, prior, inner)
+
+
+def network_of(
+    who: Topology, measured: PairArrays, held: Mapping[int, FloatArray] | None = None,
+    start: Mapping[int, FloatArray] | None = None, prior: Mapping[int, tuple[FloatArray, FloatArray]] | None = None,
+    inner: Sequence[int] | None = None, survey: Survey | None = None,
+) -> PoseNetwork:  # fmt: skip
+    """The same from pairs as arrays."""
+    n = who.n_stations
     R, T = np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan)
     held, start, prior = dict(held or {}), dict(start or {}), dict(prior or {})
     known = {**start, **{k: p for k, (p, _) in prior.items()}, **held}
@@ -171,8 +194,7 @@ def pose_network(
     if inner is None:
         inner = range(n) if not held and not prior else ()
     network = PoseNetwork(
-        tuple(station_ids), tuple(pair_ids), a, b, np.array(rotations, dtype=float).reshape(n_pairs, 3, 3), t, Q,
-        np.ones(n_pairs, dtype=np.bool_) if used is None else np.asarray(used, dtype=np.bool_), R, T,
+        who.station_ids, who.pair_ids, who.a_idx, who.b_idx, measured, R, T,
         np.array(sorted(held), dtype=np.int64), {k: np.asarray(c, dtype=float) for k, (_, c) in prior.items()},
         np.array(sorted(inner), dtype=np.int64), survey,
     )  # fmt: skip
@@ -211,7 +233,7 @@ def check_network(network: PoseNetwork) -> None:
     off = np.abs(network.rotations @ np.swapaxes(network.rotations, 1, 2) - np.eye(3)).max(axis=(1, 2))
     bad = ~(off < 1e-6) | ~(np.linalg.det(network.rotations) > 0.0)
     _pairs_where(network, bad, "has a matrix that is no rotation; normalize its quaternion")
-    _pairs_where(network, doubtful(network.arrays), "has a covariance that is not symmetric and positive definite")
+    _pairs_where(network, network.arrays.doubtful, "has a covariance that is not symmetric and positive definite")
     free = [i for i in network.held.tolist() if not np.isfinite(network.station_translations[i]).all()]
     if free:
         raise SurveyError(f"station {network.station_ids[free[0]]!r} is held but has no pose")

@@ -103,14 +103,14 @@ def _head(survey: Survey) -> tuple[Station, Table]:
     if len(heads) != 1:
         names = ", ".join(s.station_id for s in heads) or "none"
         raise SurveyError(f"they calibrate one head of cameras on a table; stations with motion table: {names}")
-    table = next(t for t in survey.tables if t.table_id == heads[0].table_id)
+    table = survey.tables_by_id[heads[0].table_id or ""]
     if len(table.axes) != 2:
         raise SurveyError(f"they need a table of two axes; {table.table_id} has {len(table.axes)}")
     return heads[0], table
 
 
 def _refuse_imperfect(adjusted: Adjustment, table: Table) -> None:
-    given = dict(zip(table.geometry.names, np.asarray(table.geometry.values), strict=True))
+    given = table.geometry.by_name
     held = [x for x in _GEOMETRY if given.get(x, 0.0) != 0.0 and x not in table.geometry.free]
     free = [x for x in _ZEROS if x in table.geometry.free]
     if held:
@@ -157,8 +157,7 @@ def _on_table(
 
 def _images(survey: Survey, table: Table, adjusted: Adjustment, camera_id: str) -> TableImages:
     """A camera calibrated alone; its angles are the readings with the held zeros of the axes."""
-    given = dict(zip(table.geometry.names, np.asarray(table.geometry.values), strict=True))
-    zeros = np.array([given.get(x, 0.0) for x in _ZEROS])
+    zeros = np.array([table.geometry.by_name.get(x, 0.0) for x in _ZEROS])
     readings = [
         replace(r, angles=r.angles + zeros) for r in survey.table_readings if r.table_id == table.table_id and r.used
     ]

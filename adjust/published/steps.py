@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from adjust.frames.tables import table_motions
 from adjust.model.errors import SurveyError
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.spatial.rigid import nearest_rotation, rotation_log
@@ -53,10 +54,7 @@ class TableImages:
 
     def turned(self) -> FloatArray:
         """``C_b'^b`` (n, 3, 3): how the table has turned the body (A5)."""
-        (cx, cz), (sx, sz) = np.cos(self.angles).T, np.sin(self.angles).T
-        zero = np.zeros_like(cx)
-        rows = [[cz, -sz, zero], [cx * sz, cx * cz, -sx], [sx * sz, sx * cz, cx]]
-        return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+        return table_motions(("x", "z"), {}, self.angles)[0]
 
     def about_main(self) -> BoolArray:
         """Which images (n,) were taken with the main axis alone turned, or none."""

@@ -38,7 +38,7 @@ def body_on_main_axis(height_m: float) -> PoseParameter:
 
 def single_camera_survey(survey: Survey, camera_id: str) -> Survey:
     """The calibration of one camera alone (Zhang): a pose of its own for every image, and no table."""
-    camera = next((c for c in survey.cameras if c.camera_id == camera_id), None)
+    camera = survey.cameras_by_id.get(camera_id)
     if camera is None:
         raise SurveyError(f"the survey has no camera {camera_id!r}")
     held = PoseParameter(Pose3(), "held")

@@ -5,7 +5,7 @@ import numpy as np
 from adjust.model.survey import FloatArray, IntArray
 from adjust.spatial.rigid import nearest_rotation, rigid
 
-_MEDOID_LIMIT = 75  # more candidates than this are thinned out for the quadratic search of the medoid
+_MEDOID_LIMIT = 40  # more candidates than this are thinned out for the quadratic search of the medoid
 _AT_ONCE = 1000  # means whose medoids are found together
 _SETTLED = 1e-4  # of the scale: a further step tells nothing that the motions do
 
@@ -82,7 +82,9 @@ def _medoids(poses: FloatArray, lever: float, spans: IntArray, member: IntArray)
     place = np.arange(len(owner)) - (spans[:, 0] - low)[owner]
     trial = np.flatnonzero(place % step[owner] == 0)
     own = member[low : spans[-1, 1]]
-    kept = np.flatnonzero(np.isin(own, own[trial]))
+    tried = np.zeros(len(member), dtype=np.bool_)
+    tried[own[trial]] = True
+    kept = np.flatnonzero(tried[own])
     counts = np.bincount(owner[kept], minlength=len(spans))
     begin = np.cumsum(counts) - counts
     n = counts[owner[trial]]

@@ -24,11 +24,13 @@ from adjust.native.lenses import Lens, fit_lens
 from adjust.native.views import homographies
 from adjust.start.closed_forms.absolute_pose import best_poses
 from adjust.start.closed_forms.zhang import pinhole_from_homographies
-from adjust.start.views import ends_of, rays_of_images
+from adjust.start.views import ENOUGH, ends_of, few_of, rays_of_images
 
 _MOST_IMAGES = 30
 _SCAN_IMAGES = 8
 _MOST_SCREENED = 60
+_MOST_POINTS = 1080  # of all images together
+_REFINEMENTS = 2  # of the poses with a lens that is refined itself afterwards
 _GOOD_START = 0.01  # of the image width: with less error a closed form needs no scan beside it
 _SEVERAL, _OTHER_STARTS = 3, 4  # images, and starts that are tried beside the first where that leads nowhere
 _LEVELS = ("focal centre k1 k2", "focal centre k1", "focal k1", "focal")
@@ -55,6 +57,20 @@ class _Fit:
     poses: FloatArray
     median_px: float
     cov: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A lens (n,) to begin with, how it was found, and the poses (B, 4, 4) that images have with it.
+
+    errors: (B,) rad, of each, infinite where there is none. error_px: their median.
+    """
+
+    values: FloatArray
+    how: str
+    poses: FloatArray
+    errors: FloatArray
+    error_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +175,7 @@ class _LensSearch:
                 )
 
     def run(self, sightings: Sequence[Sighting], near: FloatArray | None) -> LensStart:
-        usable = [s for s in sightings if len(s.x) >= 4]
+        usable = _thinned([s for s in sightings if len(s.x) >= 4])
         if any(name in self.prior for name in _FOCAL):
             focal = self.prior.get("fx", self.prior.get("c", self.prior.get("ck", 0.0)))
             return LensStart(self._values(focal / (self.constants[0] if self.model.in_mm else 1.0)), "lens prior", {})
@@ -180,12 +196,12 @@ class _LensSearch:
             )
         determined = [m for s in chosen if (m := maps.get(s.block_idx)) is not None]
         starts = self._focal_lengths(determined, chosen, near)
-        start, how = next(starts)
-        found = self._refined(start, how, chosen)
+        first = next(starts)
+        found = self._refined(first, chosen)
         # a closed form that misses little may lead nowhere: few images that are hardly tilted fit any focal length
         others = itertools.islice(starts, _OTHER_STARTS if len(chosen) >= _SEVERAL else 0)
-        found = found or next((f for values, said in others if (f := self._refined(values, said, chosen))), None)
-        unrefined = start, f"lens from {len(chosen)} images ({how}; too few to refine it)"
+        found = found or next((f for other in others if (f := self._refined(other, chosen))), None)
+        unrefined = first.values, f"lens from {len(chosen)} images ({first.how}; too few to refine it)"
         return LensStart(*(found or unrefined), excluded, found is not None)
 
     def _on_plane(self, sighting: Sighting) -> FloatArray | None:
@@ -212,41 +228,40 @@ class _LensSearch:
 
     def _focal_lengths(
         self, maps: Sequence[FloatArray], chosen: Sequence[Sighting], near: FloatArray | None
-    ) -> Iterator[tuple[FloatArray, str]]:
-        """Values to begin with and how they were found: a closed form that misses little, near ones, else the least."""
-        trials: list[tuple[FloatArray, str]] = []
-        errors: list[float] = []
-        trial_images = _every(chosen, _SCAN_IMAGES)
+    ) -> Iterator[_Trial]:
+        """Trials to begin with: a closed form that misses little, near values, else what misses least."""
+        trials: list[_Trial] = []
         for variants in (("full",), ("centred", "square")) if maps and self.model.name != "fisheye" else ():
             try:
                 found = pinhole_from_homographies(np.array(maps), self.size, variants)
             except SurveyError:
                 continue
             centre = found.values[2:] if found.variant == "full" else None
-            trials.append((self._values(found.values[0], found.values[1], centre), f"Zhang, {found.variant}"))
-            errors.append(self._error_px(trials[-1][0], trial_images))
-            if errors[-1] < _SIMPLE_PX:  # nor does it need another one
+            values = self._values(found.values[0], found.values[1], centre)
+            trials.append(self._tried(values, f"Zhang, {found.variant}", chosen))
+            if trials[-1].error_px < _SIMPLE_PX:  # nor does it need another one
                 break
-        begun = bool(errors) and min(errors) < _GOOD_START * max(self.size)
-        if begun:
-            first = int(np.argmin(errors))
-            yield trials.pop(first)
-            del errors[first]
+        best = min(trials, key=lambda trial: trial.error_px, default=None)
+        begun = best is not None and best.error_px < _GOOD_START * max(self.size)
+        if best is not None and begun:
+            yield best
+            trials.remove(best)
         if near is not None:
             focal = focal_length_px(self.model, near, self.constants)
-            yield self._values(focal, centre=principal_point_px(self.model, near, self.constants)), "known before"
+            values = self._values(focal, centre=principal_point_px(self.model, near, self.constants))
+            yield self._tried(values, "known before", chosen)
             return
         low, high = (0.15, 2.0) if self.model.name == "fisheye" else (0.35, 8.0)
-        scanned = [self._values(factor * max(self.size)) for factor in np.geomspace(low, high, 16)]
-        trials += [(values, "scan of focal lengths") for values in scanned]
-        errors += [self._error_px(values, trial_images) for values in scanned]
-        order = [int(i) for i in np.argsort(errors, kind="stable") if np.isfinite(errors[i])]
-        if not order and not begun:
+        some = _every(chosen, _SCAN_IMAGES)
+        for factor in np.geomspace(low, high, 16):
+            trials.append(self._tried(self._values(factor * max(self.size)), "scan of focal lengths", some))
+        in_order = sorted((t for t in trials if np.isfinite(t.error_px)), key=lambda trial: trial.error_px)
+        if not in_order and not begun:
             raise SurveyError(
                 f"camera {self.camera.camera_id!r}: no focal length from {low:g} to {high:g} image widths explains its"
                 " images of known points; check point order, coordinates and image size, or give lens values"
             )
-        yield from (trials[i] for i in order)
+        yield from in_order
 
     def _values(self, fx: float, fy: float | None = None, centre: FloatArray | None = None) -> FloatArray:
         """Values without distortion; prior means where there are any, ties respected."""
@@ -262,27 +277,26 @@ class _LensSearch:
             values[index[name]] = tie.factor * values[index[tie.to]]
         return values
 
-    def _error_px(self, values: FloatArray, images: Sequence[Sighting]) -> float:
-        """Median over the images of the best pose's error, relative to the extent of the points, in px."""
-        errors = self._poses(values, images, 2)[1]
-        return float(np.median(errors)) * focal_length_px(self.model, values, self.constants)
-
-    def _poses(self, values: FloatArray, images: Sequence[Sighting], refinements: int) -> tuple[FloatArray, FloatArray]:
-        """The best pose (B, 4, 4) of every image and its error (B,) rad, infinite where there is none."""
+    def _tried(self, values: FloatArray, how: str, images: Sequence[Sighting]) -> _Trial:
+        """A lens with the best pose of every image."""
         rays = rays_of_images(self.camera, values, [s.uv for s in images])
         some = [i for i, r in enumerate(rays) if not isinstance(r, SurveyError)]
         poses, errors = np.tile(np.eye(4), (len(images), 1, 1)), np.full(len(images), np.inf)
         if some:
             seen, x = (np.concatenate([part[i] for i in some]) for part in (rays, [s.x for s in images]))
             ptr = ends_of([len(images[i].x) for i in some])
-            poses[some], errors[some] = best_poses(x, seen, ptr, refinements)
-        return poses, errors
+            poses[some], errors[some] = best_poses(x, seen, ptr, _REFINEMENTS)
+        focal = focal_length_px(self.model, values, self.constants)
+        return _Trial(values, how, poses, errors, float(np.median(errors)) * focal)
 
-    def _refined(self, start: FloatArray, how: str, chosen: Sequence[Sighting]) -> tuple[FloatArray, str] | None:
+    def _refined(self, trial: _Trial, chosen: Sequence[Sighting]) -> tuple[FloatArray, str] | None:
         """The richest lens that the images determine, refined together with the poses, and a note; None without one."""
-        poses, errors = self._poses(start, chosen, 3)
+        start, how = trial.values, trial.how
+        if len(trial.errors) < len(chosen):
+            trial = self._tried(start, how, chosen)
         # images without a pose are left to the screening of all blocks, which reports them
-        images, poses = [s for s, e in zip(chosen, errors, strict=True) if np.isfinite(e)], poses[np.isfinite(errors)]
+        some = np.isfinite(trial.errors)
+        images, poses = [s for s, there in zip(chosen, some, strict=True) if there], trial.poses[some]
         if not images:
             raise SurveyError(
                 f"camera {self.camera.camera_id!r}: no image of known points gives a pose with the {how} lens"
@@ -366,6 +380,20 @@ def _plane_coordinates(x: FloatArray) -> FloatArray | None:
     return np.asarray(xy / np.sqrt((xy**2).sum(axis=1).max()))
 
 
+def _thinned(images: Sequence[Sighting]) -> list[Sighting]:
+    """The images with no more points each than tell the lens and all poses, one array for all that show the same."""
+    most, parts = max(ENOUGH, _MOST_POINTS // max(1, min(len(images), _MOST_IMAGES))), dict[int, FloatArray]()
+    out = []
+    for s in images:
+        if len(s.x) > most:
+            few = few_of(len(s.x), most)
+            if id(s.x) not in parts:
+                parts[id(s.x)] = s.x[few]
+            s = Sighting(s.block_idx, parts[id(s.x)], s.uv[few])
+        out.append(s)
+    return out
+
+
 def _every(images: Sequence[Sighting], n: int) -> list[Sighting]:
     if len(images) <= n:
         return list(images)
@@ -379,10 +407,11 @@ def spread_out(images: Sequence[Sighting], n: int = _MOST_IMAGES) -> list[Sighti
     features = _features(images)
     features = (features - features.mean(axis=0)) / np.maximum(features.std(axis=0), 1e-9)
     squares = ((features[:, None] - features) ** 2).sum(axis=2)  # of at most _MOST_SCREENED images
-    chosen = [int(np.argmax([len(s.x) for s in images]))]
+    sizes = [len(s.x) for s in images]
+    chosen = [sizes.index(max(sizes))]
     nearest = squares[chosen[0]]
     while len(chosen) < n:
-        chosen.append(int(np.argmax(nearest)))
+        chosen.append(int(nearest.argmax()))
         nearest = np.minimum(nearest, squares[chosen[-1]])
     return [images[i] for i in sorted(chosen)]
 

@@ -16,7 +16,7 @@ from adjust.start.closed_forms.absolute_pose import view_poses
 
 _RIVAL = 4.0  # a second pose whose error is within this factor of the best stays a candidate
 _NOISE_PX = 0.3  # ... or within this much of it
-_ENOUGH = 36  # points of a view from which its pose is found before all of them refine it
+ENOUGH = 36  # points of a view from which its pose is found before all of them refine it
 _STEPS = 8, 2  # of refinement with these, and with all points of a view
 _GROSS_SHARE = 0.2  # more gross points than this make a whole block untrustworthy
 
@@ -150,7 +150,7 @@ def rays_of_images(
 
 
 @lru_cache(maxsize=256)
-def few_of(n: int, most: int = _ENOUGH) -> IntArray:
+def few_of(n: int, most: int = ENOUGH) -> IntArray:
     """Positions of at most so many of n points, without the pattern of a grid, the same at every call."""
     return np.arange(n) if n <= most else np.sort(np.random.default_rng(n).permutation(n)[:most])
 

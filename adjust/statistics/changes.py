@@ -214,6 +214,7 @@ class ChangeSearch:
         length[u.rows] = q
         ptr = np.concatenate([[0], np.cumsum(length)])
         wide = sparse.csr_matrix((u.B[order].ravel(), columns[order].ravel(), ptr), (len(length), J * q))
+        wide.eliminate_zeros()
         X = (self.A.T @ wide).tocsr()
         P = _from_runs_on(_by_run(u, u.B))
         g = _from_runs_on(_by_run(u, self.e[u.rows, None]))[:, :, 0]
@@ -257,8 +258,9 @@ def _taken(system: LinearSystem, X: sparse.csr_matrix, J: int) -> FloatArray:
 
 
 def _by_runs(u: Unit) -> Unit:
-    """With its rows in the order of the runs."""
-    order = np.argsort(u.run, kind="stable")
+    """With its rows in the order of the runs, less those that have nothing of it."""
+    some = np.flatnonzero(u.B.any(axis=1))
+    order = some[np.argsort(u.run[some], kind="stable")]
     return replace(u, rows=u.rows[order], B=u.B[order], run=u.run[order])
 
 

@@ -137,7 +137,9 @@ def _known(
     numbers.append(number[order])
     groups = [images.blocks[b].group for b in order.tolist()]
     used = np.ones(len(groups), dtype=np.bool_)
-    return ImageRows(entries.matrix((at, n)), np.concatenate(e), np.concatenate(lengths), used, groups)
+    A = entries.matrix((at, n))
+    A.eliminate_zeros()  # rows that are triangular leave half of it empty
+    return ImageRows(A, np.concatenate(e), np.concatenate(lengths), used, groups)
 
 
 @dataclass(frozen=True, eq=False)

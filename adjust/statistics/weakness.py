@@ -85,15 +85,17 @@ def correlations(
 
     def above(first: int) -> list[tuple[int, int, float]]:
         part = index[first : first + AT_ONCE]
-        C = system.through_tree(_units(system, part)) if whole is None else whole[:, part]
-        C = C if whole is None and names is None else C[among]
-        C /= sigma[among, None]
+        rows = among if len(among) > len(index) else index[: first + len(part)]
+        C = (system.through_tree(_units(system, part)) if whole is None else whole[:, part])[rows]
+        C /= sigma[rows, None]
         C /= sigma[part]
-        high = np.abs(C) >= limit
-        a, b = np.nonzero(high) if high.any() else np.zeros((2, 0), dtype=np.int64)
-        i, j = among[a], part[b]
-        kept = np.where(number[i] < 0, True, number[i] < number[j])  # each pair once, nothing with itself
-        return list(zip(i[kept].tolist(), j[kept].tolist(), C[a, b][kept].tolist(), strict=True))
+        size = np.abs(C)
+        size[number[rows][:, None] >= number[part]] = 0.0  # each pair once, nothing with itself
+        high = size >= limit
+        if (n := int(np.count_nonzero(high))) > _MOST:
+            high = size >= np.partition(size[high], n - _MOST)[n - _MOST]
+        a, b = np.nonzero(high) if n else np.zeros((2, 0), dtype=np.int64)
+        return list(zip(rows[a].tolist(), part[b].tolist(), C[a, b].tolist(), strict=True))
 
     found = [x for part in side_by_side(above, range(0, len(index), AT_ONCE)) for x in part]
     if names is None and len(index) < len(c):

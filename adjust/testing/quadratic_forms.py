@@ -69,7 +69,9 @@ def _factored(Q: FloatArray, held: FloatArray) -> tuple[FloatArray, FloatArray, 
     """Sigmas s (n,), N (n, k) that spans what is held in sigmas, and R with R'R = Q in sigmas + N N'; None if lost."""
     s = np.sqrt(np.maximum(np.diag(Q), 1e-300))
     N = np.linalg.qr(s[:, None] * held)[0]
-    full = Q / np.outer(s, s) + N @ N.T
+    full = Q / s[:, None]
+    full /= s
+    full += N @ N.T
     least = _DETERMINED * np.diag(full)
     factor, lost = scipy.linalg.lapack.dpotrf(full.T, lower=0, clean=0, overwrite_a=1) if len(Q) else (full, 1)
     return s, N, None if lost or (np.diag(factor) ** 2 < least).any() else factor

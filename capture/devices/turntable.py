@@ -1,13 +1,12 @@
-"""What a turntable is to the session: one small protocol, its axes with their limits, and the ways in which it fails.
+"""What turntables are made of: axes with their limits, moves, controllers, and the ways in which they fail.
 
-The shape is bluesky's (name, position, limits, set -> status, stop, locate), without the dependency. Angles are
-radians, one per axis, outermost first; they count whole turns, because a cable does. Drivers are in
-``capture.devices.turntables``.
+Angles are radians, one per axis, outermost first; they count whole turns, because a cable does. Drivers are in
+``capture.devices.turntables``, over which ``MovingTable`` is the turntable of a session.
 """
 
 import math
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -120,83 +119,17 @@ class Settle:
     poll_s: float = 0.01
 
 
-class Turntable(Protocol):
-    """A turntable of any driver; usable from several threads."""
-
-    @property
-    def name(self) -> str:
-        """For messages."""
-        ...
-
-    @property
-    def axes(self) -> tuple[Axis, ...]:
-        """The axes, outermost first."""
-        ...
-
-    @property
-    def position(self) -> FloatArray:
-        """The readback, (n,) rad. Raises TableDisconnectedError."""
-        ...
-
-    def check(self, angles: Sequence[float]) -> None:
-        """Raise LimitError where a position cannot be reached; sends nothing."""
-        ...
-
-    def set(self, angles: Sequence[float] | FloatArray) -> "MoveStatus":
-        """Start to turn to ``angles`` (n,) rad. Raises LimitError before anything is sent."""
-        ...
-
-    def home(self) -> "MoveStatus":
-        """Look for the reference of every axis."""
-        ...
-
-    def stop(self) -> None:
-        """Stop all axes now; a move under way ends with StoppedError."""
-        ...
-
-    def emergency_stop(self) -> None:
-        """Stop, and refuse to move until ``release``."""
-        ...
-
-    def release(self) -> None:
-        """Allow moves again after an emergency stop."""
-        ...
-
-    def locate(self) -> Location:
-        """Setpoint and readback."""
-        ...
-
-    def reopen(self) -> None:
-        """Connect anew, after a cable was pulled."""
-        ...
-
-    def close(self) -> None:
-        """Let go of the controller; an axis that still turns is stopped. Never raises."""
-        ...
-
-
 class MoveStatus:
     """How a move goes on; filled by the table, read by anyone."""
 
     def __init__(self) -> None:
         self._finished = threading.Event()
-        self._lock = threading.Lock()
         self._exception: BaseException | None = None
-        self._callbacks: list[Callable[[MoveStatus], None]] = []
 
     @property
     def done(self) -> bool:
         """Whether it is over, well or not."""
         return self._finished.is_set()
-
-    @property
-    def success(self) -> bool:
-        """Whether it is over and well."""
-        return self.done and self._exception is None
-
-    def exception(self) -> BaseException | None:
-        """Why it failed; None while it lasts and when it went well."""
-        return self._exception
 
     def wait(self, timeout_s: float | None = None) -> None:
         """Wait for the end; raises what went wrong, or NotSettledError after ``timeout_s``."""
@@ -205,24 +138,10 @@ class MoveStatus:
         if self._exception is not None:
             raise self._exception
 
-    def add_callback(self, callback: "Callable[[MoveStatus], None]") -> None:
-        """Call with this status at the end, at once if it is over."""
-        with self._lock:
-            if not self.done:
-                self._callbacks.append(callback)
-                return
-        callback(self)
-
     def finish(self, exception: BaseException | None = None) -> None:
-        """For the table: the end; a second one changes nothing."""
-        with self._lock:
-            if self.done:
-                return
-            self._exception = exception
-            self._finished.set()
-            callbacks = list(self._callbacks)
-        for callback in callbacks:
-            callback(self)
+        """For the table, once: the end, and why where it went wrong."""
+        self._exception = exception
+        self._finished.set()
 
 
 @dataclass(frozen=True)

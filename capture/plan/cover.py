@@ -81,14 +81,14 @@ def _world_from_station(survey: Survey, station: Station, angles: FloatArray) ->
         return _known(station.world_from_station, f"world_from_station of {station.station_id!r}")
     if station.motion == "epoch":
         raise ValueError(f"station {station.station_id!r} is moved by hand: no table angles help")
-    table = next(t for t in survey.tables if t.table_id == station.table_id)
+    table = survey.tables_by_id[station.table_id or ""]
     world_from_table = _known(table.world_from_table, f"world_from_table of {table.table_id!r}")
     mount_from_station = _known(station.mount_from_station, f"mount_from_station of {station.station_id!r}")
     return np.asarray(world_from_table @ table_from_mount(table, angles) @ mount_from_station)
 
 
 def _camera_from_target(survey: Survey, camera: Camera, target: Target, angles: FloatArray) -> FloatArray:
-    stations = {s.station_id: s for s in survey.stations}
+    stations = survey.stations_by_id
     world_from_station = _world_from_station(survey, stations[camera.station_id], angles)
     world_from_camera = world_from_station @ _known(
         camera.station_from_camera, f"station_from_camera of {camera.camera_id!r}"

@@ -15,7 +15,10 @@ _DESCRIBED = ("DeviceVendorName", "DeviceModelName", "Width", "Height", "PixelFo
 
 
 class PlannedCameras:
-    """The ``CameraSet`` of a session. trigger: software, hardware (pulses come from outside) or free (no trigger)."""
+    """The cameras of a session, taken together.
+
+    trigger: software, hardware (pulses come from outside) or free (no trigger).
+    """
 
     def __init__(
         self,
@@ -76,7 +79,7 @@ class PlannedCameras:
             camera.close()
 
     def take(self, timeout_s: float) -> Mapping[str, Frame]:
-        """One image of every camera, exposed after this call."""
+        """One image of every camera, by camera_id, exposed after this call. Raises CameraError."""
         if self._set is None or not self._set.armed:
             self.recover(reopen=self._set is None)
         if self._set is None:

@@ -18,7 +18,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
 from capture.devices.camera import GrayImage
 from capture.session.journal import Record
-from survey.folder.locking import SESSION_LOCK, FileLock, holder_of
+from survey.folder.locking import SESSION_LOCK, FileLock
 from survey.folder.text import atomic_write, decode, read_bytes
 from survey.project.captured import CAPTURE_FOLDER
 from survey.project.project import DEFINITION_FILE, IMAGES_FOLDER, OBSERVATIONS_FOLDER
@@ -37,11 +37,6 @@ def session_lock(folder: Path) -> FileLock:
     path = folder / SESSION_LOCK
     path.parent.mkdir(parents=True, exist_ok=True)
     return FileLock(path, folder, "session")
-
-
-def lock_holder(folder: Path) -> str | None:
-    """Who works on a folder now; None where nobody does, whatever a dead process has left behind."""
-    return holder_of(folder / SESSION_LOCK)
 
 
 def write_image(folder: Path, camera_id: str, epoch_id: str, image: GrayImage) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray
 from capture.devices.camera import Frame, GrayImage
-from survey.detection.detect import detect_image
+from survey.detection.batch import detect_image
 from survey.detection.gray import Gray32
 from survey.project.targets import DetectableTarget
 

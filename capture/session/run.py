@@ -22,7 +22,7 @@ from capture.session.folder import session_lock
 from capture.session.progress import Progress
 from capture.session.quality_thread import QualityWatch
 from capture.session.resume import last_readback
-from capture.session.run_session import CameraSet, Outcome, Session, Taken
+from capture.session.run_session import Outcome, Session, Taken
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 _LOOK_S = 0.05
@@ -60,7 +60,7 @@ def _open_table(plan: CapturePlan, stack: ExitStack) -> MovingTable | None:
 def run_session(
     plan: CapturePlan,
     table: MovingTable | None,
-    cameras: CameraSet,
+    cameras: PlannedCameras,
     control: Control,
     progress: Progress,
     watch: QualityWatch | None,

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -23,38 +23,19 @@ from capture.devices.turntable import (
     Location,
     StoppedError,
     TableDisconnectedError,
-    Turntable,
     TurntableError,
     degrees_text,
     location_dict,
 )
+from capture.devices.turntables.moving import MovingTable
 from capture.plan.plan import CapturePlan, Shot, check_plan_limits
+from capture.session.cameras import PlannedCameras
 from capture.session.control import AbortedError, Control
 from capture.session.folder import journal_path, prepare, remove_unrecorded, write_image, write_table_angles
 from capture.session.journal import Journal, Record, clocks
 from capture.session.resume import verified_sets
 
 JOURNAL_FORMAT = 1
-
-
-class CameraSet(Protocol):
-    """The cameras of a session, taken together."""
-
-    def take(self, timeout_s: float) -> Mapping[str, Frame]:
-        """One image of every camera, by camera_id, exposed after this call. Raises CameraError, SetError."""
-        ...
-
-    def values(self, camera_id: str, names: Sequence[str]) -> Mapping[str, Any]:
-        """Features as they are now; those that a camera does not know are left out."""
-        ...
-
-    def recover(self, reopen: bool) -> None:
-        """Throw away what is under way and be ready again, with new connections where ``reopen``."""
-        ...
-
-    def describe(self) -> Mapping[str, Mapping[str, Any]]:
-        """Address and serial number of every camera."""
-        ...
 
 
 class SessionStoppedError(SurveyError):
@@ -108,8 +89,8 @@ class Session:
     def __init__(
         self,
         plan: CapturePlan,
-        table: Turntable | None,
-        cameras: CameraSet,
+        table: MovingTable | None,
+        cameras: PlannedCameras,
         control: Control | None = None,
         listener: Callable[[Taken], None] = lambda taken: None,
         note: Callable[[str], None] = lambda line: None,

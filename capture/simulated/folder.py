@@ -22,8 +22,15 @@ from capture.simulated.laboratory import (
     furnished_lab,
     make_lab,
 )
-from survey.examples.folders import GIVEN, camera_text, coordinates_text, head_on_table, spots_text, target_text
-from survey.examples.truth import truth_json
+from survey.examples.folders import (
+    GIVEN,
+    camera_text,
+    coordinates_text,
+    head_on_table,
+    spots_text,
+    target_text,
+    truth_json,
+)
 from survey.folder.whole import whole_folder
 
 LAB, ANGLES = "lab.json", "angles.json"

@@ -10,17 +10,12 @@ from pathlib import Path
 from urllib.parse import parse_qs
 
 from adjust.model.errors import SurveyError
-from capture.devices.camera import Camera, CameraInfo
+from capture.devices.camera import Camera
 from capture.devices.cameras.simulated import SimulatedCamera, parsed_faults
 from capture.simulated.angles import Angles, AnglesFile
 from capture.simulated.folder import ANGLES, read_lab
 from capture.simulated.laboratory import SimulatedLab
 from survey.simulate.rendering import GrayImage
-
-
-def discover() -> tuple[CameraInfo, ...]:
-    """None: simulated cameras are named, not discovered."""
-    return ()
 
 
 def camera(place: str, angles: Angles | None = None) -> Camera:

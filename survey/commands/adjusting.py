@@ -1,10 +1,12 @@
-"""The command ``adjust``: one project folder, or many as a batch."""
+"""The commands ``adjust``, for one project folder or many as a batch, and ``report``, its precision report alone."""
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from survey.commands.common import (
+    DONE,
+    TEST_FAILED,
     begin_adjusting,
     is_set,
     not_negative,
@@ -86,7 +88,7 @@ def _adjust_one(folder: Path, arguments: argparse.Namespace) -> int:
     begin_adjusting()
     require_project(folder, arguments.out)
     from survey.jobs.adjusting.job import adjust_job
-    from survey.report.results import ReportOptions
+    from survey.report.language import ReportOptions
 
     if arguments.candidate is not None:
         from survey.jobs.adjusting.trying import try_job
@@ -136,3 +138,46 @@ def _adjust_batch(arguments: argparse.Namespace) -> int:
         print(*([""] + trend_lines(trends, records) if trends.charts else []), sep="\n")
         say(arguments, *(f"written: {path}" for path in paths.values()))
     return exit_code(records)
+
+
+def declare_report(commands: Commands) -> None:
+    """Add ``report`` to the commands."""
+    parser = commands.add(
+        "report",
+        _report,
+        help="write the precision report of a project, also in German, as PDF, or as a check",
+        usage="labsurvey report lab --pdf   (labsurvey report FOLDER [--language en|de] [--pdf] [--check] [--out DIR])",
+        description="Adjusts the observations of FOLDER and writes FOLDER/results, report.html in the language asked "
+        "for.\nWith --check the exit code is 3 when the global test or a tolerance of survey.toml is not met.",
+        epilog="Next: open FOLDER/results/report.html",
+    )
+    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="folder with a survey.toml")
+    parser.add_argument("--language", choices=("en", "de"), default="en", help="of the report; default: en")
+    parser.add_argument("--pdf", action="store_true", help="write report.pdf too; needs Chromium, Chrome or WeasyPrint")
+    parser.add_argument("--check", action="store_true", help="exit code 3 also where a tolerance is not met")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER")
+
+
+def _report(arguments: argparse.Namespace) -> int:
+    begin_adjusting()
+    require_project(arguments.folder, arguments.out)
+    from survey.jobs.adjusting.job import adjust_job, command_line
+    from survey.report.language import ReportOptions
+
+    language = arguments.language if arguments.language != "en" else None
+    flags = {"language": language, "pdf": arguments.pdf, "check": arguments.check, "out": arguments.out}
+    outcome = adjust_job(
+        arguments.folder, out=arguments.out, progress=not is_set(arguments, "quiet"),
+        report=ReportOptions(arguments.language, arguments.pdf), said=command_line("report", arguments.folder, **flags),
+    )  # fmt: skip
+    unmet = [v for v in outcome.statistics.verdicts if not v.met] if outcome.statistics is not None else []
+    if is_set(arguments, "json"):
+        print_json(outcome.summary())
+    else:
+        print(outcome.text())
+        for v in unmet:
+            times = f"{v.found / v.allowed:.2f} times what is allowed"
+            print(f"  tolerance {v.tolerance} not met: {' '.join(v.result)} {v.quantity}, {times}")
+        say(arguments, *(f"written: {path}" for path in outcome.paths.values()))
+    code = tested(outcome.solution["summary"])
+    return TEST_FAILED if code == DONE and arguments.check and unmet else code

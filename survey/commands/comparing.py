@@ -2,7 +2,7 @@
 
 import argparse
 
-from survey.commands.common import DONE, is_set, require_project, show
+from survey.commands.common import DONE, begin_adjusting, is_set, require_project, show
 from survey.commands.parser import Commands, project_folder
 
 
@@ -24,6 +24,7 @@ def declare_compare(commands: Commands) -> None:
 def _compare(arguments: argparse.Namespace) -> int:
     require_project(arguments.first)
     require_project(arguments.second)
+    begin_adjusting()
     from survey.jobs.comparing import compare_job
 
     outcome = compare_job(arguments.first, arguments.second, progress=not is_set(arguments, "quiet"))
@@ -49,6 +50,7 @@ def declare_cross_validate(commands: Commands) -> None:
 
 def _cross_validate(arguments: argparse.Namespace) -> int:
     require_project(arguments.folder)
+    begin_adjusting()
     from survey.jobs.cross_validation import cross_validate
     from survey.project import read
 

@@ -130,11 +130,7 @@ def _pairs(arguments: argparse.Namespace) -> int:
     from survey.jobs.pairs import station_pairs
 
     outcome = station_pairs(arguments.folder, station=arguments.station, out=arguments.out, joint=arguments.joint)
-    if is_set(arguments, "json"):
-        print_json(outcome.summary())
-    else:
-        print(outcome.text())
-        say(arguments, *([f"written: {outcome.written}"] if outcome.written else []))
+    show(arguments, outcome, [outcome.written] if outcome.written else [])
     return DONE
 
 

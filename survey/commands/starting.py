@@ -1,10 +1,12 @@
-"""The commands ``init`` and ``detect``: a project begins, and its images tell their points."""
+"""How a project begins: the commands ``init``, ``detect``, ``example`` and ``schema`` of what survey.toml may hold."""
 
 import argparse
+import json
 from pathlib import Path
 
-from survey.commands.common import DONE, is_set, positive, print_json, require_project, say, show
+from survey.commands.common import DONE, is_set, not_negative, positive, print_json, require_project, say, show
 from survey.commands.parser import Commands, project_folder
+from survey.examples import EXAMPLES, write_example
 
 
 def declare_init(commands: Commands) -> None:
@@ -27,10 +29,7 @@ def _init(arguments: argparse.Namespace) -> int:
     from survey.jobs.starting import start_project
 
     outcome = start_project(arguments.images, arguments.folder)
-    if is_set(arguments, "json"):
-        print_json(outcome.summary())
-    else:
-        print(f"{outcome.text()}\nNext: labsurvey open {arguments.folder}")
+    show(arguments, outcome, then=f"\nNext: labsurvey open {arguments.folder}")
     return DONE
 
 
@@ -66,4 +65,68 @@ def _detect(arguments: argparse.Namespace) -> int:
     if is_set(arguments, "verbose"):
         say(arguments, *outcome.messages)
     show(arguments, outcome, then=f"\nNext: labsurvey adjust {arguments.folder}")
+    return DONE
+
+
+def declare_example(commands: Commands) -> None:
+    """Add ``example`` to the commands."""
+    listed = "\n".join(f"  {name:<15}{what}" for name, what in EXAMPLES.items())
+    parser = commands.add(
+        "example",
+        _example,
+        help="write a ready project folder to try things on",
+        usage="labsurvey example full-lab lab   (labsurvey example NAME DIR [--seed N] [--jobs N])",
+        description=f"Writes a project with rendered images and simulated readings.\n\n{listed}",
+        epilog="Next: labsurvey adjust DIR",
+    )
+    parser.add_argument("name", choices=tuple(EXAMPLES), metavar="NAME", help=", ".join(EXAMPLES))
+    parser.add_argument("folder", type=Path, metavar="DIR", help="new folder")
+    parser.add_argument("--seed", type=not_negative, default=1, metavar="N", help="other numbers give other noise")
+    parser.add_argument("--jobs", type=positive, metavar="N", help="images at a time; default: one per processor")
+
+
+def declare_schema(commands: Commands) -> None:
+    """Add ``schema`` to the commands."""
+    parser = commands.add(
+        "schema",
+        _schema,
+        help="print a JSON schema of survey.toml for editors, or its reference",
+        usage="labsurvey schema --out lab/survey.schema.json   (labsurvey schema [--markdown] [--out FILE])",
+        description="Prints a JSON schema of survey.toml, made from the declarations that check it. With the first\n"
+        "line #:schema ./survey.schema.json in survey.toml, editors complete and check its keys.\n"
+        "With --markdown: the reference of all keys and of all columns of the tables.",
+        epilog="Next: write #:schema ./survey.schema.json above the first line of survey.toml",
+    )
+    parser.add_argument("--markdown", action="store_true", help="the reference as a page, not the schema")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="write FILE, not to stdout")
+
+
+def _example(arguments: argparse.Namespace) -> int:
+    progress = not is_set(arguments, "quiet")
+    n = write_example(arguments.name, arguments.folder, seed=arguments.seed, jobs=arguments.jobs, progress=progress)
+    if is_set(arguments, "json"):
+        print_json({"example": arguments.name, "folder": str(arguments.folder), "seed": arguments.seed, "images": n})
+    else:
+        print(
+            f"{arguments.folder}: example {arguments.name}{f' with {n} images' if n else ''}\n"
+            f"Next: labsurvey adjust {arguments.folder}"
+        )
+    return DONE
+
+
+def _schema(arguments: argparse.Namespace) -> int:
+    if arguments.markdown:
+        from survey.project.reference import reference_page
+
+        text = reference_page()
+    else:
+        from survey.project.reference import survey_schema
+
+        text = json.dumps(survey_schema(), indent=1, ensure_ascii=False) + "\n"
+    if arguments.out is None:
+        print(text, end="")
+    else:
+        from survey.folder.text import atomic_write
+
+        atomic_write(arguments.out, text)
     return DONE

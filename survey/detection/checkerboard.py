@@ -8,8 +8,7 @@ import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.native.vision import MOST_CROSSINGS, count_crossings, find_grid, first_is_dark, of_neighbours, off_grid
-from survey.detection.corners import CornerFit, refine_corners, unbent
-from survey.detection.extent import grown
+from survey.detection.corners import CornerFit, grown, refine_corners, unbent
 from survey.detection.gray import Gray8, Gray32, halved, reduced
 from survey.detection.results import Detection, nothing_found
 from survey.project.targets import Checkerboard
@@ -100,7 +99,7 @@ def _measured(gray: Gray32, rough: FloatArray) -> tuple[Detection, FloatArray]:
         notes += (f"{int((~keep).sum())} of {keep.size} corners were not sharp or not free",)
     if ambiguous:
         notes += ("order is ambiguous: the board looks the same after a turn",)
-    blur, contrast = float(np.median(fit.blur_px[keep])), float(np.median(fit.contrast[keep]))
+    blur, contrast = np.median([fit.blur_px[keep], fit.contrast[keep]], axis=1).tolist()
     measured = np.where(keep[:, None], fit.uv, start).reshape(grid.shape)
     if not of_neighbours(gray, measured, contrast):
         return nothing_found("corners found, but not those of neighbouring squares"), rough
@@ -178,8 +177,8 @@ def _found_in(coarse: Gray8, pattern: tuple[int, int]) -> tuple[bool, Any]:
 
 def _ordered(gray: Gray32, grid: FloatArray) -> tuple[FloatArray, bool]:
     """The grid (rows, columns, 2) in the order that ``find_checkerboard`` defines, and whether that is ambiguous."""
-    along, down = grid[:, -1] - grid[:, 0], grid[-1] - grid[0]
-    if np.linalg.det(np.stack([along.mean(0), down.mean(0)])) < 0.0:
+    (a, b), (c, d) = (grid[:, -1] - grid[:, 0]).mean(0), (grid[-1] - grid[0]).mean(0)
+    if a * d < b * c:
         grid = grid[:, ::-1]
     rows, columns = grid.shape[:2]
     dark = first_is_dark(gray, grid)

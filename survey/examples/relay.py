@@ -8,7 +8,7 @@ from gtsam import Pose3, Rot3
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray
 from adjust.spatial.rotation_forms import quaternion_wxyz
-from survey.examples.truth import truth_json
+from survey.examples.folders import truth_json
 
 Files = dict[str, str]
 _ROOMS = "ABCD"

@@ -21,7 +21,7 @@ from adjust.model.survey import (
     Target,
     VectorParameter,
 )
-from survey.examples.truth import truth_json
+from survey.examples.folders import truth_json
 from survey.project import write_project
 from survey.simulate.scene import BROWN, Scene, Truth
 

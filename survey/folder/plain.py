@@ -14,6 +14,11 @@ class PlainRecords(Mapping[str, dict[str, Any]]):
     """Entries by name whose values are what JSON knows already."""
 
 
+def attributes(thing: object, *names: str) -> dict[str, Any]:
+    """What a thing says under these names, in this order."""
+    return {name: getattr(thing, name) for name in names}
+
+
 def plain(value: Any) -> Any:
     """Only what JSON knows: mappings and sequences kept, numbers as Python's, None for what is not finite."""
     kind = type(value)

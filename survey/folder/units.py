@@ -15,6 +15,11 @@ _UNITS = ("mm", "m", "deg", "arcsec", "gon", "mgon", "cc", "px", "rad", "mm2", "
           "us", "s", "1")  # fmt: skip
 
 
+def unit_in(name: str) -> str:
+    """The unit that a name ends with, as ``sigma_mm`` does; "1" where it has none."""
+    return max((unit for unit in _UNITS if name.endswith(f"_{unit}")), key=len, default="1")
+
+
 def to_si(value: npt.ArrayLike, unit: str) -> FloatArray:
     """Values in ``unit`` as metres, radians, pixels or plain numbers; the same shape."""
     x = np.asarray(value, dtype=float)

@@ -5,7 +5,7 @@ asks for a number, so that YAML's guesses ("1e-5" is text, "no" is false) do not
 is, which gives its errors lines too. OpenCV's files begin with "%YAML:1.0" and tag their matrices; both are known.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -200,18 +200,34 @@ class _Builder:
             self.stack[-1] = (parent, None)
 
 
-def yaml_list(values: FloatArray) -> str:
-    """Numbers as a list in one line, with every bit: a decimal point always, as some readers want floats."""
-    return "[" + ", ".join(yaml_number(v) for v in np.asarray(values, dtype=float).ravel()) + "]"
+class _Dumper(yaml.SafeDumper):
+    """Lists stand further in than their key, as OpenCV wants them; numbers have a point, as all readers do."""
+
+    def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:
+        """One level deeper."""
+        super().increase_indent(flow, False)
 
 
-def yaml_number(value: float) -> str:
-    """A number that all YAML readers take for a float: YAML 1.1 wants "1.0e-05" where Python writes "1e-05"."""
-    text = repr(float(value))
-    mantissa, e, exponent = text.partition("e")
-    return f"{mantissa}.0e{exponent}" if e and "." not in mantissa else text
+def _opencv_matrix(dumper: yaml.SafeDumper, matrix: FloatArray) -> yaml.Node:
+    return dumper.represent_mapping(OPENCV_MATRIX, {**matrix_entry(matrix), "dt": "d"})
+
+
+_Dumper.add_representer(np.ndarray, _opencv_matrix)
+
+
+def matrix_entry(matrix: FloatArray) -> dict[str, Any]:
+    """A matrix (n, m) as OpenCV and ROS have it: rows, cols and its numbers row by row."""
+    rows, cols = matrix.shape
+    return {"rows": rows, "cols": cols, "data": matrix.ravel().tolist()}
+
+
+def yaml_text(document: Mapping[str, Any]) -> str:
+    """YAML of plain values, numbers with every bit; the innermost lists stand in one line, arrays are as OpenCV's."""
+    text: str = yaml.dump(dict(document), Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=2**31,
+                          allow_unicode=True)  # fmt: skip
+    return text
 
 
 def quoted(text: str) -> str:
-    """A text as a quoted YAML scalar."""
+    """A text as a quoted scalar."""
     return '"' + "".join(f"\\{c}" if c in '"\\' else c for c in text) + '"'

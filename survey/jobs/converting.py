@@ -20,8 +20,7 @@ from survey.folder.replacing import filling
 from survey.folder.text import read_bytes, suggestion
 from survey.interop.cameras import formats as camera_formats
 from survey.interop.cameras.values import CameraValues, camera_values
-from survey.interop.names import with_safe_ids
-from survey.interop.networks.foreign import ForeignNetwork, is_utf8
+from survey.interop.networks.foreign import ForeignNetwork, is_utf8, with_safe_ids
 from survey.interop.networks.g2o import Information
 from survey.interop.networks.gama import read_gama
 from survey.interop.networks.gama_writer import gama_text

@@ -38,13 +38,7 @@ class ExcludeOutcome:
 
     def summary(self) -> dict[str, Any]:
         """As plain values."""
-        names = [
-            {"name": str(o.exclusion.name), "what": o.exclusion.name.what, "id": o.exclusion.name.id,
-             "reason": o.exclusion.reason, "author": o.exclusion.author, "time": o.exclusion.time,
-             "n_images": o.n_images, "n_image_points": o.n_image_points, "n_spots": o.n_spots,
-             "n_readings": o.n_readings}
-            for o in self.done
-        ]  # fmt: skip
+        names = [o.exclusion.as_dict() | o.counts() for o in self.done]
         return {"folder": str(self.folder), "excluded" if self.excluded else "included": names,
                 "n_in_force": self.n_in_force, "written": str(self.path)}  # fmt: skip
 

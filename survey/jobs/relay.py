@@ -27,7 +27,7 @@ from adjust.spatial.rigid_motions import Motions
 from survey.folder.text import decode, read_bytes
 from survey.project import read
 from survey.project.tables.files import write_table
-from survey.project.tables.observation_columns import pair_columns
+from survey.project.tables.pairs import pair_columns
 
 _INTERVALS_S = (1.0, 1.5, 2.0, 3.0, 4.0)
 _GROWTH_S = (0.1, 0.3, 1.0, 3.0, 9.0)

@@ -20,7 +20,8 @@ from adjust.model.survey import Survey
 from adjust.statistics.outliers.supported import supported
 from survey.folder.replacing import complete, copy_folder, place_for, replace_parts
 from survey.folder.text import atomic_write
-from survey.jobs.adjusting.job import AdjustOutcome, Clock, command_line, made
+from survey.jobs.adjusting.job import Clock, command_line
+from survey.jobs.adjusting.outcome import AdjustOutcome, made
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.adjusting.warm_start import COLD, warm_adjustment
 from survey.jobs.excluding import FILE, new_rows

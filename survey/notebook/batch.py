@@ -16,7 +16,7 @@ from survey.batch.tables import STATES, count_line, findings, short_names, summa
 from survey.batch.trends import Trends, trends_of
 from survey.folder.text import suggestion
 from survey.notebook.frames import frame
-from survey.notebook.html import heading, html_table
+from survey.notebook.names import heading, html_table
 from survey.notebook.plots import Plot
 from survey.report.drawing import ON_WHITE, standalone
 

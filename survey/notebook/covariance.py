@@ -7,8 +7,7 @@ import numpy as np
 
 from adjust.model.survey import FloatArray
 from survey.notebook.frames import pandas
-from survey.notebook.html import Cell, heading, html_table
-from survey.notebook.names import Component
+from survey.notebook.names import Cell, Component, heading, html_table
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,13 +1,18 @@
-"""Names of estimated things as people write them: "X", "lens/X", "lens/X/fx", ("world_from_station", "head")."""
+"""Names of estimated things as people write them: "X", "lens/X", "lens/X/fx", ("world_from_station", "head").
 
-from collections.abc import Iterator, Mapping, Sequence
+And small pieces of HTML that look well in a notebook, on light and on dark ground.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 from gtsam import Pose3
+from markupsafe import Markup
 
 from adjust.model.errors import SurveyError
 from adjust.model.result import Estimate, ParameterName
 from survey.folder.text import suggestion
+from survey.report.markup import part
 
 Component = tuple[ParameterName, str]
 Estimates = Mapping[ParameterName, Estimate]
@@ -74,3 +79,23 @@ def rows_in_joint(estimates: Estimates, wanted: Sequence[Component]) -> tuple[li
     names = list(dict.fromkeys(name for name, _ in wanted))
     starts = dict(zip(names, np.cumsum([0] + [len(in_joint(estimates[n])) for n in names]).tolist()[:-1], strict=True))
     return names, [starts[n] + in_joint(estimates[n]).index(c) for n, c in wanted]
+
+
+Cell = str | tuple[str, str]
+_OF = "notebook.html"
+
+
+def heading(title: str, said: str = "") -> Markup:
+    """A title with a remark; both are escaped."""
+    return part("heading", title, said, of=_OF)
+
+
+def verdict(colour: str, said: str) -> Markup:
+    """What an adjustment comes to, in a colour of CSS."""
+    return part("verdict", colour, said, of=_OF)
+
+
+def html_table(columns: Sequence[str], rows: Iterable[Sequence[Cell]]) -> Markup:
+    """A table of texts, first column left, others right; a cell may be a text with its style. Texts are escaped."""
+    cells = [[cell if isinstance(cell, tuple) else (cell, "") for cell in row] for row in rows]
+    return part("table", columns, cells, of=_OF)

@@ -13,12 +13,12 @@ from adjust.model.result import Adjustment
 from survey.jobs.adjusting.published_methods import published_dict
 from survey.notebook import frames
 from survey.notebook.covariance import Covariance
-from survey.notebook.html import heading, html_table, verdict
-from survey.notebook.names import components, rows_in_joint
+from survey.notebook.names import components, heading, html_table, rows_in_joint, verdict
 from survey.notebook.plots import Plot
 from survey.notebook.plots import plot as plot_by_name
 from survey.project import Project
-from survey.report.results import ReportOptions, RunInfo, summary_text, write_results
+from survey.report.language import ReportOptions
+from survey.report.results import RunInfo, summary_text, write_results
 from survey.solution.dictionary import solution_dict
 from survey.solution.quantities import Scale, scale_of
 from survey.solution.statistics import Statistics, statistics_of

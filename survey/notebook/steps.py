@@ -7,13 +7,13 @@ from typing import Any
 from adjust.model.errors import SurveyError
 from adjust.model.survey import Survey
 from survey.folder.text import suggestion
-from survey.jobs.adjusting.job import run_info
+from survey.jobs.adjusting.outcome import run_info
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.cross_validation import CrossValidation
 from survey.jobs.cross_validation import cross_validate as cross_validate_project
 from survey.jobs.detecting import DetectOutcome, detect_job
 from survey.jobs.excluding import ExcludeOutcome, exclude_job, include_job
-from survey.notebook.html import heading, html_table
+from survey.notebook.names import heading, html_table
 from survey.notebook.solution import Solution
 from survey.project import AdjustmentOptions, Project
 from survey.project import read as read_project

@@ -17,7 +17,7 @@ from survey.planning.plan_navigation import NavigationPlan, read_navigation
 from survey.planning.plan_readings import TERRESTRIAL_KEYS, Terrestrial, few, read_terrestrial, tables_of
 from survey.project.declared.node import Node, read_toml
 from survey.project.declared.poses import POSE_KEYS, read_pose
-from survey.project.tables.references import NameProblemError, Names, position_of, read_frame
+from survey.project.tables.references import Names, read_frame, read_position
 
 PLAN_FILE = "plan.toml"
 _EPOCH_KEYS = (
@@ -131,7 +131,7 @@ def read_plan(folder: Path, survey: Survey) -> Plan:
     candidates.allow("epochs", "distances", "coordinates", "pairs", "points", *TERRESTRIAL_KEYS)
     return Plan(
         path=Path(folder) / PLAN_FILE,
-        image_sigma_px=root.number("image_sigma_px", positive=True) if root.has("image_sigma_px") else None,
+        image_sigma_px=root.si("image_sigma_px", None, True),
         seeing=_seeing(root.table("seen"), survey),
         planned=_measurements(root, survey, names, "p"),
         candidates=_measurements(candidates, survey, names, "c"),
@@ -148,9 +148,9 @@ def _seeing(node: Node, survey: Survey) -> Seeing:
     targets = tuple(t.target_id for t in survey.targets)
     return Seeing(
         margin_px=node.number("margin_px", d.margin_px),
-        nearest_m=float(to_si(node.number("nearest_mm", 1e3 * d.nearest_m, positive=True), "mm")),
-        farthest_m=float(to_si(node.number("farthest_mm", positive=True), "mm")) if node.has("farthest_mm") else np.inf,
-        widest_incidence=float(to_si(node.number("widest_incidence_deg", 70.0, positive=True), "deg")),
+        nearest_m=node.si("nearest_mm", 1e3 * d.nearest_m, positive=True),
+        farthest_m=node.si("farthest_mm", np.inf, True),
+        widest_incidence=node.si("widest_incidence_deg", 70.0, positive=True),
         fewest_points=node.integer("fewest_points", 1, d.fewest_points),
         two_sided=node.references("two_sided", targets, "target", ()),
     )
@@ -242,39 +242,33 @@ def _by_hand(node: Node, survey: Survey) -> ByHand:
     return ByHand(
         node.reference("camera", (c.camera_id for c in survey.cameras), "camera"),
         node.reference("target", (t.target_id for t in survey.targets), "target"),
-        few(node, node.integer("count", 1), "count"), (near, far), float(to_si(node.number("tilt_deg", 40.0), "deg")),
+        few(node, node.integer("count", 1), "count"), (near, far), node.si("tilt_deg", 40.0),
         node.integer("seed", 0, 1),
     )  # fmt: skip
 
 
 def _distance(node: Node, names: Names) -> Distance:
     node.allow("name", "from", "to", "sigma_mm")
-    a, b = (position_of(node, names, node.text(key), key) for key in ("from", "to"))
+    a, b = (read_position(node.text(key), names, node.fail(key)) for key in ("from", "to"))
     name = node.text("name", f"{node.text('from')}-{node.text('to')}")
-    return Distance(name, a, b, 1.0, float(to_si(node.number("sigma_mm", positive=True), "mm")))
+    return Distance(name, a, b, 1.0, node.si("sigma_mm", positive=True))
 
 
 def _coordinates(node: Node, names: Names) -> list[PlannedPoint]:
     node.allow("of", "sigma_mm")
-    sigma = float(to_si(node.number("sigma_mm", positive=True), "mm"))
-    return [PlannedPoint(f"coordinates of {text}", position_of(node, names, text, "of", i), sigma)
+    sigma = node.si("sigma_mm", positive=True)
+    return [PlannedPoint(f"coordinates of {text}", read_position(text, names, node.fail("of", i)), sigma)
             for i, text in enumerate(node.names("of"))]  # fmt: skip
 
 
 def _pair(node: Node, names: Names) -> Pair:
     node.allow("name", "a", "b", "sigma_rotation_arcsec", "sigma_translation_mm")
-    ends = []
-    for key in ("a", "b"):
-        try:
-            ends.append(read_frame(node.text(key), names))
-        except NameProblemError as problem:
-            raise node.error(str(problem), key) from problem
-    turn = float(to_si(node.number("sigma_rotation_arcsec", positive=True), "arcsec"))
-    sigmas = [turn] * 3
-    if node.has("sigma_translation_mm"):
-        sigmas += [float(to_si(node.number("sigma_translation_mm", positive=True), "mm"))] * 3
+    a, b = (read_frame(node.text(key), names, node.fail(key)) for key in ("a", "b"))
+    turn = node.si("sigma_rotation_arcsec", positive=True)
+    shift = node.si("sigma_translation_mm", None, True)
+    sigmas = [turn] * 3 + ([] if shift is None else [shift] * 3)
     name = node.text("name", f"{node.text('a')}-{node.text('b')}")
-    return Pair(name, ends[0], ends[1], Pose3(), np.diag(np.square(sigmas)))
+    return Pair(name, a, b, Pose3(), np.diag(np.square(sigmas)))
 
 
 def _new_point(node: Node, survey: Survey) -> NewPoint:
@@ -284,20 +278,18 @@ def _new_point(node: Node, survey: Survey) -> NewPoint:
         raise node.error(problem, "id")
     if name in {p.point_id for p in survey.points}:
         raise node.error(f"{name!r} is a point of the survey already; give the new one another id", "id")
-    sigma = float(to_si(node.number("sigma_mm", positive=True), "mm")) if node.has("sigma_mm") else float("nan")
-    return NewPoint(name, to_si(node.numbers("x_mm", (3,)), "mm"), sigma)
+    return NewPoint(name, to_si(node.numbers("x_mm", (3,)), "mm"), node.si("sigma_mm", np.nan, True))
 
 
 def _requirement(node: Node) -> Requirement:
     node.allow("of", "sigma_rotation_deg", "sigma_rotation_arcsec", "sigma_translation_mm", "sigma_mm", "sigma_px")
     sigma: dict[str, float] = {}
-    for key, unit, si in (("sigma_rotation_deg", "deg", "rad"), ("sigma_rotation_arcsec", "arcsec", "rad"),
-                          ("sigma_translation_mm", "mm", "m"), ("sigma_mm", "mm", "m"),
-                          ("sigma_px", "px", "px")):  # fmt: skip
+    for key, si in (("sigma_rotation_deg", "rad"), ("sigma_rotation_arcsec", "rad"), ("sigma_translation_mm", "m"),
+                    ("sigma_mm", "m"), ("sigma_px", "px")):  # fmt: skip
         if node.has(key):
             if si in sigma:
                 raise node.error("this sigma is given twice; keep one of the two", key)
-            sigma[si] = float(to_si(node.number(key, positive=True), unit))
+            sigma[si] = node.si(key, positive=True)
     if not sigma:
         raise node.error("a requirement needs a sigma; add sigma_translation_mm, sigma_rotation_deg or sigma_px")
     return Requirement(node.text("of"), sigma)

@@ -54,18 +54,18 @@ def read_navigation(node: Node, survey: Survey) -> NavigationPlan:
     return NavigationPlan(
         node.reference("station", stations, "station") if node.has("station") else None,
         poses,
-        float(to_si(node.number("required_rotation_deg", 0.17, positive=True), "deg")),
-        float(to_si(node.number("required_translation_mm", 1.0, positive=True), "mm")),
+        node.si("required_rotation_deg", 0.17, positive=True),
+        node.si("required_translation_mm", 1.0, positive=True),
         _beacon_places(node),
         node.number("sigma_px", 0.2, positive=True),
-        float(to_si(node.number("beacon_sigma_mm", 0.4, positive=True), "mm")),
+        node.si("beacon_sigma_mm", 0.4, positive=True),
         (
-            float(to_si(node.number("camera_sigma_mm", 0.1, positive=True), "mm")),
-            float(to_si(node.number("camera_sigma_deg", 0.01, positive=True), "deg")),
+            node.si("camera_sigma_mm", 0.1, positive=True),
+            node.si("camera_sigma_deg", 0.01, positive=True),
         ),
         "worst" if criterion == "worst" else "mean",
         node.integer("at_least", 1, 3),
-        float(to_si(node.number("spacing_mm", 0.0), "mm")),
+        node.si("spacing_mm", 0.0),
         node.names("epochs", ()),
     )
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -17,21 +17,17 @@ from adjust.model.observations import (
     OnSurface,
     PositionRef,
     Reading,
-    ReadingKind,
     position_text,
 )
 from adjust.model.survey import FloatArray, Survey
-from survey.folder.units import to_si
 from survey.project.declared.instruments import setup_problem
 from survey.project.declared.node import Node
 from survey.project.project import Accuracy, Project
-from survey.project.tables.references import Names, frame_of, position_of
+from survey.project.tables.references import Names, read_position, timed_frame
+from survey.project.tables.terrestrial import ANGLES, READING_KINDS
 
-READING_KINDS = ("direction", "angle", "zenith", "azimuth", "slope_distance", "horizontal_distance",
-                 "height_difference")  # fmt: skip
 _MOST = 100_000  # of whatever is counted in one place: more nobody measures, and memory ends
 _Count = TypeVar("_Count", int, float)
-_ANGLES = READING_KINDS[:4]
 _KEYS = (
     *("setup", "from", "to", "second", "kinds", "sigma_arcsec", "sigma_mm", "instrument_height_mm"),
     "target_height_mm",
@@ -129,7 +125,7 @@ def with_usual_sigmas(
     out = []
     for r in readings:
         accuracy = project.sigmas.instruments.get(instruments.get(r.setup_id) or "", Accuracy())
-        sigma: float | None = r.sigma if np.isfinite(r.sigma) else _usual(r.kind, accuracy, distance(r))
+        sigma: float | None = r.sigma if np.isfinite(r.sigma) else accuracy.sigma(r.kind, distance(r))
         if sigma is None:
             raise SurveyError(
                 f"{project.folder}/plan.toml: reading {r.reading_id} ({r.kind}) has no sigma; give sigma_arcsec or "
@@ -140,17 +136,6 @@ def with_usual_sigmas(
     return tuple(out)
 
 
-def _usual(kind: str, accuracy: Accuracy, distance: float) -> float | None:
-    match kind:
-        case "slope_distance" | "horizontal_distance":
-            return None if accuracy.distance is None else accuracy.distance + accuracy.distance_slope * distance
-        case "angle" if accuracy.angle is None and accuracy.direction is not None:
-            return float(np.sqrt(2.0)) * accuracy.direction
-        case "height_difference" if accuracy.levelling is not None:
-            return float(np.hypot(accuracy.height_difference or 0.0, accuracy.levelling * (distance / 1000.0) ** 0.5))
-    return cast("float | None", getattr(accuracy, kind))
-
-
 def _readings(node: Node, names: Names, prefix: str) -> list[Reading]:
     """One reading of every kind to every target."""
     node.allow(*_KEYS)
@@ -158,10 +143,10 @@ def _readings(node: Node, names: Names, prefix: str) -> list[Reading]:
     if setup and (problem := setup_problem(setup, names.survey.setups)):
         raise node.error(problem, "setup")
     kinds = node.names("kinds")
-    at, targets = position_of(node, names, node.text("from"), "from"), _positions(node, "to", names)
-    second = position_of(node, names, node.text("second"), "second") if node.has("second") else None
-    sigma = {True: _length(node, "sigma_arcsec", "arcsec"), False: _length(node, "sigma_mm", "mm")}
-    heights = [float(to_si(node.number(f"{x}_height_mm", 0.0), "mm")) for x in ("instrument", "target")]
+    at, targets = _position(node, "from", names), _positions(node, "to", names)
+    second = _position(node, "second", names) if node.has("second") else None
+    sigma = {True: node.si("sigma_arcsec", np.nan, True), False: node.si("sigma_mm", np.nan, True)}
+    heights = [node.si(f"{x}_height_mm", 0.0) for x in ("instrument", "target")]
     out: list[Reading] = []
     for i, kind in enumerate(kinds):
         if kind not in READING_KINDS:
@@ -174,19 +159,19 @@ def _readings(node: Node, names: Names, prefix: str) -> list[Reading]:
             if to in (at, second):
                 raise node.error("stands in the same reading twice; its positions must differ", "to")
             name = f"plan {prefix} {kind} {to.point_id or len(out) + 1}"
-            out.append(Reading(name, cast("ReadingKind", kind), at, to, 1.0, sigma[kind in _ANGLES], setup, second,
+            out.append(Reading(name, kind, at, to, 1.0, sigma[kind in ANGLES], setup, second,
                                heights[0], heights[1], heights[1], group=kind))  # fmt: skip
     return out
 
 
-def _length(node: Node, key: str, unit: str) -> float:
-    return float(to_si(node.number(key, positive=True), unit)) if node.has(key) else float("nan")
+def _position(node: Node, key: str, names: Names) -> PositionRef:
+    return read_position(node.text(key), names, node.fail(key))
 
 
 def _positions(node: Node, key: str, names: Names) -> list[PositionRef]:
     if isinstance(node.values.get(key), str):
-        return [position_of(node, names, node.text(key), key)]
-    return [position_of(node, names, text, key) for text in node.names(key)]
+        return [_position(node, key, names)]
+    return [read_position(text, names, node.fail(key)) for text in node.names(key)]
 
 
 def _axis(node: Node, key: str) -> FloatArray:
@@ -199,14 +184,14 @@ def _axis(node: Node, key: str) -> FloatArray:
 
 def _level(node: Node, names: Names, name: str) -> Level:
     node.allow("frame", "axis", "sigma_arcsec")
-    sigma = float(to_si(node.number("sigma_arcsec", positive=True), "arcsec"))
-    return Level(node.text("name", name), frame_of(node, "frame", names), _axis(node, "axis"), 0.0, sigma)
+    frame = timed_frame(node.text("frame"), names, node.fail("frame"))
+    return Level(node.text("name", name), frame, _axis(node, "axis"), 0.0, node.si("sigma_arcsec", positive=True))
 
 
 def _alignment(node: Node, names: Names, name: str) -> Alignment:
     node.allow("a", "axis_a", "b", "axis_b", "sigma_arcsec")
-    sigma = float(to_si(node.number("sigma_arcsec", positive=True), "arcsec"))
-    a, b = frame_of(node, "a", names), frame_of(node, "b", names)
+    sigma = node.si("sigma_arcsec", positive=True)
+    a, b = (timed_frame(node.text(key), names, node.fail(key)) for key in ("a", "b"))
     return Alignment(name, a, _axis(node, "axis_a"), b, _axis(node, "axis_b"), np.zeros(2), sigma**2 * np.eye(2))
 
 
@@ -214,21 +199,21 @@ def _spot(node: Node, names: Names, name: str) -> LaserSpot:
     node.allow("beam", "target", "epoch", "sigma_mm")
     beam = node.reference("beam", (b.beam_id for b in names.survey.beams), "beam")
     target = node.reference("target", (t.target_id for t in names.survey.targets), "target")
-    sigma = float(to_si(node.number("sigma_mm", positive=True), "mm"))
+    sigma = node.si("sigma_mm", positive=True)
     return LaserSpot(name, beam, node.text("epoch"), target, np.zeros(2), sigma**2 * np.eye(2))
 
 
 def _on_surface(node: Node, names: Names) -> list[OnSurface]:
     node.allow("surface", "of", "sigma_mm")
     surface = node.reference("surface", (s.surface_id for s in names.survey.surfaces), "surface")
-    sigma = float(to_si(node.number("sigma_mm", positive=True), "mm"))
+    sigma = node.si("sigma_mm", positive=True)
     return [OnSurface(surface, p, sigma) for p in _positions(node, "of", names)]
 
 
 def _differences(node: Node, names: Names) -> list[CoordinateDifferences]:
     node.allow("from", "to", "sigma_mm")
-    at = position_of(node, names, node.text("from"), "from")
-    sigma = float(to_si(node.number("sigma_mm", positive=True), "mm"))
+    at = _position(node, "from", names)
+    sigma = node.si("sigma_mm", positive=True)
     return [
         CoordinateDifferences((at,), (to,), np.zeros((1, 3)), sigma**2 * np.eye(3))
         for to in _positions(node, "to", names)

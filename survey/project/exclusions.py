@@ -25,8 +25,10 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from adjust.model.errors import SurveyError
+from survey.folder.plain import attributes
 from survey.folder.text import decode, read_bytes, suggestion
 from survey.project.tables.reading import LARGEST_ROWS, Layout, check_header
 
@@ -64,6 +66,11 @@ class Exclusion:
     time: str = ""
     line: int = 0
     at: tuple[float, float] | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Who left what out, and why."""
+        return {"name": str(self.name), "what": self.name.what, "id": self.name.id,
+                **attributes(self, "reason", "author", "time")}  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,9 @@ from survey.project.declared.toml_text import KeyPath, key_lines, toml_text
 from survey.project.detected import ImageKey, file_of
 from survey.project.exclusions import EXCLUSIONS_FILE, appended, read_exclusions
 from survey.project.project import DEFINITION_FILE, FORMAT, IMAGES_FOLDER, OBSERVATIONS_FOLDER, Project
-from survey.project.reading import LAYOUTS, read
+from survey.project.reading import read
 from survey.project.tables.files import read_table
+from survey.project.tables.kinds import LAYOUTS
 
 _KINDS = ("cameras", "stations", "tables", "targets", "points", "instruments", "setups", "beams", "surfaces")
 Origin = tuple[Path, int]

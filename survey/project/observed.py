@@ -1,8 +1,7 @@
 """The observations of a project by the names under which they are left out, and what each name means."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -21,28 +20,11 @@ from adjust.model.survey import BoolArray, Survey
 from survey.folder.text import suggestion
 from survey.project.exclusions import WHAT, Name, name_problem
 from survey.project.project import SpotBlock
+from survey.project.tables.kinds import KINDS
 
 Ref = PositionRef | FrameRef | str
 """What an observation names: a position, a frame, an epoch."""
-_READINGS: Mapping[str, tuple[str, Callable[[Any], str]]] = {  # table: field of the survey, id of an observation
-    "table_angles": ("table_readings", lambda r: f"{r.table_id}/{r.epoch_id}"),
-    "pairs": ("pairs", lambda p: p.pair_id),
-    "distances": ("distances", lambda d: d.distance_id),
-    "coordinates": ("coordinates", lambda c: c.set_id or position_text(c.positions[0])),
-    "terrestrial": ("readings", lambda r: r.reading_id),
-    "coordinate_differences": ("coordinate_differences", lambda d: d.set_id),
-    "levels": ("levels", lambda x: x.level_id),
-    "alignments": ("alignments", lambda x: x.alignment_id),
-    "laser_spots": ("laser_spots", lambda x: x.spot_id),
-    "on_surfaces": ("on_surfaces", lambda o: f"{o.surface_id}/{position_text(o.position)}"),
-}
-_FIELDS = {name: table for table, (name, _) in _READINGS.items()}
-_KINDS = {  # as reports call the observations of a table
-    "table": "table_angles", "pair": "pairs", "distance": "distances", "level": "levels", "alignment": "alignments",
-    "coordinate_difference": "coordinate_differences", "laser": "laser_spots", "surface": "on_surfaces",
-    "direction": "terrestrial", "angle": "terrestrial", "zenith": "terrestrial", "azimuth": "terrestrial",
-    "slope_distance": "terrestrial", "horizontal_distance": "terrestrial", "height_difference": "terrestrial",
-}  # fmt: skip
+_KINDS = {name: kind for kind in KINDS for name in (kind.layout.name, *kind.called)}  # as tables and reports call them
 _NEAR_PX = 3.0  # detection may move a spot by noise and a new threshold, but not onto another one
 
 
@@ -95,9 +77,9 @@ class Observed:
     def __init__(self, survey: Survey, spots: Sequence[SpotBlock]) -> None:
         self.survey, self.spots = survey, tuple(spots)
         self.readings: dict[str, list[tuple[str, int]]] = {}
-        for table, (name, id_of) in _READINGS.items():
-            for i, item in enumerate(getattr(survey, name)):
-                self.readings.setdefault(f"{table}:{id_of(item)}", []).append((name, i))
+        for kind in KINDS:
+            for i, item in enumerate(getattr(survey, kind.field)):
+                self.readings.setdefault(f"{kind.layout.name}:{kind.id_of(item)}", []).append((kind.field, i))
         self._target_points = {t.target_id: {p: i for i, p in enumerate(t.point_ids)} for t in survey.targets}
         self._points = {p.point_id: i for i, p in enumerate(survey.points)}
         self._blocks: dict[tuple[str, str], list[int]] = {}
@@ -186,8 +168,8 @@ class Observed:
                 found.spots[i] = {spot}
 
     def _others_where(self, found: Hits, wanted: Callable[[Ref], bool]) -> None:
-        for name in _FIELDS:
-            for i, item in enumerate(getattr(self.survey, name)):
+        for name, items in self.survey.others.items():
+            for i, item in enumerate(items):
                 rows = _rows(item)
                 mine = {k for k, refs in enumerate(rows) if any(wanted(ref) for ref in refs)}
                 if len(mine) == len(rows):
@@ -289,12 +271,13 @@ class Observed:
             return [Name("reading", rest)]
         if prefix in WHAT:
             return [Name(prefix, rest)] if name_problem(prefix, rest) is None else []
-        table = prefix if prefix in _READINGS else _KINDS.get(prefix)
-        return [] if table is None else [Name("reading", f"{table}:{rest}")]
+        kind = _KINDS.get(prefix)
+        return [] if kind is None else [Name("reading", f"{kind.layout.name}:{rest}")]
 
     def _bare(self, text: str) -> tuple[list[Name], ...]:
         """Groups of names that a bare text may stand for; the first group in which any means something counts."""
-        readings = [Name("reading", f"{table}:{text}") for table in _READINGS if f"{table}:{text}" in self.readings]
+        named = (f"{kind.layout.name}:{text}" for kind in KINDS)
+        readings = [Name("reading", name) for name in named if name in self.readings]
         n = text.count("/") + 1
         if n > 1:
             shapes = {2: ("image", "point"), 3: ("image_point", "target", "spot"), 4: ("image_point",)}.get(n, ())
@@ -337,7 +320,8 @@ def _frame(ref: Ref) -> FrameRef:
 def name_of_residual(residual: ObservationResidual) -> str:
     """The name of an observation of ``Adjustment.other_residuals``: ``table:id``."""
     whole = residual.kind in ("table", "coordinates", "surface")  # the others carry their id in front of what they join
-    return f"{_KINDS.get(residual.kind, residual.kind)}:{'/'.join(residual.ids) if whole else residual.ids[0]}"
+    table = _KINDS[residual.kind].layout.name if residual.kind in _KINDS else residual.kind
+    return f"{table}:{'/'.join(residual.ids) if whole else residual.ids[0]}"
 
 
 def _rows(item: Observation) -> list[list[Ref]]:

@@ -1,17 +1,20 @@
 """What a project folder holds, as frozen values."""
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, get_args
 
+import numpy as np
 from gtsam import Rot3
 
-from adjust.model.observations import Closure, FrameRef
+from adjust.model.observations import Closure, FrameRef, ReadingKind
 from adjust.model.survey import FloatArray, IntArray, Survey
 from survey.folder.locking import OBSERVATIONS_FOLDER as OBSERVATIONS_FOLDER
 from survey.folder.locking import RESULTS as RESULTS
+from survey.folder.plain import attributes
 from survey.project.detected import DetectedImage
 from survey.project.exclusions import Exclusion
 from survey.project.targets import TargetKind
@@ -19,8 +22,6 @@ from survey.project.targets import TargetKind
 _SEVERAL = {"table_readings": "table readings", "reading_covariances": "covariances of readings",
             "coordinate_differences": "coordinate differences", "laser_spots": "laser spots",
             "on_surfaces": "points on surfaces"}  # fmt: skip
-_OBSERVED = ("table_readings", "pairs", "distances", "coordinates", "readings", "coordinate_differences", "levels",
-             "alignments", "laser_spots", "on_surfaces")  # fmt: skip
 _OWNERS = ("cameras", "stations", "tables", "targets", "points", "instruments", "setups", "beams", "surfaces")
 
 
@@ -28,7 +29,7 @@ def observed(survey: Survey, n_spots: int) -> dict[str, int]:
     """How many observations of each kind there are; n_spots: those that are still to be identified."""
     found = {"image points": sum(len(b.uv) for b in survey.image_blocks), "images": len(
         {(b.camera_id, b.epoch_id) for b in survey.image_blocks})}  # fmt: skip
-    found |= {_SEVERAL.get(name, name): len(getattr(survey, name)) for name in _OBSERVED}
+    found |= {_SEVERAL.get(name, name): len(items) for name, items in survey.others.items()}
     found["spots to identify"] = n_spots
     return {name: n for name, n in found.items() if n}
 
@@ -187,6 +188,19 @@ class Accuracy:
     centring: float = 0.0
     height: float = 0.0
 
+    def sigma(self, kind: ReadingKind, length: float) -> float | None:
+        """Of one reading. length: m, of a distance, or of the line of a height difference (nan: not known)."""
+        match kind:
+            case "slope_distance" | "horizontal_distance":
+                return None if self.distance is None else self.distance + self.distance_slope * length
+            case "height_difference":
+                if self.levelling is None or np.isnan(length):
+                    return self.height_difference
+                return float(np.hypot(self.height_difference or 0.0, self.levelling * (length / 1000.0) ** 0.5))
+            case "angle" if self.angle is None and self.direction is not None:
+                return self.direction * math.sqrt(2.0)  # the difference of two directions
+        return {"direction": self.direction, "angle": self.angle, "zenith": self.zenith, "azimuth": self.azimuth}[kind]
+
 
 @dataclass(frozen=True, eq=False)
 class Sigmas:
@@ -223,6 +237,10 @@ class LeftOut:
     n_image_points: int = 0
     n_spots: int = 0
     n_readings: int = 0
+
+    def counts(self) -> dict[str, int]:
+        """How many of each."""
+        return attributes(self, "n_images", "n_image_points", "n_spots", "n_readings")
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,10 +1,10 @@
 """Reading a project folder."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Literal
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from adjust.model.survey import Datum, FloatArray, Point, PointParameter, Survey
 from survey.folder.locking import settled
 from survey.folder.text import id_problem, suggestion
 from survey.project.declared.clocks import are_timed, read_times
-from survey.project.declared.declarations import keys_of
 from survey.project.declared.instruments import (
     read_beams,
     read_bearings,
@@ -45,54 +44,11 @@ from survey.project.project import (
     Sigmas,
     SpotsRequest,
 )
-from survey.project.tables.coordinates import (
-    COORDINATES,
-    COORDINATES_COVARIANCE,
-    DIFFERENCES,
-    DIFFERENCES_COVARIANCE,
-    read_coordinates,
-    read_differences,
-)
 from survey.project.tables.files import read_table
-from survey.project.tables.geometric import (
-    ALIGNMENTS,
-    LASER_SPOTS,
-    LEVELS,
-    ON_SURFACES,
-    read_alignments,
-    read_laser_spots,
-    read_levels,
-    read_on_surfaces,
-)
-from survey.project.tables.image_points import IMAGE_POINTS, SPOTS, read_image_blocks, read_spots, world_names
-from survey.project.tables.measurements import ANGLES, DISTANCES, read_angles, read_distances
-from survey.project.tables.pairs import PAIRS, read_pairs
+from survey.project.tables.image_points import read_image_blocks, read_spots, world_names
+from survey.project.tables.kinds import GROUPS, KINDS, LAYOUTS, with_observations
 from survey.project.tables.reading import Layout, Table
 from survey.project.tables.references import Names
-from survey.project.tables.terrestrial import (
-    KINDS,
-    TERRESTRIAL,
-    TERRESTRIAL_COVARIANCE,
-    read_reading_covariances,
-    read_readings,
-)
-
-LAYOUTS = {
-    layout.name: layout
-    for layout in (
-        IMAGE_POINTS, SPOTS, ANGLES, PAIRS, DISTANCES, COORDINATES, COORDINATES_COVARIANCE, TERRESTRIAL,
-        TERRESTRIAL_COVARIANCE, DIFFERENCES, DIFFERENCES_COVARIANCE, LEVELS, ALIGNMENTS, LASER_SPOTS, ON_SURFACES,
-    )
-}  # fmt: skip
-_GROUPS = (
-    "image", "table", "pair", "distance", "coordinates", *KINDS, "coordinate_difference", "level", "alignment",
-    "laser", "surface",
-)  # fmt: skip
-_EXTRA = {  # tables that only make sense beside another
-    "coordinates_covariance": "coordinates",
-    "terrestrial_covariance": "terrestrial",
-    "coordinate_differences_covariance": "coordinate_differences",
-}
 
 
 def read_definition(folder: Path) -> Definition:
@@ -101,17 +57,19 @@ def read_definition(folder: Path) -> Definition:
         return _read_definition(Path(folder))[0]
 
 
-def read(folder: Path) -> Project:
+def read(folder: Path, then: Callable[[], object] = lambda: None) -> Project:
     """Read a whole project folder; tables of observations that are not there yet are empty. Raises SurveyError.
 
     What ``exclusions.csv`` leaves out is not used. ``notes`` say which of its rows name nothing, ``image_notes``
-    which images are not those any more that the points come from.
+    which images are not those any more that the points come from. then: called when all files are read.
     """
-    project = read_all(folder)
+    project = read_all(folder, then=then)
     return leaving_out(project, in_force(read_exclusions(project.folder / OBSERVATIONS_FOLDER)[0]).values())
 
 
-def read_all(folder: Path, texts: Mapping[str, str] = MappingProxyType({})) -> Project:
+def read_all(
+    folder: Path, texts: Mapping[str, str] = MappingProxyType({}), then: Callable[[], object] = lambda: None
+) -> Project:
     """:func:`read`, with what is excluded as if it were not.
 
     texts: what is to stand in files of the folder, not yet written, by their paths in it.
@@ -123,6 +81,7 @@ def read_all(folder: Path, texts: Mapping[str, str] = MappingProxyType({})) -> P
         _, digest = read_exclusions(place)
         known = read_detected(place)
         images = _image_news(definition, tables, known)
+    then()
     project = _observed(definition, root, tables)
     hashes = dict(sorted({**project.inputs, f"{OBSERVATIONS_FOLDER}/{EXCLUSIONS_FILE}": digest}.items()))
     if digest:
@@ -158,10 +117,8 @@ def leaving_out(project: Project, exclusions: Iterable[Exclusion]) -> Project:
 
 
 def _n_unused(survey: Survey) -> int:
-    kinds = (survey.table_readings, survey.pairs, survey.distances, survey.coordinates, survey.readings, survey.levels,
-             survey.coordinate_differences, survey.alignments, survey.laser_spots, survey.on_surfaces)  # fmt: skip
     images = sum(int((~b.used).sum()) for b in survey.image_blocks if b.used is not None)
-    return images + sum(not o.used for kind in kinds for o in kind)
+    return images + sum(not o.used for kind in survey.others.values() for o in kind)
 
 
 def _image_news(
@@ -184,49 +141,17 @@ def _image_news(
 def _observed(definition: Definition, root: Node, tables: dict[str, Table]) -> Project:
     """All that the tables hold."""
     _check_scales(root, definition.sigmas, tables)
-    survey = _with_tie_points(definition, tables, flat_point(root.integer("dimensions", 1, 3)))
+    survey = _with_tie_points(definition, tables, flat_point(root.integer("dimensions")))
     _check_datum_points(root, survey)
     names, sigmas = Names.of(survey), definition.sigmas
     points = tables.get("image_points")
     blocks, where = read_image_blocks(points, names, sigmas) if points is not None else ((), ImagePointsWhere())
-    for extra_name, main in _EXTRA.items():
-        if extra_name in tables and main not in tables:
-            problem = f"there is no table of {main} beside it; add {main}.csv or remove this file"
-            raise tables[extra_name].error(0, problem)
-    extra, coordinates = tables.get("coordinates_covariance"), tables.get("coordinates")
-    survey = dataclasses.replace(
-        survey,
-        image_blocks=blocks,
-        table_readings=read_angles(tables["table_angles"], names, sigmas) if "table_angles" in tables else (),
-        pairs=read_pairs(tables["pairs"], names, sigmas) if "pairs" in tables else (),
-        distances=read_distances(tables["distances"], names, sigmas) if "distances" in tables else (),
-        coordinates=read_coordinates(coordinates, extra, names, sigmas) if coordinates is not None else (),
-    )
-    survey = dataclasses.replace(survey, **_terrestrial_and_geometric(tables, Names.of(survey), sigmas))
+    survey = with_observations(dataclasses.replace(survey, image_blocks=blocks), tables, sigmas)
     fields = {field.name: getattr(definition, field.name) for field in dataclasses.fields(Definition)}
     hashes = {table.path.relative_to(definition.folder).as_posix(): table.digest for table in tables.values()}
     fields |= {"survey": survey, "inputs": dict(sorted(({**definition.inputs, **hashes}).items()))}
     spots = read_spots(tables["spots"], names, sigmas) if "spots" in tables else ()
     return Project(**fields, spots=spots, image_points_where=where)
-
-
-def _terrestrial_and_geometric(tables: dict[str, Table], names: Names, sigmas: Sigmas) -> dict[str, Any]:
-    """The fields of the survey that these tables fill; ``names`` know the readings of the turntables already."""
-    found: dict[str, Any] = {}
-    if "terrestrial" in tables:
-        found["readings"] = read_readings(tables["terrestrial"], names, sigmas)
-    if "terrestrial_covariance" in tables:
-        found["reading_covariances"] = read_reading_covariances(
-            tables["terrestrial_covariance"], found["readings"]
-        )
-    if "coordinate_differences" in tables:
-        extra = tables.get("coordinate_differences_covariance")
-        found["coordinate_differences"] = read_differences(tables["coordinate_differences"], extra, names, sigmas)
-    for name, read_one in (("levels", read_levels), ("alignments", read_alignments), ("laser_spots", read_laser_spots),
-                           ("on_surfaces", read_on_surfaces)):  # fmt: skip
-        if name in tables:
-            found[name] = read_one(tables[name], names, sigmas)
-    return found
 
 
 def _read_definition(folder: Path, text: str | None = None) -> tuple[Definition, Node]:
@@ -235,7 +160,7 @@ def _read_definition(folder: Path, text: str | None = None) -> tuple[Definition,
         raise SurveyError(f"{path}: there is no such file; a project folder holds a {DEFINITION_FILE}")
     root, digest = read_toml(path, text)
     _check_format(root)
-    root.allow(*keys_of("root"))
+    root = root.declared_as("root")
     inputs = {DEFINITION_FILE: digest}
     times = read_times(root)
     tables, table_sigmas = read_tables(root, are_timed(times))
@@ -244,7 +169,7 @@ def _read_definition(folder: Path, text: str | None = None) -> tuple[Definition,
     cameras = read_cameras(root, station_ids, are_timed(times))
     camera_ids = tuple(camera.camera_id for camera in cameras)
     targets, kinds, seen_by = read_targets(root, station_ids, camera_ids, inputs)
-    dimensions = root.integer("dimensions", 1, 3)
+    dimensions = root.integer("dimensions")
     if dimensions > 3:
         raise root.error(f"found {dimensions}; a network has 1 (levelling), 2 (plane) or 3 dimensions", "dimensions")
     points = tuple(Point(point_id, read_point(node, dimensions)) for point_id, node in root.tables("points"))
@@ -259,12 +184,12 @@ def _read_definition(folder: Path, text: str | None = None) -> tuple[Definition,
         beams=read_beams(root, station_ids, table_ids), surfaces=read_surfaces(root),
         temperatures={epoch_id: node.number(epoch_id) for epoch_id in node.values}, **times,
     )  # fmt: skip
-    tie_points = root.flag("tie_points", False)
+    tie_points = root.flag("tie_points")
     if not tie_points:
         _check_datum_points(root, survey)
     definition = Definition(
         folder=folder,
-        title=root.text("title", ""),
+        title=root.text("title"),
         tie_points=tie_points,
         survey=survey,
         target_kinds=kinds,
@@ -287,13 +212,12 @@ def _check_format(root: Node) -> None:
 
 
 def _read_datum(node: Node, station_ids: tuple[str, ...]) -> Datum:
-    node.allow(*keys_of("datum"))
-    kind = node.choice("kind", ("given", "inner"), "given")
+    kind: Literal["given", "inner"] = node.choice("kind", ("given", "inner"))
     for key in ("points", "stations"):
         if kind == "given" and node.has(key):
             raise node.error('only the datum of kind "inner" names points and stations; remove this', key)
     stations = node.references("stations", station_ids, "station", ())
-    return Datum("inner" if kind == "inner" else "given", node.names("points", ()), stations)
+    return Datum(kind, node.names("points", ()), stations)
 
 
 def _check_datum_points(root: Node, survey: Survey) -> None:
@@ -302,31 +226,28 @@ def _check_datum_points(root: Node, survey: Survey) -> None:
 
 
 def _read_spots_request(node: Node, camera_ids: tuple[str, ...]) -> SpotsRequest:
-    node.allow(*keys_of("spots"))
     cameras = node.references("cameras", camera_ids, "camera")
     epochs = node.names("epochs") if node.has("epochs") else None
     for i, epoch_id in enumerate(epochs or ()):
         problem = id_problem(epoch_id)
         if problem:
             raise node.error(problem, "epochs", i)
-    smallest, largest = node.numbers("diameter_px", (2,), [2.0, 12.0]).tolist()
+    smallest, largest = node.numbers("diameter_px", (2,)).tolist()
     if not 0 < smallest <= largest:
         raise node.error(f"found [{smallest:g}, {largest:g}]; expected [smallest, largest]", "diameter_px")
-    return SpotsRequest(cameras, epochs, (smallest, largest), node.number("gate_px", 15.0, positive=True))
+    return SpotsRequest(cameras, epochs, (smallest, largest), node.number("gate_px"))
 
 
 def _read_sigmas(node: Node, tables: dict[str, FloatArray]) -> Sigmas:
-    node.allow(*keys_of("sigmas"))
     scale = node.table("scale")
-    image_px = node.number("image_px", positive=True) if node.has("image_px") else None
-    return Sigmas(image_px, {group: scale.number(group, positive=True) for group in scale.values}, tables)
+    return Sigmas(node.si("image_px", None), {group: scale.number(group) for group in scale.values}, tables)
 
 
 def _check_scales(root: Node, sigmas: Sigmas, tables: dict[str, Table]) -> None:
     found = {name for table in tables.values() for name in table.text("group").names if name}
     for group in sigmas.scale:
-        if group not in (*_GROUPS, *found):
-            problem = f"unknown group; {suggestion(group, (*_GROUPS, *sorted(found)))}"
+        if group not in (*GROUPS, *found):
+            problem = f"unknown group; {suggestion(group, (*GROUPS, *sorted(found)))}"
             raise root.table("sigmas").table("scale").error(problem, group)
 
 
@@ -358,12 +279,10 @@ def _with_tie_points(definition: Definition, tables: dict[str, Table], unknown: 
     if not definition.tie_points:
         return survey
     found = world_names(tables["image_points"]) if "image_points" in tables else set()
-    for table, columns in (
-        ("distances", ("from_id", "to_id")), ("coordinates", ("point_id",)), ("on_surfaces", ("point_id",)),
-        ("terrestrial", ("from_id", "to_id", "second_id")), ("coordinate_differences", ("from_id", "to_id")),
-    ):  # fmt: skip
-        for column in columns if table in tables else ():
-            found |= {name for name in tables[table].text(column).names if name and not set(name) & set(":@/")}
+    for kind in KINDS:
+        for column in kind.positions if kind.layout.name in tables else ():
+            texts = tables[kind.layout.name].text(column).names
+            found |= {name for name in texts if name and not set(name) & set(":@/")}
     new = found - {point.point_id for point in survey.points} - {"world"}
     ordered = sorted((name for name in new if not id_problem(name)), key=natural_key)
     return dataclasses.replace(survey, points=(*survey.points, *(Point(name, unknown) for name in ordered)))

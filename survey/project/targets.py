@@ -119,5 +119,7 @@ class PointList:
         return self.point_ids, self.x_in_target
 
 
-DetectableTarget = Checkerboard | Charuco | MarkerGrid | MarkerBlock
+Board = Checkerboard | Charuco | MarkerGrid
+BOARDS: dict[str, type[Board]] = {"checkerboard": Checkerboard, "charuco": Charuco, "marker_grid": MarkerGrid}
+DetectableTarget = Board | MarkerBlock
 TargetKind = DetectableTarget | PointList

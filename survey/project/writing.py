@@ -22,18 +22,10 @@ from survey.project.project import (
     SpotBlock,
     SpotsRequest,
 )
-from survey.project.reading import LAYOUTS
 from survey.project.tables.files import write_table
-from survey.project.tables.observation_columns import (
-    angle_columns,
-    coordinate_columns,
-    distance_columns,
-    image_point_columns,
-    pair_columns,
-    spot_columns,
-)
+from survey.project.tables.image_points import image_point_columns, spot_columns
+from survey.project.tables.kinds import LAYOUTS, observation_tables
 from survey.project.tables.reading import Columns
-from survey.project.tables.terrestrial_columns import new_tables
 from survey.project.targets import PointList, TargetKind
 
 
@@ -119,15 +111,6 @@ def _point_list_columns(kind: PointList) -> Columns:
 
 def _tables(survey: Survey, spots: Sequence[SpotBlock]) -> dict[str, Columns]:
     """The columns of every table that has rows."""
-    coordinates, between = coordinate_columns(survey.coordinates)
-    tables = {
-        "image_points": image_point_columns(survey.image_blocks, survey),
-        "spots": spot_columns(spots),
-        "table_angles": angle_columns(survey.table_readings),
-        "pairs": pair_columns(survey.pairs),
-        "distances": distance_columns(survey.distances),
-        "coordinates": coordinates,
-        "coordinates_covariance": between,
-        **new_tables(survey),
-    }
+    tables = {"image_points": image_point_columns(survey.image_blocks, survey), "spots": spot_columns(spots)}
+    tables |= observation_tables(survey)
     return {name: columns for name, columns in tables.items() if len(next(iter(columns.values())))}

@@ -64,22 +64,19 @@ def vector_field(c: CameraResiduals) -> Markup:
     scale, height, parts = _frame(c.size, t("Residuals"))
     rank = np.random.default_rng(0).permutation(len(c.uv))
     ordinary = c.used & ~c.suspect
-    shown = ordinary & np.isin(np.arange(len(c.uv)), rank[np.isin(rank, np.flatnonzero(ordinary))][:_MOST_ARROWS])
+    shown, n = np.sort(rank[ordinary[rank]][:_MOST_ARROWS]), int(np.count_nonzero(ordinary))
     grow = _arrow_scale(np.hypot(*c.residuals[ordinary].T), 15.0)
-    start = c.uv * scale + (0.5 * scale, _ABOVE + 0.5 * scale)
-    end = start + grow * c.residuals
-    parts.append(d.arrows(start[shown], end[shown], d.ARROWS, 0.7))
+    origin = 0.5 * scale, _ABOVE + 0.5 * scale
+    start = c.uv[shown] * scale + origin
+    parts.append(d.arrows(start, start + grow * c.residuals[shown], d.ARROWS, 0.7))
     for mask, colour in ((~c.used, d.ORANGE), (c.used & c.suspect, d.RED)):
         few = np.flatnonzero(mask)[:_MOST_ARROWS]
-        length = np.hypot(*c.residuals[few].T)[:, None]
-        capped = start[few] + grow * c.residuals[few] * np.minimum(1.0, 45.0 / np.maximum(grow * length, 1e-12))
-        parts.append(d.arrows(start[few], capped, colour, 1.4, 4.0))
-        parts += [d.dot(x, y, 1.8, colour) for x, y in start[few]]
-    note = (
-        t("{shown} of {n} shown", shown=count(int(shown.sum())), n=count(int(ordinary.sum())))
-        if shown.sum() < ordinary.sum()
-        else t("all {n}", n=count(int(ordinary.sum())))
-    )
+        start, length = c.uv[few] * scale + origin, np.hypot(*c.residuals[few].T)[:, None]
+        capped = start + grow * c.residuals[few] * np.minimum(1.0, 45.0 / np.maximum(grow * length, 1e-12))
+        parts.append(d.arrows(start, capped, colour, 1.4, 4.0))
+        parts += [d.dot(x, y, 1.8, colour) for x, y in start]
+    said = "{shown} of {n} shown" if len(shown) < n else "all {n}"
+    note = t(said, shown=count(len(shown)), n=count(n))
     parts += [_bar(_ABOVE + height + 14, grow), d.text(WIDTH, _ABOVE + height + 18, note, "end")]
     return d.svg(WIDTH, _ABOVE + height + _BELOW, parts, t("Residual vectors of camera {name}", name=c.camera_id))
 

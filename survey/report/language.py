@@ -37,6 +37,20 @@ _WORDS = frozenset(("required", "planned"))
 _current: ContextVar[str] = ContextVar("language", default="en")
 
 
+@dataclass(frozen=True)
+class ReportOptions:
+    """How results are written.
+
+    language: of report.html, "en" or "de". pdf: report.pdf too. parquet: residuals.parquet too, which is written again
+    as long as it is there.
+    """
+
+    language: str = "en"
+    pdf: bool = False
+    parquet: bool = False
+
+
+ENGLISH_PAGE = ReportOptions()
 class MissingTranslationError(KeyError):
     """A text of the report that a language does not know: a bug, found by the tests."""
 

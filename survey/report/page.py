@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import tempfile
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from survey.report.modules import WEB, bundled
 from survey.report.sections import diagnosis, loops, observations, overview, published, statistics, unknowns
 from survey.solution.dictionary import RunInfo, solution_dict
 from survey.solution.quantities import scale_of
-from survey.solution.residual_tables import image_rows
+from survey.solution.residual_tables import ImageRows, image_rows
 from survey.solution.statistics import Statistics
 
 _SECTIONS = (
@@ -54,6 +55,20 @@ _SECTIONS = (
 )
 
 
+_OF_STATISTICS = frozenset((
+    "tolerances", "components", "parts", "all-observations", "reliability", "relative", "budget", "correlations",
+))  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class BegunPage:
+    """A page without what statistics say. made: sections by their anchors."""
+
+    context: Context
+    language: str
+    made: dict[str, Markup]
+
+
 def report_html(
     adjustment: Adjustment,
     run: RunInfo,
@@ -66,22 +81,33 @@ def report_html(
     found: the statistics, where they are to be shown. in_language: "en" or "de"; raises SurveyError for others.
     """
     solution = solution_dict(adjustment, run) if solution is None else solution
+    return finished_page(begun_page(adjustment, run, solution, image_rows(adjustment), in_language), solution, found)
+
+
+def begun_page(
+    adjustment: Adjustment, run: RunInfo, solution: dict[str, Any], rows: ImageRows, in_language: str
+) -> BegunPage:
+    """What can be made before there are statistics; the ``solution`` may lack them."""
     limit = solution["summary"]["suspects"]["image_test_limit"]
     images = adjustment.image_residuals
     c = Context(
-        adjustment, run, solution, scale_of(adjustment, run.sigmas), image_rows(adjustment),
-        images.used & (images.test > limit), found,
+        adjustment, run, solution, scale_of(adjustment, run.sigmas), rows,
+        images.used & (images.test > limit),
     )  # fmt: skip
     with speaking(in_language):
-        return _page(c)
+        made = {anchor: make(c) for _, anchor, make in _SECTIONS if anchor not in _OF_STATISTICS}
+    return BegunPage(c, in_language, made)
 
 
-def _page(c: Context) -> str:
-    made = [(name, anchor, make(c)) for name, anchor, make in _SECTIONS]
-    nav = part("nav", [(anchor, t(name)) for name, anchor, body in made if body])
-    title = f"{c.solution['summary']['title'] or c.run.folder} – {t('Adjustment report')}"
-    shown = overview.header(c) + nav + joined((body for _, _, body in made), "\n")
-    return document(title, shown, json_script("words", _words()) + element("script", Markup(bundled("report"))))
+def finished_page(begun: BegunPage, solution: dict[str, Any], found: Statistics | None) -> str:
+    """The whole page; arguments as of :func:`report_html`."""
+    c = replace(begun.context, solution=solution, statistics=found)
+    with speaking(begun.language):
+        made = begun.made | {anchor: make(c) for _, anchor, make in _SECTIONS if anchor in _OF_STATISTICS}
+        nav = part("nav", [(anchor, t(name)) for name, anchor, _ in _SECTIONS if made[anchor]])
+        title = f"{c.solution['summary']['title'] or c.run.folder} – {t('Adjustment report')}"
+        shown = overview.header(c) + nav + joined((made[anchor] for _, anchor, _ in _SECTIONS), "\n")
+        return document(title, shown, json_script("words", _words()) + element("script", Markup(bundled("report"))))
 
 
 def _words() -> dict[str, Any]:

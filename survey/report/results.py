@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from adjust.model.result import Adjustment
@@ -11,20 +12,26 @@ from adjust.native.parallel import Beside
 from survey.folder.replacing import changing, replace_parts
 from survey.project import atomic_write
 from survey.project.project import RESULTS
-from survey.report.page import report_html, report_pdf
+from survey.report.language import ENGLISH_PAGE, ReportOptions
+from survey.report.page import BegunPage, begun_page, finished_page, report_pdf
 from survey.report.terminal import summary_text
 from survey.solution.covariances import covariance_npz
-from survey.solution.dictionary import RunInfo, solution_dict
+from survey.solution.dictionary import RunInfo, solution_dict, with_statistics
 from survey.solution.records import solution_json
-from survey.solution.residual_tables import image_residuals_csv, image_residuals_parquet, other_residuals_csv
+from survey.solution.residual_tables import (
+    image_residuals_csv,
+    image_residuals_parquet,
+    image_rows,
+    other_residuals_csv,
+)
 from survey.solution.statistics import Statistics
 
 __all__ = [
     "RESULTS",
     "ReportOptions",
     "RunInfo",
-    "begun_tables",
-    "make_results",
+    "begun_results",
+    "finished_results",
     "solution_dict",
     "solution_json",
     "summary_text",
@@ -32,20 +39,6 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True)
-class ReportOptions:
-    """How results are written.
-
-    language: of report.html, "en" or "de". pdf: report.pdf too. parquet: residuals.parquet too, which is written again
-    as long as it is there.
-    """
-
-    language: str = "en"
-    pdf: bool = False
-    parquet: bool = False
-
-
-ENGLISH_PAGE = ReportOptions()
 PARQUET = "residuals.parquet"
 
 
@@ -62,10 +55,10 @@ def write_results(
     nothing has been written then.
     """
     with changing(folder) as place, Beside() as writing:
-        begun = begun_tables(place, adjustment, run, options, writing)
-        make_results(begun, adjustment, run, solution_dict(adjustment, run, statistics), statistics, options)
+        begun = begun_results(place, adjustment, run, options, writing)
+        names = list(finished_results(begun, adjustment, run, statistics, options)[1])
         replace_parts(folder)
-    return {name: folder / RESULTS / name for name in begun.paths}
+    return {name: folder / RESULTS / name for name in names}
 
 
 class ResultFiles:
@@ -92,39 +85,51 @@ class ResultFiles:
         return {name: self.folder / name for name in sorted(self._begun, key="solution.json".__eq__)}
 
 
-def begun_tables(
-    place: Path, adjustment: Adjustment, run: RunInfo, options: ReportOptions, writing: Beside
-) -> ResultFiles:  # fmt: skip
-    """What needs the adjustment alone: residuals and covariances."""
+@dataclass(frozen=True, eq=False)
+class BegunResults:
+    """What needs the adjustment alone, in the making. page: gives the report as far as it is one without statistics."""
+
+    files: ResultFiles
+    page: Callable[[], BegunPage]
+
+
+def begun_results(
+    place: Path, adjustment: Adjustment, run: RunInfo, options: ReportOptions, writing: Beside,
+    more: Mapping[str, Any] = MappingProxyType({}),
+) -> BegunResults:  # fmt: skip
+    """Begin with what needs no statistics: tables of residuals and covariances, the solution, most of the report.
+
+    more: what else ``solution.json`` is to hold.
+    """
     files = ResultFiles(place, writing)
+    rows = writing.of(lambda: image_rows(adjustment))
+    page = writing.of(
+        lambda: begun_page(adjustment, run, solution_dict(adjustment, run) | dict(more), rows(), options.language)
+    )
     parquet = options.parquet or (place.parent / RESULTS / PARQUET).is_file()  # there: not to be old
     files.begin({
         "covariance.npz": lambda: covariance_npz(adjustment, run.sigmas),
-        "residuals.csv": lambda: image_residuals_csv(adjustment),
+        "residuals.csv": lambda: image_residuals_csv(adjustment, rows()),
         **({PARQUET: lambda: image_residuals_parquet(adjustment)} if parquet else {}),
         "residuals_other.csv": lambda: other_residuals_csv(adjustment),
     })  # fmt: skip
-    return files
+    return BegunResults(files, page)
 
 
-def make_results(
-    begun: ResultFiles,
-    adjustment: Adjustment,
-    run: RunInfo,
-    solution: dict[str, Any],
-    statistics: Statistics | None = None,
-    options: ReportOptions = ENGLISH_PAGE,
-) -> dict[str, Path]:
-    """Make everything else; the paths of all by file name. Raises as :func:`write_results`.
-
-    begun: of :func:`begun_tables`. solution: of :func:`survey.solution.dictionary.solution_dict`, with the statistics.
-    """
-    begun.begin({"solution.json": lambda: solution_json(solution).encode()})
-    page = report_html(adjustment, run, solution, statistics, options.language)
-    begun.begin({
-        "report.html": page.encode, **({"report.pdf": lambda: report_pdf(page)} if options.pdf else {}),
+def finished_results(
+    begun: BegunResults, adjustment: Adjustment, run: RunInfo, statistics: Statistics | None, options: ReportOptions
+) -> tuple[dict[str, Any], dict[str, Path]]:
+    """What ``solution.json`` holds, and the paths of all files by name. Raises as :func:`write_results`."""
+    page = begun.page()
+    solution = page.context.solution
+    if statistics is not None:
+        solution = with_statistics(solution, adjustment, run, statistics)
+    begun.files.begin({"solution.json": lambda: solution_json(solution).encode()})
+    report = finished_page(page, solution, statistics)
+    begun.files.begin({
+        "report.html": report.encode, **({"report.pdf": lambda: report_pdf(report)} if options.pdf else {}),
     })  # fmt: skip
-    return begun.paths
+    return solution, begun.files.paths
 
 
 def _write(path: Path, make: Callable[[], bytes]) -> None:

@@ -1,11 +1,12 @@
 """The file ``covariance.npz`` of results: covariances of all parameters."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from adjust.model.result import Adjustment
+from adjust.model.result import Adjustment, Estimate
 from survey.folder.arrays import packed_arrays, read_arrays
 from survey.solution.quantities import SigmaKind, scale_of
 
@@ -21,20 +22,22 @@ _README = (
 def covariance_npz(adjustment: Adjustment, sigmas: SigmaKind = "a_posteriori") -> bytes:
     """Covariance of every parameter, joint within the parameter, as an ``.npz`` that explains itself."""
     scale, estimates = scale_of(adjustment, sigmas), list(adjustment.estimates.values())
-    parameters = ["/".join(e.name) for e in estimates]
-    names = [f"{p}/{c}" for p, e in zip(parameters, estimates, strict=True) for c in e.components]
+    names = [f"{'/'.join(e.name)}/{c}" for e in estimates for c in e.components]
+    return packed_arrays(README=np.array(_README), names=np.array(names, dtype=str),
+                         **covariance_arrays(estimates, scale.factor), sigmas=np.array(scale.sigmas),
+                         factor=np.array(scale.factor))  # fmt: skip
+
+
+def covariance_arrays(estimates: Sequence[Estimate], factor: float = 1.0) -> dict[str, Any]:
+    """Names, units and covariances of estimates one behind the other, with what :func:`covariance_npz` says of them."""
     sizes = np.array([len(e.components) for e in estimates], dtype=np.int64)
-    return packed_arrays(
-        README=np.array(_README),
-        names=np.array(names, dtype=str),
-        units=np.array([u for e in estimates for u in e.units], dtype=str),
-        parameters=np.array(parameters, dtype=str),
-        start=np.concatenate([[0], np.cumsum(sizes)]),
-        block=np.concatenate([[0], np.cumsum(sizes**2)]),
-        covariance=np.concatenate([*((scale.factor**2 * e.cov).ravel() for e in estimates), np.empty(0)]),
-        sigmas=np.array(scale.sigmas),
-        factor=np.array(scale.factor),
-    )
+    return {
+        "units": np.array([u for e in estimates for u in e.units], dtype=str),
+        "parameters": np.array(["/".join(e.name) for e in estimates], dtype=str),
+        "start": np.concatenate([[0], np.cumsum(sizes)]),
+        "block": np.concatenate([[0], np.cumsum(sizes**2)]),
+        "covariance": np.concatenate([*((factor**2 * e.cov).ravel() for e in estimates), np.empty(0)]),
+    }
 
 
 def read_covariances(path: Path) -> dict[str, Any]:

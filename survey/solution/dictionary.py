@@ -14,7 +14,7 @@ from adjust.precision.precision import in_conditions
 from adjust.statistics.score import SharedLens, shared_lenses
 from adjust.testing.distributions import norm
 from adjust.testing.significance import Significance, significance_of_changes, significances
-from survey.folder.plain import plain
+from survey.folder.plain import attributes, plain
 from survey.project.detected import DetectedImage
 from survey.project.project import LeftOut
 from survey.solution.instruments import instrument_entries
@@ -66,13 +66,15 @@ class RunInfo:
 
 def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None = None) -> dict[str, Any]:
     """The whole solution as plain values, floats in full, None where there is no number; ``found``: its statistics."""
+    if found is not None:
+        return with_statistics(solution_dict(adjustment, run), adjustment, run, found)
     scale = scale_of(adjustment, run.sigmas)
     columns = pose_columns(adjustment.estimates.values(), scale)
     poses = _poses(columns)
     solution: dict[str, Any] = plain(
         {
             "format": 1,
-            "summary": _summary(adjustment, run, scale, found),
+            "summary": _summary(adjustment, run, scale, None),
             "conventions": CONVENTIONS,
             "cameras": _cameras(adjustment, poses, scale),
             "stations": _stations(adjustment, poses, columns, scale),
@@ -85,17 +87,16 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
             **_free_datum(adjustment),
             "groups": {g.group: _group(g) for g in adjustment.groups},
             **left_out_dict(adjustment, run.left_out, run.n_left_out, run.n_unused_in_files),
-            "warnings": _warnings(adjustment, found),
+            "warnings": list(adjustment.warnings),
             **({"diagnosis": adjustment.diagnosis.told()} if adjustment.diagnosis is not None else {}),
-            **(statistics_dict(adjustment, found, scale) if found is not None else {}),
             "inputs": {
                 "folder": run.folder,
                 "identification": dict(run.identification),
                 "command": run.command,
                 "hashes": dict(run.input_hashes),
                 "images": {
-                    name: {"file": i.file, "sha256": i.sha256, "points": i.status, "n_image_points": i.n_image_points,
-                           "n_spots": i.n_spots}
+                    name: attributes(i, "file", "sha256") | {"points": i.status}
+                    | attributes(i, "n_image_points", "n_spots")
                     for name, i in run.images.items()
                 },
                 "options": dict(run.options),
@@ -107,11 +108,23 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
     return solution
 
 
-def _warnings(adjustment: Adjustment, found: Statistics | None) -> list[str]:
-    """Causes that were tried first, then what tests of parts found, then the rest."""
+def with_statistics(
+    solution: dict[str, Any], adjustment: Adjustment, run: RunInfo, found: Statistics
+) -> dict[str, Any]:
+    """The solution of :func:`solution_dict`, with its statistics before what went in, and judged by them.
+
+    Its warnings: causes that were tried first, then what tests of parts found, then the rest.
+    """
+    scale, warnings = scale_of(adjustment, run.sigmas), adjustment.warnings
     tried = len(adjustment.diagnosis.lines) if adjustment.diagnosis is not None else 0
-    return [*adjustment.warnings[:tried], *findings(found.consistency if found else None),
-            *adjustment.warnings[tried:]]  # fmt: skip
+    told = {
+        "summary": _summary(adjustment, run, scale, found),
+        "warnings": [*warnings[:tried], *findings(found.consistency), *warnings[tried:]],
+        **statistics_dict(adjustment, found, scale),
+    }
+    out: dict[str, Any] = solution | plain(told)
+    names = list(solution)
+    return out | {name: out.pop(name) for name in names[names.index("inputs") :]}
 
 
 def _free_datum(adjustment: Adjustment) -> dict[str, Any]:
@@ -134,35 +147,23 @@ def _summary(adjustment: Adjustment, run: RunInfo, scale: Scale, statistics: Sta
         "reason": reason,
         "fit": fit_of(adjustment, tested),
         "sigma0": adjustment.sigma0 if adjustment.redundancy > 0 else None,
-        "redundancy": adjustment.redundancy,
-        "n_observations": adjustment.n_observations,
-        "n_unknowns": adjustment.n_unknowns,
+        **attributes(adjustment, "redundancy", "n_observations", "n_unknowns"),
         "datum": adjustment.survey.datum.kind,
         "datum_defect": adjustment.datum_defect,
         "n_tolerances_not_met": n_unmet,
-        "converged": adjustment.converged,
-        "iterations": adjustment.iterations,
+        **attributes(adjustment, "converged", "iterations"),
         "last_step_sigmas": adjustment.max_step,
         "sigmas": scale.sigmas,
         "sigma_factor": scale.factor,
         "omega": adjustment.omega,
         "global_test": test
-        and {
-            "omega": test.omega,
-            "redundancy": test.redundancy,
-            "alpha": test.alpha,
-            "lower": test.lower,
-            "upper": test.upper,
-            "passed": test.passed,
-            "status": test.status,
-        },
+        and attributes(test, "omega", "redundancy", "alpha", "lower", "upper", "passed", "status"),
         "suspects": {
             "alpha": found.alpha,
             "image_test_limit": found.image_limit,
             "standardized_limit": found.w_limit,
             "n_image_points": found.n_image,
-            "n_other": found.n_other,
-            "n_not_used": found.n_not_used,
+            **attributes(found, "n_other", "n_not_used"),
         },
     }
 
@@ -171,9 +172,7 @@ def _group(group: GroupSummary) -> dict[str, Any]:
     """``deviation``: of omega from its expectation r, in units of its own sigma sqrt(2 r), as chi-square has it."""
     factor, r = group.factor, group.redundancy
     return {
-        "n_observations": group.n_observations,
-        "redundancy": group.redundancy,
-        "omega": group.omega,
+        **attributes(group, "n_observations", "redundancy", "omega"),
         "variance_factor": factor,
         "sigma_scale": float(np.sqrt(factor)) if factor >= 0.0 else float("nan"),
         "deviation": (group.omega - r) / float(np.sqrt(2.0 * r)) if factor >= 0.0 else float("nan"),

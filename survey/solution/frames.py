@@ -5,7 +5,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.frames.tables import table_motions
 from adjust.model.observations import FrameRef
-from adjust.model.result import Adjustment, ParameterName, adjusted_pose
+from adjust.model.result import Adjustment, ParameterName, adjusted_numbers, adjusted_pose
 from adjust.model.survey import FloatArray, PoseParameter, Station, Table, Target
 
 
@@ -21,10 +21,8 @@ class AdjustedFrames:
     def __init__(self, adjustment: Adjustment) -> None:
         survey = adjustment.survey
         self.estimates = adjustment.estimates
-        self.cameras = {c.camera_id: c for c in survey.cameras}
-        self.stations = {s.station_id: s for s in survey.stations}
-        self.tables = {t.table_id: t for t in survey.tables}
-        self.targets = {t.target_id: t for t in survey.targets}
+        self.cameras, self.stations = survey.cameras_by_id, survey.stations_by_id
+        self.tables, self.targets = survey.tables_by_id, survey.targets_by_id
         self.readings = {(r.table_id, r.epoch_id): r for r in survey.table_readings}
 
     def pose(self, name: ParameterName, parameter: PoseParameter) -> Pose3 | None:
@@ -63,10 +61,7 @@ class AdjustedFrames:
         return self.pose(("world_from_station", station.station_id, epoch_id), parameter)
 
     def _motion(self, table: Table, epoch_id: str) -> Pose3:
-        geometry = dict(zip(table.geometry.names, map(float, table.geometry.values), strict=True))
-        estimate = self.estimates.get(("table_geometry", table.table_id))
-        if estimate is not None and not isinstance(estimate.value, Pose3):
-            geometry |= dict(zip(estimate.components, map(float, estimate.value), strict=True))
+        geometry = adjusted_numbers(self.estimates, ("table_geometry", table.table_id), table.geometry)
         reading = self.estimates.get(("table_angles", table.table_id, epoch_id))
         angles = self.readings[table.table_id, epoch_id].angles
         if reading is not None and not isinstance(reading.value, Pose3):

@@ -39,17 +39,5 @@ def _entry(
     sizes += [np.abs(others[name].standardized).ravel() for name in observed.names(hit) if name in others]
     known = np.concatenate([*sizes, np.zeros(0)])
     known = known[np.isfinite(known)]
-    return {
-        "name": str(said.name),
-        "what": said.name.what,
-        "id": said.name.id,
-        "reason": said.reason,
-        "author": said.author,
-        "time": said.time,
-        "line": said.line,
-        "n_images": one.n_images,
-        "n_image_points": one.n_image_points,
-        "n_spots": one.n_spots,
-        "n_readings": one.n_readings,
-        "largest_standardized_residual": float(known.max()) if len(known) else None,
-    }
+    largest = {"largest_standardized_residual": float(known.max()) if len(known) else None}
+    return said.as_dict() | {"line": said.line} | one.counts() | largest

@@ -75,9 +75,12 @@ def _point_names(survey: Survey) -> tuple[tuple[str, ...], dict[str | None, int]
     return tuple(names), start
 
 
-def image_residuals_csv(adjustment: Adjustment) -> bytes:
-    """``residuals.csv``; sigmas are those of the observations, a priori; no number is written where there is none."""
-    rows, found = image_rows(adjustment), adjustment.image_residuals
+def image_residuals_csv(adjustment: Adjustment, rows: ImageRows | None = None) -> bytes:
+    """``residuals.csv``; sigmas are those of the observations, a priori; no number is written where there is none.
+
+    rows: of the adjustment, where they are known already.
+    """
+    rows, found = rows or image_rows(adjustment), adjustment.image_residuals
     blocks = adjustment.survey.image_blocks
     names = [(b.epoch_id, b.camera_id, b.target_id or "") for b in blocks]
     cell = {name: _quoted(cell_text(name)) for name in set(chain.from_iterable(names))}

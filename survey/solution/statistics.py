@@ -189,8 +189,8 @@ def correlation_matrix(adjustment: Adjustment) -> CorrelationMatrix | None:
     names: list[ParameterName] = []
     components: list[tuple[str, ...]] = []
     for name, estimate in adjustment.estimates.items():
-        free = _unknown_components(estimate)
-        if free and len(name) < 3 and name[0] != "table_angles":
+        free = _unknown_components(estimate) if len(name) < 3 and name[0] != "table_angles" else ()
+        if free:
             if sum(map(len, components)) + len(free) > MOST_CORRELATED:
                 break
             names.append(name)

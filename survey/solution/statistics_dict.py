@@ -1,14 +1,16 @@
 """The statistics of an adjustment as plain values, for ``solution.json``: the same as the sections of the report."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from adjust.model.result import Adjustment, Component, ParameterName
 from adjust.statistics.reliability import observation_name
-from adjust.statistics.result import BudgetEntry, Consistency, Influence, RelativePrecision
+from adjust.statistics.result import BudgetEntry, Consistency, Influence, PartTest, RelativePrecision
+from survey.folder.plain import attributes
 from survey.solution.quantities import Scale, key_of, sigma_unit_for_people
+from survey.solution.records import Form, Records
 from survey.solution.statistics import Statistics
 from survey.solution.tolerances import Verdict, coverage
 
@@ -56,23 +58,27 @@ def statistics_dict(adjustment: Adjustment, found: Statistics, scale: Scale) -> 
 
 def _consistency(x: Consistency) -> dict[str, Any]:
     """Parts by kind and name; amounts of changes in SI units beside the unit."""
-    parts: dict[str, dict[str, Any]] = {}
+    parts: dict[str, list[PartTest]] = {}
     for p in x.parts:
-        parts.setdefault(p.kind, {})[p.name] = {
-            "n_observations": p.n, "redundancy": p.redundancy, "omega": p.omega, "variance_factor": p.factor,
-            "p_value": p.p, "fits": not p.fails,
-        }  # fmt: skip
+        parts.setdefault(p.kind, []).append(p)
     return {
         "alpha": x.alpha, "level_of_one_test": x.level, "n_tests": x.n_tests, "relative_to_the_rest": x.relative,
-        "parts": parts,
+        "parts": {kind: _parts(alike) for kind, alike in parts.items()},
         "changes": [
             {"kind": c.kind, "name": c.name, "what": c.what, "from_epoch": c.epoch or None, "test": c.statistic,
              "freedom": c.freedom, "p_value": c.p,
-             "shifts": [{"component": s.component, "unit": s.unit, "amount": s.amount, "sigma": s.sigma}
-                        for s in c.shifts]}
+             "shifts": [attributes(s, "component", "unit", "amount", "sigma") for s in c.shifts]}
             for c in x.changes
         ],
     }  # fmt: skip
+
+
+def _parts(tests: Sequence[PartTest]) -> Records:
+    columns = {"n_observations": "n", "redundancy": "redundancy", "omega": "omega", "variance_factor": "factor",
+               "p_value": "p"}  # fmt: skip
+    tree = {key: np.array([getattr(p, of) for p in tests]) for key, of in columns.items()}
+    tree["fits"] = np.array([not p.fails for p in tests])
+    return Records([p.name for p in tests], [Form(np.arange(len(tests)), tree)])
 
 
 def _path(name: ParameterName, component: str = "") -> str:
@@ -90,8 +96,8 @@ def _verdict(v: Verdict) -> dict[str, Any]:
 
 def _component(x: Component) -> dict[str, Any]:
     return {
-        "factor": x.factor, "sigma": x.sigma, "n": x.n, "redundancy": x.redundancy, "omega": x.omega,
-        "freedom": x.freedom, "p_value": x.p, "lower": x.lower, "upper": x.upper, "status": x.status,
+        **attributes(x, "factor", "sigma", "n", "redundancy", "omega", "freedom"), "p_value": x.p,
+        **attributes(x, "lower", "upper", "status"),
     }  # fmt: skip
 
 

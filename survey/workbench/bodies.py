@@ -1,4 +1,4 @@
-"""What a request says, checked."""
+"""What a request says, checked, and what of a workbench answers it."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -10,7 +10,7 @@ from starlette.requests import Request
 from adjust.model.errors import SurveyError
 
 if TYPE_CHECKING:
-    from survey.detection import ImageReport
+    from survey.solution.earlier.changes import Changes
     from survey.workbench.pages.beginning import Told
     from survey.workbench.session import Workbench
 
@@ -127,23 +127,86 @@ def _plan(bench: "Workbench", body: Body, _: Any) -> "Told":
 
 
 @dataclass(frozen=True)
-class Job:
-    """A job of a page. call: what of ``survey.Workbench`` it is; changes: whether files may change."""
+class Asked:
+    """What a page asks of a project. calls: what of ``survey.Workbench`` it is; changes: whether files may change.
 
-    call: str
-    run: "Callable[[Any, Body, Callable[[ImageReport], None]], Told]"
+    run: with the workbench, then the body where there is one, then the request; of jobs what is told of each image.
+    what: that runs, for pages; only a "view" waits for no solution.
+    """
+
+    calls: tuple[str, ...]
+    run: Callable[..., Any]
     changes: bool = True
+    what: str = "view"
 
 
-JOBS: Mapping[str, Job] = {
-    "init": Job("start", lambda bench, body, _: bench.start(body.text("images"), body.text("folder"))),
-    "show": Job("show", lambda bench, body, _: bench.show(body.text("folder")), changes=False),
-    "detect": Job("detect", lambda bench, body, found: bench.detect(everything=body.flag("all", False), told=found)),
-    "plan": Job("plan", _plan),
-    "navigate": Job("navigate", lambda bench, body, _: bench.navigate(body.text("station"),
+JOBS: Mapping[str, Asked] = {
+    "init": Asked(("start",), lambda bench, body, _: bench.start(body.text("images"), body.text("folder"))),
+    "show": Asked(("show",), lambda bench, body, _: bench.show(body.text("folder")), changes=False),
+    "detect": Asked(("detect",), lambda bench, body, found: bench.detect(
+        everything=body.flag("all", False), told=found)),
+    "plan": Asked(("plan",), _plan),
+    "navigate": Asked(("navigate",), lambda bench, body, _: bench.navigate(body.text("station"),
                                                                       body.number("interval_s", 0.0) or None)),
-    "add": Job("add", lambda bench, body, _: bench.add(body.text("folder"))),
-    "compare": Job("compare_with", lambda bench, body, _: bench.compare_with(body.text("folder")), changes=False),
-    "batch": Job("batch", lambda bench, body, _: bench.batch(body.names("folders"))),
+    "add": Asked(("add",), lambda bench, body, _: bench.add(body.text("folder"))),
+    "compare": Asked(("compare_with",), lambda bench, body, _: bench.compare_with(body.text("folder")), changes=False),
+    "batch": Asked(("batch",), lambda bench, body, _: bench.batch(body.names("folders"))),
 }  # fmt: skip
 """The jobs of a page by their names, with what it asks of them."""
+
+
+def _definition(bench: "Workbench", body: Body, _: Request) -> Any:
+    """One of: {group, factor}, {parameter, treatment}, {datum: kind, points, stations}."""
+    base = body.base()
+    if body.text("group"):
+        return bench.set_sigma_scale(body.text("group"), body.number("factor"), base)
+    if body.text("parameter"):
+        return bench.set_treatment(body.text("parameter"), body.text("treatment"), base)
+    return bench.set_datum(body.text("datum"), body.names("points"), body.names("stations"), base)
+
+
+def _exclusions(bench: "Workbench", body: Body, _: Request) -> Any:
+    excluded, included = body.changes()
+    return bench.decide(exclude=excluded, include=included, reason=body.text("reason"), author=body.text("author"),
+                        base=body.base())  # fmt: skip
+
+
+DECISIONS: Mapping[str, Asked] = {
+    "adjust": Asked(("adjust",), lambda bench, body, _: bench.adjust(
+        "cold" if body.text("mode") == "cold" else "warm"), False),
+    "reload": Asked(("reload",), lambda bench, _, __: bench.reload(), False),
+    "exclusions": Asked(("exclude", "include", "decide"), _exclusions),
+    "definition": Asked(("set_sigma_scale", "set_treatment", "set_datum"), _definition),
+    "remedy": Asked(("apply_remedy",), lambda bench, body, _: bench.apply_remedy(
+        int(body.number("number")), body.base())),
+    "undo": Asked(("undo",), lambda bench, body, _: bench.undo(body.base())),
+    "redo": Asked(("redo",), lambda bench, body, _: bench.redo(body.base())),
+    "runs/{number}/restore": Asked(("restore",), lambda bench, body, request: bench.restore(
+        run_of(request), body.base())),
+}  # fmt: skip
+"""By their addresses; what they answer is the state after them."""
+
+
+def told_changes(changes: "Changes | None", most: int | None) -> dict[str, Any] | None:
+    """What an adjustment changed, its summaries in the language that is spoken."""
+    from survey.workbench.views import in_words
+
+    found = None if changes is None else changes.as_dict(most)
+    return found and found | {k: in_words(found[k]) for k in ("before", "after")}
+
+
+VIEWS: Mapping[str, Asked] = {
+    name: Asked((name,), lambda bench, _, name=name: getattr(bench, name)(), False)
+    for name in ("readings", "parameters", "scene", "findings", "loops", "network", "table_residuals", "runs")
+} | {
+    "changes": Asked(("changes",), lambda bench, _: {
+        "version": bench.version, "changes": told_changes(bench.changes, 500)}, False),
+    "camera/{camera}": Asked(("camera_view",), lambda bench, request: bench.camera_view(
+        request.path_params["camera"], distance_of(request)), False),
+    "camera/{camera}/difference": Asked(("lens_change",), lambda bench, request: bench.lens_change(
+        request.path_params["camera"], whole_of(request, "run"), request.query_params.get("other", ""),
+        distance_of(request)), False),
+    "compare": Asked(("compare",), lambda bench, request: told_changes(bench.compare(
+        whole_of(request, "a"), whole_of(request, "b")), whole_of(request, "most")), False, "compare"),
+}  # fmt: skip
+"""By their addresses."""

@@ -27,7 +27,7 @@ if TYPE_CHECKING:  # detection brings in OpenCV, planning much else
     from adjust.graph.assembly import StartValues
     from adjust.navigation.model import Beacons
     from survey.detection import ImageReport
-    from survey.jobs.adjusting.job import AdjustOutcome
+    from survey.jobs.adjusting.outcome import AdjustOutcome
     from survey.jobs.cross_validation import CrossValidation
     from survey.planning.job import PlanRequest
     from survey.planning.summary import PlanningOutcome
@@ -41,7 +41,8 @@ class Jobs(Deciding):
 
     def save(self) -> "AdjustOutcome":
         """Write ``results`` as ``labsurvey adjust`` does, and a run beside the others. Raises as :meth:`exclude`."""
-        from survey.jobs.adjusting.job import Clock, command_line, kept_run, made
+        from survey.jobs.adjusting.job import Clock, command_line
+        from survey.jobs.adjusting.outcome import kept_run, made
 
         with self._lock:
             self._check(None)
@@ -58,7 +59,7 @@ class Jobs(Deciding):
 
     def run(self) -> "RunInfo":
         """What was run, for reports."""
-        from survey.jobs.adjusting.job import run_info
+        from survey.jobs.adjusting.outcome import run_info
 
         return run_info(self.situation.project, {})
 

@@ -27,12 +27,23 @@ from survey.folder.locking import BusyError
 from survey.folder.text import suggestion
 from survey.report.language import LANGUAGES, message, speaking
 from survey.report.modules import WEB as SHARED
-from survey.workbench.bodies import JOBS, Body, BodyError, distance_of, json_of, run_of, size_of, whole_of
+from survey.workbench.bodies import (
+    DECISIONS,
+    JOBS,
+    VIEWS,
+    Asked,
+    Body,
+    BodyError,
+    distance_of,
+    json_of,
+    run_of,
+    size_of,
+    whole_of,
+)
 from survey.workbench.guard import LONGEST_BODY, Guard, TooLongError
 from survey.workbench.live import Live
 
 if TYPE_CHECKING:
-    from survey.solution.earlier.changes import Changes
     from survey.workbench.pages.beginning import Beginning
     from survey.workbench.session import Workbench
 
@@ -92,35 +103,22 @@ class Server:
 
     def ways(self) -> tuple[Way, ...]:
         """All addresses of the interface."""
-        def view(name: str) -> Way:
-            return Way("GET", f"/api/{name}", (name,), self._view(name))
-
         return (
             Way("GET", "/api/state", ("state",), self._state),
             Way("GET", "/api/points", ("points",), self._points),
             Way("GET", "/api/image/{camera}/{epoch}", ("picture",), self._image),
-            *map(view, ("readings", "parameters", "scene", "findings", "loops", "network", "table_residuals", "runs")),
-            Way("GET", "/api/changes", ("changes",), self._changes),
-            Way("GET", "/api/camera/{camera}", ("camera_view",), self._camera),
-            Way("GET", "/api/camera/{camera}/difference", ("lens_change",), self._difference),
-            Way("GET", "/api/compare", ("compare",), self._compare),
+            *(Way("GET", f"/api/{path}", view.calls, self._view(view)) for path, view in VIEWS.items()),
             Way("GET", "/api/capture", ("capture_status",), self._capture),
             Way("GET", "/api/capture/{camera}", ("capture_picture",), self._captured),
             Way("GET", "/api/halves", ("cross_validate",), self._halves),
             Way("GET", "/api/statistics/{part}", ("statistics_part",), self._statistics),
             Way("POST", "/api/preview", ("preview",), self._preview),
-            Way("POST", "/api/adjust", ("adjust",), self._adjust),
-            Way("POST", "/api/reload", ("reload",), self._reload),
             Way("POST", "/api/cancel", ("cancel",), self._cancel),
-            Way("POST", "/api/exclusions", ("exclude", "include", "decide"), self._exclusions, True),
-            Way("POST", "/api/definition", ("set_sigma_scale", "set_treatment", "set_datum"), self._definition, True),
-            Way("POST", "/api/remedy", ("apply_remedy",), self._remedy, True),
-            Way("POST", "/api/undo", ("undo",), self._act("undo"), True),
-            Way("POST", "/api/redo", ("redo",), self._act("redo"), True),
+            *(Way("POST", f"/api/{path}", decision.calls, self._decision(decision), decision.changes)
+              for path, decision in DECISIONS.items()),
             Way("POST", "/api/save", ("save",), self._save, True),
-            Way("POST", "/api/runs/{number}/restore", ("restore",), self._restore, True),
             Way("POST", "/api/runs/{number}/pin", ("pin",), self._pin, True),
-            *(Way("POST", f"/api/jobs/{name}", (job.call,), self._job(name), job.changes)
+            *(Way("POST", f"/api/jobs/{name}", job.calls, self._job(name), job.changes)
               for name, job in JOBS.items()),
             Way("POST", "/api/jobs/{name}", (), self._no_job),
         )
@@ -257,9 +255,9 @@ class Server:
         response.set_cookie(self.cookie, self.token, httponly=True, samesite="strict")
         return response
 
-    def _view(self, name: str) -> _Handler:
-        async def answering(_request: Request) -> Response:
-            return JSONResponse(await self._run("view", getattr(self.bench, name)))
+    def _view(self, view: Asked) -> _Handler:
+        async def answering(request: Request) -> Response:
+            return JSONResponse(await self._run(view.what, lambda: view.run(self.bench, request)))
 
         return answering
 
@@ -276,20 +274,6 @@ class Server:
         part = request.path_params["part"]
         found = await self._run("statistics", lambda: self.bench.statistics_part(part))
         return Response(solution_json(found), media_type="application/json")
-
-    async def _compare(self, request: Request) -> Response:
-        a, b = (whole_of(request, k) for k in "ab")
-        found = await self._run("compare", lambda: self.bench.compare(a, b))
-        return JSONResponse(_in_words(found, whole_of(request, "most")))
-
-    async def _camera(self, request: Request) -> Response:
-        camera, distance = request.path_params["camera"], distance_of(request)
-        return JSONResponse(await self._run("view", lambda: self.bench.camera_view(camera, distance)))
-
-    async def _difference(self, request: Request) -> Response:
-        camera, distance = request.path_params["camera"], distance_of(request)
-        run, other = whole_of(request, "run"), request.query_params.get("other", "")
-        return JSONResponse(await self._run("view", lambda: self.bench.lens_change(camera, run, other, distance)))
 
     async def _halves(self, request: Request) -> Response:
         from survey.folder.plain import plain
@@ -331,56 +315,19 @@ class Server:
         names, out = (excluded, True) if excluded else (included, False)
         return JSONResponse(await self._run("view", lambda: self.bench.preview(*names, excluded=out)))
 
-    async def _exclusions(self, request: Request) -> Response:
-        body = Body(await json_of(request))
-        excluded, included = body.changes()
-        return await self._decided(lambda: self.bench.decide(
-            exclude=excluded, include=included, reason=body.text("reason"), author=body.text("author"), base=body.base()
-        ))  # fmt: skip
-
-    async def _definition(self, request: Request) -> Response:
-        """One of: {group, factor}, {parameter, treatment}, {datum: kind, points, stations}."""
-        body = Body(await json_of(request))
-        base, bench = body.base(), self.bench
-        if body.text("group"):
-            return await self._decided(lambda: bench.set_sigma_scale(body.text("group"), body.number("factor"), base))
-        if body.text("parameter"):
-            name, treatment = body.text("parameter"), body.text("treatment")
-            return await self._decided(lambda: bench.set_treatment(name, treatment, base))
-        kind, points, stations = body.text("datum"), body.names("points"), body.names("stations")
-        return await self._decided(lambda: bench.set_datum(kind, points, stations, base))
-
-    async def _decided(self, work: Callable[[], Any]) -> Response:
-        await self._run("adjust", work)
-        return JSONResponse(await asyncio.to_thread(self.bench.state) | self._changed())
-
-    async def _remedy(self, request: Request) -> Response:
-        body = Body(await json_of(request))
-        number, base = int(body.number("number")), body.base()
-        return await self._decided(lambda: self.bench.apply_remedy(number, base))
-
-    async def _adjust(self, request: Request) -> Response:
-        mode = Body(await json_of(request)).text("mode")
-        return await self._decided(lambda: self.bench.adjust("cold" if mode == "cold" else "warm"))
-
-    def _act(self, verb: str) -> _Handler:
+    def _decision(self, decision: Asked) -> _Handler:
         async def answering(request: Request) -> Response:
-            base = Body(await json_of(request)).base()
-            return await self._decided(lambda: getattr(self.bench, verb)(base))
+            body = Body(await json_of(request))
+            await self._run("adjust", lambda: decision.run(self.bench, body, request))
+            state = await asyncio.to_thread(self.bench.state)
+            return JSONResponse(state | VIEWS["changes"].run(self.bench, request))
 
         return answering
-
-    async def _restore(self, request: Request) -> Response:
-        number, base = run_of(request), Body(await json_of(request)).base()
-        return await self._decided(lambda: self.bench.restore(number, base))
 
     async def _pin(self, request: Request) -> Response:
         number, pinned = run_of(request), Body(await json_of(request)).flag("pinned")
         run = await self._run("pin", lambda: self.bench.pin(number, pinned))
         return JSONResponse(run.as_dict())
-
-    async def _reload(self, _request: Request) -> Response:
-        return await self._decided(self.bench.reload)
 
     async def _save(self, _request: Request) -> Response:
         said = (await self._run("save", self.bench.save)).summary()
@@ -424,17 +371,3 @@ class Server:
     async def _cancel(self, _request: Request) -> Response:
         self.bench.cancel()
         return JSONResponse({})
-
-    async def _changes(self, _request: Request) -> Response:
-        return JSONResponse(await self._run("view", self._changed))
-
-    def _changed(self) -> dict[str, Any]:
-        found = self.bench.changes
-        return {"version": self.bench.version, "changes": None if found is None else _in_words(found, 500)}
-
-
-def _in_words(changes: "Changes", most: int | None) -> dict[str, Any]:
-    from survey.workbench.views import in_words
-
-    found = changes.as_dict(most)
-    return found | {k: in_words(found[k]) for k in ("before", "after")}

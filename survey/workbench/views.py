@@ -9,7 +9,7 @@ from gtsam import Pose3
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Reading
 from adjust.model.result import Adjustment
-from survey.folder.plain import plain
+from survey.folder.plain import attributes, plain
 from survey.folder.text import suggestion
 from survey.project.observed import Observed, name_of_residual
 from survey.report.language import message
@@ -60,12 +60,11 @@ def state(bench: Jobs) -> dict[str, Any]:
         "failure": None if bench.failure is None or empty else message(str(bench.failure)),
         "empty": empty, "n_looked_at": len(now.everything.detected),
         "n_pictures": len(now.everything.images),
-        "exclusions": [{"name": str(e.name), "what": e.name.what, "id": e.name.id, "reason": e.reason,
-                        "author": e.author, "time": e.time, "line": e.line} for e in now.exclusions.values()],
+        "exclusions": [e.as_dict() | {"line": e.line} for e in now.exclusions.values()],
         "tree": _tree(bench),
         "groups": [] if solved is None else [
-            {"group": g.group, "n_observations": g.n_observations, "redundancy": g.redundancy, "omega": g.omega,
-             "factor": g.factor, "scale": now.project.sigmas.scale.get(g.group, 1.0)} for g in solved.groups],
+            attributes(g, "group", "n_observations", "redundancy", "omega", "factor")
+            | {"scale": now.project.sigmas.scale.get(g.group, 1.0)} for g in solved.groups],
         "datum": {"kind": now.project.survey.datum.kind, "points": now.project.survey.datum.points,
                   "stations": now.project.survey.datum.stations},
     }))  # fmt: skip
@@ -182,9 +181,8 @@ def remedies(bench: Jobs) -> list[dict[str, Any]]:
         h = candidate.hypothesis
         out.append({
             "number": number, "name": h.name, "cause": message(h.cause), "change": message(h.change),
-            "possible": bool(h.edits), "where": candidate.where,
-            "anchor": _anchor_of(h.place), "explained": candidate.explained, "statistic": candidate.statistic,
-            "critical": candidate.critical, "probability": candidate.probability, "sigma0": candidate.sigma0,
+            "possible": bool(h.edits), "anchor": _anchor_of(h.place),
+            **attributes(candidate, "where", "explained", "statistic", "critical", "probability", "sigma0"),
         })  # fmt: skip
     return out
 

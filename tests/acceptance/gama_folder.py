@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from survey.cli import main
-from survey.interop.names import safe_ids
+from survey.interop.networks.foreign import safe_ids
 from tests.acceptance.gama_results import GamaResult, gama_result
 
 SOLVED = (0, 3)

@@ -18,8 +18,7 @@ import numpy as np
 
 from adjust.model.survey import FloatArray, Survey
 from survey.cli import main
-from survey.interop.names import with_safe_ids
-from survey.interop.networks.foreign import ForeignNetwork
+from survey.interop.networks.foreign import ForeignNetwork, with_safe_ids
 from survey.interop.networks.gama import read_gama
 from survey.interop.networks.krumm import read_krumm
 from survey.interop.networks.lgc import read_lgc

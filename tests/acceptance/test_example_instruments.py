@@ -65,7 +65,7 @@ def test_commands(tmp_path, capsys):
 
 
 def test_report_shows_instruments_surfaces_and_beams_in_both_languages(tmp_path):
-    from survey.jobs.adjusting.job import run_info
+    from survey.jobs.adjusting.outcome import run_info
     from survey.report.page import report_html
 
     assert main(["example", "alignment", str(tmp_path / "a"), "--quiet"]) == 0

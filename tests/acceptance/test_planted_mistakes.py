@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import adjust
-from adjust.diagnosis.case import Budget, Case
+from adjust.diagnosis.budget import Budget
+from adjust.diagnosis.case import Case
 from adjust.diagnosis.diagnosis import diagnose
 from adjust.model.errors import SurveyError
 from survey.cli import main

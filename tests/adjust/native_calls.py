@@ -35,7 +35,7 @@ from adjust.relay.loops import loop_basis
 from adjust.relay.network import topology
 from adjust.start import find_start
 from survey.detection import SpotOptions, detect_image, detect_spots
-from survey.detection.extent import grown
+from survey.detection.corners import grown
 from survey.project.targets import Checkerboard
 from survey.simulate import head_on_table
 from survey.simulate.rendering import Beacons, BrownCamera, PlacedTarget, render
@@ -132,7 +132,8 @@ def _images() -> None:
     solved = solve_network(pose_networks.simulate(3, 2).network)
     solved.pairs  # noqa: B018  # is computed when asked for
     solved.precision.tree.among(sparse.csr_array(np.eye(solved.precision.tree.n)[:2]))
-    loop_basis(topology([(a + b, a, b) for a, b in ("AB", "BC", "CA", "CD", "DA")]))
+    ring = [(chr(65 + i), chr(65 + (i + step) % 12)) for step in (1, 2) for i in range(0, 12, step)]
+    loop_basis(topology([(a + b, a, b) for a, b in ring]))  # triangles, then a loop through the stations of one pair
     survey, truth = head_on_table(1, n_cameras=2, n_table_epochs=3, n_free_epochs=2)
     graph, done = h.solved(survey, near(truth))  # nothing to reduce: every block is condensed for itself
     graph.prepare(done.values, jacobians=False)
@@ -167,7 +168,6 @@ def _navigation() -> None:
     navigate(*known, [simulated(*known, turned(0.0), rng, Sight(1e-6, only=("B9", "B10")))[0]])
     pose = Pose3(Rot3.Rodrigues(np.array([0.3, -0.2, 0.5])), np.array([0.1, 0.2, -0.3])).matrix()
     pose = np.ascontiguousarray(pose)
-    navigation.real_roots(np.array([0.1, -1.0, 2.0, 0.5, -3.0, 0.2, 1.0, -0.4, 0.1]), 0.0, 3.0)
     rays = np.array([[0.1, 0.2, 1.0], [-0.2, 0.1, 1.0], [0.1, -0.3, 1.0]])
     rays /= np.linalg.norm(rays, axis=1)[:, None]
     origins = np.zeros((3, 3))
@@ -187,8 +187,6 @@ def _pictures() -> None:
     assert not len(detect_image(np.full_like(image, 128), board))
     gray, grid = image.astype(np.float32), found.uv.reshape(5, 8, 2)
     assert grown(gray, grid[1:-1, 1:-1], found.contrast).shape == grid.shape
-    one, disc = np.ones(len(found)), [6.0, 0.0, 0.0, 0.0]
-    vision.fit_corners(gray, found.uv, one[:, None] * [0.1, 1.6], one, one[:, None] * disc, True, 2.0, 1e-4)
     lights = np.stack(np.meshgrid(np.linspace(-0.2, 0.2, 4), np.linspace(-0.15, 0.15, 3), [1.0]), -1).reshape(-1, 3)
     assert len(detect_spots(render(camera, beacons=Beacons(lights, 0.006, 200.0, "disc"), seed=1), SpotOptions())) == 12
     xy = np.random.default_rng(1).uniform(-4.0, 4.0, (50, 2))

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 from adjust.adjustment import adjust
 from adjust.diagnosis.case import Case
-from adjust.diagnosis.diagnosis import Diagnosis, Family, diagnose
+from adjust.diagnosis.diagnosis import Diagnosis, diagnose
+from adjust.diagnosis.families import Family
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Reading
 from adjust.model.survey import Survey

@@ -45,4 +45,5 @@ def test_uneven_axes_are_named_first(
 @pytest.mark.slow
 def test_an_even_axis_is_not_suspected() -> None:
     survey = taken_for_even({})
-    assert not list(unsteady_axes(Case(survey, adjust(survey))))
+    case = Case(survey, adjust(survey))
+    assert not list(unsteady_axes(case, case.linear))

@@ -7,10 +7,9 @@ import pytest
 
 from adjust.adjustment import adjust
 from adjust.diagnosis.case import Case
-from adjust.diagnosis.names import hypotheses as names
+from adjust.diagnosis.families import NAMES, UNITS
 from adjust.diagnosis.names.epochs import exchanged_cameras, misplaced_epochs
 from adjust.diagnosis.names.stations import exchanged_stations
-from adjust.diagnosis.units import hypotheses as units
 from adjust.model.survey import Survey
 from survey.project import read
 from survey.simulate import stereo
@@ -33,7 +32,7 @@ def called(survey: Survey, a: str, b: str, setup: str | None) -> Survey:
 @pytest.mark.parametrize("plane", [False, True])
 @pytest.mark.parametrize("pair", [("P4", "P6"), ("P5", "P7"), ("P4", "P5")])
 def test_two_points_exchanged_in_one_set_up(plane: bool, pair: tuple[str, str]) -> None:
-    first = diagnosed(called(hall(plane=plane), *pair, "S2"), names, units).candidates[0].hypothesis
+    first = diagnosed(called(hall(plane=plane), *pair, "S2"), *NAMES, *UNITS).candidates[0].hypothesis
     assert first.name == "points exchanged"
     assert set(first.place.ids) == set(pair)
     assert "S2" in first.cause
@@ -49,7 +48,7 @@ def test_given_points_exchanged(plane: bool) -> None:
         replace(p, x_in_world=replace(p.x_in_world, value=other[p.point_id])) if p.point_id in other else p
         for p in good.points
     )
-    found = diagnosed(replace(good, points=points), names, units).candidates
+    found = diagnosed(replace(good, points=points), *NAMES, *UNITS).candidates
     assert "given points exchanged" in [c.hypothesis.name for c in found[:3]]
 
 
@@ -60,7 +59,7 @@ def test_a_slipped_decimal_of_a_given_point(axis: int, factor: float) -> None:
     value = np.array(good.points[1].x_in_world.value)
     value[axis] *= factor
     wrong = (good.points[0], replace(good.points[1], x_in_world=replace(good.points[1].x_in_world, value=value)))
-    found = diagnosed(replace(good, points=wrong + good.points[2:]), names, units).candidates
+    found = diagnosed(replace(good, points=wrong + good.points[2:]), *NAMES, *UNITS).candidates
     assert found[0].hypothesis.name == "slipped decimal"
     assert (found[0].hypothesis.place.ids, found[0].hypothesis.place.key) == (("P1",), "xyz"[axis])
 

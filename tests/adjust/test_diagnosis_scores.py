@@ -8,7 +8,7 @@ import pytest
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.diagnosis.effects.effect import of_shape
-from adjust.diagnosis.linear import Linear
+from adjust.diagnosis.prediction import Linear
 from adjust.diagnosis.units.conventions import MISREADINGS, Misreading, shrinking
 from adjust.graph.solver import SolveOptions
 from adjust.model.boards import deformation

@@ -8,12 +8,10 @@ import pytest
 from gtsam import Pose3, Rot3
 
 from adjust.diagnosis.case import Case
-from adjust.diagnosis.names import hypotheses as names
-from adjust.diagnosis.units import hypotheses as units
+from adjust.diagnosis.families import NAMES, UNITS, WEIGHTS
 from adjust.diagnosis.units.heights import wrong_heights
 from adjust.diagnosis.units.pairs import misread_pairs
 from adjust.diagnosis.units.readings import misread_readings
-from adjust.diagnosis.weights import hypotheses as weights
 from adjust.model.survey import Survey
 from survey.project import read
 from tests.adjust.planted import case_of, diagnosed, hall, reread
@@ -32,7 +30,7 @@ def distance(plane: bool) -> str:
                                               (1 / 0.3048, "feet, read as metres")])  # fmt: skip
 def test_distances_of_one_set_up_in_another_unit(plane: bool, factor: float, said: str) -> None:
     wrong = reread(hall(plane=plane), lambda r: r.setup_id == "S1" and r.kind == distance(plane), lambda v: factor * v)
-    first = diagnosed(wrong, units, names).candidates[0].hypothesis
+    first = diagnosed(wrong, *UNITS, *NAMES).candidates[0].hypothesis
     assert first.name == "unit of lengths"
     assert first.place.ids == ("S1",)
     assert said in first.cause
@@ -55,7 +53,7 @@ def test_directions_in_gon_or_counter_clockwise(plane: bool, setup: str | None, 
 @pytest.mark.parametrize("mend", [lambda v: np.pi / 2 - v, lambda v: np.pi - v, lambda v: 2 * np.pi - v])
 def test_zenith_angles_from_another_zero(mend) -> None:
     wrong = reread(hall(), lambda r: r.kind == "zenith" and r.setup_id == "S1", mend)
-    first = diagnosed(wrong, units, names).candidates[0].hypothesis
+    first = diagnosed(wrong, *UNITS, *NAMES).candidates[0].hypothesis
     assert first.name == "angles from another zero"
     assert first.place.ids == ("S1",)
     assert _same(first.changed(), hall())
@@ -86,7 +84,7 @@ def test_height_of_an_instrument(metres: float) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_innocent_networks_are_not_blamed(seed: int) -> None:
-    assert diagnosed(hall(seed), units, names, weights).candidates == ()
+    assert diagnosed(hall(seed), *UNITS, *NAMES, *WEIGHTS).candidates == ()
 
 
 # -- the poses of a real robot ---------------------------------------------------------------------------------------

@@ -201,10 +201,11 @@ def test_what_is_only_read_may_be_locked_and_numbers_may_be_numpys() -> None:
 
 
 def test_numbers_and_their_count_are_checked() -> None:
-    with pytest.raises(TypeError, match=r"real_roots: lo must be a number, not str"):
-        FUNCTIONS["real_roots"](np.zeros(9), "0", 1.0, np.zeros(18))
-    with pytest.raises(TypeError, match="real_roots takes 4 arguments, 3 were given"):
-        FUNCTIONS["real_roots"](np.zeros(9), 0.0, 1.0)
+    rays = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    with pytest.raises(TypeError, match=r"three_point_poses: nearest must be a number, not str"):
+        FUNCTIONS["three_point_poses"](*rays, "0", 1.0, np.zeros((8, 3, 3)), np.zeros((8, 3)))
+    with pytest.raises(TypeError, match="three_point_poses takes 7 arguments, 6 were given"):
+        FUNCTIONS["three_point_poses"](*rays, 0.0, 1.0, np.zeros((8, 3, 3)))
 
 
 @pytest.mark.parametrize(("kind", "n"), [(BROWN, 12), (len(N_LENS), 13), (-1, 13)])
@@ -218,9 +219,9 @@ def test_a_lens_of_no_model_or_with_too_few_parameters_is_refused(kind: int, n: 
 @pytest.mark.parametrize("start", [(np.nan, 20.0), (np.inf, 20.0), (1e300, 20.0), (-50.0, 20.0), (20.0, 61.0)])
 def test_a_fit_that_begins_nowhere_finds_nothing(start: tuple[float, float]) -> None:
     image, places, one = np.full((60, 80), 30.0, np.float32), np.array([start]), np.ones(1)
-    shapes = np.array([[6.0, 2.0, 8.0, 8.0]])
-    status = vision.fit_corners(image, places, np.array([[0.0, 1.5]]), one, shapes, True, 2.0, 1e-4)[-1]
-    assert status.tolist() == [1]  # at the border
+    edges, none = np.array([[[20.0, 0.0], [1.0, 20.0]]]), np.zeros(1)
+    good = vision.refine_corners(image, places, edges, 8.0 * one, True, 0.0, none, none)[4]
+    assert good.tolist() == [False]
     none = np.zeros((60, 80), np.int64), 255.0, places, np.ones(1, np.int64)
     assert vision.fit_spots(image, *none, 5.0 * one, 100.0 * one, one)[1].tolist() == [-1]
 

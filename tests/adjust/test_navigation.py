@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from adjust.model.errors import SurveyError
 from adjust.model.survey import TABLE_GEOMETRY
-from adjust.native.navigation import real_roots, three_point_poses
+from adjust.native.navigation import three_point_poses
 from adjust.navigation import Motion, NavigateOptions, NavigationEpoch, PosePrior, Spots, expected_precision, navigate
 from adjust.navigation.fit import local, local_derivative
 from adjust.navigation.motion import MotionState, predicted, table_prior
@@ -34,12 +34,6 @@ ALONE = NavigateOptions(motion=None)
 def retract(pose, step):
     """The inverse of ``local``."""
     return pose @ rigid(rotation_exp(step[:3]), step[3:])
-
-
-def test_roots_of_a_polynomial_of_degree_eight():
-    roots = np.array([-2.0, -0.5, 0.1, 0.4, 1.3, 2.0, 5.0, 9.0])
-    found = real_roots(np.poly(roots)[::-1].copy(), 0.0, 20.0)
-    np.testing.assert_allclose(np.sort(found), roots[2:], rtol=1e-8)
 
 
 @pytest.mark.parametrize("centres", [3, 2, 1])

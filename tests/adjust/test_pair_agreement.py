@@ -26,7 +26,7 @@ def _left_out(result: Adjustment) -> set[str]:
 
 
 def _scaled(network: PoseNetwork, factor: float) -> PoseNetwork:
-    return replace(network, cov=network.cov * factor)
+    return replace(network, arrays=replace(network.arrays, cov=network.cov * factor))
 
 
 def test_short_loops_are_walks_that_end_where_they_begin() -> None:

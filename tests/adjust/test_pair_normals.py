@@ -91,8 +91,7 @@ def test_covariances_are_those_of_gtsams_tree(nx: int, extra: int, monkeypatch: 
     expected = theirs.joint(keys)
     np.testing.assert_allclose(mine.joint(keys), expected, rtol=1e-7, atol=1e-9 * np.abs(expected).max())
     order = np.concatenate([np.arange(mine.n)[mine.places()[k]] for k in keys])
-    whole = mine.times(np.eye(mine.n))
-    np.testing.assert_allclose(whole[np.ix_(order, order)], mine.joint(keys), rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(mine.full()[np.ix_(order, order)], mine.joint(keys), rtol=1e-9, atol=1e-15)
 
 
 @pytest.mark.parametrize("n", [1, 2, 25])
@@ -150,7 +149,7 @@ def test_covariances_among_sparse_rows_are_those_of_the_whole_matrix(monkeypatch
     tree = solve_network(pose_networks.simulate(12, 4, 3, extra=12).network).precision.tree
     A = sparse.random_array((40, tree.n), density=0.01, rng=rng, format="csr")
     assert (np.diff(A.indptr) == 0).any()
-    found, expected = tree.among(A), A @ (A @ tree.times(np.eye(tree.n))).T
+    found, expected = tree.among(A), A @ (A @ tree.full()).T
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
     np.testing.assert_array_equal(found, found.T)
     assert tree.among(A[:0]).shape == (0, 0)
@@ -170,17 +169,18 @@ def test_covariances_among_rows_of_neighbours_go_no_further_up_than_they_have_to
 
     monkeypatch.setattr(tree_module, "solve_cliques", counted)
     tree = solve_network(pose_networks.simulate(8, 8, 3).network).precision.tree
-    Q, rng = tree.times(np.eye(tree.n)), np.random.default_rng(0)
+    Q, rng, cliques = tree.full(), np.random.default_rng(0), tree.cliques
     number = {n: k for k, n in tree.number.items()}
-    for c, keys in enumerate(np.split(tree._keys, tree._key_ptr[1:-1])):
-        below = tree._keys[tree._key_ptr[-2]] if c == tree._parents[-1] else keys[0]  # of the last leaf too
+    for c in range(len(cliques)):
+        keys = cliques.keys_in(c)
+        below = cliques.keys_in(len(cliques) - 1)[0] if c == cliques.parents[-1] else keys[0]  # of the last leaf too
         rows = tree.rows([number[k] for k in {*keys.tolist(), int(below)}])
         A = np.zeros((20, tree.n))
         A[:, rows] = rng.standard_normal((20, len(rows)))
         seen.clear()
         expected = A @ Q @ A.T
         np.testing.assert_allclose(tree.among(sparse.csr_array(A)), expected, rtol=1e-9, atol=1e-9 * np.abs(Q).max())
-        assert max(seen) == (c == tree._parents[-1])
+        assert max(seen) == (c == cliques.parents[-1])
 
 
 @pytest.mark.parametrize("n_last", [0, 2])
@@ -204,9 +204,9 @@ def test_large_networks_are_eliminated_in_the_order_of_least_work(
 def test_columns_cost_their_way_to_the_root() -> None:
     tree = solve_network(pose_networks.simulate(20, 4, 1, extra=10).network).precision.tree
     numbers = tree.arrays.front * tree.arrays.width
-    ways = [numbers[tree._ancestors({c})].sum() for c in range(len(numbers))]
+    ways = [numbers[tree.cliques.ancestors({c})].sum() for c in range(len(numbers))]
     assert 0 < max(ways) < numbers.sum()  # there are branches
-    assert tree.columns_for(3.0) * max(ways) == pytest.approx(3.0 * float(numbers @ tree.arrays.width))
+    assert tree.cliques.columns_for(3.0) * max(ways) == pytest.approx(3.0 * float(numbers @ tree.arrays.width))
 
 
 def test_rows_of_pairs_in_batches_are_those_of_their_factors() -> None:

@@ -188,7 +188,7 @@ def test_covariances_that_are_brought_together_are_those_of_the_whole_matrix(mon
     each = [tree.joint(pair) for pair in pairs]
     tree.bring_together(pairs)
     monkeypatch.setattr(tree, "_apart", None)  # no way of its own is left to take
-    whole = tree.times(np.eye(tree.n))
+    whole = tree.full()
     for pair, alone in zip(pairs, each, strict=True):
         rows = np.concatenate([np.arange(len(whole))[tree.places()[key]] for key in pair])
         for found in (alone, tree.joint(pair), tree.joint(pair[::-1])[np.ix_(*[np.roll(np.arange(12), 6)] * 2)]):

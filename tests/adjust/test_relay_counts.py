@@ -92,6 +92,56 @@ def test_shortest_loops_against_all_loops():
         assert loop_basis(top).minimal or rank == 0
 
 
+def through_every_station(top):
+    """Of every station and pair the loop of the shortest ways from the station to the pair's ends: sets of pairs."""
+    ways = [[] for _ in range(top.n_stations)]
+    for e, (a, b) in enumerate(zip(top.a_idx.tolist(), top.b_idx.tolist(), strict=True)):
+        ways[a].append((b, e))
+        ways[b].append((a, e))
+    found = set()
+    for start in range(top.n_stations):
+        to, front = {start: frozenset()}, [start]
+        for v in front:
+            for w, e in ways[v]:
+                if w not in to:
+                    to[w] = to[v] | {e}
+                    front.append(w)
+        for e, (a, b) in enumerate(zip(top.a_idx.tolist(), top.b_idx.tolist(), strict=True)):
+            if a in to and e not in to[a] | to[b]:
+                found.add(to[a] ^ to[b] ^ {e})
+    return found
+
+
+def far_apart(n, m, seed):
+    """Pairs between near stations and a few across, in a ring: some loops are short, the others of every length."""
+    rng = np.random.default_rng(seed)
+    rows = [(i, (i + 1) % n) for i in range(n)]
+    rows += [(int(i), int(i + rng.integers(1, 5)) % n) for i in rng.integers(0, n, m)]
+    rows += [tuple(rng.choice(n, 2, replace=False).tolist()) for _ in range(6)]
+    return topology([(f"p{e}", str(a), str(b)) for e, (a, b) in enumerate(rows)], [str(i) for i in range(n)])
+
+
+@pytest.mark.parametrize(("n", "m"), [(40, 20), (60, 90), (50, 150), (150, 120)])
+def test_many_loops_are_as_short_as_those_through_every_station(n, m):
+    for seed in range(3):
+        top = far_apart(n, m, seed)
+        rank, shortest = rank_and_length(through_every_station(top))
+        basis = loop_basis(top)
+        sets = [frozenset(basis.pair_idx[basis.ptr[k] : basis.ptr[k + 1]].tolist()) for k in range(len(basis))]
+        assert basis.minimal
+        assert len(sets) == rank == rank_and_length(sets)[0]
+        assert basis.lengths.sum() == shortest
+
+
+def test_the_way_round_a_cylinder_is_found_within_the_budget():
+    n, rings = 80, 25
+    rows = [(f"r{i},{k}", f"{i},{k}", f"{(i + 1) % n},{k}") for i in range(n) for k in range(rings)]
+    rows += [(f"u{i},{k}", f"{i},{k}", f"{i},{k + 1}") for i in range(n) for k in range(rings - 1)]
+    basis = loop_basis(topology(rows), budget=2_000_000)
+    assert basis.minimal
+    assert sorted(basis.lengths.tolist()) == [4] * n * (rings - 1) + [n]
+
+
 def test_loops_are_walks():
     top = grid(5, 4)
     basis = loop_basis(top)

@@ -41,7 +41,7 @@ PARTS: list[Part] = [
     ("redundancy of readings and others", adjustment, "other_residuals"),
     ("estimates", adjustment, "estimates"),
     ("groups", adjustment, "group_summaries"),
-    ("whole covariance matrix", TreeCovariance, "times"),
+    ("whole covariance matrix", TreeCovariance, "full"),
 ]
 POSE_PARTS: list[Part] = [
     ("start values", pose_solve, "find_network_start"),
@@ -160,7 +160,7 @@ def readings(sizes: Sequence[int]) -> str:
             precision = Precision(graph, solved)
             result = clock.timed("tests and warnings", assemble)(graph, solved, AdjustOptions(), (), precision)
             if result.n_unknowns <= terrestrial.FULL_UP_TO:
-                terrestrial.whole(precision)
+                precision.tree.full()
 
         columns[f"{n} points"] = best_of(run, PARTS, 3 if n <= 3000 else 1)
     return milliseconds(columns)

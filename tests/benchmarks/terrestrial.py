@@ -81,15 +81,6 @@ def rough(survey: Survey) -> dict[str, FloatArray]:
     }
 
 
-def whole(precision: Precision) -> FloatArray:
-    """The whole covariance matrix (n, n)."""
-    n, at_once = precision.stacked.n, 64
-    out = np.empty((n, n))
-    for i in range(0, n, at_once):
-        out[:, i : i + at_once] = precision.stacked.times(np.eye(n, min(at_once, n - i), -i))
-    return out
-
-
 def ours(given: Terrestrial) -> Competitor:
     """Graph, least squares, variances and statistics of everything, and the whole matrix where it is not too large."""
     survey = network(int(given.n), bool(given.free), int(given.seed))
@@ -107,7 +98,7 @@ def ours(given: Terrestrial) -> Competitor:
         clock.append(perf_counter())
         names = ["build", "solve", "tree", "statistics"]
         if result.n_unknowns <= FULL_UP_TO:
-            whole(precision)
+            precision.tree.full()
             clock.append(perf_counter())
             names.append("full covariance")
         stages = dict(zip(names, np.diff(clock).tolist(), strict=True))

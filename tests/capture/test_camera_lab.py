@@ -16,7 +16,7 @@ from capture.session.trigger_set import TriggerSet
 from capture.simulated.angles import AnglesFile, write_angles
 from capture.simulated.folder import ANGLES, read_lab, write_lab
 from capture.simulated.laboratory import CAMERA_IDS, LabPose, LabSize, SimulatedLab, make_lab
-from survey.detection.detect import detect_image
+from survey.detection.batch import detect_image
 from survey.detection.results import SpotOptions
 from survey.detection.spots import detect_spots
 from survey.project import read

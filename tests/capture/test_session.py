@@ -15,11 +15,12 @@ import pytest
 from adjust.model.errors import SurveyError
 from capture.devices.turntable import LimitError
 from capture.plan.plan import read_plan
-from capture.session.folder import lock_holder, session_lock
+from capture.session.folder import session_lock
 from capture.session.journal import read_journal
 from capture.session.progress import Progress
 from capture.session.run import run_plan
 from capture.session.run_session import SessionStoppedError
+from survey.folder.locking import SESSION_LOCK, holder_of
 from tests.capture.session_runs import processes, require_complete, run_to_end, write_plan
 from tests.capture.table_server import table_server
 
@@ -237,13 +238,13 @@ def test_two_sessions_on_one_folder_are_refused(tmp_path):
             assert other.stdout.readline() == "held\n"
             with pytest.raises(SurveyError, match=f"another session works on this folder .process {other.pid} on"):
                 run(plan)
-            assert lock_holder(tmp_path / "lab").startswith(f"process {other.pid}")
+            assert holder_of(tmp_path / "lab" / SESSION_LOCK).startswith(f"process {other.pid}")
         finally:
             other.kill()
         other.wait()
     # the lock file is still there and names a process that is dead: nobody holds it
     assert str(other.pid) in (tmp_path / "lab" / "capture" / "lock").read_text()
-    assert lock_holder(tmp_path / "lab") is None
+    assert holder_of(tmp_path / "lab" / SESSION_LOCK) is None
     assert run(plan).taken == 6
 
 

@@ -45,7 +45,7 @@ def _samples() -> dict[str, dict[str, bytes]]:
 
 def _network(format: str, path: Path) -> object:
     from survey.interop.cameras.formats import READERS
-    from survey.interop.names import with_safe_ids
+    from survey.interop.networks.foreign import with_safe_ids
 
     return with_safe_ids(READERS[format.removesuffix("-json")](path).survey)
 

@@ -258,7 +258,7 @@ def _g2o(path: Path) -> object:
 
 def _foreign(name: str) -> Callable[[Path], object]:
     def read(path: Path) -> object:
-        from survey.interop.names import with_safe_ids
+        from survey.interop.networks.foreign import with_safe_ids
         from survey.jobs.converting import READERS as FOREIGN
 
         return with_safe_ids(FOREIGN[name](path).survey)

@@ -8,7 +8,7 @@ from gtsam import Pose3, Rot3
 from adjust.model.errors import SurveyError
 from adjust.native.vision import of_neighbours
 from survey.detection import detect_image
-from survey.detection.extent import grown
+from survey.detection.corners import grown
 from survey.jobs.adjusting.job import adjust_job, detect_job
 from survey.project.targets import Checkerboard
 from survey.simulate.rendering import BrownCamera, Imaging, PlacedTarget, render

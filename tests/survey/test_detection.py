@@ -7,10 +7,10 @@ from gtsam import Pose3, Rot3
 from scipy.stats import chi2
 
 from adjust.model.errors import SurveyError
-from adjust.native.vision import corner_rows, count_crossings, find_grid, fit_corners
+from adjust.native.vision import corner_rows, count_crossings, find_grid, refine_corners
 from survey.detection import detect_image, markers
+from survey.detection.batch import detect_targets
 from survey.detection.corners import CROSSING_FLOOR_PX, MARKER_FLOOR_PX
-from survey.detection.detect import detect_targets
 from survey.detection.gray import gray_values, reduced, saturation_level
 from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid
 from survey.simulate.rendering import BrownCamera, Imaging, PlacedTarget, render
@@ -283,12 +283,16 @@ def test_a_fit_to_its_own_grey_values_gives_back_what_they_were_made_with(crossi
     v, u = np.mgrid[:41, :41]
     value, _ = corner_rows(np.stack([u.ravel() - 20.0, v.ravel() - 20.0], axis=1), p - [20, 20, *[0] * 7], crossing)
     image = value.reshape(41, 41).astype(np.float32)
-    start, angles = p[None, :2] + 0.2, p[None, 2:4] + 0.03
-    shapes = np.array([[8.0, 0.0, 0.0, 0.0]])
-    found, _, _, rms, status = fit_corners(image, start, angles, np.array([1.1]), shapes, crossing, 3.0, 1e-7)
-    assert status[0] == 0
-    assert rms[0] < 1e-4  # grey values of single precision
-    assert np.abs(found[0] - p).max() < 1e-4
+    angles, none = p[None, 2:4] + 0.03, np.zeros(1)
+    edges, free = 17.0 * np.stack([np.cos(angles), np.sin(angles)], axis=2), np.full(1, np.inf if crossing else 8.0)
+    uv, cov, blur, contrast, good, angles, _ = refine_corners(
+        image, p[None, :2] + 0.2, edges, free, crossing, 0.0, none, none
+    )
+    assert good[0]
+    assert np.sqrt(np.abs(cov)).max() < 1e-5  # grey values of single precision
+    assert np.abs(np.concatenate([uv[0], angles[0]]) - p[:4]).max() < 1e-4
+    assert contrast[0] == pytest.approx(p[5] * (1.0 + crossing), abs=1e-3)
+    assert blur[0] == pytest.approx(np.sqrt(0.9**2 - 1.0 / 12.0), abs=1e-4)
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 17.0, 45.0, 100.0])

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from survey import project as files
-from survey.project.declared.declarations import INSTRUMENT_UNITS, SURFACE_UNITS, keys_of
+from survey.project.declared.declarations import INSTRUMENT_UNITS, SURFACE_UNITS, declared
 from survey.project.declared.vectors import vector_keys
-from survey.project.reading import LAYOUTS
+from survey.project.tables.kinds import LAYOUTS
 
 PAGE = Path(__file__).parents[2] / "docs" / "observations.md"
 NEW = ("terrestrial", "terrestrial_covariance", "coordinate_differences", "coordinate_differences_covariance", "levels",
@@ -50,7 +50,7 @@ def test_every_column_and_key_is_named() -> None:
     assert missing == set()
     keys = {k for units in (INSTRUMENT_UNITS, *SURFACE_UNITS.values()) for k in vector_keys(units)}
     assert {k for k in keys if k not in text} == set()
-    assert {k for k in keys_of("instrument") if k.rsplit("_", 1)[0] not in text} == set()
+    assert {k for k in declared("instrument").by_name if k.rsplit("_", 1)[0] not in text} == set()
     for name in LAYOUTS:
         if name in NEW:
             assert name in text

@@ -31,7 +31,7 @@ from survey.folder.units import from_si, to_si
 from survey.project.declared.toml_text import key_lines, read_tables
 from survey.project.tables import files as table_reading
 from survey.project.tables import reading as tables
-from survey.project.tables.observation_columns import pair_columns
+from survey.project.tables.pairs import pair_columns
 from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList
 from survey.simulate import full_lab
 from tests.survey.faults import write_good_project

@@ -18,15 +18,14 @@ from adjust.model.errors import SurveyError
 from adjust.model.names import natural_key
 from survey import project as files
 from survey.cli import FAILED, main
-from survey.detection.gray import read_image
-from survey.detection.image_header import image_size
+from survey.detection.gray import image_size, read_image
 from survey.folder.messages import message
 from survey.folder.replacing import recover
 from survey.folder.text import cell_text, id_problem, read_bytes
 from survey.jobs.adjusting.job import adjust_job
 from survey.project.declared.node import read_toml
 from survey.project.tables.files import read_table, write_table
-from survey.project.tables.reading import Layout, group_names
+from survey.project.tables.reading import Layout, marks
 from survey.solution.earlier.previous import read_previous
 from survey.solution.residual_tables import other_residuals_csv
 from tests.adjust.test_deformation import adjusted, chain, measured
@@ -171,7 +170,7 @@ def test_no_cell_of_a_table_is_taken_for_a_formula(tmp_path: Path, text: str) ->
     path.write_text(f'a_id,value_m,group\nA,1.0,image\nA,2.0,"{text}"\n', encoding="utf-8", newline="")
     table = read_table(path, Layout("distances", ("a_id",), ("value_m",), ("group",)))
     with pytest.raises(SurveyError, match=r"distances.csv:3: group: .* cannot be a name"):
-        group_names(table, "distance")
+        marks(table, "distance", {})
 
 
 def test_residuals_of_evil_names_are_shown_as_text() -> None:

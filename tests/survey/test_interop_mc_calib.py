@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from adjust.model.errors import SurveyError
-from survey.interop.cameras.mc_calib import read_mc_calib
+from survey.interop.cameras.opencv_files import read_mc_calib
 from tests.survey.camera_lab import pixels, points_before, same_rig
 
 

@@ -17,8 +17,8 @@ from adjust.model.errors import SurveyError
 from adjust.model.survey import Camera, LensParameter
 from survey.cli import main
 from survey.interop.cameras.formats import write_cameras
-from survey.interop.cameras.lens_maps import BROWN_8, mapped_lens
 from survey.interop.cameras.mrcal import read_mrcal, rt_by_tangent, rt_of
+from survey.interop.cameras.values import BROWN_8, mapped_lens
 from survey.project import read
 from tests.survey.camera_lab import LENSES, SIZE, pixels, points_before, same_rig
 

@@ -14,7 +14,7 @@ import adjust
 import survey
 from adjust.model import observations
 from survey.batch.causes import CAUSES
-from survey.project.tables.terrestrial import KINDS
+from survey.project.tables.terrestrial import READING_KINDS
 from survey.report.language import (
     GROUPS_BY_KIND,
     LANGUAGES,
@@ -172,7 +172,7 @@ def test_groups_named_after_their_kind_are_said_in_the_language_and_others_as_th
         for field in fields(kind) if field.name == "group"
     }  # fmt: skip
     assert {"image", "distance", "coordinates"} <= named
-    assert named | set(KINDS) <= GROUPS_BY_KIND
+    assert named | set(READING_KINDS) <= GROUPS_BY_KIND
     with speaking("de"):
         assert group_name("slope_distance") == "Schrägstrecke"
         assert [x for x in GROUPS_BY_KIND if group_name(x) == x.replace("_", " ")] == []

@@ -12,7 +12,7 @@ from adjust.lenses.models import MODELS
 from adjust.model.errors import SurveyError
 from adjust.model.survey import CROP, ImageCrop, LensDrift, Survey, VectorParameter
 from adjust.navigation import Beacons, head_and_beacons
-from survey.interop.cameras.lens_maps import mapped_lens
+from survey.interop.cameras.values import mapped_lens
 from survey.jobs.navigating.lenses import lenses_taken, with_images_left
 from survey.jobs.navigating.task import require_one_time
 from survey.simulate import Truth, resample, stereo

@@ -17,10 +17,10 @@ from survey.project.declared.declarations import DECLARATIONS, declared
 from survey.project.declared.keys import NOTHING, REQUIRED, Declared, Key
 from survey.project.exclusions import EXCLUSIONS
 from survey.project.project import DEMANDED
-from survey.project.reading import LAYOUTS, read_definition
-from survey.project.reference import reference_page
-from survey.project.schema import survey_schema
+from survey.project.reading import read_definition
+from survey.project.reference import reference_page, survey_schema
 from survey.project.tables.column_texts import COLUMN_TEXTS, column_text
+from survey.project.tables.kinds import LAYOUTS
 
 jsonschema = pytest.importorskip("jsonschema")
 ROOT = Path(__file__).parents[2]

@@ -18,10 +18,10 @@ from survey.batch.trends import trends_of
 from survey.cli import main
 from survey.examples import write_example
 from survey.examples.alignment import alignment_files
-from survey.jobs.adjusting.job import run_info
+from survey.jobs.adjusting.outcome import run_info
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.aligning import align_job
-from survey.notebook.html import heading, html_table
+from survey.notebook.names import heading, html_table
 from survey.planning.job import PlanRequest, planning_job
 from survey.planning.page import plan_page
 from survey.project import AdjustmentOptions, Project, Sigmas, read

@@ -16,7 +16,8 @@ from adjust.adjustment import adjust
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment, Estimate, GlobalTest
 from adjust.native.text import NUMBERS, TEXT, WORD, Words, number_rows, record_rows
-from survey.report.results import ReportOptions, write_results
+from survey.report.language import ReportOptions
+from survey.report.results import write_results
 from survey.simulate import head_on_table
 from survey.solution.covariances import covariance_npz, read_covariances
 from survey.solution.dictionary import RunInfo, correlated, solution_dict

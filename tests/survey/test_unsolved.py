@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 
-import survey.jobs.adjusting.job as job
+import survey.jobs.adjusting.steps as steps
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.solver import SolveOptions, solve
 from adjust.model.errors import NotConvergedError, SurveyError
@@ -76,12 +76,12 @@ def test_failure_is_written_beside_what_was_there_and_goes_with_the_next_solutio
     write_project(lab, survey_of("stereo", 3)[0])
     assert main(["adjust", str(lab), "--quiet"]) == 0
     solved = (lab / "results" / "solution.json").read_bytes()
-    real, error = job.adjust_project, stopped()[0]
+    real, error = steps.adjust_project, stopped()[0]
 
     def failing(*_: object, **__: object) -> None:
         raise SurveyError("it does <not> fit") from error
 
-    monkeypatch.setattr(job, "adjust_project", failing)
+    monkeypatch.setattr(steps, "adjust_project", failing)
     assert main(["adjust", str(lab)]) == 1
     said = capsys.readouterr().err
     assert "it does <not> fit" in said
@@ -100,7 +100,7 @@ def test_failure_is_written_beside_what_was_there_and_goes_with_the_next_solutio
     assert "lens of camera" in page
     assert main(["report", str(lab), "--quiet", "--language", "de"]) == 1
     assert "Beim Abbruch" in (lab / "results" / "unsolved.html").read_text(encoding="utf-8")
-    monkeypatch.setattr(job, "adjust_project", real)
+    monkeypatch.setattr(steps, "adjust_project", real)
     assert main(["adjust", str(lab), "--quiet"]) == 0
     assert not list((lab / "results").glob("unsolved*"))
 

@@ -72,7 +72,7 @@ def _empty_corners(camera: Camera, uv: FloatArray) -> list[str]:
 
 def _images(case: Case) -> Iterator[Finding]:
     """Single images: covered too little, the board too far or seen too flat."""
-    cameras, times = {c.camera_id: c for c in case.survey.cameras}, LensTimes(case.survey)
+    cameras, times = case.survey.cameras_by_id, LensTimes(case.survey)
     small, far, flat = list[str](), list[str](), list[str]()
     for i, b in enumerate(case.survey.image_blocks):
         if b.target_id is None or len(b.uv) < 4:

@@ -1,6 +1,6 @@
 """Bodies taken for rigid that are not: a camera or target moved, a focus touched, an image cropped or turned later."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 from adjust.diagnosis.bodies.cameras import changed_camera, turned_images
@@ -12,11 +12,20 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.prediction import adjusted_values
 
-__all__ = ["hypotheses"]
 _MOST, _FAINT = 4, 5.0
 
 
-def hypotheses(case: Case) -> Iterable[Hypothesis]:
+def lost_cameras(case: Case) -> Iterator[Hypothesis]:
+    """Cameras that do not even fit by themselves, where the values of all are lost: nothing else tells so clearly.
+
+    Those whose images two lenses explain; none where scores at values that are near say what changed.
+    """
+    for step in lens_steps(case) if by_themselves(case) else ():
+        if epochs := epochs_from(case.survey, "camera_id", step.name[1], step.first):
+            yield changed_camera(case.survey, step, epochs)
+
+
+def changed_bodies(case: Case) -> Iterator[Hypothesis]:
     """Cameras and targets that are others from some epoch on, where single images show a step."""
     found: dict[tuple[str, int], Step] = {}
     for step in _steps(case):  # the first of a place tells the motion too

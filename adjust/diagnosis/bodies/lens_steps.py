@@ -9,6 +9,7 @@ import numpy as np
 from adjust.diagnosis.alone import own_lenses, single_views, squares_alone, squares_of
 from adjust.diagnosis.bodies.series import Step
 from adjust.diagnosis.case import Case
+from adjust.diagnosis.sequences import costs_of_cuts
 from adjust.diagnosis.table.views import single_camera_survey
 from adjust.diagnosis.trial import misfit_of
 from adjust.model.errors import SurveyError
@@ -82,7 +83,7 @@ def _cut(case: Case, alone: Survey, now: FloatArray) -> int:
     if not np.isfinite(typical):
         return 0
     first, last, now = (np.minimum((e / typical) ** 2, _BOUND) for e in (first, last, now))
-    costs = np.concatenate([[0.0], np.cumsum(first)]) + np.concatenate([np.cumsum(last[::-1])[::-1], [0.0]])
+    costs = costs_of_cuts(first, last)
     return int(np.argmin(costs)) if costs.min() - n < 0.5 * (now.sum() - n) else 0
 
 
@@ -104,7 +105,7 @@ def _split(case: Case, alone: Survey, cut: int) -> tuple[int, float]:
         left += omega
         squares.append(squares_alone(middle, {camera: lens}))
     first, last = squares
-    costs = np.concatenate([[0.0], np.cumsum(first)]) + np.concatenate([np.cumsum(last[::-1])[::-1], [0.0]])
+    costs = costs_of_cuts(first, last)
     return near.start + int(np.argmin(costs)), left + float(costs.min())
 
 

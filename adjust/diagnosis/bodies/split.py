@@ -16,7 +16,7 @@ def epochs_from(survey: Survey, field: str, owner_id: str, first: int) -> tuple[
 
 def split_camera(survey: Survey, camera_id: str, epochs: Iterable[str], new_id: str) -> Survey:
     """The images of a camera at some epochs as those of a camera of its own: lens and place on the station are free."""
-    camera = next(c for c in survey.cameras if c.camera_id == camera_id)
+    camera = survey.cameras_by_id[camera_id]
     pose = camera.station_from_camera
     own = PoseParameter(pose.value if pose.treatment == "free" else None)
     other = replace(camera, camera_id=new_id, station_from_camera=own)
@@ -27,7 +27,7 @@ def split_camera(survey: Survey, camera_id: str, epochs: Iterable[str], new_id: 
 
 def split_target(survey: Survey, target_id: str, epochs: Iterable[str], new_id: str) -> Survey:
     """A target with a place of its own at some epochs."""
-    target = next(t for t in survey.targets if t.target_id == target_id)
+    target = survey.targets_by_id[target_id]
     other = replace(target, target_id=new_id, carrier_from_target=PoseParameter())
     return replace(
         survey, targets=(*survey.targets, other), image_blocks=_renamed(survey, "target_id", target_id, epochs, new_id)

@@ -1,8 +1,5 @@
 """A target that was moved during the session."""
 
-from collections.abc import Sequence
-from dataclasses import replace
-
 import numpy as np
 from gtsam import Pose3, Rot3
 
@@ -21,24 +18,24 @@ def moved_target(survey: Survey, step: Step, epochs: tuple[str, ...]) -> Hypothe
         for b in survey.image_blocks
         if b.target_id == target and b.epoch_id in epochs
     )
-    hypothesis = Hypothesis(
+    cause = f"target {target} was moved before epoch {epochs[0]}"
+
+    def told(result: Adjustment) -> str:
+        found = (result.estimates.get(("carrier_from_target", name)) for name in (target, new))
+        before, after = (None if e is None else e.value for e in found)
+        if not isinstance(before, Pose3) or not isinstance(after, Pose3):  # its images were left out
+            return ""
+        return f"{cause} {motion_text(before.between(after))}"
+
+    return Hypothesis(
         "target moved",
-        f"target {target} was moved before epoch {epochs[0]}",
+        cause,
         f"give it a name of its own from epoch {epochs[0]} on, or leave these {len(images)} images of it out",
         Place("target", (target,), epochs=epochs),
         split_target(survey, target, epochs, new),
         (LeaveOut(tuple(images)),),
         evidence=step.gain, parameters=7, looked_at=step.cuts,
-    )  # fmt: skip
-
-    def told(result: Adjustment) -> Sequence[Hypothesis]:
-        found = (result.estimates.get(("carrier_from_target", name)) for name in (target, new))
-        before, after = (None if e is None else e.value for e in found)
-        if not isinstance(before, Pose3) or not isinstance(after, Pose3):  # its images were left out
-            return ()
-        return (replace(hypothesis, cause=f"{hypothesis.cause} {motion_text(before.between(after))}"),)
-
-    return replace(hypothesis, follow=told)
+    ).told(told)  # fmt: skip
 
 
 def motion_text(motion: Pose3) -> str:

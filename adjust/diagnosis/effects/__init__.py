@@ -18,6 +18,7 @@ from adjust.diagnosis.effects.shapes import shapes
 from adjust.diagnosis.effects.steps import steps
 from adjust.diagnosis.effects.ties import untied
 from adjust.diagnosis.hypothesis import Hypothesis
+from adjust.diagnosis.prediction import Linear
 from adjust.model.errors import SurveyError
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
@@ -29,17 +30,14 @@ _MOST = 6
 
 def hypotheses(case: Case) -> Iterator[Hypothesis]:
     """The few changes that explain most for what they cost, each once; bent targets, uneven axes, lenses not shared."""
-    yield from bent_targets(case)
-    yield from unsteady_axes(case)
-    yield from untied(case)
-    yield from _scored(case)
-
-
-def _scored(case: Case) -> Iterator[Hypothesis]:
     linear = case.linear
-    if linear is None:
-        return
-    effects = [e for make in (steps, pixels, clocks, shapes) for e in _formed(make, case)]
+    if linear is not None:
+        for make in (bent_targets, unsteady_axes, untied, _scored):
+            yield from make(case, linear)
+
+
+def _scored(case: Case, linear: Linear) -> Iterator[Hypothesis]:
+    effects = [e for make in (steps, pixels, clocks, shapes) for e in _formed(make, case, linear)]
     excess = linear.result.omega - linear.result.redundancy
     clear = [e for e in effects if e.first.seen and e.first.drop > _SHARE * excess]
     if not clear:
@@ -55,9 +53,9 @@ def _scored(case: Case) -> Iterator[Hypothesis]:
         yield e.formed(case, linear, len(effects))
 
 
-def _formed(make: Callable[[Case], Iterator[Effect]], case: Case) -> list[Effect]:
+def _formed(make: Callable[[Case, Linear], Iterator[Effect]], case: Case, linear: Linear) -> list[Effect]:
     try:
         with np.errstate(all="ignore"):
-            return list(make(case))
+            return list(make(case, linear))
     except SurveyError:
         return []

@@ -1,6 +1,6 @@
 """A turntable whose axes do not turn evenly: eccentric encoders, run-out and wobble, as unknowns of their own."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import gtsam
@@ -8,6 +8,7 @@ import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, SetKey
+from adjust.diagnosis.prediction import Linear
 from adjust.frames.tables import check_harmonics
 from adjust.graph.assembly import values_of
 from adjust.graph.building import GraphBuilder
@@ -26,11 +27,8 @@ _KINDS = (
 )
 
 
-def unsteady_axes(case: Case) -> Iterator[Hypothesis]:
+def unsteady_axes(case: Case, linear: Linear) -> Iterator[Hypothesis]:
     """Of every axis that was read all round and has no harmonics yet, where their score is clear."""
-    linear = case.linear
-    if linear is None:
-        return
     for table in case.survey.tables:
         if any(harmonic(name) for name in table.geometry.names):
             continue
@@ -78,26 +76,24 @@ def _hypothesis(survey: Survey, table: Table, axis: int, name: str, kinds: dict[
     keys = {f"{kind}_{axis + 1}": highest for kind, highest in kinds.items()}
     shown = ", ".join(f"{key} = {highest}" for key, highest in keys.items())
     n = sum(len(harmonic_names(kind, axis, highest)) for kind, highest in kinds.items())
-    hypothesis = Hypothesis(
-        name, f"axis {axis + 1} of table {table.table_id}: {said}",
+    cause = f"axis {axis + 1} of table {table.table_id}: {said}"
+    return Hypothesis(
+        name, cause,
         f"let the adjustment find its harmonics: harmonics = {{ {shown} }}",
         Place("table", (table.table_id,), "harmonics"), survey,
         tuple(SetKey(("tables", table.table_id, "harmonics", key), highest) for key, highest in keys.items()),
         parameters=n, looked_at=len(table.axes) * len(_KINDS),
-    )  # fmt: skip
-    return replace(hypothesis, follow=_sizes_told(hypothesis, table.table_id))
+    ).told(lambda result: f"{cause} ({_sizes(result, table.table_id)})")  # fmt: skip
 
 
-def _sizes_told(hypothesis: Hypothesis, table_id: str) -> Callable[[Adjustment], list[Hypothesis]]:
-    def told(result: Adjustment) -> list[Hypothesis]:
-        estimate = result.estimates[("table_geometry", table_id)]
-        values = dict(zip(estimate.components, np.asarray(estimate.value).tolist(), strict=True))
-        parts = []
-        for test in significances(result, estimate, estimated_sigma0=True):
-            if test.significant:
-                size, in_m = float(np.hypot(*(values[c] for c in test.components))), test.term[:2] in ("ax", "ra")
-                shown = f"{1e3 * size:.3f} mm" if in_m else f"{np.degrees(size) * 3600.0:.1f} arcsec"
-                parts.append(f"{test.term.replace('_', ' ')} {shown}")
-        return [replace(hypothesis, cause=f"{hypothesis.cause} ({', '.join(parts) or 'no single order stands out'})")]
-
-    return told
+def _sizes(result: Adjustment, table_id: str) -> str:
+    """Of the harmonics that stand out."""
+    estimate = result.estimates[("table_geometry", table_id)]
+    values = dict(zip(estimate.components, np.asarray(estimate.value).tolist(), strict=True))
+    parts = []
+    for test in significances(result, estimate, estimated_sigma0=True):
+        if test.significant:
+            size, in_m = float(np.hypot(*(values[c] for c in test.components))), test.term[:2] in ("ax", "ra")
+            shown = f"{1e3 * size:.3f} mm" if in_m else f"{np.degrees(size) * 3600.0:.1f} arcsec"
+            parts.append(f"{test.term.replace('_', ' ')} {shown}")
+    return ", ".join(parts) or "no single order stands out"

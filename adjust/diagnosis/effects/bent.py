@@ -1,13 +1,15 @@
 """A target that is bent: its sag as an unknown of its own."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import of_shape
 from adjust.diagnosis.hypothesis import Hypothesis, Place, SetKey
+from adjust.diagnosis.prediction import Linear
 from adjust.model.boards import BENT, deformation
 from adjust.model.result import Adjustment
 from adjust.model.survey import VectorParameter
@@ -18,11 +20,8 @@ _ALPHA = 1e-4
 _FLAT = 0.1
 
 
-def bent_targets(case: Case) -> Iterator[Hypothesis]:
+def bent_targets(case: Case, linear: Linear) -> Iterator[Hypothesis]:
     """The sag of a flat target as an unknown of its own, where the score of a sag is clear."""
-    linear = case.linear
-    if linear is None:
-        return
     flat = [t for t in case.survey.targets if np.ptp(t.x_in_target[:, 2]) < _FLAT * np.ptp(t.x_in_target[:, :2])]
     limit = linear.scale * float(chi2.isf(sidak(_ALPHA, len(flat)), 2))
     for given in flat:
@@ -46,16 +45,13 @@ def bent_targets(case: Case) -> Iterator[Hypothesis]:
             (SetKey(("targets", target, "warp", "free"), True),),
             evidence=linear.ratio(clear), parameters=2, looked_at=len(flat), scored=True,
         )  # fmt: skip
-        yield replace(hypothesis, follow=_sag_told(hypothesis, target))
+        yield hypothesis.told(partial(_sag, target))
 
 
-def _sag_told(hypothesis: Hypothesis, target: str) -> Callable[[Adjustment], list[Hypothesis]]:
-    def told(result: Adjustment) -> list[Hypothesis]:
-        sag = result.estimates[("warp", target)]
-        text = ", ".join(
-            f"{1e3 * v:+.3f} mm +- {1e3 * s:.3f} mm along {axis}"
-            for v, s, axis in zip(np.asarray(sag.value), np.sqrt(np.diag(sag.cov)), "xy", strict=True)
-        )
-        return [replace(hypothesis, cause=f"target {target} is bent: sag {text}")]
-
-    return told
+def _sag(target: str, result: Adjustment) -> str:
+    sag = result.estimates[("warp", target)]
+    text = ", ".join(
+        f"{1e3 * v:+.3f} mm +- {1e3 * s:.3f} mm along {axis}"
+        for v, s, axis in zip(np.asarray(sag.value), np.sqrt(np.diag(sag.cov)), "xy", strict=True)
+    )
+    return f"target {target} is bent: sag {text}"

@@ -16,7 +16,7 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect, Shifts, of_others, of_shifts
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.late import Freed, as_unknowns, keyed, spoken
-from adjust.diagnosis.linear import Linear
+from adjust.diagnosis.prediction import Linear
 from adjust.diagnosis.sequences import hand_poses
 from adjust.model.observations import ImageBlock, TableReading
 from adjust.model.result import Adjustment
@@ -31,11 +31,8 @@ _STEP = 1e-3  # intervals
 _CLEAR = 4.0  # sigmas
 
 
-def clocks(case: Case) -> Iterator[Effect]:
+def clocks(case: Case, linear: Linear) -> Iterator[Effect]:
     """Of cameras, of tables, of measured poses of stations; gear ratios of tables."""
-    linear = case.linear
-    if linear is None:
-        return
     yield from _of_cameras(case, linear)
     yield from _of_tables(case, linear)
     yield from _of_hands(case, linear)
@@ -118,13 +115,12 @@ def _of_cameras(case: Case, linear: Linear) -> Iterator[Effect]:
 
 def _late(survey: Survey, cameras: Sequence[str], weight: Any) -> Shifts:
     """By block the shifts (n, 2, k) px that an interval of each of k cameras makes."""
-    heights = {c.camera_id: c.image_size[1] for c in survey.cameras}
     out = {}
     for i, (k, n, speed, _) in _motion(survey).items():
         block = survey.image_blocks[i]
         if block.camera_id in cameras:
             D = np.zeros((len(speed), 2, len(cameras)))
-            w = weight(k, n, block, heights[block.camera_id])
+            w = weight(k, n, block, survey.cameras_by_id[block.camera_id].image_size[1])
             D[:, :, cameras.index(block.camera_id)] = w[:, None] * speed
             out[i] = D
     return out

@@ -12,7 +12,7 @@ import numpy as np
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect, of_shifts, shifted_back
 from adjust.diagnosis.hypothesis import ChangeColumns, Hypothesis, Place
-from adjust.diagnosis.linear import Linear
+from adjust.diagnosis.prediction import Linear
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import FloatArray, Survey
 
@@ -20,24 +20,19 @@ _HALF = 0.5
 _NEAR = 0.05
 
 
-def pixels(case: Case) -> Iterator[Effect]:
+def pixels(case: Case, linear: Linear) -> Iterator[Effect]:
     """A shift of all images of a camera, of all of a target or of the points of the world, of a group."""
-    linear = case.linear
-    if linear is None:
-        return
     blocks = case.survey.image_blocks
     for kind, field in (("camera", "camera_id"), ("target", "target_id"), ("group", "group")):
         owners = list(dict.fromkeys(getattr(b, field) for b in blocks))
         for owner in owners if kind == "camera" or len(owners) > 1 else ():
-            yield _of(case, kind, field, owner)
+            yield _of(case, linear, kind, field, owner)
     for camera in dict.fromkeys(b.camera_id for b in blocks):
         yield _interlaced(case, linear, camera)
 
 
-def _of(case: Case, kind: str, field: str, owner: str | None) -> Effect:
-    linear, name = case.linear, owner or "points"
-    if linear is None:
-        raise ValueError("a shift is scored at an adjustment")
+def _of(case: Case, linear: Linear, kind: str, field: str, owner: str | None) -> Effect:
+    name = owner or "points"
     what = f"{kind} {name}" if owner else "the points of the world"
 
     def shifts(survey: Survey) -> dict[int, FloatArray]:

@@ -8,7 +8,7 @@ import numpy as np
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect, of_shape
 from adjust.diagnosis.hypothesis import Hypothesis, Place, ScaleKey, SetKey
-from adjust.diagnosis.linear import Linear
+from adjust.diagnosis.prediction import Linear
 from adjust.diagnosis.targets.size import reshaped, well_known
 from adjust.model.survey import FloatArray, Survey, Target
 from adjust.statistics.score import Score
@@ -26,21 +26,19 @@ _SHAPES: tuple[tuple[str, FloatArray, str, str], ...] = (
 """Names, the change of points (3, 3) by one unit, words, and the component of the warp that takes it."""
 
 
-def shapes(case: Case) -> Iterator[Effect]:
+def shapes(case: Case, linear: Linear) -> Iterator[Effect]:
     """Each change of each target."""
-    linear = case.linear
-    if linear is not None:
-        for target in case.survey.targets:
-            if len(target.point_ids) >= 3:
-                every = (_of(case, linear, target, *shape) for shape in _SHAPES)
-                yield from (e for e in every if not (np.abs(e.first.theta) > _FAR).any())
+    for target in case.survey.targets:
+        if len(target.point_ids) >= 3:
+            every = (_of(case, linear, target, *shape) for shape in _SHAPES)
+            yield from (e for e in every if not (np.abs(e.first.theta) > _FAR).any())
 
 
 def _of(case: Case, linear: Linear, given: Target, name: str, by: FloatArray, what: str, component: str) -> Effect:
     target = given.target_id
 
     def scored(at: Linear) -> Score:
-        now = next(t for t in at.result.survey.targets if t.target_id == target)
+        now = at.result.survey.targets_by_id[target]
         return of_shape(at, target, (now.x_in_target @ by.T)[:, :, None])
 
     def known(theta: FloatArray, sigmas: FloatArray) -> tuple[FloatArray, Mapping[str, Any]] | None:

@@ -12,8 +12,7 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect
 from adjust.diagnosis.hypothesis import Edit, Hypothesis, LeaveOut, Place
 from adjust.diagnosis.lens_keys import block_keys, crop_keys, key_text
-from adjust.diagnosis.linear import Linear
-from adjust.diagnosis.prediction import Prediction, adjusted_values
+from adjust.diagnosis.prediction import Linear, Prediction, adjusted_values
 from adjust.diagnosis.sequences import with_pairs
 from adjust.model.observations import FrameRef, ImageBlock, Pair
 from adjust.model.result import Adjustment, ParameterName
@@ -41,23 +40,33 @@ _MOVED = {  # name of the unknown: of the mistake, kind of the thing, what happe
 
 @dataclass(frozen=True, eq=False)
 class _Course:
-    """An unknown, or some components of it, through time. labels: of its parts."""
+    """An unknown, or some components of it, through time, as an adjustment has it. labels: of its parts."""
 
+    linear: Linear
     name: ParameterName
     components: tuple[str, ...]
     kind: str  # of observation: image, pair, reading
     labels: tuple[str, ...]
     parts: tuple[Part, ...]
 
+    @property
+    def estimated(self) -> list[str]:
+        """Those of its components that are."""
+        columns = self.linear.system.columns
+        known = [columns.components[i] for i in self.linear.columns(self.name)]
+        return [c for c in self.components if c in known]
 
-def steps(case: Case) -> Iterator[Effect]:
+    @property
+    def is_pose(self) -> bool:
+        """Whether it is a motion."""
+        return self.name[0].endswith("_body") or isinstance(self.linear.result.estimates[self.name].value, Pose3)
+
+
+def steps(case: Case, linear: Linear) -> Iterator[Effect]:
     """The best step of every unknown that is the same for several epochs, and the drift of every lens."""
-    linear = case.linear
-    if linear is None:
-        return
     n, tree = len(linear.system.columns), linear.system.precision.tree
     # columns of the covariance matrix: as many as it has, or as cost no more than some adjustments
-    room = min(float(n), tree.columns_for(_ELIMINATIONS)) if n > DENSE else np.inf
+    room = min(float(n), tree.cliques.columns_for(_ELIMINATIONS)) if n > DENSE else np.inf
     for course in _courses(linear):
         room -= sum(B.shape[1] for _, B in course.parts)
         if not case.few("what moved from some epoch on, of things that fit better than others", int(room < 0.0), 0):
@@ -67,9 +76,9 @@ def steps(case: Case) -> Iterator[Effect]:
         found = linear.steps(course.parts)
         if found:
             cut = max(found, key=lambda t: found[t].drop)
-            yield _step(case, course, cut, found[cut], len(found))
+            yield _step(case.survey, course, cut, found[cut], len(found))
         if course.name[0] == "lens":
-            yield _drift(case, course, linear.drift(course.parts))
+            yield _drift(case.survey, course, linear.drift(course.parts))
 
 
 def _courses(
@@ -85,7 +94,8 @@ def _courses(
     def course(name: ParameterName, kind: str, ids: Mapping[int, str], rows: IntArray) -> _Course:
         numbers = [i for i in np.unique(row_of[rows]).tolist() if i in ids]
         of = [np.arange(ptr[i], ptr[i + 1]) for i in numbers]
-        return _Course(name, (), kind, tuple(ids[i] for i in numbers), tuple(linear.parts(columns.at[name], of)))
+        parts = tuple(linear.parts(columns.at[name], of))
+        return _Course(linear, name, (), kind, tuple(ids[i] for i in numbers), parts)
 
     yield from _of_held(linear, only)
     for name in _worst_first(linear) if only is None else [only] if only in columns.at else []:
@@ -136,7 +146,7 @@ def _of_images(
         columns = linear.columns(name, components)
         if len(columns):
             labels = tuple(epochs[k] for k in known)
-            yield _Course(name, components, "image", labels, tuple(linear.parts(columns, by_epoch)))
+            yield _Course(linear, name, components, "image", labels, tuple(linear.parts(columns, by_epoch)))
 
 
 def _of_held(linear: Linear, only: ParameterName | None) -> Iterator[_Course]:
@@ -157,7 +167,7 @@ def _of_held(linear: Linear, only: ParameterName | None) -> Iterator[_Course]:
             if D is not None:
                 by_epoch.setdefault(survey.image_blocks[i].epoch_id, []).extend(linear.image_parts({i: D}))
         parts = tuple((np.concatenate([r for r, _ in p]), np.concatenate([B for _, B in p])) for p in by_epoch.values())
-        yield _Course(name, (), "image", tuple(by_epoch), parts)
+        yield _Course(linear, name, (), "image", tuple(by_epoch), parts)
 
 
 def _other_rows(linear: Linear, kind: str) -> list[int]:
@@ -166,7 +176,7 @@ def _other_rows(linear: Linear, kind: str) -> list[int]:
     return [linear.system.n_image + i for i, k in enumerate(kinds) if k == kind]
 
 
-def _step(case: Case, course: _Course, cut: int, first: Score, looked_at: int) -> Effect:
+def _step(survey: Survey, course: _Course, cut: int, first: Score, looked_at: int) -> Effect:
     since, thing = course.labels[cut], course.name[1]
     later = course.labels[cut:]
     name, kind, what = _MOVED.get(course.name[0], ("", "camera", ""))
@@ -174,70 +184,68 @@ def _step(case: Case, course: _Course, cut: int, first: Score, looked_at: int) -
         name = "images shifted" if course.components == CENTRE else "focus touched"
     place = Place(kind, (thing,), epochs=later if course.kind == "image" else ())
     before = "before epoch" if course.kind == "image" else f"before {course.kind}"
-    names = [c for c in course.components if c in _components(case, course.name)]
 
     def said(theta: FloatArray, sigmas: FloatArray) -> str:
         if course.name[0] == "lens":
-            by = ", ".join(f"{n} {t:+.2f} +- {s:.2f}" for n, t, s in zip(names, theta, sigmas, strict=False))
+            by = _sizes(course.estimated, theta, sigmas)
             why = "focus or zoom was touched" if name == "focus touched" else "another crop of the sensor"
             return f"camera {thing}: from epoch {since} on its lens is another one by {by} px: {why}"
-        tables = [t.table_id for t in case.survey.tables] if len(_standing(case.survey)) == 1 else []
+        tables = [t.table_id for t in survey.tables] if len(_standing(survey)) == 1 else []
         alike = f" (or table {tables[0]}: its images cannot tell)" if name == "target moved" and tables else ""
         return f"{what.format(thing)} {before} {since}{_amount(course.name[0], theta, sigmas)}{alike}"
 
-    keys = _lens_keys(case, course, since, first)
+    keys = _lens_keys(survey, course, since, first)
     change = f"leave out what was observed from {since} on, or give it a name of its own there"
     change = f"let the adjustment find it: {key_text(keys)}; or {change}" if keys else change
-    edits = keys or _edits(case.survey, course, later)
-    hypothesis = Hypothesis(name, "", change, place, case.survey, edits, 1.0, 1, looked_at)
+    edits = keys or _edits(survey, course, later)
+    hypothesis = Hypothesis(name, "", change, place, survey, edits, 1.0, 1, looked_at)
     chosen = frozenset(later)
     return Effect(
         hypothesis, first,
         lambda linear: _at(linear, course, lambda parts: linear.of_parts(parts[cut:])),
-        lambda result, theta: _mended(case.survey, result, course, dict.fromkeys(chosen, 1.0), theta),
-        said, _composed if _is_pose(case, course.name) else np.add,
-        nearer=lambda result, theta: _nearer(case, course, cut, first, looked_at, result, theta),
+        lambda result, theta: _mended(survey, result, course, dict.fromkeys(chosen, 1.0), theta),
+        said, _composed if course.is_pose else np.add,
+        nearer=lambda result, theta: _nearer(survey, course, cut, first, looked_at, result, theta),
     )  # fmt: skip
 
 
 def _nearer(
-    case: Case, course: _Course, cut: int, first: Score, looked_at: int, result: Adjustment, theta: FloatArray
+    survey: Survey, course: _Course, cut: int, first: Score, looked_at: int, result: Adjustment, theta: FloatArray
 ) -> Effect | None:
     """The same step before another epoch, if its images, each as before and as after, say so; None else."""
     if course.kind != "image":
         return None
-    prediction = Prediction(case.survey, adjusted_values(result))
+    prediction = Prediction(survey, adjusted_values(result))
     altered = {course.name: _altered(result, course, theta)}
     number = {label: k for k, label in enumerate(course.labels)}
     gain = np.zeros(len(number))  # of v'Pv, where an epoch is after the step
-    for block in case.survey.image_blocks:
+    for block in survey.image_blocks:
         if block.epoch_id in number and _concerns(block, course):
             before, after = (prediction.squares(block, a) for a in ({}, altered))
             if before is not None and after is not None:
                 gain[number[block.epoch_id]] += float(np.fmin(before, _BOUND).sum() - np.fmin(after, _BOUND).sum())
     since = np.cumsum(gain[::-1])[::-1]
     best = 1 + int(np.argmax(since[1:]))
-    return None if best == cut else _step(case, course, best, replace(first, theta=theta), looked_at)
+    return None if best == cut else _step(survey, course, best, replace(first, theta=theta), looked_at)
 
 
-def _drift(case: Case, course: _Course, first: Score) -> Effect:
+def _drift(survey: Survey, course: _Course, first: Score) -> Effect:
     thing, weights = course.name[1], dict(zip(course.labels, drift_times(len(course.labels)), strict=True))
-    names = [c for c in course.components if c in _components(case, course.name)]
 
     def said(theta: FloatArray, sigmas: FloatArray) -> str:
-        by = ", ".join(f"{n} {t:+.2f} +- {s:.2f}" for n, t, s in zip(names, theta, sigmas, strict=False))
+        by = _sizes(course.estimated, theta, sigmas)
         return f"camera {thing}: its lens drifts from epoch {course.labels[0]} to {course.labels[-1]} by {by} px"
 
     n = len(course.labels)
     edits: tuple[Edit, ...] = ()
     if course.kind == "image" and n >= 6:
-        edits = block_keys(case.survey, thing, names, (course.labels[n // 3], course.labels[2 * n // 3]))
+        edits = block_keys(survey, thing, course.estimated, (course.labels[n // 3], course.labels[2 * n // 3]))
     hypothesis = Hypothesis(
         "lens drifts", "", "let the camera warm up, or adjust its lens by blocks of epochs: lens.drift",
-        Place("camera", (thing,), "lens"), case.survey, edits, 1.0, 0,
+        Place("camera", (thing,), "lens"), survey, edits, 1.0, 0,
     )  # fmt: skip
     return Effect(hypothesis, first, lambda linear: _at(linear, course, linear.drift),
-                  lambda result, theta: _mended(case.survey, result, course, weights, theta), said)  # fmt: skip
+                  lambda result, theta: _mended(survey, result, course, weights, theta), said)  # fmt: skip
 
 
 def _at(linear: Linear, course: _Course, score: Callable[[Sequence[Part]], Score]) -> Score:
@@ -248,15 +256,8 @@ def _at(linear: Linear, course: _Course, score: Callable[[Sequence[Part]], Score
     return Score(np.zeros(0), np.zeros((0, 0)), 0.0, 0)
 
 
-def _components(case: Case, name: ParameterName) -> list[str]:
-    linear = case.linear
-    return [] if linear is None else [linear.system.columns.components[i] for i in linear.columns(name)]
-
-
-def _is_pose(case: Case, name: ParameterName) -> bool:
-    linear = case.linear
-    body = name[0].endswith("_body")
-    return body or (linear is not None and isinstance(linear.result.estimates[name].value, Pose3))
+def _sizes(names: Sequence[str], theta: FloatArray, sigmas: FloatArray) -> str:
+    return ", ".join(f"{n} {t:+.2f} +- {s:.2f}" for n, t, s in zip(names, theta, sigmas, strict=False))
 
 
 def _composed(first: FloatArray, more: FloatArray) -> FloatArray:
@@ -274,14 +275,13 @@ def _amount(kind: str, theta: FloatArray, sigmas: FloatArray) -> str:
     return f" {motion_text(Pose3.Expmap(theta))}" if len(theta) == 6 else ""
 
 
-def _lens_keys(case: Case, course: _Course, since: str, first: Score) -> tuple[Edit, ...]:
+def _lens_keys(survey: Survey, course: _Course, since: str, first: Score) -> tuple[Edit, ...]:
     """What lets a lens be another one since then; none of other things."""
     if course.name[0] != "lens":
         return ()
-    names = [c for c in course.components if c in _components(case, course.name)]
     if course.components == CENTRE:
-        return crop_keys(case.survey, course.name[1], since, 1.0, first.theta) if len(names) == 2 else ()
-    return block_keys(case.survey, course.name[1], names, (since,))
+        return crop_keys(survey, course.name[1], since, 1.0, first.theta) if len(course.estimated) == 2 else ()
+    return block_keys(survey, course.name[1], course.estimated, (since,))
 
 
 def _edits(survey: Survey, course: _Course, later: Sequence[str]) -> tuple[Edit, ...]:

@@ -3,11 +3,13 @@
 The score at the solution gives it with its covariance, without another adjustment (:mod:`adjust.statistics.score`).
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, SetKey
+from adjust.diagnosis.prediction import Linear
 from adjust.frames.lens_states import lenders
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
@@ -17,11 +19,9 @@ from adjust.testing.distributions import chi2
 _ALPHA = 1e-4
 
 
-def untied(case: Case) -> Iterator[Hypothesis]:
+def untied(case: Case, linear: Linear) -> Iterator[Hypothesis]:
     """Every camera with a lens of its own that shares parameters which clearly differ."""
-    linear, shared = case.linear, lenders(case.survey)
-    if linear is None:
-        return
+    shared = lenders(case.survey)
     for camera, (lender, parameters) in shared.items():
         score = own_score(linear, camera, lender, parameters)
         if score.seen and score.drop > linear.scale * float(chi2.isf(_ALPHA / len(shared), score.seen)):
@@ -32,15 +32,12 @@ def untied(case: Case) -> Iterator[Hypothesis]:
                 (SetKey(("cameras", camera, "lens", "shared", "parameters"), ()),),
                 evidence=linear.ratio(score.drop), parameters=score.seen, looked_at=len(shared), scored=True,
             )  # fmt: skip
-            yield replace(hypothesis, follow=_told(hypothesis, linear.result, camera))
+            yield hypothesis.told(partial(_difference, hypothesis.cause, linear.result, camera))
 
 
-def _told(hypothesis: Hypothesis, tied: Adjustment, camera: str) -> Callable[[Adjustment], list[Hypothesis]]:
-    def told(_: Adjustment) -> list[Hypothesis]:
-        found = next((s for s in shared_lenses(tied, True) if s.camera == camera), None)
-        return [] if found is None else [replace(hypothesis, cause=f"{hypothesis.cause}: {found.said()}")]
-
-    return told
+def _difference(cause: str, tied: Adjustment, camera: str, _: Adjustment) -> str:
+    found = next((s for s in shared_lenses(tied, True) if s.camera == camera), None)
+    return "" if found is None else f"{cause}: {found.said()}"
 
 
 def _freed(survey: Survey, camera_id: str) -> Survey:

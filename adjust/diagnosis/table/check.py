@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 from gtsam import Pose3
 
-from adjust.diagnosis.case import with_lenses
 from adjust.diagnosis.table.fit import fit_table
 from adjust.diagnosis.table.places import (
     Places,
@@ -44,10 +43,19 @@ def probable_causes(survey: Survey, result: Adjustment | None = None) -> tuple[s
     table carries anything.
     """
     try:
-        every = table_views(survey if result is None else with_lenses(survey, result))
+        every = table_views(survey if result is None else _with_lenses(survey, result))
     except SurveyError:
         return ()
     return tuple(line for views in every for line in _causes(survey, views))
+
+
+def _with_lenses(survey: Survey, result: Adjustment) -> Survey:
+    """The survey whose lenses start from those of an adjustment."""
+    cameras = []
+    for camera in survey.cameras:
+        value = result.estimates[("lens", camera.camera_id)].value
+        cameras.append(camera if isinstance(value, Pose3) else replace(camera, lens=replace(camera.lens, values=value)))
+    return replace(survey, cameras=tuple(cameras))
 
 
 _SYMPTOMS = (

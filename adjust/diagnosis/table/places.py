@@ -181,7 +181,7 @@ def wrapped(angle: FloatArray) -> FloatArray:
 def _angles(views: TableViews, R: FloatArray) -> FloatArray:
     """Angles (k,) rad with R1(a1) R2(a2) nearest to R, geometry and zeros of the table left aside."""
     axes = ["xyz".index(a) for a in views.table.axes]
-    zeros = dict(zip(views.table.geometry.names, views.table.geometry.values, strict=True))
+    zeros = views.table.geometry.by_name
     p = axes[0]
     if len(axes) == 1:
         u, v = (p + 1) % 3, (p + 2) % 3

@@ -43,7 +43,7 @@ class TableViews:
         geometry: (2,) non-orthogonality (rad) and axis offset (m), where they are not those given.
         """
         a = self.angles if angles is None else angles
-        given = dict(zip(self.table.geometry.names, self.table.geometry.values.tolist(), strict=True))
+        given = self.table.geometry.by_name
         if geometry is not None and len(self.table.axes) > 1:
             given |= dict(zip(("non_orthogonality", "axis_offset"), geometry.tolist(), strict=True))
         return rigid(*table_motions(self.table.axes, given, a)[:2])
@@ -53,8 +53,8 @@ class TableViews:
         if len(self.table.axes) == 1:
             return np.zeros((len(self.angles), 6, 2))
         p, q = ("xyz".index(x) for x in self.table.axes)
-        given = dict(zip(self.table.geometry.names, self.table.geometry.values, strict=True))
-        back = rotation_exp(-(self.angles[:, 1] + given.get("zero_2", 0.0))[:, None] * np.eye(3)[q])
+        zero = self.table.geometry.by_name.get("zero_2", 0.0)
+        back = rotation_exp(-(self.angles[:, 1] + zero)[:, None] * np.eye(3)[q])
         out = np.zeros((len(self.angles), 6, 2))
         out[:, :3, 0] = out[:, 3:, 1] = back[:, :, 3 - p - q]
         return out
@@ -85,7 +85,7 @@ class TableViews:
 
 def given_geometry(table: Table) -> FloatArray:
     """Non-orthogonality (rad) and axis offset (m) as they are given, (2,)."""
-    given = dict(zip(table.geometry.names, table.geometry.values, strict=True))
+    given = table.geometry.by_name
     return np.array([given.get("non_orthogonality", 0.0), given.get("axis_offset", 0.0)])
 
 
@@ -99,8 +99,7 @@ def table_views(survey: Survey) -> tuple[TableViews, ...]:
     blocks = [b for b in survey.image_blocks if b.target_id is not None]
     if not readings or not carried or not blocks:
         return ()
-    targets = {t.target_id: t for t in survey.targets}
-    cameras = {c.camera_id: c for c in survey.cameras}
+    cameras, targets = survey.cameras_by_id, survey.targets_by_id
     sides: list[tuple[str, bool] | None] = []
     for block in blocks:
         target = targets[str(block.target_id)]
@@ -141,7 +140,7 @@ def _calibrated(survey: Survey) -> Survey:
 def single_camera_survey(survey: Survey, camera_id: str) -> Survey:
     """The calibration of one camera alone: every image of a target has a pose of its own."""
     held = PoseParameter(Pose3(), "held")
-    camera = next(c for c in survey.cameras if c.camera_id == camera_id)
+    camera = survey.cameras_by_id[camera_id]
     blocks = [b for b in survey.image_blocks if b.camera_id == camera_id and b.target_id is not None]
     alone = tuple(replace(b, epoch_id=f"{b.epoch_id}/{b.target_id}") for b in blocks)
     targets = [t for t in survey.targets if t.target_id in {b.target_id for b in blocks}]
@@ -160,10 +159,9 @@ def poses_of_views(survey: Survey) -> dict[int, View]:
 
     Raises SurveyError where a camera has no lens and its images give none.
     """
-    cameras = {c.camera_id: c for c in survey.cameras}
     seen = dict.fromkeys(b.camera_id for b in survey.image_blocks)
     # those without a pose are named by the search for start values
-    found = single_views(survey, {camera_id: own_lens(survey, cameras[camera_id]) for camera_id in seen})
+    found = single_views(survey, {camera_id: own_lens(survey, survey.cameras_by_id[camera_id]) for camera_id in seen})
     reasons, _ = untrustworthy(found, survey)
     return {view.block_idx: view for view in found if view.block_idx not in reasons}
 
@@ -191,7 +189,7 @@ def _gathered(
         table, inner_ids, outer_ids, epoch_ids,
         np.array([inner_ids.index(e[0]) for e in ends]), np.array([outer_ids.index(e[1]) for e in ends]),
         np.array([epoch_ids.index(b.epoch_id) for b in blocks]), poses, cov,
-        np.array([readings[e].angles for e in epoch_ids]), {t.target_id: t for t in survey.targets},
+        np.array([readings[e].angles for e in epoch_ids]), survey.targets_by_id,
     )  # fmt: skip
 
 

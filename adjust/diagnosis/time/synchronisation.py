@@ -98,9 +98,8 @@ def apart(survey: Survey, cameras: tuple[str, ...]) -> tuple[Survey | None, int]
     Nothing joins such a camera with the others any more: its body is held where it is, at the world's origin. None
     where cameras stand on bodies that move.
     """
-    stations = {s.station_id: s for s in survey.stations}
     chosen = {c.camera_id: c for c in survey.cameras if c.camera_id in cameras}
-    if any(stations[c.station_id].motion != "fixed" for c in chosen.values()):
+    if any(survey.stations_by_id[c.station_id].motion != "fixed" for c in chosen.values()):
         return None, 0
     blocks = tuple(
         replace(b, epoch_id=_own(b.epoch_id, b.camera_id)) if b.camera_id in chosen else b for b in survey.image_blocks

@@ -4,22 +4,27 @@ A driver says how its library finds a node, reads and writes it, and starts and 
 exceptions mean that a feature refuses a value; and translates all others.
 """
 
+import time
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, suppress
 from typing import Any, ClassVar
 
 from capture.devices.camera import (
+    Camera,
     CameraError,
     FeatureValue,
     FetchTimeoutError,
     IncompleteFrameError,
     OutOfRangeError,
 )
-from capture.devices.cameras.base import LOCKED_WHILE_ARMED, OLDER_NAMES, READY_S, DriverCamera
+from capture.devices.cameras.features import LOCKED_WHILE_ARMED, OLDER_NAMES
+
+READY_S = 2.0  # from the start of acquisition, or from a trigger, until the next trigger is obeyed
+_LATE_S = 0.3  # how long after its exposure an image may still arrive
 
 
-class GenicamCamera(DriverCamera):
+class GenicamCamera(Camera):
     """A camera by its nodes. ``_camera``: the library's object while the camera is open."""
 
     _refusals: ClassVar[tuple[type[Exception], ...]]
@@ -54,7 +59,7 @@ class GenicamCamera(DriverCamera):
         """Raise CameraError for what cannot be received."""
 
     @abstractmethod
-    def _start(self) -> None:
+    def _receive(self) -> None:
         """Begin to receive images."""
 
     @abstractmethod
@@ -107,19 +112,39 @@ class GenicamCamera(DriverCamera):
 
     def arm(self) -> None:
         """See ``Camera``."""
-        self.disarm()
-        self._note_trigger()
+        super().arm()
+        self._drain()
+
+    def _start(self) -> None:
         self._require_format(str(self.get("PixelFormat")))
         with self._translated("arm"):
-            self._start()
-            self._armed = True
-            if self.triggered:
+            self._receive()
+            if self._triggered_armed:
                 self._wait_until_ready()
-        self._drain()
+
+    def _drain(self) -> None:
+        """After arming: a trigger that was given before, and never answered, may still bring an image."""
+        if not self._unanswered:
+            return
+        self._unanswered = False
+        if self.triggered:
+            with suppress(FetchTimeoutError, IncompleteFrameError):
+                self.fetch(_LATE_S + float(self.get("ExposureTime")) * 1e-6)
+
+    def _wait_for(self, ready: Callable[[], object]) -> None:
+        """Until the camera waits for a trigger: one sent before is lost without a word."""
+        end = time.monotonic() + READY_S
+        while not ready():
+            if time.monotonic() > end:
+                raise FetchTimeoutError(
+                    self.address,
+                    f"it does not wait for a trigger within {READY_S:.0f} s",
+                    "check that TriggerSelector is FrameStart, and that the exposure is shorter than that",
+                )
 
     def disarm(self) -> None:
         """See ``Camera``."""
-        self._armed = False
+        super().disarm()
         with self._translated("disarm"):
             self._stop()
 

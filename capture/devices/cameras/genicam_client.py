@@ -15,7 +15,7 @@ from capture.devices.camera import (
     IncompleteFrameError,
     InUseError,
 )
-from capture.devices.cameras.base import bits_of, is_mosaic_or_gray
+from capture.devices.cameras.features import bits_of, is_mosaic_or_gray
 from capture.devices.cameras.genicam_camera import GenicamCamera, values_taken
 
 
@@ -75,7 +75,7 @@ class GenicamClientCamera(GenicamCamera):
         if not is_mosaic_or_gray(pixel_format):
             raise CameraError(self.address, f"it sends colour ({pixel_format})", "set PixelFormat to Mono8 or Mono12")
 
-    def _start(self) -> None:
+    def _receive(self) -> None:
         # incomplete ones too, to tell them from images that never came
         self._stream = self._camera.stream(deliver_incomplete=True)
         self._stream.__enter__()

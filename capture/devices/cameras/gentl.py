@@ -22,7 +22,7 @@ from capture.devices.camera import (
     InUseError,
     UnknownFeatureError,
 )
-from capture.devices.cameras.base import bits_of, gray_copy, is_mosaic_or_gray
+from capture.devices.cameras.features import bits_of, gray_copy, is_mosaic_or_gray
 from capture.devices.cameras.genicam_camera import GenicamCamera, values_taken
 
 _BUFFERS = 8
@@ -44,11 +44,6 @@ def discover_in(producers: tuple[str, ...]) -> tuple[CameraInfo, ...]:
         CameraInfo(f"gentl:{prefix}{d.serial_number}", d.vendor, d.model, d.serial_number, _is_held(producers, d))
         for d in devices
     )
-
-
-def camera(place: str) -> "GentlCamera":
-    """The camera, not opened."""
-    return GentlCamera(place)
 
 
 def _producers() -> tuple[str, ...]:
@@ -148,7 +143,7 @@ class GentlCamera(GenicamCamera):
             advice = "set PixelFormat to Mono8, Mono10, Mono12 or Mono16, not packed"
             raise CameraError(self.address, f"it sends {pixel_format}", advice)
 
-    def _start(self) -> None:
+    def _receive(self) -> None:
         self._camera.start()
         self._lost_parts = False
 
@@ -200,3 +195,6 @@ def _time_stamp_ns(buffer: Any) -> int | None:
         return int(buffer.timestamp_ns)
     except gentl.GenericException:  # the device has no clock
         return None
+
+
+camera = GentlCamera

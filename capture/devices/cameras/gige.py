@@ -7,7 +7,7 @@ from typing import Any
 import viva_genicam as vg
 
 from capture.devices.camera import CameraInfo
-from capture.devices.cameras.base import OLDER_NAMES
+from capture.devices.cameras.features import OLDER_NAMES
 from capture.devices.cameras.genicam_client import GenicamClientCamera, held_by_another, not_found
 
 _DISCOVERY_MS = 300
@@ -20,11 +20,6 @@ _CONTROL_PRIVILEGE, _TICK_FREQUENCY = 0x0A00, 0x093C
 def discover() -> tuple[CameraInfo, ...]:
     """All cameras that answer on the machine's networks, loopback included."""
     return tuple(_info(device) for device in vg.discover(timeout_ms=_DISCOVERY_MS, all=True))
-
-
-def camera(place: str) -> "GigeCamera":
-    """The camera of that IP address, MAC address or serial number, not opened."""
-    return GigeCamera("gige", place)
 
 
 def _info(device: Any) -> CameraInfo:
@@ -44,7 +39,10 @@ def _look_at(device: Any) -> tuple[str, bool]:
 
 
 class GigeCamera(GenicamClientCamera):
-    """A GigE Vision camera."""
+    """A GigE Vision camera, by its IP address, MAC address or serial number."""
+
+    def __init__(self, place: str) -> None:
+        super().__init__("gige", place)
 
     @property
     def last_block_id(self) -> int | None:
@@ -86,3 +84,6 @@ def _ns_per_tick(connected: Any) -> float:
         frequency = int.from_bytes(connected.read_register(_TICK_FREQUENCY, 8), "big")
         return 1e9 / frequency if frequency else 1.0
     return 1.0
+
+
+camera = GigeCamera

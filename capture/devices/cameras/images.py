@@ -6,8 +6,8 @@ import numpy as np
 
 from adjust.model.names import natural_key
 from capture.devices.camera import (
+    Camera,
     CameraError,
-    CameraInfo,
     DisconnectedError,
     FeatureValue,
     FetchTimeoutError,
@@ -15,23 +15,16 @@ from capture.devices.camera import (
     GrayImage,
     OutOfRangeError,
 )
-from capture.devices.cameras.base import LOCKED_WHILE_ARMED, DriverCamera, gray_copy
+from capture.devices.cameras.features import LOCKED_WHILE_ARMED, gray_copy
 from survey.detection.gray import read_image
 from survey.project.images import IMAGE_ENDINGS
 
 
-def discover() -> tuple[CameraInfo, ...]:
-    """None: files are named, not discovered."""
-    return ()
+class ImageFiles(Camera):
+    """The images of a folder or pattern, in natural order of their names.
 
-
-def camera(place: str) -> "ImageFiles":
-    """The images of that folder or pattern, in natural order of their names; not opened."""
-    return ImageFiles(place)
-
-
-class ImageFiles(DriverCamera):
-    """Each trigger gives the next file; with ``TriggerMode`` Off, each ``fetch``. ``arm`` begins anew."""
+    Each trigger gives the next file; with ``TriggerMode`` Off, each ``fetch``. ``arm`` begins anew.
+    """
 
     def __init__(self, place: str) -> None:
         super().__init__("images", place)
@@ -79,15 +72,8 @@ class ImageFiles(DriverCamera):
             raise OutOfRangeError(self.address, f"{name} cannot be {value!r}", f"it takes {', '.join(allowed[name])}")
         self._features[name] = value
 
-    def arm(self) -> None:
-        """See ``Camera``."""
-        self.disarm()
-        self._note_trigger()
-        self._armed, self._next, self._asked = True, 0, 0
-
-    def disarm(self) -> None:
-        """See ``Camera``."""
-        self._armed = False
+    def _start(self) -> None:
+        self._next, self._asked = 0, 0
 
     def _execute_trigger(self) -> None:
         self._asked += 1
@@ -111,3 +97,6 @@ class ImageFiles(DriverCamera):
             found = f"{self._files[k].name} has values of type {image.dtype}"
             raise CameraError(self.address, found, "save it with 8 or 16 bit")
         return gray_copy(image)
+
+
+camera = ImageFiles

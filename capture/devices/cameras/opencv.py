@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 
 from capture.devices.camera import (
+    Camera,
     CameraError,
     CameraInfo,
     DisconnectedError,
@@ -18,7 +19,7 @@ from capture.devices.camera import (
     InUseError,
     OutOfRangeError,
 )
-from capture.devices.cameras.base import LOCKED_WHILE_ARMED, DriverCamera, gray_copy
+from capture.devices.cameras.features import LOCKED_WHILE_ARMED, gray_copy
 
 _DEVICES = Path("/sys/class/video4linux")
 # Video4Linux gives exposures in units of 100 us; its Gain has no unit, so it is not SFNC's
@@ -38,18 +39,13 @@ def discover() -> tuple[CameraInfo, ...]:
     )
 
 
-def camera(place: str) -> "OpencvCamera":
-    """The device or film, not opened."""
-    return OpencvCamera(place)
-
-
 def _serial(device: str) -> str:
     """The serial number of its USB device, else its own name."""
     file = _DEVICES / device / "device" / ".." / "serial"
     return file.read_text().strip() if file.is_file() else device
 
 
-class OpencvCamera(DriverCamera):
+class OpencvCamera(Camera):
     """A device or a film that OpenCV opens."""
 
     def __init__(self, place: str) -> None:
@@ -111,17 +107,10 @@ class OpencvCamera(DriverCamera):
             raise CameraError(self.address, "it is not open", "open it first")
         return self._capture
 
-    def arm(self) -> None:
-        """See ``Camera``."""
+    def _start(self) -> None:
         self._opened()
-        self.disarm()
-        self._note_trigger()
-        self._armed, self._block_id = True, 0
+        self._block_id = 0
         self._skip_pending()
-
-    def disarm(self) -> None:
-        """See ``Camera``."""
-        self._armed = False
 
     def _execute_trigger(self) -> None:
         """It has no trigger."""
@@ -144,3 +133,6 @@ class OpencvCamera(DriverCamera):
             raise FetchTimeoutError(self.address, "the device gave no image", "check exposure and cable")
         what = "the device is gone" if self._is_device else "the film is over"
         raise DisconnectedError(self.address, what, "check the cable, open it anew")
+
+
+camera = OpencvCamera

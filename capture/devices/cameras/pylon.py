@@ -13,8 +13,8 @@ from capture.devices.camera import (
     Frame,
     InUseError,
 )
-from capture.devices.cameras.base import READY_S, bits_of, is_mosaic_or_gray
-from capture.devices.cameras.genicam_camera import GenicamCamera, values_taken
+from capture.devices.cameras.features import bits_of, is_mosaic_or_gray
+from capture.devices.cameras.genicam_camera import READY_S, GenicamCamera, values_taken
 
 with warnings.catch_warnings():
     # SWIG's types have no __module__; where warnings are errors, that one ends the interpreter
@@ -28,11 +28,6 @@ def discover() -> tuple[CameraInfo, ...]:
     return tuple(_info(factory, device) for device in factory.EnumerateDevices())
 
 
-def camera(place: str) -> "PylonCamera":
-    """The camera of that serial number, user-defined name or IP address, not opened."""
-    return PylonCamera(place)
-
-
 def _info(factory: Any, device: Any) -> CameraInfo:
     serial = device.GetSerialNumber()
     in_use = not factory.IsDeviceAccessible(device)
@@ -40,7 +35,7 @@ def _info(factory: Any, device: Any) -> CameraInfo:
 
 
 class PylonCamera(GenicamCamera):
-    """A camera of pylon."""
+    """A camera of pylon, by its serial number, user-defined name or IP address."""
 
     _refusals = (genicam.OutOfRangeException, genicam.InvalidArgumentException, genicam.AccessException, TypeError)
 
@@ -112,7 +107,7 @@ class PylonCamera(GenicamCamera):
     def _require_format(self, pixel_format: str) -> None:
         self._bits, self._mono = bits_of(pixel_format), is_mosaic_or_gray(pixel_format)
 
-    def _start(self) -> None:
+    def _receive(self) -> None:
         self._camera.StartGrabbing(pylon.GrabStrategy_OneByOne, pylon.GrabLoop_ProvidedByUser)
 
     def _stop(self) -> None:
@@ -168,3 +163,6 @@ class PylonCamera(GenicamCamera):
 
 def _readable(node: Any) -> bool:
     return node is not None and bool(genicam.IsReadable(node))
+
+
+camera = PylonCamera

@@ -3,7 +3,7 @@
 import difflib
 import importlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from types import ModuleType
 from typing import cast
@@ -16,9 +16,9 @@ from capture.devices.camera import Camera, CameraInfo, DriverMissingError
 class DriverDescription:
     """A driver: what it reaches, the form of its addresses, and where its software comes from.
 
-    Its module has ``discover() -> tuple[CameraInfo, ...]`` and ``camera(place, **options) -> Camera`` (not opened).
-    packages: what it imports. extra: the extra of this package that installs them; None: always there. room: where its
-    module is.
+    Its module has ``camera(place, **options) -> Camera`` (not opened) and, where cameras are not only named,
+    ``discover() -> tuple[CameraInfo, ...]``. packages: what it imports. extra: the extra of this package that installs
+    them; None: always there. room: where its module is.
     """
 
     name: str
@@ -82,13 +82,11 @@ def open_camera(address: str, **options: object) -> Camera:
 def discover(name: str = "all") -> tuple[CameraInfo, ...]:
     """The cameras that a driver finds; ``all``: those of every driver whose software is installed."""
     if name != "all":
-        return tuple(load_driver(name).discover())
+        return tuple(getattr(load_driver(name), "discover", tuple)())
     found: list[CameraInfo] = []
     for each in DRIVERS:
-        try:
-            found += load_driver(each).discover()
-        except DriverMissingError:
-            continue
+        with suppress(DriverMissingError):
+            found += discover(each)
     return tuple(found)
 
 

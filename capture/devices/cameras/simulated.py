@@ -15,8 +15,8 @@ import numpy as np
 
 from adjust.model.errors import SurveyError
 from capture.devices.camera import (
+    Camera,
     CameraError,
-    CameraInfo,
     FeatureValue,
     Frame,
     GrayImage,
@@ -24,7 +24,7 @@ from capture.devices.camera import (
     InUseError,
     OutOfRangeError,
 )
-from capture.devices.cameras.base import LOCKED_WHILE_ARMED, DriverCamera, bits_of
+from capture.devices.cameras.features import LOCKED_WHILE_ARMED, bits_of
 
 FaultKind = Literal["timeout", "incomplete", "disconnect", "wrong_id", "duplicate", "swap", "extra", "lost"]
 _RANGES = {"Width": (16, 8192), "Height": (16, 8192), "OffsetX": (0, 8191), "OffsetY": (0, 8191),
@@ -51,11 +51,6 @@ class Fault:
     at: int
 
 
-def discover() -> tuple[CameraInfo, ...]:
-    """None: simulated cameras are named, not discovered."""
-    return ()
-
-
 def camera(place: str, source: ImageSource | None = None, faults: Sequence[Fault] = ()) -> "SimulatedCamera":
     """The camera of that name, not opened."""
     name, _, query = place.partition("?")
@@ -76,7 +71,7 @@ def parsed_faults(text: str) -> list[Fault]:
     return faults
 
 
-class SimulatedCamera(DriverCamera):
+class SimulatedCamera(Camera):
     """See the module."""
 
     def __init__(
@@ -132,18 +127,9 @@ class SimulatedCamera(DriverCamera):
             raise self._unknown(name)
         self._features[name] = value
 
-    def arm(self) -> None:
-        """See ``Camera``."""
-        self._require_there()
-        self.disarm()
-        self._note_trigger()
+    def _start(self) -> None:
         self._queue.clear()
-        self._delayed = None
-        self._armed, self._block_id = True, 0
-
-    def disarm(self) -> None:
-        """See ``Camera``."""
-        self._armed = False
+        self._delayed, self._block_id = None, 0
 
     def pulse(self) -> None:
         """A pulse on Line1."""

@@ -22,13 +22,11 @@ def _devices() -> list[Any]:
         return []
 
 
-def camera(place: str, connect: Any = None) -> "U3vCamera":
-    """The camera of that serial number, not opened. connect: gives the client's camera, in place of a look on USB."""
-    return U3vCamera(place, connect)
-
-
 class U3vCamera(GenicamClientCamera):
-    """A USB3 Vision camera; block ids have 64 bits, time stamps are in ns."""
+    """A USB3 Vision camera; block ids have 64 bits, time stamps are in ns.
+
+    connect: gives the client's camera, in place of a look on USB.
+    """
 
     def __init__(self, place: str, connect: Any = None) -> None:
         super().__init__("u3v", place)
@@ -56,3 +54,6 @@ class U3vCamera(GenicamClientCamera):
         except vg.GenicamError:
             return False
         return True
+
+
+camera = U3vCamera

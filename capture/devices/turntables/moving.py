@@ -28,8 +28,9 @@ _LEAST = 3  # readings that tell rest from motion
 
 
 class MovingTable:
-    """A ``Turntable`` over a ``Controller``; a thread of its own watches each move.
+    """The turntable of a session, over a ``Controller``; usable from several threads, one more watches each move.
 
+    The shape is bluesky's (name, position, set -> status, stop, locate), without the dependency.
     near: (n,) rad, where the table was last, for controllers whose readback does not count turns.
     """
 
@@ -61,11 +62,6 @@ class MovingTable:
         return self._controller.address
 
     @property
-    def limits(self) -> tuple[tuple[float, float], ...]:
-        """Lower and upper limit of every axis, rad."""
-        return tuple((axis.lower, axis.upper) for axis in self._axes)
-
-    @property
     def position(self) -> FloatArray:
         """The readback, (n,) rad."""
         return np.array([state.angle for state in self.states()])
@@ -81,14 +77,14 @@ class MovingTable:
             raise
 
     def reopen(self) -> None:
-        """Connect anew; the count of turns goes on."""
+        """Connect anew, after a cable was pulled; the count of turns goes on."""
         with self._io:
             self._controller.close()
             self._controller.open()
         self.states()
 
     def close(self) -> None:
-        """Stop what still turns, and disconnect."""
+        """Stop what still turns, and disconnect; never raises."""
         try:
             if self._status is not None and not self._status.done:
                 self.stop()
@@ -124,7 +120,7 @@ class MovingTable:
         return np.array([axis.target(float(angle), float(now)) for axis, angle, now in rows])
 
     def set(self, angles: Sequence[float] | FloatArray) -> MoveStatus:
-        """Start to turn; all limits are checked before the first axis is told anything."""
+        """Start to turn to angles (n,) rad. Raises LimitError before the first axis is told anything."""
         self.check(angles)
         if self._locked_out:
             raise StoppedError(f"{self._name}: stopped in an emergency; it moves again after release")
@@ -167,7 +163,7 @@ class MovingTable:
             raise StoppedError(f"{self._name}: stopped before all axes were sent off")
 
     def stop(self) -> None:
-        """Stop all axes; over a cut connection it is tried once more with a new one."""
+        """Stop all axes, a move under way ends with StoppedError; over a cut connection once more with a new one."""
         self._stopped.set()
         with self._io:
             try:

@@ -33,11 +33,9 @@ from adjust.model.survey import (
 )
 from survey.folder.text import atomic_write, id_problem
 from survey.interop.cameras.colmap_model import ColmapCamera, ColmapModel, read_model
-from survey.interop.cameras.lens_maps import BROWN_8, FISHEYE_4, MappedLens, mapped_lens
 from survey.interop.cameras.rig import lens_of
-from survey.interop.cameras.values import CameraValues
-from survey.interop.names import safe_ids
-from survey.interop.networks.foreign import ForeignNetwork, Where, text_of
+from survey.interop.cameras.values import BROWN_8, FISHEYE_4, CameraValues, MappedLens, mapped_lens
+from survey.interop.networks.foreign import ForeignNetwork, Where, safe_ids, text_of
 
 HALF_PIXEL = 0.5
 NAMES_FILE = "point_names.csv"

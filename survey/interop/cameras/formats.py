@@ -9,10 +9,9 @@ from adjust.model.errors import SurveyError
 from survey.folder.whole import whole_folder
 from survey.interop.cameras.colmap import read_colmap, write_colmap
 from survey.interop.cameras.kalibr import kalibr_files, read_kalibr, target_text
-from survey.interop.cameras.mc_calib import mc_calib_files, read_mc_calib
 from survey.interop.cameras.mrcal import mrcal_files, read_mrcal
 from survey.interop.cameras.nerf import nerf_files, read_nerf
-from survey.interop.cameras.opencv_files import opencv_files, read_opencv
+from survey.interop.cameras.opencv_files import mc_calib_files, opencv_files, read_mc_calib, read_opencv
 from survey.interop.cameras.robots import read_sdf, read_urdf, sdf_files, urdf_files
 from survey.interop.cameras.ros import industrial_files, read_industrial, read_ros, ros_files
 from survey.interop.cameras.values import CameraValues

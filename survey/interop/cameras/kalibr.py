@@ -6,17 +6,17 @@ a block of markers can; its tags carry a double black frame.
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
 from adjust.model.survey import LensParameter, Survey, Target
-from survey.interop.cameras.lens_maps import BROWN_4, FISHEYE_4, MappedLens
 from survey.interop.cameras.rig import Rig, RigCamera, lens_of, pose_of, rig_network
-from survey.interop.cameras.values import CameraValues, RigValues, rig_values
+from survey.interop.cameras.values import BROWN_4, FISHEYE_4, CameraValues, RigValues, rig_values
 from survey.interop.networks.foreign import ForeignNetwork, Where
-from survey.interop.safe_yaml import Entry, quoted, read_yaml, yaml_list, yaml_number
+from survey.interop.safe_yaml import Entry, read_yaml, yaml_text
 from survey.project.targets import Checkerboard, MarkerBlock, PointList, TargetKind
 
 CHOICES = {"brown": BROWN_4, "fisheye": FISHEYE_4}
@@ -87,29 +87,20 @@ def kalibr_files(values: CameraValues, station: str | None) -> tuple[dict[str, s
 
 def camchain_text(found: RigValues) -> str:
     """The camchain: cameras in order as cam0, cam1 ..., their own names as topics."""
-    lines: list[str] = []
+    chain: dict[str, Any] = {}
     before: Pose3 | None = None
-    everyone = list(range(len(found.lenses)))
     for i, (camera, lens) in enumerate(zip(found.rig.cameras, found.lenses, strict=True)):
-        pose = camera.rig_from_camera or Pose3()
-        lines += [f"cam{i}:", f"  cam_overlaps: {[k for k in everyone if k != i]}", "  camera_model: pinhole"]
-        lines += _lens_lines(lens)
-        lines += [f"  resolution: [{camera.image_size[0]}, {camera.image_size[1]}]"]
-        lines += [f"  rostopic: {quoted(f'/{camera.camera_id}/image_raw')}"]
-        if before is not None:
-            lines += ["  T_cn_cnm1:"]
-            lines += [f"  - {yaml_list(row)}" for row in (pose.inverse() * before).matrix()]
+        fisheye, pose = lens.model == "fisheye", camera.rig_from_camera or Pose3()
+        chain[f"cam{i}"] = {
+            "cam_overlaps": [k for k in range(len(found.lenses)) if k != i], "camera_model": "pinhole",
+            "distortion_coeffs": lens.array(*(_EQUIDISTANT if fisheye else _RADTAN)).tolist(),
+            "distortion_model": "equidistant" if fisheye else "radtan",
+            "intrinsics": lens.array("fx", "fy", "u0", "v0").tolist(), "resolution": list(camera.image_size),
+            "rostopic": f"/{camera.camera_id}/image_raw",
+            **({} if before is None else {"T_cn_cnm1": (pose.inverse() * before).matrix().tolist()}),
+        }  # fmt: skip
         before = pose
-    return "\n".join(lines) + "\n"
-
-
-def _lens_lines(lens: MappedLens) -> list[str]:
-    fisheye = lens.model == "fisheye"
-    return [
-        f"  distortion_coeffs: {yaml_list(lens.array(*(_EQUIDISTANT if fisheye else _RADTAN)))}",
-        f"  distortion_model: {'equidistant' if fisheye else 'radtan'}",
-        f"  intrinsics: {yaml_list(lens.array('fx', 'fy', 'u0', 'v0'))}",
-    ]
+    return yaml_text(chain)
 
 
 def _target_network(root: Entry, path: Path) -> ForeignNetwork:
@@ -173,25 +164,18 @@ def _aprilgrid(root: Entry) -> MarkerBlock:
 def target_text(kind: TargetKind) -> str:
     """A target as Kalibr's YAML. Raises SurveyError for what Kalibr does not know."""
     if isinstance(kind, Checkerboard):
-        spacing = yaml_number(kind.square_m)
-        return (
-            f"target_type: 'checkerboard'\ntargetCols: {kind.columns}\ntargetRows: {kind.rows}\n"
-            f"rowSpacingMeters: {spacing}\ncolSpacingMeters: {spacing}\n"
-        )
+        return yaml_text({"target_type": "checkerboard", "targetCols": kind.columns, "targetRows": kind.rows,
+                          "rowSpacingMeters": kind.square_m, "colSpacingMeters": kind.square_m})  # fmt: skip
     if isinstance(kind, MarkerBlock) and (found := _as_aprilgrid(kind)) is not None:
-        columns, rows, size, spacing_ratio = found
-        return (
-            f"target_type: 'aprilgrid'\ntagCols: {columns}\ntagRows: {rows}\ntagSize: {yaml_number(size)}\n"
-            f"tagSpacing: {yaml_number(spacing_ratio)}\n"
-        )
+        return yaml_text({"target_type": "aprilgrid", **found})
     raise SurveyError(
         f"a {type(kind).__name__} is no target of Kalibr; it has checkerboards, and aprilgrids of the family 36h11 "
         "that count from the lower left"
     )
 
 
-def _as_aprilgrid(kind: MarkerBlock) -> tuple[int, int, float, float] | None:
-    """Columns, rows, size and ratio of spacing where the block is an aprilgrid, to rounding."""
+def _as_aprilgrid(kind: MarkerBlock) -> dict[str, int | float] | None:
+    """Columns, rows, size and ratio of spacing by their keys where the block is an aprilgrid, to rounding."""
     n, first = len(kind.corners), kind.corners.get(0)
     if first is None or kind.dictionary.upper().removeprefix("DICT_") != _DICTIONARY or n < 4:
         return None
@@ -201,15 +185,10 @@ def _as_aprilgrid(kind: MarkerBlock) -> tuple[int, int, float, float] | None:
     if size <= 0.0 or columns < 2 or n % columns:
         return None
     ratio = float((lower_left[1, 0] - size) / size)
-    text = {"tagCols": str(columns), "tagRows": str(n // columns), "tagSize": repr(size), "tagSpacing": repr(ratio)}
-    again = _aprilgrid(_as_read(text))
+    found = {"tagCols": columns, "tagRows": n // columns, "tagSize": size, "tagSpacing": ratio}
+    where = Where(Path("target"), 1)  # as if it stood in a file
+    again = _aprilgrid(Entry(where, "", {k: Entry(where, k, repr(v)) for k, v in found.items()}))
     same = again.corners.keys() == kind.corners.keys() and all(
         np.allclose(again.corners[i], kind.corners[i], rtol=0, atol=1e-12) for i in again.corners
     )
-    return (columns, n // columns, size, ratio) if same else None
-
-
-def _as_read(values: dict[str, str]) -> Entry:
-    """Values as if they stood in a file."""
-    where = Where(Path("target"), 1)
-    return Entry(where, "", {k: Entry(where, k, v) for k, v in values.items()})
+    return found if same else None

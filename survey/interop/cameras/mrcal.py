@@ -20,9 +20,8 @@ from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, LensParameter
 from adjust.spatial.rigid import skew
 from survey.folder.text import decode, read_bytes
-from survey.interop.cameras.lens_maps import BROWN_8, MappedLens
 from survey.interop.cameras.rig import Rig, RigCamera, lens_of, pose_of, rig_network
-from survey.interop.cameras.values import CameraValues, rig_values
+from survey.interop.cameras.values import BROWN_8, CameraValues, MappedLens, rig_values
 from survey.interop.networks.foreign import ForeignNetwork, Where
 
 CHOICES = {"brown": BROWN_8}

@@ -14,11 +14,9 @@ from gtsam import Pose3
 from adjust.model.observations import FrameRef
 from adjust.model.survey import LensParameter, PoseParameter, Survey
 from survey.folder.text import id_problem
-from survey.interop.cameras.lens_maps import BROWN_5, FISHEYE_4, MappedLens, mapped_lens
-from survey.interop.cameras.rig import lens_of, pose_of
-from survey.interop.cameras.values import CameraValues
+from survey.interop.cameras.rig import lens_of, moving_camera, pose_of
+from survey.interop.cameras.values import BROWN_5, FISHEYE_4, CameraValues, MappedLens, mapped_lens
 from survey.interop.networks.foreign import ForeignNetwork
-from survey.interop.photogrammetry.conventions import moving_camera
 from survey.interop.safe_yaml import Entry, read_yaml
 
 CHOICES = {"brown": BROWN_5, "fisheye": FISHEYE_4}

@@ -3,20 +3,25 @@
 One camera: the keys of OpenCV's calibration sample. Two: those of its stereo sample, M1 D1 M2 D2 R T, where
 x_2 = R x_1 + T. More: a list ``cameras`` with R and T from the first one. Pixels and lenses are OpenCV's own here; the
 unit of T is metres.
+
+MC-Calib's calibrated_cameras_data.yml: ``camera_pose_matrix`` is ``reference camera of the group from camera``, in the
+unit of its board; metres are taken and written. ``distortion_type`` 0 is Brown's with five coefficients, 1 OpenCV's
+fisheye.
 """
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from gtsam import Pose3
 
 from adjust.model.survey import FloatArray
-from survey.interop.cameras.lens_maps import BROWN_8, FISHEYE_4, MappedLens
 from survey.interop.cameras.rig import Rig, RigCamera, opencv_lens, pose_of, rig_network
-from survey.interop.cameras.values import CameraValues, RigValues, rig_values
+from survey.interop.cameras.values import BROWN_5, BROWN_8, FISHEYE_4, CameraValues, MappedLens, RigValues, rig_values
 from survey.interop.networks.foreign import ForeignNetwork
-from survey.interop.safe_yaml import Entry, quoted, read_yaml, yaml_number
+from survey.interop.safe_yaml import Entry, quoted, read_yaml, yaml_text
 
 CHOICES = {"brown": ("skew", *BROWN_8), "fisheye": FISHEYE_4}
 _NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -102,9 +107,9 @@ def opencv_text(found: RigValues, json: bool = False) -> str:
     cameras, lenses = found.rig.cameras, found.lenses
     base = cameras[0].rig_from_camera or Pose3()
     poses = [(c.rig_from_camera or Pose3()).inverse() * base for c in cameras]
-    writer = _Json() if json else OpencvYaml()
+    text = _Json().document if json else opencv_yaml
     if len(cameras) == 1:
-        return writer.document(_camera_values(cameras[0], lenses[0]))
+        return text(_camera_values(cameras[0], lenses[0]))
     if len(cameras) == 2 and lenses[0].model == lenses[1].model:
         out: dict[str, Value] = {"fisheye_model": int(lenses[0].model == "fisheye")}
         for i, (camera, lens) in enumerate(zip(cameras, lenses, strict=True), 1):
@@ -112,9 +117,9 @@ def opencv_text(found: RigValues, json: bool = False) -> str:
             out |= {f"name{i}": camera.camera_id, f"image_width{i}": camera.image_size[0],
                     f"image_height{i}": camera.image_size[1], f"M{i}": own["camera_matrix"],
                     f"D{i}": own["distortion_coefficients"]}  # fmt: skip
-        return writer.document(out | _motion(poses[1]))
-    return writer.document({"cameras": [_camera_values(c, lens) | _motion(pose)
-                                        for c, lens, pose in zip(cameras, lenses, poses, strict=True)]})  # fmt: skip
+        return text(out | _motion(poses[1]))
+    return text({"cameras": [_camera_values(c, lens) | _motion(pose)
+                             for c, lens, pose in zip(cameras, lenses, poses, strict=True)]})  # fmt: skip
 
 
 Value = str | int | FloatArray | list[dict[str, "Value"]]
@@ -142,29 +147,9 @@ def _motion(pose: Pose3) -> dict[str, Value]:
     return {"R": pose.rotation().matrix(), "T": np.asarray(pose.translation()).reshape(3, 1)}
 
 
-class OpencvYaml:
-    """Values in the YAML of cv2.FileStorage."""
-
-    def document(self, values: dict[str, Value]) -> str:
-        """A whole file."""
-        return "%YAML:1.0\n---\n" + "".join(self.lines(values, ""))
-
-    def lines(self, values: dict[str, Value], indent: str) -> list[str]:
-        """The lines of a mapping."""
-        out = []
-        for key, value in values.items():
-            if isinstance(value, list):
-                out.append(f"{indent}{key}:\n")
-                for item in value:
-                    out.append(f"{indent}   -\n")
-                    out += self.lines(item, f"{indent}      ")
-            elif isinstance(value, np.ndarray):
-                rows, cols = value.shape
-                out.append(f"{indent}{key}: !!opencv-matrix\n{indent}   rows: {rows}\n{indent}   cols: {cols}\n")
-                out.append(f"{indent}   dt: d\n{indent}   data: [ {_numbers(value)} ]\n")
-            else:
-                out.append(f"{indent}{key}: {value if isinstance(value, int) else quoted(value)}\n")
-        return out
+def opencv_yaml(values: Mapping[str, Any]) -> str:
+    """What cv2.FileStorage reads; arrays (n, m) as its matrices."""
+    return "%YAML:1.0\n---\n" + yaml_text(values)
 
 
 class _Json:
@@ -188,4 +173,53 @@ class _Json:
 
 def _numbers(matrix: FloatArray) -> str:
     """Numbers with every bit; OpenCV wants a point in each."""
-    return ", ".join(re.sub(r"^(-?\d+)(e.*)?$", r"\1.0\2", yaml_number(v)) for v in matrix.ravel())
+    return ", ".join(re.sub(r"^(-?\d+)(e.*)$", r"\1.0\2", repr(float(v))) for v in matrix.ravel())
+
+
+MC_CALIB_CHOICES = {"brown": BROWN_5, "fisheye": FISHEYE_4}
+_MOST_CAMERAS = 1000
+
+
+def read_mc_calib(path: Path) -> ForeignNetwork:
+    """The cameras of a result. Raises SurveyError with file and line for what cannot be read."""
+    root = read_yaml(path)
+    groups: dict[str, str] = {}
+    cameras = []
+    for i in range(root.get("nb_camera").count(_MOST_CAMERAS)):
+        entry = root.get(f"camera_{i}")
+        distortion, matrix = entry.get("distortion_vector"), entry.get("camera_pose_matrix")
+        kind = entry.get("distortion_type")
+        if kind.text not in ("0", "1"):
+            raise kind.error(f"found {kind.text}; 0 (Brown) and 1 (fisheye) are read")
+        lens = opencv_lens(entry.get("camera_matrix").matrix(3, 3), distortion.matrix(-1), kind.text == "1",
+                           distortion.where)  # fmt: skip
+        size = (entry.get("img_width").count(), entry.get("img_height").count())
+        group = entry.get("camera_group").text if "camera_group" in entry else "0"
+        groups[group] = f"camera_{i}"
+        cameras.append(RigCamera(f"camera_{i}", size, lens, pose_of(matrix.matrix(4, 4), matrix.where)))
+    if len(groups) > 1:
+        raise root.error(f"found {len(groups)} groups of cameras without poses between them; give one group per file")
+    note = "MC-Calib's poses are in the unit of its board; they are taken for metres"
+    return rig_network(Rig("rig", tuple(cameras), (note,)), path)
+
+
+def mc_calib_files(values: CameraValues, station: str | None) -> tuple[dict[str, str], tuple[str, ...]]:
+    """The cameras of one station, relative to the first, and what was approximated."""
+    found = rig_values(values, station, "mc-calib", MC_CALIB_CHOICES)
+    return {"": mc_calib_text(found)}, found.notes
+
+
+def mc_calib_text(found: RigValues) -> str:
+    """What MC-Calib and cv2.FileStorage read."""
+    base = (found.rig.cameras[0].rig_from_camera or Pose3()).inverse()
+    document: dict[str, Any] = {"nb_camera": len(found.lenses)}
+    for i, (camera, lens) in enumerate(zip(found.rig.cameras, found.lenses, strict=True)):
+        fisheye = lens.model == "fisheye"
+        k = lens.array(*(("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")))
+        document[f"camera_{i}"] = {
+            "camera_matrix": camera_matrix(lens), "distortion_vector": k.reshape(1, -1),
+            "distortion_type": int(fisheye), "camera_group": 0,
+            "img_width": camera.image_size[0], "img_height": camera.image_size[1],
+            "camera_pose_matrix": np.asarray((base * (camera.rig_from_camera or Pose3())).matrix()),
+        }  # fmt: skip
+    return opencv_yaml(document)

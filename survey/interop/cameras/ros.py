@@ -7,6 +7,7 @@ OpenCV's. ROS-Industrial: ``camera_mount_to_camera`` is the pose of the camera o
 ``static_cameras`` and ``moving_cameras`` angle_axis and position take reference coordinates to the camera.
 """
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,7 @@ from gtsam import Pose3
 from scipy.spatial.transform import Rotation
 
 from adjust.model.errors import SurveyError
-from adjust.model.survey import LensParameter
-from survey.interop.cameras.lens_maps import BROWN_5, BROWN_8, FISHEYE_4, MappedLens
+from adjust.model.survey import FloatArray, LensParameter
 from survey.interop.cameras.opencv_files import camera_matrix
 from survey.interop.cameras.rig import (
     Rig,
@@ -27,9 +27,9 @@ from survey.interop.cameras.rig import (
     quaternion_xyzw,
     rig_network,
 )
-from survey.interop.cameras.values import CameraValues, rig_values
+from survey.interop.cameras.values import BROWN_5, BROWN_8, FISHEYE_4, CameraValues, MappedLens, rig_values
 from survey.interop.networks.foreign import ForeignNetwork
-from survey.interop.safe_yaml import Entry, quoted, read_yaml, yaml_list, yaml_number
+from survey.interop.safe_yaml import Entry, matrix_entry, read_yaml, yaml_text
 
 EXTRINSICS = "extrinsics.yaml"
 FRAME = "_optical_frame"
@@ -112,28 +112,26 @@ def camera_info_text(camera: RigCamera, lens: MappedLens) -> str:
     else:
         k = lens.array(*_DISTORTION)
         name, k = ("rational_polynomial", k) if k[5:].any() else ("plumb_bob", k[:5])
-    projection = np.column_stack([matrix, np.zeros(3)])
-    lines = [f"image_width: {camera.image_size[0]}", f"image_height: {camera.image_size[1]}"]
-    lines += [f"camera_name: {quoted(camera.camera_id)}"]
-    lines += ["camera_matrix:", "  rows: 3", "  cols: 3", f"  data: {yaml_list(matrix)}"]
-    lines += [f"distortion_model: {name}", "distortion_coefficients:", "  rows: 1", f"  cols: {len(k)}"]
-    lines += [f"  data: {yaml_list(k)}"]
-    lines += ["rectification_matrix:", "  rows: 3", "  cols: 3", f"  data: {yaml_list(np.eye(3))}"]
-    lines += ["projection_matrix:", "  rows: 3", "  cols: 4", f"  data: {yaml_list(projection)}"]
-    return "\n".join(lines) + "\n"
+    return yaml_text({
+        "image_width": camera.image_size[0], "image_height": camera.image_size[1], "camera_name": camera.camera_id,
+        "camera_matrix": matrix_entry(matrix), "distortion_model": name,
+        "distortion_coefficients": matrix_entry(k[None]), "rectification_matrix": matrix_entry(np.eye(3)),
+        "projection_matrix": matrix_entry(np.column_stack([matrix, np.zeros(3)])),
+    })  # fmt: skip
 
 
 def extrinsics_text(rig: Rig) -> str:
     """Poses of the cameras on their station as a list of transforms."""
-    lines = ["transforms:"]
-    for camera in rig.cameras:
-        lines += ["- header:", f"    frame_id: {quoted(rig.rig_id)}"]
-        lines += [f"  child_frame_id: {quoted(camera.camera_id + FRAME)}", "  transform:"]
-        pose = camera.rig_from_camera or Pose3()
-        t = [f"{a}: {yaml_number(v)}" for a, v in zip("xyz", pose.translation(), strict=True)]
-        q = [f"{a}: {yaml_number(v)}" for a, v in zip("xyzw", quaternion_xyzw(pose), strict=True)]
-        lines += [f"    translation: {{{', '.join(t)}}}", f"    rotation: {{{', '.join(q)}}}"]
-    return "\n".join(lines) + "\n"
+    poses = {camera.camera_id: camera.rig_from_camera or Pose3() for camera in rig.cameras}
+    return yaml_text({"transforms": [
+        {"header": {"frame_id": rig.rig_id}, "child_frame_id": name + FRAME,
+         "transform": {"translation": _named("xyz", pose.translation()),
+                       "rotation": _named("xyzw", quaternion_xyzw(pose))}} for name, pose in poses.items()
+    ]})  # fmt: skip
+
+
+def _named(names: Iterable[str], values: FloatArray) -> dict[str, float]:
+    return dict(zip(names, np.asarray(values, float).tolist(), strict=True))
 
 
 def read_industrial(path: Path) -> ForeignNetwork:
@@ -196,14 +194,13 @@ def industrial_files(values: CameraValues, station: str | None) -> tuple[dict[st
     files = {}
     for camera, lens in zip(found.rig.cameras, found.lenses, strict=True):
         pose = camera.rig_from_camera or Pose3()
-        lines = [f"camera_name: {quoted(camera.camera_id)}", f"image_width: {camera.image_size[0]}"]
-        lines += [f"image_height: {camera.image_size[1]}", "intrinsics:"]
-        lines += [f"  {key}: {yaml_number(lens.values[ours])}" for ours, key in _PINHOLE]
-        lines += ["distortions:", *(f"  {n}: {yaml_number(lens.values[n])}" for n in _DISTORTION[:5])]
-        lines += ["camera_mount_to_camera:"]
-        lines += [f"  {a}: {yaml_number(v)}" for a, v in zip("xyz", pose.translation(), strict=True)]
-        lines += [f"  q{a}: {yaml_number(v)}" for a, v in zip("xyzw", quaternion_xyzw(pose), strict=True)]
-        files[f"{camera.camera_id}.yaml"] = "\n".join(lines) + "\n"
+        files[f"{camera.camera_id}.yaml"] = yaml_text({
+            "camera_name": camera.camera_id, "image_width": camera.image_size[0], "image_height": camera.image_size[1],
+            "intrinsics": {key: lens.values[ours] for ours, key in _PINHOLE},
+            "distortions": {n: lens.values[n] for n in _DISTORTION[:5]},
+            "camera_mount_to_camera": _named("xyz", pose.translation())
+            | _named(("qx", "qy", "qz", "qw"), quaternion_xyzw(pose)),
+        })  # fmt: skip
     notes = [f"camera {c.camera_id}: distortions are written, but ROS-Industrial's extrinsic tools take lenses without"
              for c, lens in zip(found.rig.cameras, found.lenses, strict=True) if lens.array(*_DISTORTION).any()]
     single = {"": next(iter(files.values()))} if len(files) == 1 else files

@@ -13,9 +13,9 @@ from adjust.model.errors import listed
 from adjust.model.observations import Reading, ReadingCovariance, ReadingKind
 from adjust.model.survey import Bearings, FloatArray, Survey
 from survey.interop.networks.foreign import MM
+from survey.project.tables.terrestrial import ANGLES
 
 _MOST_NAMED = 6
-_ANGULAR: tuple[ReadingKind, ...] = ("direction", "angle", "zenith", "azimuth")
 _PLANE: tuple[ReadingKind, ...] = ("direction", "angle", "azimuth", "horizontal_distance")
 
 
@@ -31,7 +31,7 @@ def within_tolerance(survey: Survey, tolerance: float, unit_weight: float) -> tu
     gone = {
         r.reading_id: r
         for r in survey.readings
-        if terms.get(r.reading_id, 0.0) * (min(1.0, unit_weight / r.sigma) if r.kind in _ANGULAR else 1.0) > tolerance
+        if terms.get(r.reading_id, 0.0) * (min(1.0, unit_weight / r.sigma) if r.kind in ANGLES else 1.0) > tolerance
     }
     left = _not_tested(survey, x, tolerance, len(survey.readings) - len(terms))
     if not gone:

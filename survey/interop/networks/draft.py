@@ -17,6 +17,7 @@ from adjust.model.observations import (
     ReadingKind,
 )
 from adjust.model.survey import Bearings, Datum, FloatArray, Point, PointParameter, Setup, Survey
+from survey.folder.text import suggestion
 from survey.interop.networks.foreign import Where, check_cov
 
 AXES = "xyz"
@@ -85,6 +86,27 @@ class NetworkDraft:
         self.notes: list[str] = []
         self._ids: dict[str, None] = {}
         self._counts: dict[str, int] = {}
+        self._setup_of: dict[str, str] = {}
+
+    def add_point(
+        self, name: str, where: Where, start: dict[str, float] | None = None, status: dict[str, str] | None = None
+    ) -> None:
+        """A new point; raises SurveyError where it is there already."""
+        if name in self.points:
+            raise where.error(f"point {name!r} is there already; remove one")
+        self.points[name] = DraftPoint(name, where, start or {}, status or {})
+
+    def require_points(self, names: Iterable[str], where: Where) -> None:
+        """Raise SurveyError for a point that is not there."""
+        for name in names:
+            if name not in self.points:
+                raise where.error(f"unknown point {name!r}; {suggestion(name, self.points)}")
+
+    def own_setup(self, key: str) -> str:
+        """The one setup of this key, which is a point or names one."""
+        if key not in self._setup_of:
+            self._setup_of[key] = self.setup(key)
+        return self._setup_of[key]
 
     def setup(self, at: str) -> str:
         """A new setup of an instrument at a point."""
@@ -135,7 +157,10 @@ class NetworkDraft:
         So are coordinates that are to be adjusted though nothing observes them.
         """
         points = {p.point_id: p for p in self.points.values() if p.status}
-        readings = tuple(r for r in self.readings if self._usable(points, _ends(r), _NEEDS[r.kind]))
+        readings = tuple(
+            r for r in self.readings
+            if all(p in points and set(_NEEDS[r.kind]) <= points[p].status.keys() for p in _ends(r))
+        )  # fmt: skip
         points = self._observed(points, readings)
         self._note("readings", len(self.readings) - len(readings))
         kept = {r.reading_id for r in readings}
@@ -171,9 +196,6 @@ class NetworkDraft:
         if gone:
             self.notes.append(f"left out, coordinates that nothing observes: {listed(gone, 6)}")
         return out
-
-    def _usable(self, points: Mapping[str, DraftPoint], ends: Iterable[str], axes: str) -> bool:
-        return all(p in points and all(a in points[p].status for a in axes) for p in ends)
 
     def _note(self, what: str, count: int) -> None:
         if count:

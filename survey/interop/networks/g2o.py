@@ -157,7 +157,8 @@ def _information(
     if not bad.any():
         return blocks, (told,)
     n = int(bad.sum())
-    return blocks, (f"{told}; as a whole {n} of the matrices {_are(n)} not positive definite: {_lines(edges, bad)}",)
+    verb = "is" if n == 1 else "are"
+    return blocks, (f"{told}; as a whole {n} of the matrices {verb} not positive definite: {_lines(edges, bad)}",)
 
 
 def _indefinite(info: FloatArray) -> BoolArray:
@@ -175,10 +176,6 @@ def _not_definite(path: Path, edges: list[_Edge], bad: BoolArray, blocks_too: bo
         f"{path}, line {first.line}: the information matrix of edge {first.i} {first.j} is not positive definite"
         + (f"; of {len(edges)} these {n} are not: {_lines(edges, bad)}" if n > 1 else "") + f"; {remedy}"
     )  # fmt: skip
-
-
-def _are(n: int) -> str:
-    return "is" if n == 1 else "are"
 
 
 def _lines(edges: list[_Edge], bad: BoolArray) -> str:

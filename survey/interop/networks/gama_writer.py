@@ -8,14 +8,14 @@ import numpy as np
 
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Reading
-from adjust.model.survey import Bearings, FloatArray, Point, Survey
+from adjust.model.survey import FloatArray, Point, Survey
 from survey.interop.networks.draft import AXES
 from survey.interop.networks.foreign import CC, GON, MM
 from survey.interop.networks.gama import KINDS
 from survey.interop.networks.values import NetworkValues, between_points, point_of
+from survey.project.tables.terrestrial import ANGLES
 
 _TAGS = {kind: tag for tag, kind in KINDS.items()}
-_ANGULAR = ("direction", "angle", "zenith", "azimuth")
 _NO_LIMIT_MM = 1000000000  # of tol-abs, its default would leave readings out that this project uses
 # how Gama calls axes along which bearings count as ours do, with angles that it reads clockwise
 _AXES_XY = {("x", False): "ne", ("x", True): "nw", ("y", True): "en", ("y", False): "wn"}
@@ -29,7 +29,7 @@ def gama_text(network: NetworkValues) -> str:
         [
             '<?xml version="1.0" ?>',
             '<gama-local xmlns="http://www.gnu.org/software/gama/gama-local">',
-            f'<network axes-xy="{axes_xy(survey.bearings)}" angles="left-handed">',
+            f'<network axes-xy="{_AXES_XY[survey.bearings.zero, survey.bearings.clockwise]}" angles="left-handed">',
             f"<description>{escape(network.title)}</description>",
             f'<parameters sigma-apr="1" conf-pr="{1.0 - network.alpha:.12g}" tol-abs="{_NO_LIMIT_MM}" '
             f'sigma-act="{actual}" />',
@@ -41,11 +41,6 @@ def gama_text(network: NetworkValues) -> str:
             "",
         ]
     )
-
-
-def axes_xy(bearings: Bearings) -> str:
-    """Gama's name for the axes."""
-    return _AXES_XY[bearings.zero, bearings.clockwise]
 
 
 def _used_axes(survey: Survey) -> str:
@@ -124,7 +119,7 @@ def _cluster(survey: Survey, members: Sequence[Reading]) -> list[str]:
     lines = [f"<obs from={quoteattr(station)}>" if station is not None else "<obs>"]
     lines += [_element(_TAGS[r.kind], _reading(r)) for r in members]
     place = {r.reading_id: k for k, r in enumerate(members)}
-    units = np.array([CC if r.kind in _ANGULAR else MM for r in members])
+    units = np.array([CC if r.kind in ANGLES else MM for r in members])
     cov = np.diag(np.array([r.sigma for r in members]) ** 2)
     for joint in survey.reading_covariances:
         rows = [k for k, i in enumerate(joint.reading_ids) if i in place]
@@ -136,7 +131,7 @@ def _cluster(survey: Survey, members: Sequence[Reading]) -> list[str]:
 
 
 def _reading(reading: Reading) -> dict[str, Any]:
-    angular = reading.kind in _ANGULAR
+    angular = reading.kind in ANGLES
     value = reading.value % (2.0 * np.pi) if reading.kind in ("direction", "azimuth") else reading.value
     sigma = reading.sigma / (CC if angular else MM)
     # the point of a direction set stands with the set

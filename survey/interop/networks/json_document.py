@@ -6,6 +6,7 @@ from typing import Any
 from adjust.model.observations import PositionRef
 from survey.folder.plain import plain
 from survey.interop.networks.values import NetworkValues, between_points, point_of
+from survey.project.tables.terrestrial import ANGLES, HEIGHTS
 
 FORMAT = "labsurvey-network-1"
 
@@ -59,14 +60,12 @@ def _point(network: NetworkValues, point: Any) -> dict[str, Any]:
 
 
 def _reading(r: Any) -> dict[str, Any]:
-    unit = "rad" if r.kind in ("direction", "angle", "zenith", "azimuth") else "m"
+    unit = "rad" if r.kind in ANGLES else "m"
     out = {"id": r.reading_id, "kind": r.kind, "from": r.at.point_id, "to": r.to.point_id}
     out |= {"second": r.second.point_id} if r.second else {}
     out |= {"setup": r.setup_id} if r.setup_id else {}
     out |= {f"value_{unit}": r.value, f"sigma_{unit}": r.sigma, "group": r.group, "used": r.used}
-    heights = {"instrument_height_m": r.instrument_height, "target_height_m": r.target_height}
-    heights |= {"second_height_m": r.second_height}
-    return out | {k: v for k, v in heights.items() if v}
+    return out | {f"{name}_m": height for name in HEIGHTS if (height := getattr(r, name))}
 
 
 def _adjusted(network: NetworkValues) -> dict[str, Any] | None:

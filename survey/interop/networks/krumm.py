@@ -121,7 +121,6 @@ class _Reader:
     def __init__(self) -> None:
         self.draft = NetworkDraft()
         self.axes: set[str] = set()
-        self.setups: dict[str, str] = {}
         # bearings without deviation: constants that orient a station; angles that wait for them
         self.constants: dict[tuple[str, str], float] = {}
         self.waiting: list[tuple[Line, list[str], float, float]] = []
@@ -131,10 +130,8 @@ class _Reader:
             name, *words = line.words
             if not 2 <= len(words) <= 3:
                 raise line.where.error(f"point {name!r}: expected 2 or 3 coordinates, found {len(words)}")
-            if name in self.draft.points:
-                raise line.where.error(f"point {name!r} is there already; remove one")
             values = line.numbers(words, f"point {name!r}")
-            self.draft.points[name] = DraftPoint(name, line.where, dict(zip(AXES, values, strict=False)))
+            self.draft.add_point(name, line.where, dict(zip(AXES, values, strict=False)))
 
     def observations(self, section: _Section) -> None:
         sigma: list[str] = []
@@ -181,16 +178,12 @@ class _Reader:
     def _add(
         self, line: Line, kind: ReadingKind, ends: list[str], value: float, sigma: float, heights: list[str]
     ) -> None:
-        for name in ends:
-            if name not in self.draft.points:
-                raise line.where.error(f"unknown point {name!r}; {suggestion(name, self.draft.points)}")
+        self.draft.require_points(ends, line.where)
         at, to, second = (*ends, None)[:3]
-        if kind == "direction" and at not in self.setups:
-            self.setups[str(at)] = self.draft.setup(str(at))
         high = [number(word, "height", line.where) for word in heights] or [0.0, 0.0]
         self.draft.reading(
             kind, str(at), str(to), value, sigma, second=second, heights=(high[0], high[1], 0.0),
-            setup_id=self.setups[str(at)] if kind == "direction" else "",
+            setup_id=self.draft.own_setup(str(at)) if kind == "direction" else "",
         )  # fmt: skip
         self.axes |= set(_AXES_OF.get(kind, "xy"))
 

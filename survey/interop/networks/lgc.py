@@ -11,7 +11,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import ReadingKind
 from adjust.model.survey import Bearings
 from survey.folder.text import suggestion
-from survey.interop.networks.draft import AXES, DraftPoint, NetworkDraft
+from survey.interop.networks.draft import AXES, NetworkDraft
 from survey.interop.networks.foreign import CC, GON, MM, ForeignNetwork, Line, lines_of, number
 
 _READINGS: dict[str, tuple[ReadingKind, float, float]] = {
@@ -45,7 +45,6 @@ class _Reader:
     def __init__(self) -> None:
         self.draft, self.title, self.section = NetworkDraft(), "", ""
         self.sigma = 0.0
-        self.setups: dict[str, str] = {}
         self.height: dict[str, float] = {}
 
     def line(self, line: Line) -> bool:
@@ -76,20 +75,16 @@ class _Reader:
         name, *coordinates = words
         if len(coordinates) != 3:
             raise line.where.error(f"point {name!r}: expected x y z, found {len(coordinates)} words")
-        if name in self.draft.points:
-            raise line.where.error(f"point {name!r} is there already; remove one")
         start = dict(zip(AXES, line.numbers(coordinates, f"point {name!r}"), strict=True))
         status = dict.fromkeys(AXES, _POINTS[self.section])
-        self.draft.points[name] = DraftPoint(name, line.where, start, status)
+        self.draft.add_point(name, line.where, start, status)
 
     def _reading(self, line: Line, words: list[str]) -> None:
         kind, unit, sigma_unit = _READINGS[self.section]
         if len(words) < 3:
             raise line.where.error("expected two points and a value")
         at, to, text, *rest = words
-        for name in (at, to):
-            if name not in self.draft.points:
-                raise line.where.error(f"unknown point {name!r}; {suggestion(name, self.draft.points)}")
+        self.draft.require_points((at, to), line.where)
         if at == to:
             raise line.where.error(f"station and target are both {at!r}; correct one")
         if not self.sigma > 0.0:
@@ -105,8 +100,6 @@ class _Reader:
         value = number(text, "value", line.where)
         if kind == "slope_distance" and not value > 0.0:
             raise line.where.error(f"a distance of {text} m; distances are above zero")
-        if kind == "direction" and at not in self.setups:
-            self.setups[at] = self.draft.setup(at)
-        setup_id = self.setups[at] if kind == "direction" else ""
+        setup_id = self.draft.own_setup(at) if kind == "direction" else ""
         heights = (self.height.get(at, 0.0), target, 0.0)
         self.draft.reading(kind, at, to, value * unit, self.sigma * sigma_unit, setup_id=setup_id, heights=heights)

@@ -18,7 +18,7 @@ import numpy as np
 from adjust.model.observations import CoordinateDifferences, Coordinates, Reading, ReadingKind
 from adjust.model.survey import Bearings, FloatArray
 from survey.folder.text import suggestion
-from survey.interop.networks.draft import AXES, DraftPoint, NetworkDraft, Vectors
+from survey.interop.networks.draft import AXES, NetworkDraft, Vectors
 from survey.interop.networks.foreign import (
     ARCSEC,
     CC,
@@ -32,6 +32,7 @@ from survey.interop.networks.foreign import (
     text_of,
 )
 from survey.interop.networks.values import NetworkValues, between_points, point_of
+from survey.project.tables.terrestrial import ANGLES, HEIGHTS
 
 COLUMNS = (
     "kind", "id", "from_id", "to_id", "second_id", "setup_id", "value_m", "value_gon", "value_deg", "sigma_mm",
@@ -39,7 +40,6 @@ COLUMNS = (
     "sigma_x_mm", "sigma_y_mm", "sigma_z_mm", "hold", "datum",
 )  # fmt: skip
 READINGS: tuple[ReadingKind, ...] = get_args(ReadingKind)
-_ANGULAR = ("direction", "angle", "zenith", "azimuth")
 _KINDS = ("point", "coordinates", "coordinate_difference", "bearings", "adjusted", *READINGS)
 _VALUES = {"value_m": 1.0, "value_gon": GON, "value_deg": DEGREE}
 _SIGMAS = {"sigma_mm": MM, "sigma_cc": CC, "sigma_arcsec": ARCSEC}
@@ -82,7 +82,6 @@ def _header(words: list[str], where: Where) -> list[str]:
 class _Reader:
     def __init__(self) -> None:
         self.draft, self.bearings = NetworkDraft(), Bearings()
-        self.setups: dict[str, str] = {}
 
     def row(self, row: Mapping[str, str], where: Where) -> None:
         kind = row.get("kind", "")
@@ -110,8 +109,6 @@ class _Reader:
     def _point(self, row: Mapping[str, str], where: Where) -> None:
         self._allow(row, where, "from_id", "x_m", "y_m", "z_m", "hold", "datum")
         name, hold, datum = self._need(row, where, "from_id"), row.get("hold", ""), row.get("datum", "no")
-        if name in self.draft.points:
-            raise where.error(f"point {name!r} is there already; remove one row")
         if set(hold) - set(AXES) or datum not in ("yes", "no"):
             raise where.error(f"hold names axes, as xy, and datum is yes or no; found {hold!r} and {datum!r}")
         start = {a: number(row[f"{a}_m"], f"{a}_m", where) for a in AXES if f"{a}_m" in row}
@@ -119,7 +116,7 @@ class _Reader:
         if missing and len(hold) == 3:
             raise where.error(f"{missing[0]}_m: is held but blank; fill it in")
         free = "constrained" if datum == "yes" else "free"
-        self.draft.points[name] = DraftPoint(name, where, start, {a: "fixed" if a in hold else free for a in AXES})
+        self.draft.add_point(name, where, start, {a: "fixed" if a in hold else free for a in AXES})
 
     def _bearings(self, row: Mapping[str, str], where: Where) -> None:
         self._allow(row, where, "from_id", "to_id")
@@ -143,21 +140,19 @@ class _Reader:
         (self.draft.differences if difference else self.draft.coordinates).append(vectors)
 
     def _reading(self, kind: ReadingKind, row: Mapping[str, str], where: Where) -> None:
-        heights = ("instrument_height_m", "target_height_m", "second_height_m")
+        heights = [f"{name}_m" for name in HEIGHTS]
         second = ("second_id",) if kind == "angle" else ()
         self._allow(row, where, "id", "from_id", "to_id", *second, "setup_id", *_VALUES, *_SIGMAS, *heights)
         ends = [self._need(row, where, end) for end in ("from_id", "to_id", *second)]
         if len(set(ends)) < len(ends):
             raise where.error(f"the points {', '.join(ends)} must differ")
-        angular = kind in _ANGULAR
+        angular = kind in ANGLES
         value = self._one(row, where, _VALUES, angular, "value_m", number)
         sigma = self._one(row, where, _SIGMAS, angular, "sigma_mm", positive)
         high = [number(row.get(name, "0"), name, where) for name in heights]
         setup = row.get("setup_id", ends[0]) if kind == "direction" else row.get("setup_id", "")
-        if setup and setup not in self.setups:
-            self.setups[setup] = self.draft.setup(setup)
         self.draft.reading(
-            kind, ends[0], ends[1], value, sigma, setup_id=self.setups.get(setup, ""),
+            kind, ends[0], ends[1], value, sigma, setup_id=self.draft.own_setup(setup) if setup else "",
             second=ends[2] if second else None, heights=(high[0], high[1], high[2]), name=row.get("id", ""),
         )  # fmt: skip
 
@@ -212,15 +207,13 @@ def _xyz(x: FloatArray | None) -> dict[str, str]:
 
 
 def _reading_row(r: Reading) -> dict[str, str]:
-    angular = r.kind in _ANGULAR
+    angular = r.kind in ANGLES
     ends = [point_of(e) or "" if e else "" for e in (r.at, r.to, r.second)]
     out: dict[str, str] = {"kind": r.kind, "id": r.reading_id, "from_id": ends[0], "to_id": ends[1]}
     out |= {"second_id": ends[2], "setup_id": r.setup_id}
     out |= {"value_gon" if angular else "value_m": repr(float(r.value / (GON if angular else 1.0)))}
     out |= {"sigma_cc" if angular else "sigma_mm": repr(float(r.sigma / (CC if angular else MM)))}
-    heights = {"instrument_height_m": r.instrument_height, "target_height_m": r.target_height}
-    heights |= {"second_height_m": r.second_height}
-    return out | {k: repr(v) for k, v in heights.items() if v}
+    return out | {f"{name}_m": repr(height) for name in HEIGHTS if (height := getattr(r, name))}
 
 
 def _vector_rows(network: NetworkValues) -> list[dict[str, str]]:

@@ -16,8 +16,8 @@ from adjust.lenses.models import MODELS
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Distance, PositionRef
 from adjust.model.survey import Datum, LensParameter, Point, PointParameter, PoseParameter, Survey
+from survey.interop.cameras.rig import image_blocks, moving_camera, world_from_camera
 from survey.interop.networks.foreign import MM, ForeignNetwork, Line, lines_of, number, positive, text_of
-from survey.interop.photogrammetry.conventions import image_blocks, moving_camera, world_from_camera
 
 SIGMA_MM = 0.0005
 ENDINGS = (".phc", ".ior", ".eor", ".obc", ".scale")

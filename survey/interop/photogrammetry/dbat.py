@@ -12,8 +12,8 @@ import numpy as np
 from adjust.lenses.models import MODELS
 from adjust.model.survey import Camera, Datum, LensParameter, Point, PointParameter, Station
 from survey.folder.text import suggestion
+from survey.interop.cameras.rig import image_blocks, moving_camera
 from survey.interop.networks.foreign import ForeignNetwork, Line, lines_of, number, positive
-from survey.interop.photogrammetry.conventions import image_blocks, moving_camera
 from survey.interop.safe_xml import Element, read_xml
 
 _MODEL = MODELS["brown_backward_dbat"]

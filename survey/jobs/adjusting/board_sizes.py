@@ -10,7 +10,7 @@ from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGri
 
 if TYPE_CHECKING:  # brings in OpenCV
     from survey.detection import ImageReport
-    from survey.detection.other_markers import OtherMarkers
+    from survey.detection.markers import OtherMarkers
 
 _LOOKED_AT = 3  # images in which a board of another size is looked for where the one wanted is in none
 
@@ -46,7 +46,7 @@ def _other_markers(folder: Path, definition: Definition, reports: "Sequence[Imag
         if not mine or any(len(r.detections[target_id]) for r in mine):
             continue
         from survey.detection.gray import for_finding, gray_values, read_image
-        from survey.detection.other_markers import other_markers
+        from survey.detection.markers import other_markers
 
         some = mine[:: max(1, len(mine) // _LOOKED_AT)][:_LOOKED_AT]
         seen = [o for r in some if (o := other_markers(for_finding(gray_values(read_image(r.path))), kind)) is not None]

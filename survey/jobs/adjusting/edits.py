@@ -26,7 +26,7 @@ from survey.folder.text import decode, read_bytes
 from survey.folder.units import from_si, to_si
 from survey.project.declared.editing import with_product, with_value
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
-from survey.project.reading import LAYOUTS
+from survey.project.tables.kinds import LAYOUTS
 
 KEPT = "kept"
 TableEdit = ChangeColumns | ExchangeColumns | ChangeReadings | Rename

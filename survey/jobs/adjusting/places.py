@@ -14,8 +14,8 @@ from survey.folder.text import decode, read_bytes
 from survey.project.declared.editing import LENGTHS
 from survey.project.declared.toml_text import key_lines
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER, Project
-from survey.project.reading import LAYOUTS
 from survey.project.tables.files import read_table
+from survey.project.tables.kinds import LAYOUTS
 from survey.project.tables.reading import Table
 
 Wanted = Mapping[str, Collection[str] | Callable[[str], bool]]

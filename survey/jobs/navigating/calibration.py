@@ -1,7 +1,6 @@
 """The calibration that navigation works with, kept in ``results`` as long as what it came from is the same."""
 
 import hashlib
-import io
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
@@ -14,7 +13,7 @@ from gtsam import Pose3
 from adjust.lenses.models import MODELS
 from adjust.model.survey import FloatArray
 from adjust.navigation import Beacons, Head, HeadCamera, HeadTable
-from survey.folder.arrays import read_arrays
+from survey.folder.arrays import packed_arrays, read_arrays
 from survey.folder.shapes import POSITIVE, WHOLE, Either, misfit
 from survey.project import atomic_write
 
@@ -97,10 +96,7 @@ def keep(path: Path, key: str, calibration: Calibration) -> None:
     if table is not None:
         arrays |= {"base": table.world_from_table.matrix(), "mount": table.mount_from_station.matrix(),
                    "geometry": np.array(list(table.geometry.values()), dtype=float)}  # fmt: skip
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, about=np.array(json.dumps(about)), **arrays)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    atomic_write(path, buffer.getvalue())
+    atomic_write(path, packed_arrays(about=np.array(json.dumps(about)), **arrays))
 
 
 _ABOUT = {

@@ -16,8 +16,9 @@ from adjust.diagnosis.trajectory import OfTrajectory, causes_of_trajectory
 from adjust.model.errors import IndeterminateError, SurveyError, listed
 from adjust.model.names import natural_key
 from adjust.navigation import EpochPose, Motion, NavigateOptions, Trajectory, head_and_beacons, navigate
+from survey.folder.plain import attributes
 from survey.folder.replacing import changing, replace_parts
-from survey.jobs.adjusting.job import run_info
+from survey.jobs.adjusting.outcome import run_info
 from survey.jobs.adjusting.probable_causes import explaining, with_probable_causes
 from survey.jobs.navigating.calibration import Calibration, digest, keep, kept
 from survey.jobs.navigating.lenses import lenses_taken
@@ -70,17 +71,8 @@ class NavigateOutcome:
             "calibration_sigma0": self.calibration.sigma0,
             "sigmas": self.sigmas,
             "diagnosis": [
-                {
-                    "name": c.name,
-                    "cause": c.cause,
-                    "change": c.change,
-                    "kind": c.kind,
-                    "ids": list(c.ids),
-                    "explained": c.explained,
-                    "statistic": c.statistic,
-                    "critical": c.critical,
-                }
-                for c in self.causes
+                attributes(c, "name", "cause", "change", "kind") | {"ids": list(c.ids)}
+                | attributes(c, "explained", "statistic", "critical") for c in self.causes
             ],
             "notes": list(self.notes),
             "written": {name: str(path) for name, path in self.paths.items()},

@@ -5,30 +5,27 @@ from typing import Any
 
 from adjust.model.errors import SurveyError
 from adjust.model.survey import Clock, VectorParameter
-from survey.folder.units import from_si, to_si
-from survey.project.declared.declarations import CLOCK_UNITS, keys_of
+from survey.folder.units import from_si
+from survey.project.declared.declarations import CLOCK_UNITS
 from survey.project.declared.node import Node
 from survey.project.declared.vectors import key_of, read_vector, vector_to_toml
 
 
-def read_clock(node: Node, declared: str, timed: bool) -> Clock | None:
-    """The table ``clock`` of a node, by the declaration of that name; None where there is none.
-
-    timed: whether the times of the epochs are known.
-    """
+def read_clock(node: Node, timed: bool) -> Clock | None:
+    """The table ``clock`` of a node; None where there is none. timed: whether the times of the epochs are known."""
     if not node.has("clock"):
         return None
     clock = node.table("clock")
-    clock.allow(*keys_of(declared))
-    units = {name: unit for name, unit in CLOCK_UNITS.items() if key_of(name, CLOCK_UNITS) in keys_of(declared)}
+    declared = clock.declared.by_name if clock.declared else {}
+    units = {name: unit for name, unit in CLOCK_UNITS.items() if key_of(name, CLOCK_UNITS) in declared}
     known = [key for key in (*(key_of(name, units) for name in units), "sigma", "jitter_ms") if clock.has(key)]
     if known and not timed:
         raise clock.error("the times of the epochs are not known; give times_s or epoch_interval_s, or leave it out",
                           known[0])  # fmt: skip
-    intervals = clock.number("jitter_intervals", 0.0)
+    intervals = clock.number("jitter_intervals")
     if timed and intervals != 0.0:
         raise clock.error("the times of the epochs are known; give jitter_ms", "jitter_intervals")
-    jitter = float(to_si(clock.number("jitter_ms", 0.0), "ms")) if timed else intervals
+    jitter = clock.si("jitter_ms") if timed else intervals
     if not jitter >= 0.0:
         raise clock.error(f"found {jitter:g}; a sigma is not negative", "jitter_ms" if timed else "jitter_intervals")
     given = read_vector(clock, units, ("offset",))
@@ -56,8 +53,8 @@ def read_times(root: Node) -> dict[str, Any]:
     node = root.table("times_s")
     if root.has("epoch_interval_s") and node.values:
         raise root.error("times_s is given too; keep one of the two", "epoch_interval_s")
-    step = root.number("epoch_interval_s", positive=True) if root.has("epoch_interval_s") else None
-    return {"times": {epoch_id: node.number(epoch_id) for epoch_id in node.values}, "epoch_interval": step}
+    times = {epoch_id: node.number(epoch_id) for epoch_id in node.values}
+    return {"times": times, "epoch_interval": root.si("epoch_interval_s", None)}
 
 
 def are_timed(times: Mapping[str, Any]) -> bool:

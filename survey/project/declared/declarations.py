@@ -523,6 +523,10 @@ DECLARATIONS: tuple[Declared, ...] = (
     ),
 )  # fmt: skip
 _BY_NAME = {declared.name: declared for declared in DECLARATIONS}
+_BY_ID = {  # the tables above those that stand under an id of the user's, as [cameras] is above [cameras.X]
+    d.name: Declared(d.name, d.path.rpartition(".")[0], d.what, free_keys=Key("ID", "table", d.what, table=d.name))
+    for d in DECLARATIONS if "." in d.path and d.path.rpartition(".")[2].isupper()
+}  # fmt: skip
 
 
 def declared(name: str) -> Declared:
@@ -530,6 +534,9 @@ def declared(name: str) -> Declared:
     return _BY_NAME[name]
 
 
-def keys_of(name: str) -> tuple[str, ...]:
-    """The names of the keys that a table may have."""
-    return _BY_NAME[name].names
+def below(table: Declared, key: str) -> Declared | None:
+    """The declaration of what stands under a key; None where a word in it tells, as ``kind`` of a target."""
+    if key in table.by_name:
+        name = table.by_name[key].table
+        return _BY_ID.get(name, _BY_NAME.get(name))
+    return _BY_NAME.get(table.free_keys.table) if table.free_keys else None

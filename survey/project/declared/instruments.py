@@ -9,7 +9,7 @@ import numpy as np
 from adjust.model.survey import BEAM, Beam, Bearings, FloatArray, Instrument, Setup, Surface, Vertical
 from survey.folder.text import suggestion
 from survey.folder.units import from_si
-from survey.project.declared.declarations import BEAM_UNITS, INSTRUMENT_UNITS, SURFACE_UNITS, TILT_UNITS, keys_of
+from survey.project.declared.declarations import BEAM_UNITS, INSTRUMENT_UNITS, SURFACE_UNITS, TILT_UNITS
 from survey.project.declared.node import Node
 from survey.project.declared.toml_text import Section
 from survey.project.declared.vectors import read_vector, vector_keys, vector_to_toml
@@ -34,29 +34,24 @@ _ACCURACY: dict[str, tuple[str, tuple[str, ...]]] = {
 
 def read_vertical(node: Node) -> Vertical:
     """The table [vertical]."""
-    node.allow(*keys_of("vertical"))
-    up = node.numbers("up_in_world", (3,), [0.0, 0.0, 1.0])
+    up = node.numbers("up_in_world", (3,))
     length = float(np.linalg.norm(up))
     if abs(length - 1.0) > 1e-3:
         raise node.error(f"the direction has length {length:g}, not 1; correct it", "up_in_world")
-    radius = node.number("radius_m", positive=True) if node.has("radius_m") else None
     if abs(length - 1.0) > 1e-12:  # else the same bits come back
         up = up / length
-    return Vertical(up, read_vector(node, TILT_UNITS, ()), radius)
+    return Vertical(up, read_vector(node, TILT_UNITS, ()), node.si("radius_m", None))
 
 
 def read_bearings(node: Node) -> Bearings:
     """The table [bearings]."""
-    node.allow(*keys_of("bearings"))
-    zero = node.choice("zero", ("x", "y"), "y")
-    return Bearings("x" if zero == "x" else "y", node.flag("clockwise", True))
+    return Bearings(node.choice("zero", ("x", "y")), node.flag("clockwise"))
 
 
 def read_instruments(root: Node) -> tuple[tuple[Instrument, ...], dict[str, Accuracy]]:
     """The tables [instruments.*], and what their readings are worth."""
     instruments, accuracies = [], {}
     for instrument_id, node in root.tables("instruments"):
-        node.allow(*keys_of("instrument"))
         instruments.append(Instrument(instrument_id, read_vector(node, INSTRUMENT_UNITS, ())))
         given: dict[str, float] = {}
         for name, (key, units) in _ACCURACY.items():
@@ -74,10 +69,7 @@ def read_setups(root: Node, instruments: tuple[str, ...], accuracies: Mapping[st
     """The tables [setups.*]; centring is the instrument's where they do not say."""
     setups = []
     for setup_id, node in root.tables("setups"):
-        node.allow(*keys_of("setup"))
-        instrument_id = None
-        if node.has("instrument"):
-            instrument_id = node.reference("instrument", instruments, "instrument")
+        instrument_id = node.reference("instrument", instruments, "instrument") if node.has("instrument") else None
         usual = accuracies.get(instrument_id or "", Accuracy())
         sigmas = []
         for key, value in (("sigma_centring_mm", usual.centring), ("sigma_height_mm", usual.height)):
@@ -85,7 +77,7 @@ def read_setups(root: Node, instruments: tuple[str, ...], accuracies: Mapping[st
             if sigma < 0:
                 raise node.error(f"found {sigma:g}; a sigma is positive, or 0 for none", key)
             sigmas.append(sigma / 1000.0)
-        setups.append(Setup(setup_id, instrument_id, node.flag("levelled", True), *sigmas))
+        setups.append(Setup(setup_id, instrument_id, node.flag("levelled"), *sigmas))
     return tuple(setups)
 
 
@@ -133,7 +125,6 @@ def setup_problem(setup_id: str, setups: tuple[Setup, ...]) -> str | None:
     return f"unknown setup {setup_id!r}; {suggestion(setup_id, known)}; setups are listed as [setups.{setup_id}]"
 
 
-_KINDS: tuple[Literal["plane", "line", "sphere"], ...] = ("plane", "line", "sphere")
 _REFERENCE = {"plane": "normal", "line": "direction"}
 
 
@@ -141,15 +132,13 @@ def read_beams(root: Node, station_ids: tuple[str, ...], table_ids: tuple[str, .
     """The tables [beams.*]: a laser on the mount of a turntable or on a station."""
     beams = []
     for beam_id, node in root.tables("beams"):
-        node.allow(*keys_of("beam"))
         if node.has("mount") == node.has("station"):
             found = "both are given; keep one" if node.has("mount") else "neither is given; add one"
             raise node.error(f"a beam is fixed on the mount of a table or on a station: {found}", "station")
         kind: Literal["mount", "station"] = "mount" if node.has("mount") else "station"
         known = table_ids if kind == "mount" else station_ids
         carrier = node.reference(kind, known, "table" if kind == "mount" else "station")
-        name = node.choice("axis", ("x", "y", "z"), "z")
-        axis: Literal["x", "y", "z"] = "x" if name == "x" else "y" if name == "y" else "z"
+        axis: Literal["x", "y", "z"] = node.choice("axis", ("x", "y", "z"))
         beams.append(Beam(beam_id, kind, carrier, axis, read_vector(node, BEAM_UNITS, BEAM)))
     return tuple(beams)
 
@@ -158,11 +147,9 @@ def read_surfaces(root: Node) -> tuple[Surface, ...]:
     """The tables [surfaces.*]; what they do not give is found by the program."""
     surfaces = []
     for surface_id, node in root.tables("surfaces"):
-        name = node.choice("kind", tuple(SURFACE_UNITS))
-        kind = next(known for known in _KINDS if known == name)
-        units = SURFACE_UNITS[kind]
-        key = _REFERENCE.get(kind)
-        node.allow(*keys_of(f"surface_{kind}"))
+        kind: Literal["plane", "line", "sphere"] = node.choice("kind", ("plane", "line", "sphere"))
+        units, key = SURFACE_UNITS[kind], _REFERENCE.get(kind)
+        node = node.declared_as(f"surface_{kind}")
         reference: FloatArray | None = None
         if key and node.has(key):
             reference = node.numbers(key, (3,))

@@ -1,21 +1,23 @@
 """How a table of ``survey.toml`` is declared: its keys with their kind, unit, default and meaning.
 
 Readers allow the keys that a declaration names and no others; the reference and the schema for editors are made from
-the same declarations (``survey.project.reference``, ``survey.project.schema``).
+the same declarations (``survey.project.reference``).
 What there is stands in ``survey.project.declared.declarations``.
 """
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal
+
+from survey.folder.units import unit_in
 
 ValueKind = Literal[
     "text", "choice", "flag", "whole", "number", "numbers", "matrix", "names", "sigma", "table"
 ]  # fmt: skip
-REQUIRED = object()
+REQUIRED: Any = object()
 """The default of a key that must be there."""
 NOTHING = None
 """The default of a key that may be absent and then says nothing."""
-_UNITS = ("ppm_per_K", "mm2", "mm", "m", "ms", "us", "s", "arcsec", "mgon", "cc", "deg", "px", "ppm")
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,7 @@ class Key:
     @property
     def unit(self) -> str:
         """The unit that the name ends with, empty where it has none."""
-        unit = next((unit for unit in _UNITS if self.name.endswith(f"_{unit}")), "")
-        return unit.replace("mm2", "mm²").replace("_per_", "/")
+        return unit_in(self.name).replace("mm2", "mm²").replace("_per_", "/").removeprefix("1")
 
 
 @dataclass(frozen=True)
@@ -58,10 +59,14 @@ class Declared:
     of: tuple[str, str] | None = None
     free_keys: Key | None = None
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The names of the keys."""
-        return tuple(key.name for key in self.keys)
+    @cached_property
+    def by_name(self) -> dict[str, Key]:
+        """The keys by their names."""
+        return {key.name: key for key in self.keys}
+
+    def key(self, name: str) -> Key | None:
+        """What is declared of a key, of the user's own too; None for one that is not known."""
+        return self.by_name.get(name, self.free_keys)
 
 
 def vector_keys_declared(units: dict[str, str], said: dict[str, str], free: tuple[str, ...]) -> tuple[Key, ...]:

@@ -7,7 +7,7 @@ import numpy as np
 from adjust.lenses.models import MODELS
 from adjust.model.survey import FloatArray, ImageCrop, LensDrift, LensParameter, LensSharing, Tie, VectorPrior
 from survey.folder.text import suggestion
-from survey.project.declared.declarations import CROP_UNITS, keys_of
+from survey.project.declared.declarations import CROP_UNITS
 from survey.project.declared.node import Node
 from survey.project.declared.vectors import read_vector, vector_to_toml
 from survey.project.tables.covariance import covariance_problem
@@ -24,13 +24,12 @@ _ESSENTIAL = {
 
 def read_lens(node: Node) -> LensParameter:
     """The table [cameras.*.lens]."""
-    node.allow(*keys_of("lens"))
     model = node.choice("model", MODELS)
     names = MODELS[model].names
     free = node.references("free", names, f"parameter of the model {model}")
     ties = _ties(node, names, free)
     values = _values(node, model, names, free, ties)
-    pixel_size_mm = node.number("pixel_size_mm", positive=True) if node.has("pixel_size_mm") else None
+    pixel_size_mm = node.number("pixel_size_mm") if node.has("pixel_size_mm") else None
     if MODELS[model].in_mm and pixel_size_mm is None:
         raise node.error(f"pixel_size_mm is missing; the model {model} is in millimetres", "pixel_size_mm")
     drift = _drift(node.table("drift"), free) if node.has("drift") else None
@@ -43,13 +42,11 @@ def read_lens(node: Node) -> LensParameter:
 
 def _shared(node: Node, free: tuple[str, ...]) -> LensSharing | None:
     """None where it names no parameter."""
-    node.allow(*keys_of("lens_shared"))
     camera, parameters = node.text("camera"), node.references("parameters", free, "free parameter", free)
     return LensSharing(camera, parameters) if parameters else None
 
 
 def _crop(node: Node) -> ImageCrop:
-    node.allow(*keys_of("lens_crop"))
     parameters = read_vector(node, CROP_UNITS, (), np.array([1.0, 0.0, 0.0]))
     if parameters.values[0] <= 0.0:
         raise node.error(f"found {parameters.values[0]:g}; the scale must be positive", "scale")
@@ -65,13 +62,12 @@ def read_size(node: Node, key: str) -> tuple[int, int]:
 
 
 def _drift(node: Node, free: tuple[str, ...]) -> LensDrift:
-    node.allow(*keys_of("lens_drift"))
     parameters = node.references("parameters", free, "free parameter")
     if not parameters:
         raise node.error("names no parameter; give some of free, or remove the table", "parameters")
-    begins, steps = node.names("begins", ()), node.table("sigma")
-    reference = node.number("reference_degC", 20.0)
-    if node.flag("with_temperature", False):
+    begins, steps = node.names("begins"), node.table("sigma")
+    reference = node.number("reference_degC")
+    if node.flag("with_temperature"):
         if begins or steps.values:
             raise node.error("a change with the temperature has no blocks; remove begins and sigma", "with_temperature")
         return LensDrift(parameters, (), None, reference)
@@ -82,14 +78,14 @@ def _drift(node: Node, free: tuple[str, ...]) -> LensDrift:
             raise steps.error(f"unknown key; {suggestion(name, parameters)}", name)
     if not steps.values:
         return LensDrift(parameters, begins)
-    return LensDrift(parameters, begins, np.array([steps.number(name, positive=True) for name in parameters]))
+    return LensDrift(parameters, begins, np.array([steps.number(name) for name in parameters]))
 
 
 def _balance(node: Node, model: str) -> float:
     """The radius where AICON's radial distortion is zero, mm."""
     if node.has("balance_radius_mm") and model != "aicon":
         raise node.error('only the model "aicon" has a balance radius; remove it', "balance_radius_mm")
-    return node.number("balance_radius_mm", 0.0)
+    return node.number("balance_radius_mm")
 
 
 def _known(node: Node, names: tuple[str, ...]) -> None:
@@ -124,14 +120,13 @@ def _prior(node: Node, names: tuple[str, ...], free: tuple[str, ...]) -> VectorP
         if name not in free:
             raise table.error("has a prior but is not free; add it to 'free' or remove the prior", name)
         entry = table.table(name)
-        entry.allow(*keys_of("lens_prior"))
         means.append(entry.number("value"))
         if has_matrix and entry.has("sigma"):
             raise entry.error("prior_covariance is given too; keep one of the two", "sigma")
         if not has_matrix:
             if not entry.has("sigma"):
                 raise entry.error("a prior needs its sigma; add it")
-            sigmas.append(entry.number("sigma", positive=True))
+            sigmas.append(entry.number("sigma"))
     k = len(means)
     cov = node.numbers("prior_covariance", (k, k)) if has_matrix else np.diag(np.array(sigmas) ** 2)
     problem = covariance_problem(cov[None])
@@ -146,13 +141,12 @@ def _ties(node: Node, names: tuple[str, ...], free: tuple[str, ...]) -> tuple[Ti
     ties = []
     for name in table.values:
         entry = table.table(name)
-        entry.allow(*keys_of("lens_tie"))
         to = entry.reference("to", names, "lens parameter")
         if to == name or to in table.values:
             raise entry.error(f"{to!r} is tied itself; tie to a parameter that is not", "to")
         if name in free:
             raise table.error("is tied and free; remove it from 'free' or remove the tie", name)
-        ties.append(Tie(name, to, entry.number("factor", 1.0)))
+        ties.append(Tie(name, to, entry.number("factor")))
     return tuple(ties)
 
 

@@ -2,20 +2,23 @@
 
 import math
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, overload
 
 import numpy as np
 
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
 from survey.folder.text import LARGEST_NUMBER, choice_hint, decode, id_problem, read_bytes, suggestion, with_digest
-from survey.folder.units import to_si
+from survey.folder.units import to_si, unit_in
+from survey.project.declared.declarations import below, declared
+from survey.project.declared.keys import NOTHING, REQUIRED, Declared, Key
 from survey.project.declared.toml_text import KeyLines, KeyPath, read_tables
 
-_REQUIRED: Any = object()
+_Word = TypeVar("_Word", bound=str)
+_NO_KEY = Key("", "text", "")
 _LARGEST_TOML = 16 * 2**20  # bytes
 _DEEPEST_KEY = 32  # parts between dots; time and memory grow with their square
 _NUMBERS = {int, float}
@@ -77,12 +80,27 @@ def _check_integers(root: "Node", value: Any, keys: KeyPath) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """``values`` is the table at ``path`` of ``file``; ``lines`` holds the line of every key of the whole file."""
+    """``values`` is the table at ``path`` of ``file``; ``lines`` holds the line of every key of the whole file.
+
+    declared: what its keys are, of survey.toml: others are refused, and what a reader does not say of a default, of
+    bounds and signs holds as it is declared there.
+    """
 
     file: Path
     lines: Mapping[KeyPath, int]
     path: KeyPath
     values: Mapping[str, Any]
+    declared: Declared | None = None
+
+    def declared_as(self, what: Declared | str) -> "Node":
+        """With the keys of a declaration, or of that of a name. Raises at the first key that is none of them."""
+        what = declared(what) if isinstance(what, str) else what
+        if what.free_keys is None:
+            self.allow(*what.by_name)
+        return replace(self, declared=what)
+
+    def _key(self, name: str) -> Key:
+        return (self.declared and self.declared.key(name)) or _NO_KEY
 
     def error(self, problem: str, *keys: str | int) -> SurveyError:
         """An error at a key below this table, or at the table itself; a missing key is shown at its table."""
@@ -92,6 +110,10 @@ class Node:
             at = at[:-1]
         name = ".".join(str(part) for part in path)
         return SurveyError(f"{self.file}:{self.lines.get(at, 1)}: {name + ': ' if name else ''}{problem}")
+
+    def fail(self, *keys: str | int) -> Callable[[str], SurveyError]:
+        """What makes an error of a problem at a key below this table."""
+        return lambda problem: self.error(problem, *keys)
 
     def allow(self, *known: str) -> None:
         """Raise at the first key that is not ``known``."""
@@ -103,12 +125,14 @@ class Node:
         """Whether any of the keys is given."""
         return not self.values.keys().isdisjoint(keys)
 
-    def value(self, key: str, default: Any = _REQUIRED) -> Any:
+    def value(self, key: str, default: Any = REQUIRED) -> Any:
         """The raw value of a key."""
         if key in self.values:
             return self.values[key]
-        if default is _REQUIRED:
-            raise self.error(f"the key {key!r} is missing; add it", key)
+        if default is REQUIRED:
+            default = self._key(key).default
+            if default is REQUIRED or default is NOTHING:
+                raise self.error(f"the key {key!r} is missing; add it", key)
         return default
 
     def table(self, key: str) -> "Node":
@@ -116,7 +140,9 @@ class Node:
         value = self.values.get(key, {})
         if not isinstance(value, dict):
             raise self.error(f"expected a table, found {_kind(value)}; write {{ ... }}", key)
-        return Node(self.file, self.lines, (*self.path, key), value)
+        found = Node(self.file, self.lines, (*self.path, key), value)
+        what = self.declared and below(self.declared, key)
+        return found.declared_as(what) if what else found
 
     def tables(self, key: str) -> list[tuple[str, "Node"]]:
         """The tables under the ids below a key, in the order of the file."""
@@ -127,42 +153,54 @@ class Node:
                 raise parent.error(problem, name)
         return [(name, parent.table(name)) for name in parent.values]
 
-    def text(self, key: str, default: Any = _REQUIRED) -> str:
+    def text(self, key: str, default: Any = REQUIRED) -> str:
         """A string."""
         return str(self._typed(key, default, str, "text"))
 
-    def choice(self, key: str, options: Iterable[str], default: Any = _REQUIRED) -> str:
+    def choice(self, key: str, options: Iterable[_Word], default: Any = REQUIRED) -> _Word:
         """One of the ``options``."""
         options = tuple(options)
         value = self.text(key, default)
-        if value not in options:
-            raise self.error(f"found {value!r}; {choice_hint(value, options)}", key)
-        return value
+        for option in options:
+            if option == value:
+                return option
+        raise self.error(f"found {value!r}; {choice_hint(value, options)}", key)
 
-    def flag(self, key: str, default: bool) -> bool:
+    def flag(self, key: str, default: Any = REQUIRED) -> bool:
         """True or false."""
         return bool(self._typed(key, default, bool, "true or false"))
 
-    def integer(self, key: str, minimum: int, default: Any = _REQUIRED) -> int:
+    def integer(self, key: str, minimum: int | None = None, default: Any = REQUIRED) -> int:
         """A whole number, at least ``minimum``."""
         value = self._typed(key, default, int, "a whole number")
-        if value < minimum:
+        minimum = self._key(key).least if minimum is None else minimum
+        if minimum is not None and value < minimum:
             raise self.error(f"found {value}; it must be at least {minimum}", key)
         return int(value)
 
-    def number(self, key: str, default: Any = _REQUIRED, positive: bool = False) -> float:
+    def number(self, key: str, default: Any = REQUIRED, positive: bool = False) -> float:
         """A finite number."""
         value = self._number(self.value(key, default), key)
         if not math.isfinite(value):
             raise self.error(f"found {value}; it must be a finite number", key)
         if abs(value) > LARGEST_NUMBER:
             raise self.error(f"found {value:g}, which is too large to be meant; correct it", key)
-        if positive and value <= 0:
+        if (positive or self._key(key).positive) and value <= 0:
             raise self.error(f"found {value}; it must be positive", key)
         return value
 
+    @overload
+    def si(self, key: str, default: float = ..., positive: bool = ...) -> float: ...
+    @overload
+    def si(self, key: str, default: None, positive: bool = ...) -> float | None: ...
+    def si(self, key: str, default: Any = REQUIRED, positive: bool = False) -> float | None:
+        """A finite number in SI, by the unit that the key ends with, as is ``default``; its None, nan or inf stay."""
+        if key not in self.values and (default is None or (isinstance(default, float) and not math.isfinite(default))):
+            return default
+        return float(to_si(self.number(key, default, positive), unit_in(key)))
+
     def numbers(
-        self, key: str, shape: tuple[int, ...], default: Any = _REQUIRED, infinite: bool = False, blank: bool = False
+        self, key: str, shape: tuple[int, ...], default: Any = REQUIRED, infinite: bool = False, blank: bool = False
     ) -> FloatArray:
         """Numbers of the given shape; ``infinite`` allows ``inf``, also written "inf", ``blank`` allows ``nan``."""
         array = np.empty(shape)
@@ -175,7 +213,7 @@ class Node:
             raise self.error(f"found a number above {LARGEST_NUMBER:g}, too large to be meant; correct it", key)
         return array
 
-    def names(self, key: str, default: Any = _REQUIRED) -> tuple[str, ...]:
+    def names(self, key: str, default: Any = REQUIRED) -> tuple[str, ...]:
         """Different strings."""
         values = self.value(key, default)
         if not isinstance(values, list | tuple) or not all(isinstance(value, str) for value in values):
@@ -185,7 +223,7 @@ class Node:
                 raise self.error(f"{value!r} is named twice; remove one", key, i)
         return tuple(values)
 
-    def references(self, key: str, known: Iterable[str], what: str, default: Any = _REQUIRED) -> tuple[str, ...]:
+    def references(self, key: str, known: Iterable[str], what: str, default: Any = REQUIRED) -> tuple[str, ...]:
         """Names that must all be ``known``."""
         known = tuple(known)
         names = self.names(key, default)

@@ -10,7 +10,6 @@ from adjust.model.observations import Closure, frame_text
 from adjust.model.survey import Survey
 from adjust.model.tables import unit_of
 from survey.folder.units import from_si, to_si
-from survey.project.declared.declarations import keys_of
 from survey.project.declared.node import Node
 from survey.project.declared.poses import quaternion_wxyz, rotation_from_euler, rotation_from_quaternion
 from survey.project.declared.toml_text import Section
@@ -24,7 +23,7 @@ from survey.project.project import (
     Foot,
     Tolerance,
 )
-from survey.project.tables.references import Names, frame_of
+from survey.project.tables.references import Names, timed_frame
 
 _UNITS = ("mm", "arcsec", "deg", "px", "1")
 _SAID = {POSITION: ("mm",), ROTATION: ("arcsec", "deg")}
@@ -33,29 +32,19 @@ _SAID = {POSITION: ("mm",), ROTATION: ("arcsec", "deg")}
 def read_options(root: Node) -> AdjustmentOptions:
     """The tables [adjustment], [closures], [tolerances] and [identification]. Raises SurveyError."""
     node, said = root.table("adjustment"), root.table("identification")
-    node.allow(*keys_of("adjustment"))
-    alpha = node.number("alpha", 0.05, positive=True)
+    alpha = node.number("alpha")
     if alpha >= 1:
         raise node.error(f"found {alpha:g}; it is a probability, between 0 and 1", "alpha")
-    flags = {name: node.flag(name, True) for name in ("reject_blocks", "reject_points", "reject_pairs")}
-    identification = tuple((key, said.text(key)) for key in said.values)
-    flags["variance_components"] = node.flag("variance_components", False)
-    asked = node.choice("sigmas", SIGMA_KINDS) if node.has("sigmas") else ""
-    sigmas = next((kind for kind in SIGMA_KINDS if kind == asked), None)
+    flags = {n: node.flag(n) for n in ("reject_blocks", "reject_points", "reject_pairs", "variance_components")}
     form, closures = _closures(root)
     return AdjustmentOptions(
-        alpha, **flags, sigmas=sigmas, pairs=form, closures=closures, tolerances=_tolerances(root),
-        identification=identification,
+        alpha, **flags, sigmas=node.choice("sigmas", SIGMA_KINDS) if node.has("sigmas") else None, pairs=form,
+        closures=closures, tolerances=tuple(_tolerance(name, node) for name, node in root.tables("tolerances")),
+        identification=tuple((key, said.text(key)) for key in said.values),
     )  # fmt: skip
 
 
-def _tolerances(root: Node) -> tuple[Tolerance, ...]:
-    """All demands, in the order of the file. Raises SurveyError."""
-    return tuple(_tolerance(name, node) for name, node in root.tables("tolerances"))
-
-
 def _tolerance(name: str, node: Node) -> Tolerance:
-    node.allow(*keys_of("tolerance"))
     for key in ("expanded", "nominal", "tolerance"):
         given = [full for unit in _UNITS if node.has(full := key if unit == "1" else f"{key}_{unit}")]
         if len(given) > 1 and not (key == "expanded" and not node.has("component")):  # which has its own words for it
@@ -87,8 +76,7 @@ def _given(node: Node, key: str, units: tuple[str, ...] | None) -> float | None:
     for unit in units or _UNITS:
         full = key if unit == "1" else f"{key}_{unit}"
         if node.has(full):
-            value = node.number(full, positive=key != "nominal")
-            return value if unit in ("px", "1") else float(to_si(value, unit))
+            return node.si(full)
     return None
 
 
@@ -122,8 +110,7 @@ FORMS: tuple[Literal["poses", "closed"], ...] = ("poses", "closed")
 
 def _closures(root: Node) -> tuple[Literal["poses", "closed"], tuple[Closure, ...]]:
     """The form and all mounts, in the order of the file. Raises SurveyError."""
-    asked = root.table("adjustment").choice("pairs", FORMS, FORMS[0])
-    form = next(f for f in FORMS if f == asked)
+    form = root.table("adjustment").choice("pairs", FORMS)
     closures = tuple(_closure(name, node) for name, node in root.tables("closures"))
     if closures and form != "closed":
         raise root.table("closures").error('a mount closes a loop only where loops are; write [adjustment] pairs = '
@@ -132,12 +119,10 @@ def _closures(root: Node) -> tuple[Literal["poses", "closed"], tuple[Closure, ..
 
 
 def _closure(name: str, node: Node) -> Closure:
-    node.allow(*keys_of("closure"))
-    along = node.number("sigma_mm", 0.0)
+    along = node.number("sigma_mm")
     if along < 0.0:
         raise node.error(f"found {along:g}; a sigma is not negative", "sigma_mm")
-    about = node.number("sigma_arcsec", positive=True)
-    return Closure(name, node.names("pairs"), float(to_si(about, "arcsec")), float(to_si(along, "mm")))
+    return Closure(name, node.names("pairs"), node.si("sigma_arcsec"), node.si("sigma_mm"))
 
 
 def closure_sections(closures: tuple[Closure, ...]) -> list[Section]:
@@ -159,22 +144,15 @@ def read_alignment_tasks(root: Node, survey: Survey) -> tuple[AlignmentTask, ...
     names = Names.of(survey)
     tasks = []
     for task_id, node in root.tables("align"):
-        node.allow(*keys_of("align"))
-        frames = [frame_of(node, key, names) for key in ("body", "onto")]
+        frames = [timed_frame(node.text(key), names, node.fail(key)) for key in ("body", "onto")]
         if frames[0] == frames[1]:
             raise node.error("body and onto are the same; name the frame that the body is to be aligned with", "onto")
         feet_node = node.table("feet_mm")
         feet = tuple(Foot(name, *to_si(feet_node.numbers(name, (2,)), "mm").tolist()) for name in feet_node.values)
         if feet and (len(feet) < 3 or np.linalg.matrix_rank(np.diff([(f.x, f.y) for f in feet], axis=0), 1e-9) < 2):
             raise node.error(f"found {len(feet)} feet; three that are not in a row make a plane", "feet_mm")
-        pitch = to_si(node.number("pitch_mm", positive=True), "mm") if node.has("pitch_mm") else None
-        tolerance = None
-        if node.has("tolerance_arcsec"):
-            tolerance = float(to_si(node.number("tolerance_arcsec", positive=True), "arcsec"))
-        tasks.append(
-            AlignmentTask(task_id, frames[0], frames[1], _wanted(node), feet, None if pitch is None else float(pitch),
-                          tolerance)
-        )  # fmt: skip
+        tasks.append(AlignmentTask(task_id, frames[0], frames[1], _wanted(node), feet, node.si("pitch_mm", None),
+                                   node.si("tolerance_arcsec", None)))  # fmt: skip
     return tuple(tasks)
 
 

@@ -17,9 +17,7 @@ from adjust.model.survey import (
 )
 from adjust.model.tables import HARMONICS, HIGHEST, harmonic_names, in_order, unit_of
 from survey.folder.text import suggestion
-from survey.folder.units import to_si
 from survey.project.declared.clocks import read_clock
-from survey.project.declared.declarations import keys_of
 from survey.project.declared.lenses import read_lens, read_size
 from survey.project.declared.node import Node
 from survey.project.declared.poses import read_pose
@@ -31,7 +29,6 @@ def read_cameras(root: Node, station_ids: tuple[str, ...], timed: bool) -> tuple
     """The cameras under [cameras.*]."""
     cameras = []
     for camera_id, node in root.tables("cameras"):
-        node.allow(*keys_of("camera"))
         station_id = node.reference("station", station_ids, "station")
         size = read_size(node, "image_size_px")
         if not node.has("lens"):
@@ -44,8 +41,7 @@ def read_cameras(root: Node, station_ids: tuple[str, ...], timed: bool) -> tuple
             others = [c for c, _ in root.tables("cameras") if c != camera_id]
             node.table("lens").table("shared").reference("camera", others, "camera")
         pose = read_pose(node.table("station_from_camera"))
-        clock = read_clock(node, "camera_clock", timed)
-        cameras.append(Camera(camera_id, station_id, size, lens, pose, clock))
+        cameras.append(Camera(camera_id, station_id, size, lens, pose, read_clock(node, timed)))
     return tuple(cameras)
 
 
@@ -53,9 +49,7 @@ def read_stations(root: Node, table_ids: tuple[str, ...], timed: bool) -> tuple[
     """The stations under [stations.*]."""
     stations = []
     for station_id, node in root.tables("stations"):
-        node.allow(*keys_of("station"))
-        name = node.choice("motion", ("fixed", "epoch", "table"), "fixed")
-        motion: Literal["fixed", "epoch", "table"] = name if name in ("epoch", "table") else "fixed"  # type: ignore[assignment]  # mypy does not narrow str by a tuple
+        motion: Literal["fixed", "epoch", "table"] = node.choice("motion", ("fixed", "epoch", "table"))
         table_id = None
         if motion == "table":
             if not node.has("table"):
@@ -72,7 +66,7 @@ def read_stations(root: Node, table_ids: tuple[str, ...], timed: bool) -> tuple[
                 read_epochs(node, motion == "fixed"),
                 table_id,
                 read_pose(node.table("mount_from_station")),
-                read_clock(node, "clock", timed),
+                read_clock(node, timed),
             )
         )
     return tuple(stations)
@@ -89,15 +83,14 @@ def read_tables(root: Node, timed: bool) -> tuple[tuple[Table, ...], dict[str, F
     """The tables under [tables.*] and the sigmas (axes,) rad of their readings, by table id."""
     tables, sigmas = [], {}
     for table_id, node in root.tables("tables"):
-        node.allow(*keys_of("turntable"))
-        axes = node.references("axes", ("x", "y", "z"), "axis", ("x", "z"))
+        axes = node.references("axes", ("x", "y", "z"), "axis")
         if len(axes) not in (1, 2):
             raise node.error(f"found {len(axes)} axes; a table has one or two, outermost first", "axes")
         sigma = node.sigmas("sigma", ("arcsec",), len(axes))
         if sigma is not None:
             sigmas[table_id] = sigma
         pose = read_pose(node.table("world_from_table"))
-        geometry, clock = _read_geometry(node, len(axes)), read_clock(node, "clock", timed)
+        geometry, clock = _read_geometry(node, len(axes)), read_clock(node, timed)
         tables.append(Table(table_id, axes, pose, geometry, clock))
     return tuple(tables), sigmas
 
@@ -120,7 +113,7 @@ def _read_geometry(node: Node, n_axes: int) -> VectorParameter:
     geometry.allow("free", *keys)
     free = geometry.references("free", known, "table parameter", base[:2] if n_axes == 2 else ())
     free = (*free, *(n for n in _harmonics(node.table("harmonics"), n_axes) if n not in free))
-    values = {name: float(to_si(geometry.number(key, 0.0), geometry_unit(name))) for key, name in keys.items()}
+    values = {name: geometry.si(key, 0.0) for key, name in keys.items()}
     for key in sigma.values:
         if key not in keys:
             raise sigma.error(f"unknown key; {suggestion(key, keys)}", key)
@@ -131,7 +124,7 @@ def _read_geometry(node: Node, n_axes: int) -> VectorParameter:
     free = tuple(n for n in names if n in free)
     if not given:
         return VectorParameter(names, chosen, free)
-    sigmas = np.array([to_si(sigma.number(geometry_key(n), positive=True), geometry_unit(n)) for n in given])
+    sigmas = np.array([sigma.si(geometry_key(n)) for n in given])
     mean = np.array([values[name] for name in given])
     return VectorParameter(names, chosen, free, VectorPrior(given, mean, np.diag(sigmas**2)))
 

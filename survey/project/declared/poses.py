@@ -14,13 +14,12 @@ from gtsam import Pose3, Rot3
 from adjust.model.survey import FloatArray, PointParameter, PoseParameter, Treatment
 from adjust.spatial import rotation_forms
 from survey.folder.units import to_si
-from survey.project.declared.declarations import keys_of
+from survey.project.declared.declarations import declared
 from survey.project.declared.node import Node
 from survey.project.tables.covariance import covariance_problem
 
 TREATMENTS: tuple[Treatment, ...] = ("free", "held", "prior")
-POSE_KEYS = keys_of("pose")
-POINT_KEYS = keys_of("point")
+POSE_KEYS, POINT_KEYS = tuple(declared("pose").by_name), tuple(declared("point").by_name)
 _COMPONENTS = ("rx", "ry", "rz", "tx", "ty", "tz")
 _FLAT = {1: ("x", "y"), 2: ("z",)}  # what keeps its value in a network of so many dimensions
 _ROTATIONS = ("rotation_quaternion_wxyz", "rotation_euler_xyz_deg")
@@ -58,7 +57,7 @@ def read_pose(node: Node) -> PoseParameter:
     if not node.values:
         return PoseParameter()
     node.allow(*POSE_KEYS)
-    treatment = _treatment(node)
+    treatment = node.choice("treatment", TREATMENTS, "free")
     held = _held(node, treatment, _COMPONENTS)
     cov = _pose_cov(node) if treatment == "prior" else None
     if treatment != "prior":
@@ -80,8 +79,7 @@ def read_pose(node: Node) -> PoseParameter:
 
 def read_point(node: Node, dimensions: int = 3) -> PointParameter:
     """A world point with its treatment. In two dimensions z keeps its value (0), in one x and y do."""
-    node.allow(*POINT_KEYS)
-    treatment = _treatment(node)
+    treatment = node.choice("treatment", TREATMENTS, "free")
     held = _held(node, treatment, tuple("xyz")) or (_FLAT.get(dimensions, ()) if treatment != "held" else ())
     value = _coordinates(node, dimensions, held)
     if treatment != "prior":
@@ -124,13 +122,6 @@ def _held(node: Node, treatment: Treatment, components: tuple[str, ...]) -> tupl
     if len(held) == len(components):
         raise node.error('all components are held; write treatment = "held"', "held")
     return tuple(name for name in components if name in held)
-
-
-def _treatment(node: Node) -> Treatment:
-    if "treatment" not in node.values:
-        return "free"
-    name = node.choice("treatment", TREATMENTS)
-    return next(treatment for treatment in TREATMENTS if treatment == name)
 
 
 def _refuse_sigmas(node: Node, treatment: str, keys: tuple[str, ...]) -> None:

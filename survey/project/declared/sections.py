@@ -1,6 +1,7 @@
 """A survey as the sections of ``survey.toml``, the inverse of ``owners``, ``kinds``, ``lenses`` and ``poses``."""
 
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -24,10 +25,11 @@ from survey.project.declared.lenses import lens_to_toml
 from survey.project.declared.options import closure_sections, tolerance_sections
 from survey.project.declared.owners import geometry_key, geometry_unit
 from survey.project.declared.poses import quaternion_wxyz
+from survey.project.declared.targets import board_key
 from survey.project.declared.toml_text import Section
 from survey.project.declared.vectors import check_vector, vector_to_toml
 from survey.project.project import FORMAT, AdjustmentOptions, Sigmas, SpotsRequest
-from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList, TargetKind
+from survey.project.targets import BOARDS, MarkerBlock, PointList, TargetKind
 
 
 def survey_sections(survey: Survey, kinds: Mapping[str, TargetKind], sigmas: Sigmas) -> list[Section]:
@@ -188,26 +190,14 @@ def points_file(target_id: str) -> str:
 
 
 def _kind(target_id: str, kind: TargetKind) -> dict[str, Any]:
-    def mm(x: float) -> float:
-        return float(from_si(x, "mm"))
-
-    match kind:
-        case Checkerboard():
-            values = {"columns": kind.columns, "rows": kind.rows, "square_mm": mm(kind.square_m)}
-            return {"kind": "checkerboard", **values}
-        case Charuco():
-            values = {"squares_x": kind.squares_x, "squares_y": kind.squares_y, "square_mm": mm(kind.square_m)}
-            values["marker_mm"] = mm(kind.marker_m)
-            return {"kind": "charuco", **values, "dictionary": kind.dictionary, "legacy": kind.legacy}
-        case MarkerGrid():
-            values = {"columns": kind.columns, "rows": kind.rows, "marker_mm": mm(kind.marker_m)}
-            values |= {"gap_mm": mm(kind.gap_m), "first_id": kind.first_id}
-            return {"kind": "marker_grid", **values, "dictionary": kind.dictionary}
-        case MarkerBlock():
-            markers = {str(marker): from_si(kind.corners[marker], "mm").tolist() for marker in sorted(kind.corners)}
-            return {"kind": "marker_block", "dictionary": kind.dictionary, "markers": markers}
-        case PointList():
-            return {"kind": "points", "file": points_file(target_id)}
+    if isinstance(kind, PointList):
+        return {"kind": "points", "file": points_file(target_id)}
+    if isinstance(kind, MarkerBlock):
+        markers = {str(marker): from_si(kind.corners[marker], "mm").tolist() for marker in sorted(kind.corners)}
+        return {"kind": "marker_block", "dictionary": kind.dictionary, "markers": markers}
+    said = {board_key(f.name): getattr(kind, f.name) for f in fields(kind)}
+    said |= {board_key(f.name): float(from_si(getattr(kind, f.name), "mm")) for f in fields(kind) if f.type is float}
+    return {"kind": next(name for name, board in BOARDS.items() if type(kind) is board), **said}
 
 
 def _point(point: PointParameter) -> dict[str, Any]:

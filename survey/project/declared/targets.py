@@ -1,8 +1,8 @@
 """Targets of ``survey.toml``, and what of them a program can find."""
 
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Literal
+from dataclasses import fields, replace
+from typing import Any, Literal
 
 import numpy as np
 
@@ -10,14 +10,14 @@ from adjust.model.boards import BENT
 from adjust.model.survey import FloatArray, Target, VectorParameter, VectorPrior
 from survey.folder.text import suggestion
 from survey.folder.units import to_si
-from survey.project.declared.declarations import DECLARATIONS, WARP_UNITS, keys_of
+from survey.project.declared.declarations import DECLARATIONS, WARP_UNITS
 from survey.project.declared.node import Node
 from survey.project.declared.owners import read_epochs
 from survey.project.declared.poses import read_pose
 from survey.project.declared.vectors import key_of, read_vector
 from survey.project.tables.files import read_table
 from survey.project.tables.reading import Layout
-from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList, TargetKind
+from survey.project.targets import BOARDS, Board, Charuco, MarkerBlock, PointList, TargetKind
 
 _KINDS = tuple(d.of[1] for d in DECLARATIONS if d.path == "targets.ID" and d.of is not None)
 _MOST_ON_BOARD = 250_000  # squares or markers
@@ -34,10 +34,9 @@ def read_targets(
     targets, kinds, seen_by = [], {}, {}
     for target_id, node in root.tables("targets"):
         kind_name = node.choice("kind", _KINDS)
-        node.allow(*keys_of(f"target_{kind_name}"))
-        name = node.choice("motion", ("fixed", "epoch"), "fixed")
-        motion: Literal["fixed", "epoch"] = "epoch" if name == "epoch" else "fixed"
-        kind = _points(node, inputs) if kind_name == "points" else _READERS[kind_name](node)
+        node = node.declared_as(f"target_{kind_name}")
+        motion: Literal["fixed", "epoch"] = node.choice("motion", ("fixed", "epoch"))
+        kind = _target_kind(node, kind_name, inputs)
         point_ids, x_in_target = kind.points()
         targets.append(
             Target(
@@ -49,7 +48,7 @@ def read_targets(
                 read_pose(node.table("pose")),
                 read_epochs(node, motion == "fixed"),
                 _warp(node.table("warp"), kind_name) if node.has("warp") else None,
-                node.table("warp").number("reference_degC", 20.0),
+                node.table("warp").number("reference_degC"),
             )
         )
         kinds[target_id] = kind
@@ -58,20 +57,10 @@ def read_targets(
     return tuple(targets), kinds, seen_by
 
 
-def _metres(node: Node, key: str) -> float:
-    return float(to_si(node.number(key, positive=True), "mm"))
-
-
-def _counts(node: Node, keys: tuple[str, str], smallest: int) -> tuple[int, int]:
-    """How many there are across and down; refused where no board can have so many."""
-    across, down = (node.integer(key, smallest) for key in keys)
-    if across * down > _MOST_ON_BOARD:
-        raise node.error(f"found {across} x {down}; a board has at most {_MOST_ON_BOARD}", keys[0])
-    return across, down
-
-
-def _checkerboard(node: Node) -> TargetKind:
-    return Checkerboard(*_counts(node, ("columns", "rows"), 2), _metres(node, "square_mm"))
+def _target_kind(node: Node, name: str, inputs: dict[str, str]) -> TargetKind:
+    if name in BOARDS:
+        return _board(node, BOARDS[name])
+    return _points(node, inputs) if name == "points" else _marker_block(node)
 
 
 def _dictionary(node: Node) -> str:
@@ -83,22 +72,23 @@ def _dictionary(node: Node) -> str:
     return name
 
 
-def _charuco(node: Node) -> TargetKind:
-    square, marker = _metres(node, "square_mm"), _metres(node, "marker_mm")
-    if marker >= square:
+def _board(node: Node, kind: type[Board]) -> Board:
+    """A board by the fields of its kind, each under its name, lengths in mm."""
+    read: dict[Any, Callable[[str], Any]] = {int: node.integer, float: node.si, bool: node.flag,
+                                             str: lambda _: _dictionary(node)}  # fmt: skip
+    found = kind(**{field.name: read[field.type](board_key(field.name)) for field in fields(kind)})
+    first, second = (field.name for field in fields(kind)[:2])
+    across, down = getattr(found, first), getattr(found, second)
+    if across * down > _MOST_ON_BOARD:
+        raise node.error(f"found {across} x {down}; a board has at most {_MOST_ON_BOARD}", first)
+    if isinstance(found, Charuco) and found.marker_m >= found.square_m:
         raise node.error("the marker is not smaller than the square; correct marker_mm or square_mm", "marker_mm")
-    columns, rows = _counts(node, ("squares_x", "squares_y"), 2)
-    return Charuco(columns, rows, square, marker, _dictionary(node), node.flag("legacy", False))
+    return found
 
 
-def _marker_grid(node: Node) -> TargetKind:
-    return MarkerGrid(
-        *_counts(node, ("columns", "rows"), 1),
-        _metres(node, "marker_mm"),
-        _metres(node, "gap_mm"),
-        _dictionary(node),
-        node.integer("first_id", 0, 0),
-    )
+def board_key(field: str) -> str:
+    """The key of a field of a board."""
+    return f"{field}m" if field.endswith("_m") else field
 
 
 def _marker_block(node: Node) -> TargetKind:
@@ -111,14 +101,6 @@ def _marker_block(node: Node) -> TargetKind:
     if not corners:
         raise node.error("no markers; write markers = { 7 = [[x, y, z], ... four corners in mm] }", "markers")
     return MarkerBlock(corners, _dictionary(node))
-
-
-_READERS: dict[str, Callable[[Node], TargetKind]] = {
-    "checkerboard": _checkerboard,
-    "charuco": _charuco,
-    "marker_grid": _marker_grid,
-    "marker_block": _marker_block,
-}
 
 
 def _points(node: Node, inputs: dict[str, str]) -> TargetKind:
@@ -142,15 +124,14 @@ def _warp(node: Node, kind_name: str) -> VectorParameter:
     """Its first two components always, the others where they are free or not zero."""
     if kind_name == "marker_block":
         raise node.error(f"a target of kind {kind_name!r} is no flat board and has no warp; remove it")
-    node.allow(*keys_of("warp"))
     free: tuple[str, ...] = BENT
-    if not isinstance(node.value("free", True), bool):
+    if not isinstance(node.value("free"), bool):
         free = node.references("free", WARP_UNITS, "parameter")
-    elif not node.flag("free", True):
+    elif not node.flag("free"):
         free = ()
     asked, keys = (*BENT, *free), {n: key_of(n, WARP_UNITS) for n in WARP_UNITS}
     units = {n: u for n, u in WARP_UNITS.items()
-             if n in asked or keys[n] in node.table("sigma").values or node.number(keys[n], 0.0)}  # fmt: skip
+             if n in asked or keys[n] in node.table("sigma").values or node.number(keys[n])}  # fmt: skip
     found = read_vector(node, units, (), chosen=tuple(n for n in units if n in free))
     sigma = node.sigmas("sigma", ("mm",), 2)
     if sigma is None:

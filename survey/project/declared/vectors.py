@@ -11,7 +11,7 @@ import numpy as np
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, VectorParameter, VectorPrior
 from survey.folder.text import suggestion
-from survey.folder.units import from_si, to_si
+from survey.folder.units import from_si
 from survey.project.declared.node import Node
 
 Units = Mapping[str, str]
@@ -41,7 +41,7 @@ def read_vector(
     values = np.full(len(names), missing)
     for i, name in enumerate(names):
         if node.has(key_of(name, units)):
-            values[i] = to_si(node.number(key_of(name, units)), units[name])
+            values[i] = node.si(key_of(name, units))
     table = node.table("sigma")
     keys = {key_of(name, units): name for name in names}
     for key in table.values:
@@ -54,7 +54,7 @@ def read_vector(
     known = tuple(name for name in names if key_of(name, units) in table.values)
     if not known:
         return VectorParameter(names, values, chosen)
-    sigmas = np.array([to_si(table.number(key_of(n, units), positive=True), units[n]) for n in known])
+    sigmas = np.array([table.si(key_of(n, units), positive=True) for n in known])
     mean = np.array([values[names.index(name)] for name in known])
     return VectorParameter(names, values, chosen, VectorPrior(known, mean, np.diag(sigmas**2)))
 

@@ -32,7 +32,7 @@ def csv_columns(data: bytes, layout: Layout) -> dict[str, TextColumn | FloatArra
 
     Plain: no quotes, every line of the same ending, no blank line.
     """
-    if len(data) < LARGE or b'"' in data or (b"\r" in data and data.count(b"\r") != data.count(b"\r\n")):
+    if len(data) < LARGE or b'"' in data or (b"\r" in data and not _before_line_feeds(data)):
         return None
     header = data[: data.find(b"\n")].decode("utf-8-sig", "replace").rstrip("\r").split(",")
     if not set(layout.required) <= set(header) <= set(layout.columns) or not len(set(header)) == len(header) > 1:
@@ -59,6 +59,13 @@ def csv_columns(data: bytes, layout: Layout) -> dict[str, TextColumn | FloatArra
             return None
         out[name] = column
     return out
+
+
+def _before_line_feeds(data: bytes) -> bool:
+    """Whether a line feed follows every carriage return."""
+    signs = np.frombuffer(data, np.uint8)
+    at = np.flatnonzero(signs == ord("\r"))
+    return bool(at[-1] < len(signs) - 1 and (signs[at + 1] == ord("\n")).all())
 
 
 def _text(column: Any) -> TextColumn:

@@ -49,10 +49,12 @@ def covariance_problem(cov: FloatArray) -> tuple[int, str] | None:
     return None
 
 
-def read_triples(
-    table: Table, values: tuple[str, ...], sigmas: tuple[str, ...], rho: tuple[str, ...]
-) -> tuple[FloatArray, FloatArray]:
-    """Values (n, 3) m, nan where not observed, and covariances (n, 3, 3) m^2, inf on the diagonal there."""
+def read_triples(table: Table, columns: tuple[str, ...]) -> tuple[FloatArray, FloatArray]:
+    """Values (n, 3) m, nan where not observed, and covariances (n, 3, 3) m^2, inf on the diagonal there.
+
+    columns: three of values, of sigmas and of correlations.
+    """
+    values, sigmas, rho = columns[:3], columns[3:6], columns[6:]
     found = to_si(np.stack([table.numbers(name) for name in values], axis=1), "mm")
     sigma = to_si(np.stack([table.positive(name) for name in sigmas], axis=1), "mm")
     known = ~np.isnan(found)

@@ -1,16 +1,30 @@
 """Tables of levels, alignments, laser spots and positions on surfaces."""
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 
 from adjust.model.names import natural_key
-from adjust.model.observations import Alignment, LaserSpot, Level, OnSurface
+from adjust.model.observations import Alignment, LaserSpot, Level, OnSurface, frame_text, position_text
 from adjust.model.survey import FloatArray
 from survey.folder.text import LARGEST_NUMBER, suggestion
-from survey.folder.units import to_si
+from survey.folder.units import from_si, to_si
 from survey.project.project import Sigmas
-from survey.project.tables.covariance import covariance_from_sigmas, table_correlations
-from survey.project.tables.reading import FLAGS, Layout, Table, first_row, group_names, needed, one_of, quantity
-from survey.project.tables.references import Names, frame_at, position_at
+from survey.project.tables.covariance import covariance_from_sigmas, sigmas_and_correlations, table_correlations
+from survey.project.tables.reading import (
+    FLAGS,
+    Columns,
+    Layout,
+    Table,
+    filled,
+    first_row,
+    group_columns,
+    marks,
+    needed,
+    one_of,
+    quantity,
+)
+from survey.project.tables.references import Names, timed_frame, timed_position
 
 _TILTS = ("arcsec", "mgon", "deg", "mm_per_m")
 LEVELS = Layout(
@@ -83,13 +97,12 @@ def read_levels(table: Table, names: Names, sigmas: Sigmas) -> tuple[Level, ...]
     every = np.ones(len(table), dtype=bool)
     needed(table, values, every, "value: is blank; fill in value_arcsec, value_mm_per_m, value_g or the like")
     needed(table, sigma, every, "sigma: is blank; fill in sigma_arcsec, sigma_mm_per_m, sigma_g or the like")
-    groups, used = group_names(table, "level"), table.flags("used").tolist()
-    levels = []
+    groups, used, scale = marks(table, "level", sigmas.scale)
+    scaled, levels = (sigma * scale).tolist(), []
     for row, text in enumerate(table.text("frame_id").values()):
-        frame = frame_at(table, row, "frame_id", text, names)
+        frame = timed_frame(text, names, table.fail(row, "frame_id"))
         axis = read_axis(table, row, "axis", axes[row])
-        scaled = float(sigma[row]) * sigmas.scale.get(groups[row], 1.0)
-        levels.append(Level(ids[row], frame, axis, float(values[row]), scaled, groups[row], used[row]))
+        levels.append(Level(ids[row], frame, axis, float(values[row]), scaled[row], groups[row], used[row]))
     return tuple(sorted(levels, key=lambda level: natural_key(level.level_id)))
 
 
@@ -107,12 +120,12 @@ def read_alignments(table: Table, names: Names, sigmas: Sigmas) -> tuple[Alignme
         row, i = (int(x[0]) for x in np.nonzero(lost))
         raise table.error(row, f"value_{i + 1}: has no sigma_{i + 1}; add it, or remove the value")
     rho = table_correlations(table, ("rho_12",))
-    groups, used = group_names(table, "alignment"), table.flags("used").tolist()
+    groups, used, scale = marks(table, "alignment", sigmas.scale)
     ends, axes = ([table.text(f"{what}{x}").values() for x in suffixes]
                   for what, suffixes in (("", ("a_id", "b_id")), ("axis_", ("a", "b"))))  # fmt: skip
     result = []
     for row, alignment_id in enumerate(ids):
-        a, b = (frame_at(table, row, column, ends[k][row], names) for k, column in enumerate(("a_id", "b_id")))
+        a, b = (timed_frame(ends[k][row], names, table.fail(row, column)) for k, column in enumerate(("a_id", "b_id")))
         if a == b:
             raise table.error(row, f"a_id, b_id: both are {ends[0][row]!r}; an alignment joins two different frames")
         known = ~np.isnan(sigma[row])
@@ -121,7 +134,7 @@ def read_alignments(table: Table, names: Names, sigmas: Sigmas) -> tuple[Alignme
             cov = covariance_from_sigmas(sigma[row][None], rho[row : row + 1])[0]
         else:
             cov[known, known] = sigma[row][known] ** 2
-        cov[np.isfinite(cov)] *= sigmas.scale.get(groups[row], 1.0) ** 2
+        cov[np.isfinite(cov)] *= scale[row] ** 2
         axis_a, axis_b = (read_axis(table, row, f"axis_{x}", axes[k][row]) for k, x in enumerate("ab"))
         result.append(Alignment(alignment_id, a, axis_a, b, axis_b, np.nan_to_num(values[row]), cov, groups[row],
                                 used[row]))  # fmt: skip
@@ -141,7 +154,7 @@ def read_laser_spots(table: Table, names: Names, sigmas: Sigmas) -> tuple[LaserS
     needed(table, sigma.sum(axis=1), np.ones(len(table), dtype=bool), "sigma: is blank; fill in sigma_mm")
     cov = covariance_from_sigmas(sigma, table_correlations(table, ("rho_xy",)))
     xy = to_si(np.stack([table.numbers("x_mm"), table.numbers("y_mm")], axis=1), "mm")
-    groups, used = group_names(table, "laser"), table.flags("used").tolist()
+    groups, used, scale = marks(table, "laser", sigmas.scale)
     known = {beam.beam_id: beam for beam in names.survey.beams}
     on_table = {(r.table_id, r.epoch_id) for r in names.survey.table_readings}
     spots = []
@@ -155,7 +168,7 @@ def read_laser_spots(table: Table, names: Names, sigmas: Sigmas) -> tuple[LaserS
         if beam.carrier_kind == "mount" and (beam.carrier_id, epochs[row]) not in on_table:
             found = f"table {beam.carrier_id!r} has no reading at epoch {epochs[row]!r}"
             raise table.error(row, f"epoch_id: {found}; add it to table_angles, or correct the epoch")
-        scaled = cov[row] * sigmas.scale.get(groups[row], 1.0) ** 2
+        scaled = cov[row] * scale[row] ** 2
         spots.append(LaserSpot(spot_id, beams[row], epochs[row], targets[row], xy[row], scaled, groups[row], used[row]))
     return tuple(sorted(spots, key=lambda spot: natural_key(spot.spot_id)))
 
@@ -164,15 +177,78 @@ def read_on_surfaces(table: Table, names: Names, sigmas: Sigmas) -> tuple[OnSurf
     """Positions on surfaces, sorted by surface and position."""
     surfaces, texts = table.text("surface_id").values(), table.text("point_id").values()
     offset = to_si(np.nan_to_num(table.numbers("offset_mm")), "mm")
-    sigma = to_si(table.positive("sigma_mm"), "mm")
-    groups, used = group_names(table, "surface"), table.flags("used").tolist()
+    groups, used, scale = marks(table, "surface", sigmas.scale)
+    sigma = (to_si(table.positive("sigma_mm"), "mm") * scale).tolist()
     known = {surface.surface_id for surface in names.survey.surfaces}
     result = []
     for row, (surface_id, text) in enumerate(zip(surfaces, texts, strict=True)):
         if surface_id not in known:
             raise table.error(row, f"surface_id: unknown surface {surface_id!r}; {suggestion(surface_id, known)}")
-        position = position_at(table, row, text, names)
-        scaled = float(sigma[row]) * sigmas.scale.get(groups[row], 1.0)
-        item = OnSurface(surface_id, position, scaled, float(offset[row]), groups[row], used[row])
+        position = timed_position(text, names, table.fail(row, "point_id"))
+        item = OnSurface(surface_id, position, sigma[row], float(offset[row]), groups[row], used[row])
         result.append(((natural_key(surface_id), natural_key(text)), item))
     return tuple(item for _, item in sorted(result, key=lambda pair: pair[0]))
+
+
+def level_columns(levels: Sequence[Level]) -> Columns:
+    """One row per level."""
+    return {
+        "level_id": [level.level_id for level in levels],
+        "frame_id": [frame_text(level.frame) for level in levels],
+        "axis": [axis_text(level.axis_in_frame) for level in levels],
+        "value_arcsec": from_si([level.value for level in levels], "arcsec"),
+        "sigma_arcsec": from_si([level.sigma for level in levels], "arcsec"),
+        **group_columns(levels, "level"),
+    }
+
+
+def alignment_columns(alignments: Sequence[Alignment]) -> Columns:
+    """One row per alignment."""
+    numbers = np.full((len(alignments), 5), np.nan)
+    for row, a in zip(numbers, alignments, strict=True):
+        known = np.isfinite(np.diag(a.cov))
+        sigma, rho = sigmas_and_correlations(np.where(np.isfinite(a.cov), a.cov, 1.0)[None])
+        row[:2] = np.where(known, from_si(a.value, "arcsec"), np.nan)
+        row[2:4] = np.where(known, from_si(sigma[0], "arcsec"), np.nan)
+        row[4] = rho[0, 0] if known.all() and rho[0, 0] != 0.0 else np.nan
+    columns = ("value_1_arcsec", "value_2_arcsec", "sigma_1_arcsec", "sigma_2_arcsec", "rho_12")
+    text: dict[str, Callable[[Alignment], str]] = {
+        "alignment_id": lambda a: a.alignment_id,
+        "a_id": lambda a: frame_text(a.a),
+        "axis_a": lambda a: axis_text(a.axis_in_a),
+        "b_id": lambda a: frame_text(a.b),
+        "axis_b": lambda a: axis_text(a.axis_in_b),
+    }
+    return {
+        **{name: [get(a) for a in alignments] for name, get in text.items()},
+        **filled(dict(zip(columns, numbers.T, strict=True))),
+        **group_columns(alignments, "alignment"),
+    }
+
+
+def laser_columns(spots: Sequence[LaserSpot]) -> Columns:
+    """One row per laser spot."""
+    xy = from_si(np.array([spot.xy for spot in spots]).reshape(-1, 2), "mm")
+    sigma, rho = sigmas_and_correlations(np.array([spot.cov for spot in spots]).reshape(-1, 2, 2))
+    sigma = from_si(sigma, "mm")
+    return {
+        **{name: [getattr(s, name) for s in spots] for name in ("spot_id", "beam_id", "epoch_id", "target_id")},
+        "x_mm": xy[:, 0],
+        "y_mm": xy[:, 1],
+        "sigma_x_mm": sigma[:, 0],
+        "sigma_y_mm": sigma[:, 1],
+        **filled({"rho_xy": np.where(rho[:, 0] != 0.0, rho[:, 0], np.nan)}),
+        **group_columns(spots, "laser"),
+    }
+
+
+def surface_columns(items: Sequence[OnSurface]) -> Columns:
+    """One row per position on a surface."""
+    offset = np.array([item.offset for item in items], dtype=float)
+    return {
+        "surface_id": [item.surface_id for item in items],
+        "point_id": [position_text(item.position) for item in items],
+        "sigma_mm": from_si([item.sigma for item in items], "mm"),
+        **filled({"offset_mm": np.where(offset != 0.0, from_si(offset, "mm"), np.nan)}),
+        **group_columns(items, "surface"),
+    }

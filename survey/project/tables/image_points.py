@@ -10,11 +10,11 @@ import numpy as np
 from adjust.lenses.crops import possible_sizes
 from adjust.model.names import natural_key
 from adjust.model.observations import ImageBlock
-from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from survey.folder.text import suggestion
 from survey.project.project import ImagePointsWhere, Sigmas, SpotBlock
-from survey.project.tables.covariance import covariance_from_sigmas, table_correlations
-from survey.project.tables.reading import Layout, Table, TextColumn, checked_groups, first_row
+from survey.project.tables.covariance import covariance_from_sigmas, sigmas_and_correlations, table_correlations
+from survey.project.tables.reading import Columns, Layout, Table, TextColumn, checked_groups, first_row
 from survey.project.tables.references import Names
 
 _SIGMAS = ("sigma_u_px", "sigma_v_px", "rho_uv")
@@ -141,11 +141,12 @@ def _measured(
             row = first_row(cameras.codes == code)
             raise table.error(row, f"camera_id: unknown camera {name!r}; {suggestion(name, sizes)}")
     uv = np.stack([table.numbers("u_px"), table.numbers("v_px")], axis=1)
-    size = np.array([sizes[name] for name in cameras.names], dtype=float).reshape(-1, 2)[cameras.codes]
-    outside = ((uv < -0.5) | (uv > size - 0.5)).any(axis=1)
+    size = np.array([sizes[name] for name in cameras.names], dtype=float).reshape(-1, 2)
+    out_u, out_v = ((x < -0.5) | (x > most[cameras.codes]) for x, most in zip(uv.T, size.T - 0.5, strict=True))
+    outside = out_u | out_v
     if outside.any():
         row = first_row(outside)
-        width, height = size[row].astype(int)
+        width, height = size[cameras.codes[row]].astype(int)
         problem = f"the point ({uv[row, 0]:g}, {uv[row, 1]:g}) px is outside the image of {width} x {height} px"
         raise table.error(row, f"{problem}; correct the table or image_size_px")
     scale = np.array([sigmas.scale.get(name, 1.0) for name in groups.names])[groups.codes]
@@ -155,16 +156,15 @@ def _measured(
 def _covariances(table: Table, default_px: float | None, scale: FloatArray) -> FloatArray:
     """Covariances (n, 2, 2) px^2, from the sigma columns or, where a row has none, from ``default_px``."""
     sigma = np.stack([table.positive("sigma_u_px"), table.positive("sigma_v_px")], axis=1)
-    rho = table.numbers("rho_uv")
     blank = np.isnan(sigma)
-    half = blank.any(axis=1) & (~blank.all(axis=1) | ~np.isnan(rho))
+    half = (blank[:, 0] != blank[:, 1]) | (blank[:, 0] & ~np.isnan(table.numbers("rho_uv")))
     if half.any():
         raise table.error(first_row(half), "sigma_u_px, sigma_v_px: one is missing; give both or leave all blank")
     filled = table_correlations(table, ("rho_uv",))
     if blank.any():
         if default_px is None:
             problem = "the row has no sigma; fill in sigma_u_px, sigma_v_px, or give [sigmas] image_px in survey.toml"
-            raise table.error(first_row(blank.any(axis=1)), problem)
+            raise table.error(first_row(blank[:, 0]), problem)
         sigma[blank] = default_px
     return covariance_from_sigmas(sigma * scale[:, None], filled)
 
@@ -213,3 +213,47 @@ def _refuse_duplicates(table: Table, column: str, *codes: IntArray) -> None:
         line = table.lines[order[i]]
         problem = f"{name!r} stands already in line {line} for this camera, epoch and target; remove one"
         raise table.error(int(order[i + 1]), f"{column}: {problem}")
+
+
+def image_point_columns(blocks: Sequence[ImageBlock], survey: Survey) -> Columns:
+    """One row per image point; ``group`` and ``used`` only where they are not as usual."""
+    names: dict[str | None, tuple[str, ...]] = {target.target_id: target.point_ids for target in survey.targets}
+    names[None] = tuple(point.point_id for point in survey.points)
+    index: dict[str, int] = {}
+    codes = {owner: np.array([index.setdefault(n, len(index)) for n in ids], int) for owner, ids in names.items()}
+    sizes = [len(block.uv) for block in blocks]
+    used = [block.mask for block in blocks]
+    flags = np.concatenate([np.zeros(0, bool), *used])
+    points = [codes[block.target_id][np.asarray(block.point_idx, int)] for block in blocks]
+    return {
+        "epoch_id": _repeat([block.epoch_id for block in blocks], sizes),
+        "camera_id": _repeat([block.camera_id for block in blocks], sizes),
+        "target_id": _repeat([block.target_id or "" for block in blocks], sizes),
+        "point_id": TextColumn(tuple(index), np.concatenate([np.zeros(0, int), *points])),
+        **_measured_columns(blocks),
+        **({"group": _repeat([b.group for b in blocks], sizes)} if any(b.group != "image" for b in blocks) else {}),
+        **({} if flags.all() else {"used": TextColumn(("false", "true"), flags.astype(int))}),
+    }
+
+
+def spot_columns(spots: Sequence[SpotBlock]) -> Columns:
+    """One row per unidentified spot."""
+    sizes = [len(block.uv) for block in spots]
+    return {
+        "epoch_id": _repeat([block.epoch_id for block in spots], sizes),
+        "camera_id": _repeat([block.camera_id for block in spots], sizes),
+        "spot_id": [spot_id for block in spots for spot_id in block.spot_ids],
+        **_measured_columns(spots),
+    }
+
+
+def _measured_columns(blocks: Sequence[ImageBlock] | Sequence[SpotBlock]) -> dict[str, FloatArray]:
+    uv = np.concatenate([np.zeros((0, 2)), *(block.uv for block in blocks)])
+    sigma, rho = sigmas_and_correlations(np.concatenate([np.zeros((0, 2, 2)), *(block.cov for block in blocks)]))
+    columns = np.column_stack([uv, sigma, rho])
+    return dict(zip(("u_px", "v_px", "sigma_u_px", "sigma_v_px", "rho_uv"), columns.T, strict=True))
+
+
+def _repeat(values: Sequence[str], sizes: Sequence[int]) -> TextColumn:
+    index = {name: i for i, name in enumerate(dict.fromkeys(values))}
+    return TextColumn(tuple(index), np.repeat(np.array([index[name] for name in values], int), sizes))

@@ -1,15 +1,17 @@
 """Tables of angles and distances."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from adjust.model.names import natural_key
-from adjust.model.observations import Distance, TableReading
+from adjust.model.observations import Distance, TableReading, position_text
 from adjust.model.survey import FloatArray
 from survey.folder.text import suggestion
-from survey.folder.units import to_si
+from survey.folder.units import from_si, to_si
 from survey.project.project import Sigmas
-from survey.project.tables.covariance import covariance_from_sigmas, table_correlations
-from survey.project.tables.reading import FLAGS, Layout, Table, first_row, group_names
+from survey.project.tables.covariance import covariance_from_sigmas, sigmas_and_correlations, table_correlations
+from survey.project.tables.reading import FLAGS, Columns, Layout, Table, first_row, group_columns, marks
 from survey.project.tables.references import Names, read_ends
 
 ANGLES = Layout(
@@ -27,7 +29,7 @@ def read_angles(table: Table, names: Names, sigmas: Sigmas) -> tuple[TableReadin
     axes = {t.table_id: len(t.axes) for t in names.survey.tables}
     epochs, tables = table.ids("epoch_id").values(), table.text("table_id").values()
     angles = np.stack([table.numbers("axis1_deg"), table.numbers("axis2_deg")], axis=1)
-    groups = group_names(table, "table")
+    groups, _, scale = marks(table, "table", sigmas.scale)
     lines: dict[tuple[str, str], int] = {}
     for row, (epoch_id, table_id) in enumerate(zip(epochs, tables, strict=True)):
         if table_id not in axes:
@@ -46,8 +48,8 @@ def read_angles(table: Table, names: Names, sigmas: Sigmas) -> tuple[TableReadin
     for row, (epoch_id, table_id) in enumerate(zip(epochs, tables, strict=True)):
         k = axes[table_id]
         cov = covariance_from_sigmas(sigma[None, row, :k], rho[row : row + 1, : k - 1])[0]
-        scaled = cov * sigmas.scale.get(groups[row], 1.0) ** 2
-        readings.append(TableReading(table_id, epoch_id, to_si(angles[row, :k], "deg"), scaled, groups[row]))
+        angle = to_si(angles[row, :k], "deg")
+        readings.append(TableReading(table_id, epoch_id, angle, cov * scale[row] ** 2, groups[row]))
     return tuple(sorted(readings, key=lambda r: (natural_key(r.table_id), natural_key(r.epoch_id))))
 
 
@@ -77,11 +79,39 @@ def read_distances(table: Table, names: Names, sigmas: Sigmas) -> tuple[Distance
     if np.isnan(sigma_mm).any():
         raise table.error(first_row(np.isnan(sigma_mm)), "sigma_mm: is blank; fill it in")
     values = np.where(np.isnan(in_m), to_si(in_mm, "mm"), in_m).tolist()
-    groups, used = group_names(table, "distance"), table.flags("used").tolist()
-    ends = list(zip(table.text("from_id").values(), table.text("to_id").values(), strict=True))
-    distances = []
-    for row, (from_text, to_text) in enumerate(ends):
-        a, b = read_ends(table, row, (from_text, to_text), names, "distance")
-        sigma = float(to_si(sigma_mm[row], "mm")) * sigmas.scale.get(groups[row], 1.0)
-        distances.append(Distance(distance_ids[row], a, b, values[row], sigma, groups[row], used[row]))
+    groups, used, scale = marks(table, "distance", sigmas.scale)
+    sigma, distances = (to_si(sigma_mm, "mm") * scale).tolist(), []
+    for row, ends in enumerate(zip(table.text("from_id").values(), table.text("to_id").values(), strict=True)):
+        a, b = read_ends(table, row, ends, names, "distance")
+        distances.append(Distance(distance_ids[row], a, b, values[row], sigma[row], groups[row], used[row]))
     return tuple(sorted(distances, key=lambda distance: natural_key(distance.distance_id)))
+
+
+def angle_columns(readings: Sequence[TableReading]) -> Columns:
+    """One row per reading; the second axis blank for a table that has one."""
+    rows = np.full((len(readings), 5), np.nan)
+    for row, reading in zip(rows, readings, strict=True):
+        k = len(reading.angles)
+        sigma, rho = sigmas_and_correlations(reading.cov[None])
+        row[:k] = from_si(reading.angles, "deg")
+        row[2 : 2 + k] = from_si(sigma[0], "arcsec")
+        row[4] = rho[0, 0] if k == 2 else np.nan
+    names = ("axis1_deg", "axis2_deg", "sigma_axis1_arcsec", "sigma_axis2_arcsec", "rho_12")
+    return {
+        "epoch_id": [reading.epoch_id for reading in readings],
+        "table_id": [reading.table_id for reading in readings],
+        **dict(zip(names, rows.T, strict=True)),
+        **group_columns(readings, "table", used=False),
+    }
+
+
+def distance_columns(distances: Sequence[Distance]) -> Columns:
+    """One row per distance."""
+    return {
+        "distance_id": [distance.distance_id for distance in distances],
+        "from_id": [position_text(distance.a) for distance in distances],
+        "to_id": [position_text(distance.b) for distance in distances],
+        "value_m": np.array([distance.value for distance in distances]),
+        "sigma_mm": from_si([distance.sigma for distance in distances], "mm"),
+        **group_columns(distances, "distance"),
+    }

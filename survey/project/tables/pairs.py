@@ -1,21 +1,22 @@
 """The table of measured pairs: relative rotations and poses, with sigmas or covariances."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model.errors import SurveyError
 from adjust.model.names import natural_key
-from adjust.model.observations import FrameRef, Pair
+from adjust.model.observations import FrameRef, Pair, frame_text
 from adjust.model.survey import BoolArray, FloatArray
+from adjust.observations.pairs import pair_arrays
 from adjust.spatial.rotation_forms import euler_from_matrix, tangent_cov_from_euler
-from survey.folder.units import to_si
-from survey.project.declared.poses import is_unit, rotation_from_euler
+from survey.folder.units import from_si, to_si
+from survey.project.declared.poses import is_unit, quaternion_wxyz, rotation_from_euler
 from survey.project.project import Sigmas
 from survey.project.tables.covariance import covariance_from_sigmas, covariance_problem
-from survey.project.tables.reading import FLAGS, Layout, Table, first_row, group_names
-from survey.project.tables.references import NameProblemError, Names, check_epochs, read_frame
+from survey.project.tables.reading import FLAGS, Columns, Layout, Table, first_row, group_columns, marks
+from survey.project.tables.references import Names, check_epochs, read_frame
 
 QUATERNION = ("qw", "qx", "qy", "qz")
 EULER = ("euler_x_deg", "euler_y_deg", "euler_z_deg")
@@ -56,9 +57,9 @@ def read_pairs(table: Table, names: Names, sigmas: Sigmas) -> tuple[Pair, ...]:
     is_pose = _all_or_none(table, TRANSLATION)
     rotations = _pair_rotations(table)
     cov = _pair_covariances(table, is_pose, rotations)
-    groups, used = group_names(table, "pair"), table.flags("used").tolist()
+    groups, used, scale = marks(table, "pair", sigmas.scale)
     translation = to_si(np.stack([table.numbers(name) for name in TRANSLATION], axis=1), "mm")
-    scaled = cov * np.array([sigmas.scale.get(group, 1.0) ** 2 for group in groups])[:, None, None]
+    scaled = cov * scale[:, None, None] ** 2
     rows = zip(pair_ids, read_ends(table, names), rotations, translation, scaled, is_pose.tolist(), groups, used,
                strict=True)  # fmt: skip
     pairs = [Pair(i, a, b, Pose3(R, t) if pose else R, C if pose else C[:3, :3], group, use)
@@ -70,14 +71,12 @@ def read_ends(table: Table, names: Names) -> Iterator[tuple[FrameRef, FrameRef]]
     """The two frames of every row. Raises SurveyError for what cannot be a pair."""
     something_moves = any(names.bodies.values())
     for row, (a_text, b_text) in enumerate(zip(table.text("a_id").values(), table.text("b_id").values(), strict=True)):
-        try:
-            a, b = read_frame(a_text, names), read_frame(b_text, names)
-            if something_moves:
-                check_epochs(a, b, names)
-        except NameProblemError as problem:
-            raise table.error(row, f"a_id, b_id: {problem}") from problem
+        fail = table.fail(row, "a_id, b_id")
+        a, b = read_frame(a_text, names, fail), read_frame(b_text, names, fail)
+        if something_moves:
+            check_epochs(a, b, names, fail)
         if a.text == b.text:
-            raise table.error(row, f"a_id, b_id: both are {a_text!r}; a pair joins two different frames")
+            raise fail(f"both are {a_text!r}; a pair joins two different frames")
         yield a, b
 
 
@@ -175,3 +174,27 @@ def _all_or_none(table: Table, columns: tuple[str, ...]) -> BoolArray:
     if some.any():
         raise table.error(first_row(some), f"{','.join(columns)}: only some are filled in; give all or none")
     return np.asarray(filled.all(axis=1))
+
+
+def pair_columns(pairs: Sequence[Pair]) -> Columns:
+    """One row per pair: quaternion, translation of poses, sigmas where they are independent, else the covariance."""
+    sigma_names = (*SIGMA_COLUMNS["rotation"][3], *SIGMA_COLUMNS["translation"][1])
+    names = (*QUATERNION, *TRANSLATION, *sigma_names, *COVARIANCE_COLUMNS)
+    measured, rows = pair_arrays(pairs), np.full((len(pairs), len(names)), np.nan)
+    rotations = (p.b_from_a.rotation() if isinstance(p.b_from_a, Pose3) else p.b_from_a for p in pairs)
+    rows[:, :4] = np.array([quaternion_wxyz(rotation) for rotation in rotations]).reshape(-1, 4)
+    rows[:, 4:7] = from_si(measured.translations, "mm")
+    alone = np.count_nonzero(measured.cov, axis=(1, 2)) == 6  # infinite where no translation was measured
+    cov = np.where(np.isinf(measured.cov), np.nan, measured.cov)
+    cov[~measured.is_pose, :, 3:] = np.nan
+    sigma = np.sqrt(np.diagonal(cov[alone], axis1=1, axis2=2))
+    rows[alone, 7:13] = np.concatenate([from_si(sigma[:, :3], "arcsec"), from_si(sigma[:, 3:], "mm")], axis=1)
+    rows[~alone, 13:] = np.where(np.triu(np.ones((6, 6), dtype=np.bool_)), cov[~alone], np.nan).reshape(-1, 36)
+    columns = {name: column for name, column in zip(names, rows.T, strict=True) if not np.isnan(column).all()}
+    return {
+        "pair_id": [pair.pair_id for pair in pairs],
+        "a_id": [frame_text(pair.a) for pair in pairs],
+        "b_id": [frame_text(pair.b) for pair in pairs],
+        **columns,
+        **group_columns(pairs, "pair"),
+    }

@@ -5,9 +5,10 @@ of several columns, each with its unit; angles also as text.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -68,7 +69,10 @@ Columns = Mapping[str, Sequence[str] | TextColumn | FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A table that was read: ``lines`` (n,) where its rows stand, and its columns. Blank numbers are nan."""
+    """A table that was read: ``lines`` (n,) where its rows stand, and its columns. Blank numbers are nan.
+
+    beside: the table of the covariances between its rows.
+    """
 
     path: Path
     layout: Layout
@@ -76,6 +80,7 @@ class Table:
     lines: IntArray
     text_columns: dict[str, TextColumn]
     number_columns: dict[str, FloatArray]
+    beside: "Table | None" = None
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -91,6 +96,10 @@ class Table:
     def error(self, row: int, problem: str) -> SurveyError:
         """An error at a row."""
         return SurveyError(f"{self.where(row)}: {problem}")
+
+    def fail(self, row: int, column: str) -> Callable[[str], SurveyError]:
+        """What makes an error of a problem with a column of a row."""
+        return lambda problem: self.error(row, f"{column}: {problem}")
 
     def text(self, column: str) -> TextColumn:
         """A text column; blank where the file does not have it."""
@@ -141,9 +150,10 @@ class Table:
         return np.array([meanings[name.lower()] for name in result.names], dtype=bool)[result.codes]
 
 
-def group_names(table: Table, default: str) -> list[str]:
-    """The group of every row. Raises SurveyError where a name would be taken for a formula."""
-    return [name or default for name in checked_groups(table).values()]
+def marks(table: Table, kind: str, scale: Mapping[str, float]) -> tuple[list[str], list[bool], FloatArray]:
+    """Of every row the group, by default its kind, whether it is used, and the factor (n,) of its group's sigmas."""
+    groups = [name or kind for name in checked_groups(table).values()]
+    return groups, table.flags("used").tolist(), np.array([scale.get(group, 1.0) for group in groups], dtype=float)
 
 
 def checked_groups(table: Table) -> TextColumn:
@@ -235,3 +245,25 @@ def needed(table: Table, values: FloatArray, rows: BoolArray, advice: str) -> No
     missing = rows & np.isnan(values)
     if missing.any():
         raise table.error(first_row(missing), advice)
+
+
+def group_columns(items: Sequence[Any], usual: str = "", used: bool = True) -> dict[str, list[str]]:
+    """``group`` and ``used`` of one item a row where they are not as usual: readings have groups by their kind.
+
+    used: whether the table tells it.
+    """
+    columns = {}
+    if any(x.group != (usual or x.kind) for x in items):
+        columns["group"] = [x.group for x in items]
+    if used and not all(x.used for x in items):
+        columns["used"] = ["true" if x.used else "false" for x in items]
+    return columns
+
+
+def filled(columns: Mapping[str, Sequence[str] | FloatArray]) -> dict[str, Sequence[str] | FloatArray]:
+    """Without the columns that are blank throughout."""
+    return {
+        name: column
+        for name, column in columns.items()
+        if not (np.isnan(column).all() if isinstance(column, np.ndarray) else not any(column))
+    }

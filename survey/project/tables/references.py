@@ -5,20 +5,20 @@ A frame is ``world`` or ``kind:id``, with ``@epoch`` where it moves: ``station:h
 """
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
+from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameKind, FrameRef, PositionRef, frame_text
 from adjust.model.survey import Survey
 from survey.folder.text import id_problem, suggestion
-from survey.project.declared.node import Node
 from survey.project.tables.reading import Table
 
 _KINDS: tuple[FrameKind, ...] = ("station", "camera", "target", "table", "mount")
 
 
-class NameProblemError(Exception):
-    """Why a reference cannot be understood; whoever knows the line makes a SurveyError of it."""
+Fail = Callable[[str], SurveyError]
+"""What makes an error of a problem: it knows where."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,61 +73,61 @@ class Names:
         return [frame_id for frame_kind, frame_id in self.bodies if frame_kind == kind]
 
 
-def read_frame(text: str, names: Names) -> FrameRef:
-    """A frame; a name without kind is a station."""
+def read_frame(text: str, names: Names, fail: Fail) -> FrameRef:
+    """A frame; a name without kind is a station. Raises what ``fail`` makes of a problem."""
     found = names.frames.get(text)
     if found is None:
-        found = names.frames[text] = _read_frame(text, names)
+        found = names.frames[text] = _read_frame(text, names, fail)
     return found
 
 
-def _read_frame(text: str, names: Names) -> FrameRef:
+def _read_frame(text: str, names: Names, fail: Fail) -> FrameRef:
     body, _, epoch = text.partition("@")
     if "@" in text:
-        _check_id(epoch, "epoch")
+        _check_id(epoch, "epoch", fail)
     kind_text, colon, frame_id = body.partition(":")
     if body == "world":
         if epoch:
-            raise NameProblemError(f"{text!r}: the world has no epochs; remove '@{epoch}'")
+            raise fail(f"{text!r}: the world has no epochs; remove '@{epoch}'")
         return FrameRef("world")
     if not colon:
         kind_text, frame_id = "station", body
     kind = next((kind for kind in _KINDS if kind == kind_text), None)
     if kind is None:
-        raise NameProblemError(f"{text!r}: unknown kind of frame {kind_text!r}; {suggestion(kind_text, _KINDS)}")
-    _check_id(frame_id, kind)
+        raise fail(f"{text!r}: unknown kind of frame {kind_text!r}; {suggestion(kind_text, _KINDS)}")
+    _check_id(frame_id, kind, fail)
     if (kind, frame_id) not in names.bodies:
-        raise NameProblemError(f"{text!r}: unknown {kind} {frame_id!r}; {suggestion(frame_id, names.ids(kind))}")
+        raise fail(f"{text!r}: unknown {kind} {frame_id!r}; {suggestion(frame_id, names.ids(kind))}")
     if epoch and not names.bodies[kind, frame_id]:
-        raise NameProblemError(f"{text!r}: this {kind} does not move; remove '@{epoch}'")
+        raise fail(f"{text!r}: this {kind} does not move; remove '@{epoch}'")
     return FrameRef(kind, frame_id, epoch or None)
 
 
-def read_position(text: str, names: Names) -> PositionRef:
-    """A position: world point, point of a target, or the origin of a frame."""
+def read_position(text: str, names: Names, fail: Fail) -> PositionRef:
+    """A position: world point, point of a target, or the origin of a frame. Raises what ``fail`` makes of a problem."""
     found = names.positions.get(text)
     if found is None:
-        found = names.positions[text] = _read_position(text, names)
+        found = names.positions[text] = _read_position(text, names, fail)
     return found
 
 
-def _read_position(text: str, names: Names) -> PositionRef:
+def _read_position(text: str, names: Names, fail: Fail) -> PositionRef:
     if ":" not in text and "@" not in text and text != "world":
         if text not in names.points:
-            raise NameProblemError(f"unknown point {text!r}; {_where_points_come_from(text, names)}")
+            raise fail(f"unknown point {text!r}; {_where_points_come_from(text, names)}")
         return PositionRef(text)
     name, slash, point_id = text.partition("/")
     if "@" in point_id:  # target:board/r0c0@e01 is as clear as target:board@e01/r0c0
         point_id, _, epoch = point_id.partition("@")
         name = f"{name}@{epoch}"
-    frame = read_frame(name, names)
+    frame = read_frame(name, names, fail)
     if not slash:
         return PositionRef(None, frame)
     if frame.kind != "target":
-        raise NameProblemError(f"{text!r}: only a target has points; write target:id/point")
+        raise fail(f"{text!r}: only a target has points; write target:id/point")
     known = names.target_points[frame.frame_id]
     if point_id not in known:
-        raise NameProblemError(f"{text!r}: unknown point {point_id!r}; {suggestion(point_id, known)}")
+        raise fail(f"{text!r}: unknown point {point_id!r}; {suggestion(point_id, known)}")
     return PositionRef(point_id, frame)
 
 
@@ -138,13 +138,13 @@ def _where_points_come_from(text: str, names: Names) -> str:
     return f"{suggestion(text, names.points)}; list it as [points.{text}], or set tie_points = true"
 
 
-def _check_id(name: str, what: str) -> None:
+def _check_id(name: str, what: str, fail: Fail) -> None:
     problem = id_problem(name)
     if problem:
-        raise NameProblemError(f"{what}: {problem}")
+        raise fail(f"{what}: {problem}")
 
 
-def check_epochs(a: FrameRef | None, b: FrameRef | None, names: Names) -> None:
+def check_epochs(a: FrameRef | None, b: FrameRef | None, names: Names, fail: Fail) -> None:
     """Raise where a moving frame has no epoch, unless both frames stand on the same body."""
     bodies = [names.bodies.get((ref.kind, ref.frame_id), "") if ref else "" for ref in (a, b)]
     if bodies[0] == bodies[1] and (a and a.epoch_id) == (b and b.epoch_id):
@@ -152,44 +152,20 @@ def check_epochs(a: FrameRef | None, b: FrameRef | None, names: Names) -> None:
     for ref, body in zip((a, b), bodies, strict=True):
         if ref and body and ref.epoch_id is None:
             name = frame_text(ref)
-            raise NameProblemError(f"{name!r} moves and the epoch is not given; write '{name}@epoch_id'")
+            raise fail(f"{name!r} moves and the epoch is not given; write '{name}@epoch_id'")
 
 
-def frame_of(node: Node, key: str, names: Names) -> FrameRef:
-    """The frame that a key of a TOML table names, with its epoch where it moves; SurveyError where it is none."""
-    try:
-        frame = read_frame(node.text(key), names)
-        check_epochs(frame, None, names)
-    except NameProblemError as problem:
-        raise node.error(str(problem), key) from problem
+def timed_frame(text: str, names: Names, fail: Fail) -> FrameRef:
+    """A frame, with its epoch where it moves."""
+    frame = read_frame(text, names, fail)
+    check_epochs(frame, None, names, fail)
     return frame
 
 
-def position_of(node: Node, names: Names, text: str, *keys: str | int) -> PositionRef:
-    """The position that a text at these keys of a TOML table names; SurveyError where it is none."""
-    try:
-        return read_position(text, names)
-    except NameProblemError as problem:
-        raise node.error(str(problem), *keys) from problem
-
-
-def frame_at(table: Table, row: int, column: str, text: str, names: Names) -> FrameRef:
-    """The frame that a row names, with its epoch where it moves; SurveyError where it is none."""
-    try:
-        frame = read_frame(text, names)
-        check_epochs(frame, None, names)
-    except NameProblemError as problem:
-        raise table.error(row, f"{column}: {problem}") from problem
-    return frame
-
-
-def position_at(table: Table, row: int, text: str, names: Names) -> PositionRef:
-    """The position that a row names in point_id; SurveyError where it is none."""
-    try:
-        position = read_position(text, names)
-        check_epochs(position.frame, None, names)
-    except NameProblemError as problem:
-        raise table.error(row, f"point_id: {problem}") from problem
+def timed_position(text: str, names: Names, fail: Fail) -> PositionRef:
+    """A position, with its epoch where it moves."""
+    position = read_position(text, names, fail)
+    check_epochs(position.frame, None, names, fail)
     return position
 
 
@@ -197,11 +173,9 @@ def read_ends(
     table: Table, row: int, texts: tuple[str, str], names: Names, what: str
 ) -> tuple[PositionRef, PositionRef]:
     """The positions that a row names in from_id and to_id; SurveyError where they are none, or the same."""
-    try:
-        a, b = (read_position(text, names) for text in texts)
-        check_epochs(a.frame, b.frame, names)
-    except NameProblemError as problem:
-        raise table.error(row, f"from_id, to_id: {problem}") from problem
+    fail = table.fail(row, "from_id, to_id")
+    a, b = (read_position(text, names, fail) for text in texts)
+    check_epochs(a.frame, b.frame, names, fail)
     if a == b:
-        raise table.error(row, f"from_id, to_id: both are {texts[0]!r}; a {what} joins two different positions")
+        raise fail(f"both are {texts[0]!r}; a {what} joins two different positions")
     return a, b

@@ -5,20 +5,32 @@ from collections.abc import Sequence
 import numpy as np
 
 from adjust.model.names import natural_key
-from adjust.model.observations import PositionRef, Reading, ReadingCovariance, ReadingKind
+from adjust.model.observations import PositionRef, Reading, ReadingCovariance, ReadingKind, position_text
 from adjust.model.survey import FloatArray
 from survey.folder.text import choice_hint, suggestion
-from survey.folder.units import to_si
+from survey.folder.units import from_si, to_si
 from survey.project.declared.instruments import setup_problem
 from survey.project.project import Accuracy, Sigmas
 from survey.project.tables.covariance import covariance_problem
-from survey.project.tables.reading import ANGLE_UNITS, FLAGS, Layout, Table, dms_angles, first_row, one_of, quantity
-from survey.project.tables.references import NameProblemError, Names, check_epochs, read_position
+from survey.project.tables.reading import (
+    ANGLE_UNITS,
+    FLAGS,
+    Columns,
+    Layout,
+    Table,
+    dms_angles,
+    filled,
+    first_row,
+    group_columns,
+    one_of,
+    quantity,
+)
+from survey.project.tables.references import Names, check_epochs, read_position
 
-KINDS: tuple[ReadingKind, ...] = (
+READING_KINDS: tuple[ReadingKind, ...] = (
     "direction", "angle", "zenith", "azimuth", "slope_distance", "horizontal_distance", "height_difference",
 )  # fmt: skip
-ANGLES = KINDS[:4]
+ANGLES = READING_KINDS[:4]
 HEIGHTS = ("instrument_height", "target_height", "second_height")
 TERRESTRIAL = Layout(
     "terrestrial",
@@ -58,7 +70,13 @@ def read_readings(table: Table, names: Names, sigmas: Sigmas) -> tuple[Reading, 
         accuracy = sigmas.instruments.get(instrument_id or "", Accuracy())
         sigma = own[row]
         if np.isnan(sigma):
-            sigma = _usual_sigma(table, row, kind, values[row], lengths[row], accuracy, instrument_id)
+            usual = accuracy.sigma(kind, (lengths if kind == "height_difference" else values)[row])
+            if usual is None:
+                what = kind if kind in ANGLES or kind == "height_difference" else "distance"
+                key = f"sigma_{what}_{'arcsec' if kind in ANGLES else 'mm'}"
+                where = f"[instruments.{instrument_id}]" if instrument_id else "the instrument of its setup"
+                raise table.error(row, f"the {kind} has no sigma; add it to the row, or {key} to {where}")
+            sigma = usual
         group = groups[row] or kind
         plumbing = centring[row] if not np.isnan(centring[row]) else accuracy.target_centring
         if plumbing < 0:
@@ -74,10 +92,10 @@ def read_readings(table: Table, names: Names, sigmas: Sigmas) -> tuple[Reading, 
 def _kinds(table: Table) -> list[ReadingKind]:
     column = table.text("kind")
     for code, name in enumerate(column.names):
-        if name not in KINDS and (column.codes == code).any():
-            found = f"kind: found {name!r}; {choice_hint(name, KINDS)}"
+        if name not in READING_KINDS and (column.codes == code).any():
+            found = f"kind: found {name!r}; {choice_hint(name, READING_KINDS)}"
             raise table.error(first_row(column.codes == code), found)
-    known = {name: name for name in KINDS}
+    known = {name: name for name in READING_KINDS}
     return [known[name] for name in column.values()]  # type: ignore[index]  # all are known, see above
 
 
@@ -131,43 +149,6 @@ def _own_sigmas(table: Table, kinds: Sequence[ReadingKind]) -> FloatArray:
     return np.where(angle, angles, lengths)
 
 
-def _usual_sigma(
-    table: Table,
-    row: int,
-    kind: ReadingKind,
-    value: float,
-    length: float,
-    accuracy: Accuracy,
-    instrument_id: str | None,
-) -> float:
-    """The sigma that the instrument gives; distances a + b d, height differences also by the root of the length."""
-    sigma: float | None
-    key = f"sigma_{kind}_arcsec"
-    match kind:
-        case "direction":
-            sigma = accuracy.direction
-        case "angle":
-            sigma = accuracy.angle
-            if sigma is None and accuracy.direction is not None:
-                sigma = accuracy.direction * 2.0**0.5  # the difference of two directions
-        case "zenith":
-            sigma = accuracy.zenith
-        case "azimuth":
-            sigma = accuracy.azimuth
-        case "height_difference":
-            sigma, key = accuracy.height_difference, "sigma_height_difference_mm"
-            if accuracy.levelling is not None and not np.isnan(length):
-                sigma = float(np.hypot(sigma or 0.0, accuracy.levelling * (length / 1000.0) ** 0.5))
-        case _:
-            sigma, key = accuracy.distance, "sigma_distance_mm"
-            if sigma is not None:
-                sigma += accuracy.distance_slope * value
-    if sigma is None:
-        where = f"[instruments.{instrument_id}]" if instrument_id else "the instrument of its setup"
-        raise table.error(row, f"the {kind} has no sigma; add it to the row, or {key} to {where}")
-    return sigma
-
-
 def _check_setup(table: Table, row: int, kind: ReadingKind, setup_id: str, names: Names) -> None:
     if not setup_id:
         if kind == "direction":
@@ -190,13 +171,11 @@ def _positions(
     for column, text in zip(columns, texts, strict=True):
         if not text:
             continue
-        try:
-            refs.append(read_position(text, names))
-            check_epochs(refs[0].frame, refs[-1].frame, names)
-        except NameProblemError as problem:
-            raise table.error(row, f"{column}: {problem}") from problem
+        fail = table.fail(row, column)
+        refs.append(read_position(text, names, fail))
+        check_epochs(refs[0].frame, refs[-1].frame, names, fail)
         if refs[-1] in refs[:-1]:
-            raise table.error(row, f"{column}: {text!r} stands in this row twice; its positions must differ")
+            raise fail(f"{text!r} stands in this row twice; its positions must differ")
     return refs[0], refs[1], refs[2] if len(refs) > 2 else None
 
 
@@ -243,3 +222,44 @@ def _components(names: list[str], edges: list[tuple[str, str]]) -> list[set[str]
             for name in of[b]:
                 of[name] = of[a]
     return list({id(members): members for members in of.values()}.values())
+
+
+def reading_columns(readings: Sequence[Reading]) -> Columns:
+    """One row per reading: angles in degrees, lengths in metres, sigmas in arcseconds and millimetres."""
+    angle = np.array([r.kind in ANGLES for r in readings], dtype=bool)
+    value, sigma = (np.array([getattr(r, name) for r in readings], dtype=float) for name in ("value", "sigma"))
+    heights = {name: np.array([getattr(r, name) for r in readings]) for name in HEIGHTS}
+    centring = np.array([r.target_centring_sigma for r in readings], dtype=float)
+    columns: dict[str, Sequence[str] | FloatArray] = {
+        "setup_id": [r.setup_id for r in readings],
+        "second_id": [position_text(r.second) if r.second else "" for r in readings],
+        "value_deg": np.where(angle, from_si(value, "deg"), np.nan),
+        "value_m": np.where(angle, np.nan, value),
+        "sigma_arcsec": np.where(angle, from_si(sigma, "arcsec"), np.nan),
+        "sigma_mm": np.where(angle, np.nan, from_si(sigma, "mm")),
+        **{f"{name}_mm": np.where(h != 0.0, from_si(h, "mm"), np.nan) for name, h in heights.items()},
+        # written even where it is zero, if any is not: a blank means the instrument's own
+        "sigma_target_centring_mm": from_si(centring, "mm"),
+    }
+    return {
+        "kind": [r.kind for r in readings],
+        "from_id": [position_text(r.at) for r in readings],
+        "to_id": [position_text(r.to) for r in readings],
+        "reading_id": [r.reading_id for r in readings],
+        **filled(columns),
+        **group_columns(readings),
+    }
+
+
+def correlation_columns(covariances: Sequence[ReadingCovariance]) -> Columns:
+    """One row per correlation of two readings."""
+    rows = []
+    for item in covariances:
+        sigma = np.sqrt(np.diagonal(item.cov))
+        for i, j in zip(*np.nonzero(np.triu(item.cov, 1)), strict=True):
+            rows.append((item.reading_ids[i], item.reading_ids[j], float(item.cov[i, j] / (sigma[i] * sigma[j]))))
+    return {
+        "a_id": [a for a, _, _ in rows],
+        "b_id": [b for _, b, _ in rows],
+        "rho": np.array([rho for _, _, rho in rows], dtype=float),
+    }

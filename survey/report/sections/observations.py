@@ -6,6 +6,7 @@ minimal detectable bias and what that would do to the unknowns. Of more than ``M
 tables beside it all.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -131,14 +132,11 @@ def image_points(c: Context) -> Markup:
 
 
 def _images(c: Context) -> Markup:
-    every = [
-        (camera_id, epoch, image["rms_residual_px"], image["n_image_points"])
-        for camera_id, camera in c.solution["cameras"].items()
-        for epoch, image in camera["images"].items()
-        if image["rms_residual_px"] is not None
-    ]
-    largest = sorted(every, key=lambda x: -x[2])[:_MOST_IMAGES]
-    rows = [[camera, epoch, count(n), fixed(rms, 3)] for camera, epoch, rms, n in largest]
+    images = {camera_id: camera["images"] for camera_id, camera in c.solution["cameras"].items()}
+    every = [(camera_id, epoch, rms) for camera_id, of in images.items()
+             for epoch, rms in of.numbers("rms_residual_px").items() if not math.isnan(rms)]  # fmt: skip
+    rows = [[camera, epoch, count(images[camera][epoch]["n_image_points"]), fixed(rms, 3)]
+            for camera, epoch, rms in sorted(every, key=lambda x: -x[2])[:_MOST_IMAGES]]  # fmt: skip
     columns = ("<Camera", "<Epoch", "Points", "RMS residual [px]")
     return element("h3", t("Images with the largest residuals")) + table(columns, rows) if rows else Markup()
 

@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 import numpy as np
 from markupsafe import Markup
 
+from adjust.model.survey import IntArray
 from survey.report import charts
 from survey.report.context import Context
 from survey.report.language import known, t
@@ -116,16 +117,16 @@ def _poses(thing_id: str, entries: Mapping[str, dict[str, Any]]) -> Iterator[_Po
     """All poses of a thing, also those per epoch."""
     for key in keys_of(entries, thing_id):
         if key == "epochs":
-            for epoch, poses in entries[thing_id][key].items():
-                for name, pose in poses.items():
-                    if "_from_" in name and isinstance(pose, dict):
-                        yield thing_id, name, epoch, partial(dict, pose)
+            poses = entries[thing_id][key]
+            for epoch in poses:
+                names = (name for name in keys_of(poses, epoch) if "_from_" in name)
+                yield from ((thing_id, name, epoch, partial(_part_of, poses, epoch, name)) for name in names)
         elif "_from_" in key:
             yield thing_id, key, "", partial(_part_of, entries, thing_id, key)
 
 
-def _part_of(entries: Mapping[str, dict[str, Any]], thing_id: str, key: str) -> dict[str, Any]:
-    return dict(entries[thing_id][key])
+def _part_of(entries: Mapping[str, dict[str, Any]], name: str, key: str) -> dict[str, Any]:
+    return dict(entries[name][key])
 
 
 def _limited(columns: Sequence[str], things: Sequence[T], row: Callable[[T], list[str]]) -> Markup:
@@ -142,8 +143,7 @@ def _more(n: int) -> Markup:
 def cameras(c: Context) -> Markup:
     """Every camera: lens, pose, residuals."""
     found = c.adjustment.image_residuals
-    blocks = c.adjustment.survey.image_blocks
-    camera_of_block = np.array([b.camera_id for b in blocks], dtype=object)
+    camera_of_block = np.array([b.camera_id for b in c.adjustment.survey.image_blocks], dtype=object)
     entries, parts = c.solution["cameras"], []
     # of very many cameras those with the largest residuals are shown whole
     by_size = sorted(entries, key=lambda k: -(entries[k]["rms_residual_px"] or 0.0))
@@ -151,7 +151,7 @@ def cameras(c: Context) -> Markup:
     for camera in c.adjustment.survey.cameras:
         if camera.camera_id not in shown:
             continue
-        mine = (camera_of_block == camera.camera_id)[c.rows.block] if len(blocks) else np.zeros(0, dtype=bool)
+        mine = _rows_of(np.flatnonzero(camera_of_block == camera.camera_id), found.block_ptr)
         residuals = charts.CameraResiduals(
             camera.camera_id, camera.image_size, c.rows.uv[mine], found.residuals[mine], found.standardized[mine],
             found.used[mine], c.suspect[mine],
@@ -167,6 +167,13 @@ def cameras(c: Context) -> Markup:
         "A pattern in the mean per cell is what the lens model leaves over; empty cells hold no points."
     )
     return section("cameras", "Cameras", joined(parts), said)
+
+
+def _rows_of(blocks: IntArray, ptr: IntArray) -> IntArray | slice:
+    """Rows of these blocks, as a slice where they follow each other: then nothing is copied."""
+    if len(blocks) and blocks[-1] - blocks[0] == len(blocks) - 1:
+        return slice(int(ptr[blocks[0]]), int(ptr[blocks[-1] + 1]))
+    return np.concatenate([np.zeros(0, dtype=np.int64), *(np.arange(ptr[b], ptr[b + 1]) for b in blocks)])
 
 
 def _camera_row(camera_id: str, entry: dict[str, Any]) -> list[str]:

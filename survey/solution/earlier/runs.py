@@ -26,6 +26,7 @@ from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write, decode, read_bytes
 from survey.project.exclusions import Exclusion, Name
 from survey.project.project import DEFINITION_FILE, RESULTS
+from survey.solution.covariances import covariance_arrays
 from survey.solution.earlier.changes import Snapshot, snapshot
 
 if TYPE_CHECKING:  # loads what adjusts
@@ -54,7 +55,9 @@ class Run:
 
     def as_dict(self) -> dict[str, Any]:
         """As it stands in ``run.json``."""
-        return {**vars(self), "exclusions": [_exclusion(e) for e in self.exclusions]}
+        left = [{k: v for k, v in e.as_dict().items() if k != "name"} | {"at": e.at and list(e.at)}
+                for e in self.exclusions]  # fmt: skip
+        return {**vars(self), "exclusions": left}
 
     def text(self) -> str:
         """One line for people."""
@@ -62,11 +65,6 @@ class Run:
         shown, verdict = "-" if sigma0 is None else f"{sigma0:.4f}", self.summary.get("verdict", "")
         return (f"{self.number:4d}{mark} {self.time}  {verdict:<7} sigma0 {shown}  redundancy "
                 f"{self.summary.get('redundancy')}  excluded {len(self.exclusions)}  {self.author}")  # fmt: skip
-
-
-def _exclusion(e: Exclusion) -> dict[str, Any]:
-    return {"what": e.name.what, "id": e.name.id, "reason": e.reason, "author": e.author, "time": e.time,
-            "at": None if e.at is None else list(e.at)}  # fmt: skip
 
 
 def record_run(
@@ -174,15 +172,10 @@ def _estimates_npz(estimates: Iterable[Estimate]) -> bytes:
     every = list(estimates)
     values = [e.value.matrix()[:3].ravel() if isinstance(e.value, Pose3) else np.asarray(e.value, dtype=float).ravel()
               for e in every]  # fmt: skip
-    sizes = np.array([len(e.components) for e in every], dtype=np.int64)
     return packed_arrays(
-        parameters=np.array(["/".join(e.name) for e in every], dtype=str),
+        **covariance_arrays(every),
         names=np.array([c for e in every for c in e.components], dtype=str),
-        units=np.array([u for e in every for u in e.units], dtype=str),
         status=np.array([s for e in every for s in e.status], dtype=str),
-        start=np.concatenate([[0], np.cumsum(sizes)]),
-        block=np.concatenate([[0], np.cumsum(sizes**2)]),
-        covariance=np.concatenate([*(e.cov.ravel() for e in every), np.empty(0)]),
         value_start=np.cumsum([0, *map(len, values)]),
         values=np.concatenate([*values, np.empty(0)]),
     )

@@ -1,0 +1,47 @@
+"""Which causes are looked for, and when. Every family forms its hypotheses by what cheap evidence makes worth a try."""
+
+from collections.abc import Callable, Iterable
+
+from adjust.diagnosis import effects
+from adjust.diagnosis.bodies import changed_bodies, lost_cameras
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import Hypothesis
+from adjust.diagnosis.images.mirrored import mirrored_images
+from adjust.diagnosis.images.turned import turned_alone
+from adjust.diagnosis.names.epochs import misplaced_epochs
+from adjust.diagnosis.names.given import wrong_given
+from adjust.diagnosis.names.images import misnamed_images
+from adjust.diagnosis.names.points import exchanged_points
+from adjust.diagnosis.names.rays import exchanged_in_images
+from adjust.diagnosis.names.setups import rows_of_another_setup
+from adjust.diagnosis.names.stations import exchanged_stations
+from adjust.diagnosis.targets.layout import other_layouts
+from adjust.diagnosis.targets.size import wrong_sizes
+from adjust.diagnosis.time.forgotten_motion import forgotten_motion
+from adjust.diagnosis.time.synchronisation import unsynchronised
+from adjust.diagnosis.units.heights import wrong_heights
+from adjust.diagnosis.units.pairs import misread_pairs
+from adjust.diagnosis.units.readings import misread_readings
+from adjust.diagnosis.weights.correlated import correlated_readings
+from adjust.diagnosis.weights.sigmas import odd_sigmas, wrong_factors
+
+Family = Callable[[Case], Iterable[Hypothesis]]
+SCORES: tuple[Family, ...] = (effects.hypotheses,)
+IMAGES: tuple[Family, ...] = (mirrored_images, other_layouts, turned_alone)
+NAMES: tuple[Family, ...] = (
+    exchanged_points, wrong_given, misplaced_epochs, misnamed_images, exchanged_in_images, rows_of_another_setup,
+    exchanged_stations,
+)  # fmt: skip
+UNITS: tuple[Family, ...] = (misread_readings, wrong_heights, misread_pairs)
+TIME: tuple[Family, ...] = (forgotten_motion, unsynchronised)
+WEIGHTS: tuple[Family, ...] = (odd_sigmas, wrong_factors, correlated_readings)
+CHEAP = (*IMAGES, *NAMES, *UNITS, *TIME, *WEIGHTS, lost_cameras)
+LATER: tuple[tuple[Family, ...], ...] = ((wrong_sizes,), (changed_bodies,))
+"""These adjust to find theirs: they are asked where what the first ones found does not explain everything."""
+
+
+def families(case: Case) -> list[tuple[Family, ...]]:
+    """By stage; scores come last where the values at which they are taken would have to be looked for first."""
+    if case.result is None and not case.survey.image_blocks:
+        return [CHEAP, *LATER, SCORES]
+    return [(*SCORES, *CHEAP), *LATER]

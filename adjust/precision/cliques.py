@@ -1,0 +1,186 @@
+"""A Bayes tree as arrays: its cliques one after the other, parents first, and the ways through them."""
+
+from bisect import bisect_left
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import gtsam
+import numpy as np
+
+from adjust.model.survey import FloatArray, IntArray
+from adjust.native.elimination import PoseTree
+from adjust.observations.images.reduction import Leaves
+
+
+@dataclass(frozen=True, eq=False)
+class Cliques:
+    """C cliques of K keys, which are numbered where they first appear: in the clique that has them as frontal ones.
+
+    number: of every key. dims: (K,) its dimension. home: (K,) its clique. keys[key_ptr[c]:key_ptr[c + 1]]: of clique c,
+    the first n_front[c] frontal. front, width: (C,) rows and columns of its [R S], which begins at at[c] in ``data``.
+    parents: (C,), -1: none.
+    """
+
+    number: Mapping[int, int]
+    dims: IntArray
+    home: IntArray
+    key_ptr: IntArray
+    keys: IntArray
+    n_front: IntArray
+    front: IntArray
+    width: IntArray
+    at: IntArray
+    parents: IntArray
+    data: FloatArray
+
+    @staticmethod
+    def of_poses(tree: PoseTree) -> "Cliques":
+        """Of the Bayes tree of a network of poses."""
+        p, number = tree.pattern, {key: i for i, key in enumerate(tree.keys.tolist())}
+        return Cliques(number, np.full(len(number), 6), p.home, p.key_ptr, p.keys, p.n_front, p.front, p.width,
+                       p.at[:-1], p.parents, tree.data.copy())  # fmt: skip
+
+    @staticmethod
+    def of_tree(tree: gtsam.GaussianBayesTree, dims: Mapping[int, int], leaves: Leaves | None) -> "Cliques":
+        """Of GTSAM's Bayes tree, with the cliques that were reduced before it below it."""
+        blocks, clique_keys, parents = _collected(tree)
+        front, width = ([b.shape[i] for b in blocks] for i in (0, 1))
+        data = [b.ravel() for b in blocks]
+        if leaves is not None:
+            first_seen: dict[int, int] = {}
+            for c, keys in enumerate(clique_keys):  # parents first: a key is frontal where it first appears
+                for k in keys:
+                    first_seen.setdefault(k, c)
+            parents += [max(first_seen[k] for k in keys[1:]) for keys in leaves.keys]
+            front, width, data = front + leaves.front.tolist(), width + leaves.width.tolist(), [*data, leaves.data]
+            clique_keys = clique_keys + leaves.keys
+        number = {k: i for i, k in enumerate(dict.fromkeys(k for keys in clique_keys for k in keys))}
+        of_key = np.array([dims[k] for k in number], dtype=np.int64)
+        keys_of = np.array([number[k] for keys in clique_keys for k in keys], dtype=np.int64)
+        key_ptr = np.cumsum([0] + [len(keys) for keys in clique_keys]).astype(np.int64)
+        n_front = _frontal_keys(of_key[keys_of].tolist(), key_ptr.tolist(), front)
+        home = np.zeros(len(number), dtype=np.int64)
+        for c in range(len(front)):
+            home[keys_of[key_ptr[c] : key_ptr[c] + n_front[c]]] = c
+        rows, columns = np.array(front, dtype=np.int64), np.array(width, dtype=np.int64)
+        at = np.cumsum(np.append(0, rows * columns))[:-1].astype(np.int64)
+        numbers = np.concatenate(data) if data else np.zeros(0)
+        return Cliques(number, of_key, home, key_ptr, keys_of, n_front, rows, columns, at,
+                       np.array(parents, dtype=np.int64), numbers)  # fmt: skip
+
+    def __len__(self) -> int:
+        return len(self.front)
+
+    def keys_in(self, c: int) -> IntArray:
+        """Of one clique, the frontal ones first."""
+        return self.keys[self.key_ptr[c] : self.key_ptr[c + 1]]
+
+    @cached_property
+    def first(self) -> IntArray:
+        """Where every key begins in a stacked vector of all unknowns, and its length (K + 1,)."""
+        return np.concatenate([[0], np.cumsum(self.dims)]).astype(np.int64)
+
+    @cached_property
+    def key_of(self) -> IntArray:
+        """Key of every row in a stacked vector of all unknowns."""
+        return np.repeat(np.arange(len(self.dims)), self.dims)
+
+    def rows_of(self, keys: IntArray) -> IntArray:
+        """Rows of keys in a stacked vector of all unknowns."""
+        start, dims = np.repeat(self.first[keys], self.dims[keys]), self.dims[keys]
+        return np.asarray(start + np.arange(len(start)) - np.repeat(np.cumsum(dims) - dims, dims))
+
+    @cached_property
+    def own(self) -> IntArray:
+        """Where the covariance of every key begins (K,), in the rows of its home."""
+        clique, dims = np.repeat(np.arange(len(self)), np.diff(self.key_ptr)), self.dims[self.keys]
+        before = np.cumsum(dims) - dims
+        at_home = self.home[self.keys] == clique
+        clique, key = clique[at_home], self.keys[at_home]
+        column = before[at_home] - before[self.key_ptr[clique]]
+        out = np.zeros(len(self.dims), dtype=np.int64)
+        out[key] = self.at[clique] + column * (self.width[clique] + 1)
+        return out
+
+    def ancestors(self, cliques: set[int], top: int = -1) -> IntArray:
+        """These and all above them, but for those from ``top`` on, which is on the way of all."""
+        found: set[int] = set()
+        for start in cliques:
+            c = start
+            while c > top and c not in found:
+                found.add(c)
+                c = int(self.parents[c])
+        return np.array(sorted(found), dtype=np.int64)
+
+    def gathered(self, cliques: IntArray, top: int = -1) -> tuple[IntArray, int]:
+        """Row (K,) at which a key begins where only the own ones of these cliques are kept, and how many these are.
+
+        Those of ``top`` come after.
+        """
+        shift, front = np.zeros(len(self), dtype=np.int64), self.front[cliques]
+        shift[cliques] = np.cumsum(front) - front - self.first[self.keys[self.key_ptr[cliques]]]
+        first, n = self.first[:-1] + shift[self.home], int(front.sum())
+        if top >= 0:
+            keys = self.keys_in(top)
+            first[keys] = n + np.cumsum(self.dims[keys]) - self.dims[keys]
+        return first, n
+
+    def common(self, keys: IntArray) -> int:
+        """The first clique, from the leaves up, that has all these keys, or those left of the cliques below; or -1."""
+        left: list[int] = sorted(set(self.home[keys].tolist()))
+        met, wanted = set[int](), set(keys.tolist())
+        while left:
+            c = left.pop()  # parents have lower numbers
+            inside = self.keys_in(c).tolist()
+            if met.isdisjoint(left) and wanted.issubset(inside):
+                return c
+            wanted.difference_update(inside[: self.n_front[c]])
+            parent = int(self.parents[c])
+            if parent < 0:
+                return -1
+            met.add(parent)
+            at = bisect_left(left, parent)
+            if at == len(left) or left[at] != parent:
+                left.insert(at, parent)
+        return -1
+
+    def columns_for(self, eliminations: float) -> float:
+        """How many columns go up the deepest way at the price of so many eliminations of the whole."""
+        own, way = (self.front * self.width).tolist(), list[int]()
+        for numbers, parent in zip(own, self.parents.tolist(), strict=True):  # parents first
+            way.append(numbers + (way[parent] if parent >= 0 else 0))
+        return eliminations * float(self.front @ self.width.astype(float) ** 2) / max(way, default=1)
+
+
+def _frontal_keys(dims: list[int], ptr: list[int], fronts: list[int]) -> IntArray:
+    """Number of frontal keys of every clique, from the dimensions of all its keys and the number of its rows."""
+    out = np.empty(len(fronts), dtype=np.int64)
+    for c, rows in enumerate(fronts):
+        n, total = 0, 0
+        while total < rows:
+            total += dims[ptr[c] + n]
+            n += 1
+        out[c] = n
+    return out
+
+
+def _collected(tree: gtsam.GaussianBayesTree) -> tuple[list[FloatArray], list[list[int]], list[int]]:
+    """Blocks [R S] (nf, n), keys and parent of every clique, parents first."""
+    blocks: list[FloatArray] = []
+    keys: list[list[int]] = []
+    parents: list[int] = []
+    stack: list[tuple[gtsam.GaussianBayesTreeClique, int]] = [(root, -1) for root in tree.roots()]
+    while stack:
+        clique, parent = stack.pop()
+        conditional = clique.conditional()
+        A = conditional.getA()
+        model = conditional.get_model()
+        if model is not None:
+            A = A / model.sigmas()[:, None]
+        me = len(blocks)
+        blocks.append(np.ascontiguousarray(A))
+        keys.append(list(conditional.keys()))
+        parents.append(parent)
+        stack += [(clique[j], me) for j in range(clique.nrChildren())]
+    return blocks, keys, parents

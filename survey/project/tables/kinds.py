@@ -1,0 +1,126 @@
+"""Every table of observations but those of image points: what of a survey it holds, how it is read and written."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from adjust.model.observations import position_text
+from adjust.model.survey import Survey
+from survey.project.project import Sigmas
+from survey.project.tables.coordinates import (
+    COORDINATES,
+    COORDINATES_COVARIANCE,
+    DIFFERENCES,
+    DIFFERENCES_COVARIANCE,
+    coordinate_columns,
+    difference_columns,
+    read_coordinates,
+    read_differences,
+)
+from survey.project.tables.geometric import (
+    ALIGNMENTS,
+    LASER_SPOTS,
+    LEVELS,
+    ON_SURFACES,
+    alignment_columns,
+    laser_columns,
+    level_columns,
+    read_alignments,
+    read_laser_spots,
+    read_levels,
+    read_on_surfaces,
+    surface_columns,
+)
+from survey.project.tables.image_points import IMAGE_POINTS, SPOTS
+from survey.project.tables.measurements import (
+    ANGLES,
+    DISTANCES,
+    angle_columns,
+    distance_columns,
+    read_angles,
+    read_distances,
+)
+from survey.project.tables.pairs import PAIRS, pair_columns, read_pairs
+from survey.project.tables.reading import Columns, Layout, Table
+from survey.project.tables.references import Names
+from survey.project.tables.terrestrial import (
+    READING_KINDS,
+    TERRESTRIAL,
+    TERRESTRIAL_COVARIANCE,
+    correlation_columns,
+    read_reading_covariances,
+    read_readings,
+    reading_columns,
+)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Observations of one kind: their table, and the field of a survey that holds them.
+
+    called: what reports call them, and their groups where the table names none. id_of: their name in that table.
+    positions: columns that may name points of the world. beside: the table of the covariances between rows.
+    """
+
+    layout: Layout
+    field: str
+    called: tuple[str, ...]
+    id_of: Callable[[Any], str]
+    read: Callable[[Table, Names, Sigmas], tuple[Any, ...]]
+    columns: Callable[[Any], Columns | tuple[Columns, Columns]]
+    positions: tuple[str, ...] = ()
+    beside: Layout | None = None
+
+
+_ENDS = ("from_id", "to_id")
+KINDS = (
+    Kind(ANGLES, "table_readings", ("table",), lambda r: f"{r.table_id}/{r.epoch_id}", read_angles, angle_columns),
+    Kind(PAIRS, "pairs", ("pair",), lambda p: p.pair_id, read_pairs, pair_columns),
+    Kind(DISTANCES, "distances", ("distance",), lambda d: d.distance_id, read_distances, distance_columns, _ENDS),
+    Kind(COORDINATES, "coordinates", ("coordinates",), lambda c: c.set_id or position_text(c.positions[0]),
+         read_coordinates, coordinate_columns, ("point_id",), COORDINATES_COVARIANCE),
+    Kind(TERRESTRIAL, "readings", READING_KINDS, lambda r: r.reading_id, read_readings, reading_columns,
+         (*_ENDS, "second_id"), TERRESTRIAL_COVARIANCE),
+    Kind(DIFFERENCES, "coordinate_differences", ("coordinate_difference",), lambda d: d.set_id,
+         read_differences, difference_columns, _ENDS, DIFFERENCES_COVARIANCE),
+    Kind(LEVELS, "levels", ("level",), lambda x: x.level_id, read_levels, level_columns),
+    Kind(ALIGNMENTS, "alignments", ("alignment",), lambda x: x.alignment_id, read_alignments, alignment_columns),
+    Kind(LASER_SPOTS, "laser_spots", ("laser",), lambda x: x.spot_id, read_laser_spots, laser_columns),
+    Kind(ON_SURFACES, "on_surfaces", ("surface",), lambda o: f"{o.surface_id}/{position_text(o.position)}",
+         read_on_surfaces, surface_columns, ("point_id",)),
+)  # fmt: skip
+LAYOUTS = {
+    layout.name: layout
+    for layout in (IMAGE_POINTS, SPOTS, *(x for k in KINDS for x in (k.layout, k.beside) if x is not None))
+}
+GROUPS = ("image", *(name for kind in KINDS for name in kind.called))
+
+
+def with_observations(survey: Survey, tables: Mapping[str, Table], sigmas: Sigmas) -> Survey:
+    """A survey with all that the tables hold, but image points. Raises SurveyError."""
+    for kinds in (KINDS[:1], KINDS[1:]):  # what a laser on a turntable met needs the turntable's readings
+        names, found = Names.of(survey), dict[str, Any]()
+        for kind in kinds:
+            name, table = kind.layout.name, tables.get(kind.layout.name)
+            extra = tables.get(kind.beside.name) if kind.beside else None
+            if table is not None:
+                found[kind.field] = kind.read(replace(table, beside=extra), names, sigmas)
+            elif extra is not None:
+                raise extra.error(0, f"there is no table of {name} beside it; add {name}.csv or remove this file")
+        survey = replace(survey, **found)
+    joint = tables.get(TERRESTRIAL_COVARIANCE.name)
+    return survey if joint is None else replace(
+        survey, reading_covariances=read_reading_covariances(joint, survey.readings)
+    )  # fmt: skip
+
+
+def observation_tables(survey: Survey) -> dict[str, Columns]:
+    """The inverse: the columns of every table, with or without rows."""
+    found: dict[str, Columns] = {}
+    for kind in KINDS:
+        made = kind.columns(getattr(survey, kind.field))
+        if isinstance(made, tuple):
+            found |= dict(zip((kind.layout.name, kind.beside.name if kind.beside else ""), made, strict=True))
+        else:
+            found[kind.layout.name] = made
+    return found | {TERRESTRIAL_COVARIANCE.name: correlation_columns(survey.reading_covariances)}
