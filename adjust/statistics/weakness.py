@@ -1,12 +1,12 @@
 """What is badly determined, by name: correlations, unknowns that replace each other, the weakest deformation."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
 
-from adjust.model.result import Adjustment, ParameterName
+from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import side_by_side
 from adjust.precision.stacked import AT_ONCE
@@ -63,42 +63,39 @@ def _as_a_whole(system: LinearSystem) -> bool:
 
 
 def correlations(
-    adjustment: Adjustment, limit: float = 0.95, names: Sequence[ParameterName] | None = None,
-    system: LinearSystem | None = None,
-) -> tuple[Correlation, ...]:  # fmt: skip
+    adjustment: Adjustment, limit: float = 0.95, system: LinearSystem | None = None
+) -> tuple[Correlation, ...]:
     """Pairs of components whose correlation is at least ``limit`` in size, largest first, 200 at most.
 
-    Without names of all unknowns. Where these are too many and share too much, of the :func:`compared_columns` with
-    all, and of the components of every unknown with each other.
+    Where unknowns are too many and share too much, of the :func:`compared_columns` with all, and of the components of
+    every unknown with each other.
     """
     system = system or linear_system(adjustment)
-    c = system.columns
-    index = compared_columns(system, limit)[0] if names is None else c.of(names)
-    among = np.arange(len(c)) if names is None else index
-    number = np.full(len(c), -1)
+    n, index = len(system.columns), compared_columns(system, limit)[0]
+    number = np.full(n, -1)
     number[index] = np.arange(len(index))
     whole = system.covariance if _as_a_whole(system) else None
     sigma = np.maximum(system.sigmas if whole is None else np.sqrt(np.maximum(np.diag(whole), 0.0)), 1e-150)
-    structure = _structure(system, limit) if names is None else None
+    structure = _structure(system, limit)
     if structure is not None:
         return _named(system, _of_structure(structure, sigma, limit))
 
     def above(first: int) -> list[tuple[int, int, float]]:
         part = index[first : first + AT_ONCE]
-        rows = among if len(among) > len(index) else index[: first + len(part)]
+        rows = np.arange(n) if n > len(index) else index[: first + len(part)]
         C = (system.through_tree(_units(system, part)) if whole is None else whole[:, part])[rows]
         C /= sigma[rows, None]
         C /= sigma[part]
         size = np.abs(C)
         size[number[rows][:, None] >= number[part]] = 0.0  # each pair once, nothing with itself
         high = size >= limit
-        if (n := int(np.count_nonzero(high))) > _MOST:
-            high = size >= np.partition(size[high], n - _MOST)[n - _MOST]
-        a, b = np.nonzero(high) if n else np.zeros((2, 0), dtype=np.int64)
+        if (k := int(np.count_nonzero(high))) > _MOST:
+            high = size >= np.partition(size[high], k - _MOST)[k - _MOST]
+        a, b = np.nonzero(high) if k else np.zeros((2, 0), dtype=np.int64)
         return list(zip(rows[a].tolist(), part[b].tolist(), C[a, b].tolist(), strict=True))
 
     found = [x for part in side_by_side(above, range(0, len(index), AT_ONCE)) for x in part]
-    if names is None and len(index) < len(c):
+    if len(index) < n:
         found += _within(system, number, limit)
     return _named(system, found)
 
