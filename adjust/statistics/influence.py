@@ -61,7 +61,7 @@ def _positions(system: LinearSystem) -> tuple[list[ParameterName], sparse.csr_ma
     names, columns, ptr = list[ParameterName](), list[int](), [0]
     components = system.columns.components
     for name, at in system.columns.at.items():
-        if name[0] == "point" or in_world(system.precision.graph, name):
+        if name[0] == "point" or in_world(system.precision.graph.survey, name):
             mine = [c for c in at.tolist() if components[c] in ("x", "y", "z", "tx", "ty", "tz")]
             if mine:
                 names.append(name)

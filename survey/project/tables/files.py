@@ -14,7 +14,16 @@ import numpy as np
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import Beside
-from survey.folder.text import LARGEST_NUMBER, atomic_write, content, decode, formula_problem, utf8, with_digest
+from survey.folder.text import (
+    LARGEST_NUMBER,
+    atomic_write,
+    content,
+    csv_text,
+    decode,
+    formula_problem,
+    utf8,
+    with_digest,
+)
 from survey.project.tables.arrow import LARGE, csv_columns, csv_rows, parquet_bytes, parquet_columns
 from survey.project.tables.reading import Columns, Layout, Table, TextColumn, check_header, check_rows, first_row
 
@@ -199,14 +208,11 @@ def _names(column: Sequence[str] | TextColumn | FloatArray) -> Sequence[str]:
 
 
 def _csv(columns: Columns) -> bytes:
-    stream = io.StringIO(newline="")
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(columns)
+    header = csv_text([columns])
     doubles = all(c.dtype == np.float64 for c in columns.values() if isinstance(c, np.ndarray))
     if doubles and 10 * len(columns) * max(map(len, columns.values()), default=0) > LARGE:
-        return utf8(stream.getvalue()) + csv_rows(columns)
-    writer.writerows(zip(*(cells_of(column) for column in columns.values()), strict=True))
-    return utf8(stream.getvalue())
+        return utf8(header) + csv_rows(columns)
+    return utf8(header + csv_text(zip(*(cells_of(column) for column in columns.values()), strict=True)))
 
 
 def cells_of(column: Sequence[str] | TextColumn | FloatArray) -> Sequence[object]:
