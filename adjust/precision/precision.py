@@ -5,20 +5,18 @@ Q_vv P. For an image point both components are tested together: v' Q_vv^-1 v, ch
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
 from gtsam import Pose3, Rot3
-from scipy import sparse
 
 from adjust.frames.unknowns import Unknowns
 from adjust.graph.assembly import AdjustmentGraph
-from adjust.graph.datum import stacking, survey_motions
+from adjust.graph.datum import survey_motions
 from adjust.graph.solver import Solved
 from adjust.model.errors import SurveyError
 from adjust.model.result import (
@@ -36,6 +34,7 @@ from adjust.observations.factors import ObservationFactor
 from adjust.observations.images.batch import whitened_squares
 from adjust.observations.images.bundle_hidden import BundleHidden
 from adjust.precision.s_transformation import STransformation, s_transformation
+from adjust.precision.stacked import Stacked
 from adjust.precision.tree import TreeCovariance
 from adjust.testing.distributions import chi2
 
@@ -125,95 +124,21 @@ class Precision(Covariances):
         self._hidden = [BundleHidden(bundle) for bundle in graph.bundles]
         for hidden in self._hidden:
             self._add_hidden(hidden)
+        self.stacked = Stacked(self.tree, self._hidden, graph.unknowns)
+        """The covariance of all unknowns, of the tree and hidden, as a factor."""
         self.by_conditions: Mapping[str, FloatArray] = {}
         """Covariances (k, k) of adjusted pairs by id, where they are from the conditions of their loops."""
         self.transformation: STransformation | None = None
         if solved.datum is not None:
             motions = survey_motions(graph, solved.values, solved.datum.directions)
-            self.transformation = s_transformation(solved.datum.rows, motions, self.products)
-
-    @cached_property
-    def places(self) -> dict[int, slice]:
-        """Rows of every key in a stacked vector of all unknowns: those of the tree, then what each bundle hides."""
-        keys = [key for below in self._hidden for key in below.keys]
-        ends = self.tree.n + np.cumsum([0, *(self.unknowns.by_key[key].dim for key in keys)])
-        return self.tree.places() | {k: slice(a, b) for k, (a, b) in zip(keys, pairwise(ends.tolist()), strict=True)}
-
-    @property
-    def n(self) -> int:
-        """Length of a stacked vector of all unknowns."""
-        return self.tree.n + sum(below.n for below in self._hidden)
-
-    @cached_property
-    def _parts(self) -> list[tuple[BundleHidden, slice, IntArray]]:
-        """What every bundle hides, its rows in a stacked vector, and the rows of its interface."""
-        ends = np.cumsum([self.tree.n, *(below.n for below in self._hidden)]).tolist()
-        return [(below, slice(a, b), self.tree.rows(below.batch.interface))
-                for below, (a, b) in zip(self._hidden, pairwise(ends), strict=True)]  # fmt: skip
-
-    def times(self, right: FloatArray) -> FloatArray:
-        """Covariance, as solved, times columns (n, k) stacked as :attr:`places` says."""
-        tree = np.array(right[: self.tree.n])
-        on_poses = [below.on_poses(right[mine]) if right[mine].any() else None for below, mine, _ in self._parts]
-        for (below, _, interface), some in zip(self._parts, on_poses, strict=True):
-            if some is not None:
-                tree[interface] += below.on_interface(some)
-        found = self.tree.times(tree)
-        hidden = (below.products(found[interface], right[mine], some)
-                  for (below, mine, interface), some in zip(self._parts, on_poses, strict=True))  # fmt: skip
-        return np.concatenate([found, *hidden])
-
-    def times_in_datum(self, right: FloatArray) -> FloatArray:
-        """The same of the covariance in the survey's datum: S Q S' times columns."""
-        out = self.times(right)
-        if self._stacked_datum is None:
-            return out
-        G, W, core = self._stacked_datum
-        moved = G.T @ right
-        out += G @ (core @ moved - W.T @ right)
-        out -= W @ moved
-        return out
-
-    @cached_property
-    def _stacked_datum(self) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """Motions G (n, d), spread W (n, d) and core (d, d) of the transformation, over all unknowns."""
-        t = self.transformation
-        if t is None:
-            return None
-        G, W = (np.concatenate([of[key] for key in self.places]) for of in (t.motions, t.spread))
-        return G, W, t.core
-
-    def among(self, A: sparse.csr_array) -> FloatArray:
-        """A Q A' (m, m) of the rows of A (m, n), stacked as :attr:`places` says: in any datum."""
-        out, n = np.zeros((A.shape[0],) * 2), self.tree.n
-        in_tree = A[:, :n]
-        for below, mine, interface in self._parts:
-            hidden = A[:, mine]
-            rows = np.flatnonzero(np.diff(hidden.indptr))
-            if not len(rows):
-                continue
-            own, over = below.among(hidden[rows].toarray())
-            out[np.ix_(rows, rows)] += own
-            places = np.repeat(rows, len(interface)), np.tile(interface, len(rows))
-            in_tree = in_tree + sparse.csr_array((over.ravel(), places), in_tree.shape)
-        return out + self.tree.among(in_tree)
-
-    def products(self, rows: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
-        """Covariance, as solved, times the transpose of ``rows`` (k, dim per key): (dim, k) for every unknown."""
-        return self._by_key(rows, self.times)
+            self.transformation = s_transformation(
+                solved.datum.rows, motions, lambda rows: self.stacked.by_key(rows, self.stacked.times)
+            )
+            self.stacked.move_to(self.transformation)
 
     def datum_products(self, rows: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
-        """The same as :meth:`products`, of the covariance in the survey's datum: S Q S' times rows."""
-        return self._by_key(rows, self.times_in_datum)
-
-    def _by_key(
-        self, rows: Mapping[int, FloatArray], times: Callable[[FloatArray], FloatArray]
-    ) -> dict[int, FloatArray]:
-        right = np.zeros((self.n, len(next(iter(rows.values())))))
-        for key, row in rows.items():
-            right[self.places[key]] = row.T
-        found = times(right)
-        return {key: found[place] for key, place in self.places.items()}
+        """Covariance times the transpose of ``rows`` (k, dim per key): (dim, k) for every unknown."""
+        return self.stacked.by_key(rows, self.stacked.times_in_datum)
 
     def _add_hidden(self, hidden: BundleHidden) -> None:
         bundle = hidden.batch
@@ -237,24 +162,15 @@ class Precision(Covariances):
     def joint(self, names: Sequence[ParameterName]) -> FloatArray:
         """See :class:`Covariances`."""
         keys = [self.graph.unknowns.by_name[name].key for name in names]
-        below = [(b, hidden) for b in self._hidden if (hidden := [k for k in keys if b.hides(k)])]
-        if tuple(keys) in self._together:
-            return _in_datum(self.transformation, keys, self._together[keys[0], keys[1]])
-        if not below:
-            return _in_datum(self.transformation, keys, self.tree.joint(keys))
-        seen = [k for k in keys if k not in self.hidden]
-        outer = list(dict.fromkeys([k for b, _ in below for k in b.batch.interface] + seen))
-        Q, at = self.tree.joint(outer), stacking(self.graph, outer)
-        L = np.zeros((sum(self.tree.dims[k] for k in keys), at.n))
-        scatter, place = np.zeros((len(L), len(L))), stacking(self.graph, keys)
-        for b, hidden in below:
-            M, own = b.from_interface(hidden)
-            mine = place.index(hidden)
-            L[np.ix_(mine, at.index(b.batch.interface))] = M
-            scatter[np.ix_(mine, mine)] = own
-        if seen:
-            L[place.index(seen), at.index(seen)] = 1.0
-        return _in_datum(self.transformation, keys, L @ Q @ L.T + scatter)
+        if not any(k in self.hidden for k in keys):
+            Q = self.tree.joint(keys)
+        elif tuple(keys) in self._together:
+            Q = self._together[keys[0], keys[1]]
+        else:
+            rows = np.concatenate([self.stacked.rows(k) for k in keys])
+            half = self.stacked.columns(rows)[rows]
+            Q = 0.5 * (half + half.T)
+        return _in_datum(self.transformation, keys, Q)
 
     def bring_together(self, pairs: Iterable[tuple[ParameterName, ParameterName]]) -> None:
         """See :class:`Covariances`."""
@@ -263,13 +179,10 @@ class Precision(Covariances):
         self.tree.bring_together((a, b) for a, b in keys if a not in self.hidden and b not in self.hidden)
         below = [(a, b) for a, b in keys if a in self.hidden or b in self.hidden]
         for k in range(0, len(below), _PAIRS):
-            first = {a: self.places[a] for a, _ in below[k : k + _PAIRS]}
-            columns = np.concatenate([np.arange(place.start, place.stop) for place in first.values()])
-            right = np.zeros((self.n, len(columns)))
-            right[columns, np.arange(len(columns))] = 1.0
-            found = self.times(right)
+            columns = np.concatenate([self.stacked.rows(a) for a in dict.fromkeys(a for a, _ in below[k : k + _PAIRS])])
+            found = self.stacked.columns(columns)
             for a, b in below[k : k + _PAIRS]:
-                across = found[self.places[b]][:, np.isin(columns, np.r_[first[a]])].T
+                across = found[self.stacked.rows(b)][:, np.isin(columns, self.stacked.rows(a))].T
                 Qa, Qb = (self.hidden[x] if x in self.hidden else self.tree.marginal(x) for x in (a, b))
                 self._together[a, b] = np.block([[Qa, across], [across.T, Qb]])
 
@@ -337,14 +250,9 @@ class Precision(Covariances):
                    for e, (row, k) in enumerate(zip(graph.pairs.rows.tolist(), sizes, strict=True))}  # fmt: skip
         for item in graph.singles:
             if item.kind == "pair":
-                _, M, root = self.influence(item)
-                out[item.ids[0]] = root @ M @ root.T
+                x = self.rows(item)
+                out[item.ids[0]] = x.root @ x.influence @ x.root.T
         return out | dict(self.by_conditions)
-
-    def influence(self, item: ObservationFactor) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Whitened residual (k,), whitened A Q A' (k, k), and the square root information's inverse (k, k)."""
-        rows = self.rows(item)
-        return rows.e, rows.influence, rows.root
 
 
 def precision_of(adjustment: Adjustment) -> Precision:
@@ -393,7 +301,8 @@ def other_residuals(precision: Precision) -> tuple[ObservationResidual, ...]:
         places = (graph.first_pair + graph.pairs.rows).tolist()
         out |= dict(zip(places, graph.pairs.residuals(precision.pairs, graph.survey.pairs), strict=True))
     for i, item in zip(graph.single, graph.singles, strict=True):
-        e, M, root = precision.influence(item)
+        x = precision.rows(item)
+        e, M, root = x.e, x.influence, x.root
         n = len(e)
         Q = np.eye(n) - M if item.used else np.eye(n) + M
         v = root @ e
@@ -469,7 +378,7 @@ def _image_sums(
         return np.asarray(np.bincount(of_point, of_points[which], len(names)), dtype=np.float64)
 
     squares = whitened_squares(images.residuals, graph.square_roots())
-    return total(np.full(len(squares), 2.0)), total(images.redundancy.sum(axis=1)), total(squares)
+    return total(np.full(len(squares), 2.0)), total(images.redundancy @ np.ones(2)), total(squares)
 
 
 def global_test(omega: float, redundancy: int, alpha: float) -> GlobalTest | None:

@@ -25,10 +25,8 @@ from adjust.observations.images.bundles import BundleBatch
 from adjust.observations.terrestrial.layout import Chunk
 from adjust.precision.precision import Precision, precision_of
 from adjust.precision.s_transformation import without_datum_rows
+from adjust.precision.stacked import AT_ONCE
 from adjust.statistics.normal import PLAIN, Inverse, Normal
-
-AT_ONCE = 64
-"""Columns that the covariance matrix is multiplied by in one go."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +105,7 @@ class LinearSystem:
     @cached_property
     def _stacked(self) -> IntArray:
         """Rows (n,) of the columns in a stacked vector of the precision's unknowns."""
-        by_name, places = self.precision.unknowns.by_name, self.precision.places
+        by_name, places = self.precision.unknowns.by_name, self.precision.stacked.places
         rows = [places[by_name[name].key].start + free for name, free in self.columns.free.items()]
         return np.concatenate(rows or [np.zeros(0, dtype=np.int64)])
 
@@ -125,16 +123,23 @@ class LinearSystem:
 
     def through_tree(self, right: FloatArray) -> FloatArray:
         """The same of some columns (n, k) in one go, as the sigmas are found: fast where many are wanted."""
-        stacked = np.zeros((self.precision.n, right.shape[1]))
+        stacked = np.zeros((self.precision.stacked.n, right.shape[1]))
         stacked[self._stacked] = right
-        return self.precision.times_in_datum(stacked)[self._stacked]
+        return self.precision.stacked.times_in_datum(stacked)[self._stacked]
 
     def among(self, rows: sparse.csr_matrix) -> FloatArray:
         """``R Q R'`` (c, c) of sparse rows R (c, n) of the normal equations, or of what is observed: in any datum."""
         if len(self.columns) <= PLAIN:
             return np.asarray(rows @ self.normal.solve(rows.T.toarray()))
-        shape = (rows.shape[0], self.precision.n)
-        return self.precision.among(sparse.csr_array((rows.data, self._stacked[rows.indices], rows.indptr), shape))
+        stacked, entries = self.precision.stacked, (rows.data, self._stacked[rows.indices], rows.indptr)
+        return stacked.among(sparse.csr_array(entries, (rows.shape[0], stacked.n)))
+
+    @cached_property
+    def most_correlated(self) -> FloatArray:
+        """Of the components of two unknowns the larger of their bounds (n,) is one of their correlation; or inf."""
+        sigmas = np.zeros(self.precision.stacked.n)
+        sigmas[self._stacked] = self.sigmas
+        return self.precision.stacked.most_correlated(sigmas)[self._stacked]
 
     @cached_property
     def normal(self) -> Normal:

@@ -1,24 +1,25 @@
 """What is badly determined, by name: correlations, unknowns that replace each other, the weakest deformation."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
 
-from adjust.model.result import Adjustment, ParameterName
+from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import side_by_side
-from adjust.statistics.normal import DENSE, FEW, Inverse
+from adjust.precision.stacked import AT_ONCE
+from adjust.statistics.normal import DENSE, FEW, PLAIN, Inverse
 from adjust.statistics.result import Correlation, WeakDirection, WeakPart
-from adjust.statistics.system import AT_ONCE, LinearSystem, linear_system
+from adjust.statistics.system import LinearSystem, linear_system
 
 _MOST = 200
 _SHARE = 0.1
 _WHOLE = 10_000
-"""Unknowns up to which all are compared with all."""
+"""Unknowns up to which all are compared that may correlate."""
 _WORK = 20_000_000
-"""Correlations that are looked at in surveys of still more."""
+"""Correlations that are looked at in surveys of still more, or of hidden ones."""
 _KRYLOV, _RESTARTS = 40, 50
 
 
@@ -33,57 +34,68 @@ def _units(system: LinearSystem, columns: IntArray) -> FloatArray:
     return out
 
 
-def compared_columns(system: LinearSystem) -> IntArray:
-    """Columns that are compared with all others: all of them, or in large surveys first what is there once.
+def compared_columns(system: LinearSystem, limit: float = 0.95) -> tuple[IntArray, int]:
+    """Columns that are compared with all others, and how many correlations as large as ``limit`` would take.
 
-    What is there at one epoch alone comes after, and points last; as many as ``_WORK`` allows.
+    That is all of them in small surveys, and in large ones those that may correlate so. Where these are too many: first
+    what is there once, then points, last what is there at one epoch alone, as many as ``_WORK`` allows.
     """
     n, columns = len(system.columns), system.columns
-    if n <= _WHOLE or _structure(system) is not None:
-        return np.arange(n)
+    if _as_a_whole(system) or _structure(system, limit) is not None:
+        return np.arange(n), n
+    sizes = [len(at) for at in columns.at.values() if len(at)]
+    first = np.cumsum([0, *sizes])[:-1]
+    possible = np.repeat(np.maximum.reduceat(system.most_correlated, first) >= limit, sizes)
+    whole = n <= _WHOLE and not system.precision.hidden
+    needed, most = int(np.count_nonzero(possible)), n if whole else max(_WORK // n, 1)
+    if needed <= most:
+        return np.flatnonzero(possible), needed
     epochs = {b.epoch_id for b in system.precision.graph.survey.image_blocks}
     rank = {name: 2 if len(name) == 3 and name[2] in epochs else 1 if name[0] == "point" else 0 for name in columns.at}
     ordered = columns.of(sorted(columns.at, key=lambda name: rank[name]))
-    return ordered[: max(_WORK // n, 1)]
+    return ordered[possible[ordered]][:most], needed
+
+
+def _as_a_whole(system: LinearSystem) -> bool:
+    """Whether the covariance matrix is at hand."""
+    n = len(system.columns)
+    return n <= PLAIN or (n <= DENSE and system.structured is not None)
 
 
 def correlations(
-    adjustment: Adjustment, limit: float = 0.95, names: Sequence[ParameterName] | None = None,
-    system: LinearSystem | None = None,
-) -> tuple[Correlation, ...]:  # fmt: skip
+    adjustment: Adjustment, limit: float = 0.95, system: LinearSystem | None = None
+) -> tuple[Correlation, ...]:
     """Pairs of components whose correlation is at least ``limit`` in size, largest first, 200 at most.
 
-    Without names of all unknowns. Where these are too many and share too much, of the :func:`compared_columns` with
-    all, and of the components of every unknown with each other.
+    Where unknowns are too many and share too much, of the :func:`compared_columns` with all, and of the components of
+    every unknown with each other.
     """
     system = system or linear_system(adjustment)
-    c = system.columns
-    index = compared_columns(system) if names is None else c.of(names)
-    among = np.arange(len(c)) if names is None else index
-    number = np.full(len(c), -1)
+    n, index = len(system.columns), compared_columns(system, limit)[0]
+    number = np.full(n, -1)
     number[index] = np.arange(len(index))
-    whole = system.covariance if len(c) <= DENSE else None
+    whole = system.covariance if _as_a_whole(system) else None
     sigma = np.maximum(system.sigmas if whole is None else np.sqrt(np.maximum(np.diag(whole), 0.0)), 1e-150)
-    structure = _structure(system, limit) if names is None and len(c) > _WHOLE else None
+    structure = _structure(system, limit)
     if structure is not None:
         return _named(system, _of_structure(structure, sigma, limit))
 
     def above(first: int) -> list[tuple[int, int, float]]:
         part = index[first : first + AT_ONCE]
-        rows = among if len(among) > len(index) else index[: first + len(part)]
+        rows = np.arange(n) if n > len(index) else index[: first + len(part)]
         C = (system.through_tree(_units(system, part)) if whole is None else whole[:, part])[rows]
         C /= sigma[rows, None]
         C /= sigma[part]
         size = np.abs(C)
         size[number[rows][:, None] >= number[part]] = 0.0  # each pair once, nothing with itself
         high = size >= limit
-        if (n := int(np.count_nonzero(high))) > _MOST:
-            high = size >= np.partition(size[high], n - _MOST)[n - _MOST]
-        a, b = np.nonzero(high) if n else np.zeros((2, 0), dtype=np.int64)
+        if (k := int(np.count_nonzero(high))) > _MOST:
+            high = size >= np.partition(size[high], k - _MOST)[k - _MOST]
+        a, b = np.nonzero(high) if k else np.zeros((2, 0), dtype=np.int64)
         return list(zip(rows[a].tolist(), part[b].tolist(), C[a, b].tolist(), strict=True))
 
     found = [x for part in side_by_side(above, range(0, len(index), AT_ONCE)) for x in part]
-    if names is None and len(index) < len(c):
+    if len(index) < n:
         found += _within(system, number, limit)
     return _named(system, found)
 
@@ -110,7 +122,7 @@ def _structure(system: LinearSystem, limit: float = 0.95) -> _Structure | None:
 
     Components of different sets have a covariance U' U alone: a correlation is at most the product of two lengths.
     """
-    Q = system.structured if not system.motions.shape[1] else None
+    Q = system.structured if not system.motions.shape[1] and len(system.columns) > _WHOLE else None
     if Q is None:
         return None
     V = Q.U / np.maximum(system.sigmas, 1e-150)

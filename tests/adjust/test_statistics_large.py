@@ -90,12 +90,18 @@ def test_correlations_of_a_large_survey_leave_out_only_what_they_say(monkeypatch
     system = condensed_system(precision_of(adjustment)).system
     every = correlations(adjustment, 0.8, system=system)
     assert every == correlations(adjustment, 0.8, system=system)
-    n_once = len([n for n in system.columns.names if len(n) < 3])
+    once = np.array([len(n) < 3 for n in system.columns.names])
     n = len(system.columns)
+    monkeypatch.setattr(weakness, "PLAIN", 10)
     monkeypatch.setattr(weakness, "DENSE", 10)
+    possible, needed = weakness.compared_columns(system, 0.8)
+    assert len(possible) == needed < n
+    n_once = int(np.count_nonzero(once[possible]))
     monkeypatch.setattr(weakness, "_WORK", n_once * n)
     monkeypatch.setattr(weakness, "_WHOLE", 10)
-    assert len(weakness.compared_columns(system)) == n_once
+    compared, still_needed = weakness.compared_columns(system, 0.8)
+    assert sorted(compared) == possible[once[possible]].tolist()
+    assert still_needed == needed > n_once
     found = correlations(adjustment, 0.8, system=system)
     key = lambda x: frozenset([(x.a, x.a_component), (x.b, x.b_component)])  # noqa: E731  # said twice
     expected = {key(x): x.coefficient for x in every if len(x.a) < 3 or len(x.b) < 3 or x.a == x.b}
@@ -117,13 +123,14 @@ def test_small_sets_that_meet_in_few_unknowns_are_compared_with_all(monkeypatch:
     every = correlations(adjustment, 0.3, system=condensed.system)
     monkeypatch.setattr(normal_module, "PLAIN", 10)
     monkeypatch.setattr(system_module, "PLAIN", 10)
+    monkeypatch.setattr(weakness, "PLAIN", 10)
     monkeypatch.setattr(weakness, "DENSE", 10)
     monkeypatch.setattr(weakness, "_WHOLE", 100)
     condensed = condensed_system(precision_of(adjustment))
     system = condensed.system
     assert system.normal.structured is not None
     found = correlations(adjustment, 0.3, system=system)
-    assert len(weakness.compared_columns(system)) == len(system.columns)
+    assert len(weakness.compared_columns(system)[0]) == len(system.columns)
     assert len(found) == len(every) > 10
     for x, y in zip(sorted(found, key=str), sorted(every, key=str), strict=True):
         assert (x.a, x.a_component, x.b, x.b_component) == (y.a, y.a_component, y.b, y.b_component)
@@ -160,14 +167,28 @@ def test_correlations_from_the_tree_are_those_of_the_normal_matrix(monkeypatch: 
         system = condensed_system(precision_of(adjustment)).system
         every = correlations(adjustment, 0.5, system=system)
         with monkeypatch.context() as m:
+            m.setattr(weakness, "PLAIN", 10)
             m.setattr(weakness, "DENSE", 10)
             m.setattr(weakness, "covariance_columns", None)
-            assert len(weakness.compared_columns(system)) == len(system.columns)
+            compared, needed = weakness.compared_columns(system, 0.5)
+            assert len(compared) == needed
             found = correlations(adjustment, 0.5, system=system)
         assert len(found) == len(every) > 10
         for x, y in zip(sorted(found, key=str), sorted(every, key=str), strict=True):
             assert (x.a, x.a_component, x.b, x.b_component) == (y.a, y.a_component, y.b, y.b_component)
             assert x.coefficient == pytest.approx(y.coefficient, abs=1e-6)
+
+
+def test_nothing_correlates_more_with_other_unknowns_than_is_possible() -> None:
+    """By the whole covariance matrix; of most points, seen from poses that are hidden, less than all is possible."""
+    for adjustment in (lab(), adjust(*net.hall(2, n_points=30)), free(), adjust(*h.network(1)[:1])):
+        system = condensed_system(precision_of(adjustment)).system
+        own = np.unique([str(n) for n in system.columns.names], return_inverse=True)[1]
+        sigmas = np.sqrt(np.diag(system.covariance))
+        among = np.where(own[:, None] == own, 0.0, np.abs(system.covariance) / sigmas / sigmas[:, None])
+        bound = system.most_correlated
+        assert (among <= np.maximum(bound, bound[:, None]) + 1e-6).all()
+        assert np.count_nonzero(bound < 0.95) > 10
 
 
 def test_the_budget_is_that_of_all_rows() -> None:

@@ -1,10 +1,7 @@
 """What follows from the interface of a bundle: poses and points that its batch has reduced, and their covariances."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import scipy
-from scipy import sparse
 
 from adjust.model.survey import FloatArray
 from adjust.native.bundles import (
@@ -156,6 +153,17 @@ class BundleHidden:
         dX = b.points_following(np.asarray(b.G @ d), -right[nh:].reshape(-1, 3, k))
         return np.concatenate([d[:nh], dX.reshape(-1, k)])
 
+    def given_interface(self, hidden: FloatArray, interface: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What of the reduced points follows from no pose and not from the interface: of columns, and their variances.
+
+        Of columns (n, k) and (n_interface, k) that part (n, k), and (n,); inf of the poses, which share anything.
+        """
+        b, nh, left = self.batch, self.batch.n_hidden, hidden.copy()
+        left[:nh] = 0.0
+        poses, none = np.vstack([hidden[:nh], interface]), np.zeros((len(b.reduced), 3, hidden.shape[1]))
+        left[nh:] -= b.points_following(np.asarray(b.G @ poses), none).reshape(left[nh:].shape)
+        return left, np.concatenate([np.full(nh, np.inf), np.diagonal(b.Vi, axis1=1, axis2=2).ravel()])
+
     def among(self, A: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Of rows A (m, n) over what is hidden: A Q A' (m, m) were the interface held, and what they are over it."""
         b, right = self.batch, np.ascontiguousarray(A.T)
@@ -164,40 +172,3 @@ class BundleHidden:
         if nh:
             own += u[:nh].T @ (self._hidden_poses_given_interface()[1] @ u[:nh])
         return own, self.on_interface(u).T
-
-    def from_interface(self, keys: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        """How hidden poses and points follow from the interface, stacked: M (n, n_interface), and their own scatter.
-
-        Their covariance is M Q_interface M' plus the second matrix (n, n); with any unknown b outside it is
-        M Cov(interface, b). The batch must be prepared with Jacobians.
-        """
-        b = self.batch
-        nh, n = b.n_hidden, b.n_keys
-        T, own = np.zeros((n, n - nh)), np.zeros((n, n))
-        T[nh:] = np.eye(n - nh)
-        if nh:
-            T[:nh], own[:nh, :nh] = self._hidden_poses_given_interface()
-        reduced = {b.point_key[i]: j for j, i in enumerate(b.reduced)}
-        rows, V = [], []
-        for key in keys:
-            if key in reduced:
-                rows.append(self._point_from_local(reduced[key]) @ b.G)
-                V.append(b.Vi[reduced[key]])
-            else:
-                at = b.key_at[key]
-                rows.append(sparse.csr_matrix((np.ones(6), (np.arange(6), at + np.arange(6))), shape=(6, n)))
-                V.append(np.zeros((6, 6)))
-        L = sparse.vstack(rows).tocsr()
-        scatter = np.asarray(L @ (L @ own).T) + scipy.linalg.block_diag(*V)
-        return np.asarray(L @ T), scatter
-
-    def _point_from_local(self, j: int) -> sparse.csr_matrix:
-        """Derivative (3, n_local) of reduced point ``j`` by the local unknowns: -V^-1 W."""
-        b = self.batch
-        Y = np.zeros((3, b.n_local))
-        for i in range(b.pc_ptr[j], b.pc_ptr[j + 1]):
-            at, n = b.lens_at[b.pc_camera[i]], b.state.lenses.n_free[b.pc_camera[i]]
-            Y[:, at : at + n] -= b.Vi[j] @ b.WL[i, :, :n]
-        for k in range(b.ptr[j], b.ptr[j + 1]):
-            Y[:, b.pose_at[k] : b.pose_at[k] + 6] -= b.Vi[j] @ b.W3[k]
-        return sparse.csr_matrix(Y)
