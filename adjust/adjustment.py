@@ -19,6 +19,7 @@ from adjust.lenses.models import MODELS, camera_constants, monotone_radius_px, p
 from adjust.model.errors import NotConvergedError, listed
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, Survey
+from adjust.native.parallel import Beside
 from adjust.observations.terrestrial.statistics import JoinedResiduals, reading_residuals
 from adjust.precision.precision import Precision, global_test, group_summaries, image_residuals, other_residuals
 from adjust.start import Start, find_start
@@ -220,7 +221,9 @@ def assemble(
     if graph.terrestrial is not None:
         readings = reading_residuals(graph.terrestrial, precision.tree, solved.values)
     every = others if readings is None else JoinedResiduals(others, graph.survey, readings)
-    groups = group_summaries(graph, images, others, readings)
+    with Beside() as made:
+        summed = made.of(lambda: group_summaries(graph, images, others, readings))
+        unknowns, groups = estimates(precision), summed()
     n_observations = sum(g.n_observations for g in groups)
     n_unknowns = graph.unknowns.n_unknowns
     defect = solved.datum.defect if solved.datum else 0
@@ -228,7 +231,7 @@ def assemble(
     omega = sum(g.omega for g in groups)
     test = global_test(omega, redundancy, options.alpha)
     result = Adjustment(
-        graph.survey, estimates(precision), images, every, groups, n_observations, n_unknowns, defect, redundancy,
+        graph.survey, unknowns, images, every, groups, n_observations, n_unknowns, defect, redundancy,
         omega, float(np.sqrt(omega / redundancy)) if redundancy > 0 else float("nan"), test, solved.iterations,
         solved.max_step, True, (), precision, readings,
     )  # fmt: skip

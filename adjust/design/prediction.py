@@ -45,8 +45,7 @@ class Predictor:
         builder = GraphBuilder(survey, start.lenses)
         self.survey, self.graph, self.frames = survey, builder.build(start), builder.frames
         self.values, self.times = self.graph.start, LensTimes(survey)
-        self.cameras = {c.camera_id: c for c in survey.cameras}
-        self.targets = {t.target_id: t for t in survey.targets}
+        self.cameras, self.targets = survey.cameras_by_id, survey.targets_by_id
 
     def b_from_a(self, a: FrameRef, b: FrameRef) -> Pose3:
         """The motion between two frames."""

@@ -99,6 +99,11 @@ class Screen(Fit):
         pairs = [o for o in self.graph.others if o.kind == "pair"]
         return {o.ids[0]: adjusted_motion(o.observed, residual_of(o, self.graph.start)) for o in pairs}
 
+    def pairs_of(self, survey: Survey) -> FloatArray:
+        """(p,) squares over sigmas of the pairs of a survey, in their order; zero of what is no factor."""
+        at = {o.ids[0]: self.others[i] for i, o in enumerate(self.graph.others) if o.kind == "pair"}
+        return np.array([at.get(p.pair_id, 0.0) for p in survey.pairs])
+
     def drop(self, rows: IntArray, after: FloatArray) -> float:
         """How much less everything misfits when these readings do as in ``after`` (n,), squares over sigmas."""
         found = []

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from gtsam import Pose3, Rot3
 
+from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.precision.precision import Precision, rotations_only
@@ -14,6 +15,7 @@ from adjust.spatial.motions import point_motions
 from adjust.spatial.rigid import skew
 
 MOTIONS = ("tx", "ty", "tz", "rx", "ry", "rz", "scale")
+_MOST = 20_000  # components: 3 GB a matrix, of which a few are held at once
 _POINT = np.array([3, 4, 5])
 _POSE = np.arange(6)
 
@@ -77,13 +79,21 @@ def origin(value: Pose3 | FloatArray) -> FloatArray:
 
 
 def epoch_state(adjustment: Adjustment) -> EpochState:
-    """Points and fixed stations of an adjustment, a priori, in its datum; in rotation networks positions are nan."""
+    """Points and fixed stations of an adjustment, a priori, in its datum; in rotation networks positions are nan.
+
+    Raises SurveyError where they are too many for one matrix.
+    """
     names = [n for n in adjustment.estimates if n[0] == "point" or (n[0] == "world_from_station" and len(n) == 2)]
     values = tuple(
         e.value if isinstance(e.value, Pose3) else np.asarray(e.value) for e in (adjustment.estimates[n] for n in names)
     )
     if rotations_only(adjustment):
         values = tuple(Pose3(v.rotation(), np.full(3, np.nan)) for v in values if isinstance(v, Pose3))
+    if sum(6 if isinstance(v, Pose3) else 3 for v in values) > _MOST:
+        raise SurveyError(
+            f"{len(names)} points and stations are too many: what moved is told from one covariance matrix of at most "
+            f"{_MOST} components; compare parts of the survey, each with the stations that hold it"
+        )
     return EpochState(tuple(names), values, adjustment.joint(names), open_directions(adjustment))
 
 

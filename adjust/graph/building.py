@@ -33,7 +33,8 @@ from adjust.observations.factors import (
 )
 from adjust.observations.geometry.building import GeometryFactors, position_refs
 from adjust.observations.images.batch import ImageBatch
-from adjust.observations.images.bundles import BundleBatch, may_be_hidden
+from adjust.observations.images.bundle_layout import may_be_hidden
+from adjust.observations.images.bundles import BundleBatch
 from adjust.observations.images.helmert_blocks import helmert_blocks
 from adjust.observations.images.reduction import reduction
 from adjust.observations.terrestrial.building import build_batch, reading_refs
@@ -381,12 +382,12 @@ class GraphBuilder:
         elif name[0] == "lens_drift":
             full = np.zeros(len(vector.names))
         elif name[0] == "lens_crop":
-            lens = next(c.lens for c in self.survey.cameras if c.camera_id == name[1])
+            lens = self.survey.cameras_by_id[name[1]].lens
             full = lens.crops[name[2]].parameters.values
         elif name[0] in ("vertical", "instrument", "orientation", "centring"):
             full = full_start(name, self.survey)
         elif name[0] == "table_geometry":
-            full = next(t.geometry.values for t in self.survey.tables if t.table_id == name[1])
+            full = self.survey.tables_by_id[name[1]].geometry.values
         elif name[0] in CLOCKS:
             full = next((c.parameters.values for owner, c in clocks_of(self.survey) if owner == name), np.zeros(1))
         else:

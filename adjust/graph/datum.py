@@ -19,7 +19,7 @@ from adjust.frames.unknowns import Unknown
 from adjust.graph.assembly import AdjustmentGraph, Evaluation
 from adjust.model.errors import SurveyError
 from adjust.model.result import ParameterName
-from adjust.model.survey import FloatArray, IntArray
+from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.observations.motions import MOVED, READINGS_MOVED, reading_motions, vector_motions
 from adjust.spatial.motions import motions_of, points_motions, poses_at, poses_motions
 
@@ -36,13 +36,13 @@ def gauge(graph: AdjustmentGraph, unknown: Unknown, values: gtsam.Values) -> Flo
         return vector_motions(graph.survey, graph.unknowns, unknown, values)
     if unknown.name[0] in READINGS_MOVED:
         return reading_motions(graph.survey, graph.unknowns, graph.terrestrial, unknown, values)
-    return motions_of(unknown, values, in_world(graph, unknown.name))
+    return motions_of(unknown, values, in_world(graph.survey, unknown.name))
 
 
-def in_world(graph: AdjustmentGraph, name: ParameterName) -> bool:
+def in_world(survey: Survey, name: ParameterName) -> bool:
     """Whether a pose parameter is the pose of something in the world."""
     if name[0] == "carrier_from_target":
-        return next(t.station_id for t in graph.survey.targets if t.target_id == name[1]) is None
+        return survey.targets_by_id[name[1]].station_id is None
     return name[0] in ("world_from_station", "world_from_table")
 
 
@@ -156,7 +156,7 @@ def survey_motions(graph: AdjustmentGraph, values: gtsam.Values, directions: Flo
     x = np.array([values.atPoint3(key) for key in points]).reshape(-1, 3)
     out = dict(zip(points, points_motions(x) @ directions, strict=True))
     poses = [u for u in unknowns if u.kind == "pose"]
-    world = np.array([in_world(graph, u.name) for u in poses], dtype=np.bool_)
+    world = np.array([in_world(graph.survey, u.name) for u in poses], dtype=np.bool_)
     moved = poses_motions(*poses_at(values, [u.key for u in poses]), world) @ directions
     out |= dict(zip([u.key for u in poses], moved, strict=True))
     for u in unknowns:

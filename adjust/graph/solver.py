@@ -35,8 +35,11 @@ _LEAST_GAIN = 0.1
 """Share of the promised decrease of chi-square that a step must bring."""
 _STATIONARY = 1e-2
 """Sigmas that a step moves at most where the rank of the system is judged."""
-_NEAR, _SHRINKING = 1.0, 0.25
-"""Sigmas that a step moves at most, and its share of the one before, where one factor of pairs serves the next step."""
+_CLOSE = (1.0, 0.25), (10.0, 0.1)
+"""Sigmas that a step moves at most, and its share of the one before, where one factor of pairs serves the next step.
+
+From farther off where the one before is known, and more was gained.
+"""
 
 Progress = Callable[[int, float], None]
 
@@ -292,7 +295,8 @@ class _Loop:
         self.judging = self.moved < _STATIONARY
         used = self.damping
         if self.pairs is not None:
-            self.pairs.kept = used == 0.0 and self.moved < min(_NEAR, _SHRINKING * self.before)
+            close = _CLOSE[: 1 + bool(np.isfinite(self.before))]
+            self.pairs.kept = used == 0.0 and any(self.moved < min(s, share * self.before) for s, share in close)
         if used == 0.0:
             self.length = min(1.0, 2.0 * self.length) if gain > 0.75 else self.length
         elif gain > 0.5:

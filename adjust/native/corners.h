@@ -44,8 +44,8 @@ struct Wedge {
 
     Wedge(const double *at, bool four) : p(at), crossing(four) {
         c1 = std::cos(p[2]), s1 = std::sin(p[2]), c2 = std::cos(p[3]), s2 = std::sin(p[3]);
-        scale = std::exp(-p[6]), turn = std::sin(p[3] - p[2]);
-        rho = smaller(larger(-std::cos(p[3] - p[2]), -0.95), 0.95);
+        scale = std::exp(-p[6]), turn = c1 * s2 - s1 * c2;
+        rho = smaller(larger(-c1 * c2 - s1 * s2, -0.95), 0.95);
         c = 1.0 / root(1.0 - rho * rho);
         const int which = magnitude(rho) < 0.3 ? 0 : magnitude(rho) < 0.6 ? 1 : 2;
         nodes = which == 2 ? 6 : 3 + which;
@@ -97,39 +97,54 @@ struct Collected {
     alignas(64) double x[MOST_PIXELS + 1], y[MOST_PIXELS + 1], value[MOST_PIXELS + 1];
 };
 
+// Whole numbers i from first to last.
+struct Run {
+    int64_t first, last;
+};
+// Those with low <= slope i + offset <= high.
+inline Run between(double slope, double offset, double low, double high) {
+    const auto whole = [](double i) { return int64_t(smaller(larger(i, -LARGEST_WINDOW), LARGEST_WINDOW)); };
+    if (magnitude(slope) < 1e-9) return low <= offset && offset <= high ? Run{whole(-LARGEST_WINDOW), whole(LARGEST_WINDOW)} : Run{0, -1};
+    const double ends[2] = {(low - offset) / slope, (high - offset) / slope};
+    return {whole(std::ceil(smaller(ends[0], ends[1]))), whole(std::floor(larger(ends[0], ends[1])))};
+}
+inline Run both(Run a, Run b) { return {larger(a.first, b.first), smaller(a.last, b.last)}; }
+
 // The pixels of a corner: a disc, and strips along its edges; their number, -1 at the border. Those near both edges come
 // first: the others need no integral (``Wedge``). shape: radius of the disc, half width of the strips, length of strip 1,
 // length of strip 2, in px.
-inline int corner_window(In<float, 2> image, int64_t u0, int64_t v0, const double *p, const double *shape, bool crossing, Collected &out) {
-    static thread_local Collected room;
-    Collected &far = room;  // where it is is asked for once, not for every pixel
+inline int64_t corner_window(In<float, 2> image, int64_t u0, int64_t v0, const double *p, const double *shape, bool crossing, Collected &out) {
+    static thread_local Collected far;
     const double radius = shape[0], width = shape[1], c[2] = {std::cos(p[2]), std::cos(p[3])}, s[2] = {std::sin(p[2]), std::sin(p[3])};
     const double extent = larger(radius, larger(shape[2], shape[3]) + width), bent = FAR * std::exp(p[6]);
     if (!(magnitude(extent) < LARGEST_WINDOW)) return -1;
-    const int reach = int(std::ceil(extent));
-    int n_near = 0, n_far = 0;
-    for (int j = -reach; j <= reach; ++j) {
-        const double dy = j - p[1], half = root(larger(radius * radius - dy * dy, 0.0));
-        const bool strips = width > 0.0, disc = magnitude(dy) <= radius;
-        if (!strips && !disc) continue;
-        const int from = strips ? -reach : int(std::ceil(p[0] - half)), to = strips ? reach : int(std::floor(p[0] + half));
-        for (int i = from; i <= to; ++i) {
-            const double dx = i - p[0], across[2] = {c[0] * dy - s[0] * dx, c[1] * dy - s[1] * dx};
-            bool inside = disc && magnitude(dx) <= half;
-            for (int a = 0; a < 2 && !inside && strips; ++a) {
-                const double along = c[a] * dx + s[a] * dy;
-                inside = magnitude(across[a]) <= width && (crossing ? -shape[2 + a] : -width) <= along && along <= shape[2 + a];
-            }
-            if (!inside) continue;
-            const int64_t u = u0 + i, v = v0 + j;
-            if (u < 0 || v < 0 || u >= image.n[1] || v >= image.n[0]) return -1;
-            if (n_near + n_far == MOST_PIXELS) break;
-            // to both lists, of which one goes on
-            const bool near = larger(magnitude(across[0]), magnitude(across[1])) <= bent;
-            const float value = image(v, u);
-            out.x[n_near] = i, out.y[n_near] = j, out.value[n_near] = value;
-            far.x[n_far] = i, far.y[n_far] = j, far.value[n_far] = value;
-            n_near += near, n_far += !near;
+    const int64_t reach = int64_t(std::ceil(extent)) + 1;
+    int64_t n_near = 0, n_far = 0;
+    const auto add = [](Collected &list, int64_t &n, const float *row, int64_t from, int64_t to, int64_t j) {
+        double *x = list.x + n, *y = list.y + n, *value = list.value + n;
+        for (int64_t k = 0; k < to - from; ++k) x[k] = from + k, y[k] = j, value[k] = row[from + k];
+        n += to - from;
+    };
+    for (int64_t j = -reach; j <= reach; ++j) {
+        const double dy = j - p[1], half = radius * radius - dy * dy;
+        const auto within = [&](int a, double most) { return between(-s[a], c[a] * dy + s[a] * p[0], -most, most); };  // of an edge
+        Run parts[3] = {half >= 0.0 ? between(1.0, -p[0], -root(half), root(half)) : Run{0, -1}, {0, -1}, {0, -1}};
+        for (int a = 0; a < 2 && width > 0.0; ++a)
+            parts[1 + a] = both(within(a, width), between(c[a], s[a] * dy - c[a] * p[0], crossing ? -shape[2 + a] : -width, shape[2 + a]));
+        for (const auto &[a, b] : {std::pair(0, 1), std::pair(1, 2), std::pair(0, 1)})
+            if (parts[b].first < parts[a].first) std::swap(parts[a], parts[b]);
+        const Run near = both(within(0, bent), within(1, bent));
+        int64_t next = -reach;
+        for (Run part : parts) {
+            part.first = larger(part.first, next);
+            if (part.last < part.first) continue;
+            const int64_t u = u0 + part.first, v = v0 + j;
+            if (u < 0 || v < 0 || u0 + part.last >= image.n[1] || v >= image.n[0]) return -1;
+            next = part.last + 1;
+            if (n_near + n_far + next - part.first > MOST_PIXELS) continue;
+            const float *row = &image(v, 0) + u0;
+            const int64_t a = smaller(larger(near.first, part.first), next), b = smaller(larger(near.last + 1, a), next);
+            add(far, n_far, row, part.first, a, j), add(out, n_near, row, a, b, j), add(far, n_far, row, b, next, j);
         }
     }
     for (const auto list : {&Collected::x, &Collected::y, &Collected::value}) std::memcpy(out.*list + n_near, far.*list, n_far * sizeof(double));
@@ -198,7 +213,7 @@ inline FittedCorner fit_corner(In<float, 2> image, const double *start, const do
     return o;
 }
 
-constexpr double ROUGH_PX = 1e-2, FINE_PX = 1e-3;  // steps after which the first and the second fit of a corner may stop
+constexpr double ROUGH_PX = 1e-2, FINE_PX = 2e-5;  // steps after which the first and the second fit of a corner may stop
 constexpr double NEAR_PX = 5.0;  // from a crossing, as far as the first fit looks where the edges' blur ends before that
 
 // The window of a corner: it keeps clear of the neighbouring edges, blurred as those are. edges: both, px, to where they

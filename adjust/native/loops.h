@@ -11,7 +11,7 @@ struct Walks {
     Out<int64_t, 1> depth, parent, by, branch, order, sum;
 
     // Shortest ways from a root to depth `half`; closed(v, e, w, length, sum of labels) of each pair e that closes a loop with two.
-    template <class Closed> void from(int64_t root, const int64_t &half, const Out<int64_t, 1> &label, int64_t &work, Closed closed) const {
+    template <class Closed> void from(int64_t root, const int64_t &half, const Ints &label, int64_t &work, Closed closed) const {
         int64_t reached = 1;
         order.data[0] = branch.data[root] = root, depth.data[root] = sum.data[root] = 0;
         for (int64_t k = 0; k < reached && depth[order[k]] <= half; ++k) {
@@ -86,34 +86,23 @@ inline void label_chords(In<int64_t, 2> rows, In<bool, 1> kept, Out<int64_t, 1> 
 }
 
 // Horton's loops of one length at every root, the independent ones into found (m, length), the stations at which they
-// begin into start (m,). A loop whose labels cancel depends on those found. free: of few that are missing the chord of each bit,
-// else none; the labels then follow what is found, and need no elimination. work: elementary steps so far; no root is begun
-// once they reach the budget. Returns how many.
-inline int64_t horton_loops(const Walks &walks, const Sets &sets, Out<int64_t, 1> label, Ints free, Ints roots, int64_t budget,
-                            Out<int64_t, 1> work, Out<int64_t, 2> found, Out<int64_t, 1> start) {
+// begin into start (m,). A loop whose labels cancel depends on those found before. work: elementary steps so far; no root is
+// begun once they reach the budget. Returns how many.
+inline int64_t horton_loops(const Walks &walks, const Sets &sets, Ints label, Ints roots, int64_t budget, Out<int64_t, 1> work,
+                            Out<int64_t, 2> found, Out<int64_t, 1> start) {
     const int64_t most = found.n[0], length = found.n[1], half = length / 2;
     int64_t n = 0;
     for (int64_t r = 0; r < roots.n[0] && n < most && work[0] < budget; ++r)
         walks.from(roots[r], half, label, work.data[0], [&](int64_t v, int64_t e, int64_t w, int64_t closed) {
             if (n == most || closed != length) return;
-            int64_t *loop = found.data + n * length;
-            walks.write(v, e, w, loop);
-            if (!free.n[0]) {
-                if (!sets.add(loop, length, work.data[0])) return;
-            } else {
-                const int64_t sum = walks.sum[v] ^ walks.sum[w] ^ label[e], bit = sum & -sum;
-                for (const Out<int64_t, 1> &x : {label, walks.sum})
-                    for (int64_t i = 0; i < x.n[0]; ++i) x.data[i] ^= x.data[i] & bit ? sum : 0;
-                sets.kept.data[free[std::countr_zero(uint64_t(bit))]] = true;
-                work.data[0] += label.n[0];
-            }
-            start.data[n++] = roots[r];
+            walks.write(v, e, w, found.data + n * length);
+            if (sets.add(found.data + n * length, length, work.data[0])) start.data[n++] = roots[r];
         });
     return n;
 }
 
 // The length of the shortest loop whose labels do not cancel, among those that meet the roots; 0 where the budget does not last.
-inline int64_t shortest_loop(const Walks &walks, Out<int64_t, 1> label, Ints roots, int64_t budget, Out<int64_t, 1> work) {
+inline int64_t shortest_loop(const Walks &walks, Ints label, Ints roots, int64_t budget, Out<int64_t, 1> work) {
     int64_t shortest = walks.depth.n[0] + 1, half = shortest;
     for (int64_t r = 0; r < roots.n[0]; ++r) {
         if (work[0] >= budget) return 0;

@@ -1,5 +1,6 @@
 // Measured pairs b_from_a of poses: residuals Log(measured^-1 b_from_a) and their derivatives; see adjust.observations.pairs.
 #pragma once
+#include "dense.h"
 #include "vectors.h"
 
 namespace {
@@ -122,6 +123,24 @@ inline void pair_rows(const Pairs &pairs, In<double, 3> W, Out<double, 2> white,
             for (int j = i; j < 6; ++j) sum += W(e, i, j) * residual[j];
             white(e, i) = sum;
         }
+    }
+}
+
+// The forms v' Q^-1 v of symmetric Q whose eigenvalues are all above `least`, as the trace of the inverse tells; else -1.
+inline void sure_forms(In<double, 3> Q, In<double, 2> v, double least, Out<double, 1> form) {
+    for (int64_t e = 0; e < form.n[0]; ++e) {
+        Block L;
+        double X[6][7] = {}, trace = 0.0, sum = 0.0;
+        std::memcpy(L, &Q(e, 0, 0), sizeof L);
+        for (int i = 0; i < 6; ++i) X[i][i] = 1.0, X[i][6] = v(e, i);
+        form.data[e] = -1.0;
+        if (!cholesky(L[0], 6, 6)) continue;
+        forward_solve(L[0], 6, 6, X[0], 7);
+        for (int i = 0; i < 6; ++i) {
+            for (int j = 0; j <= i; ++j) trace += X[i][j] * X[i][j];
+            sum += X[i][6] * X[i][6];
+        }
+        if (least * trace < 1.0) form.data[e] = sum;
     }
 }
 

@@ -9,6 +9,8 @@ _PAIRS = "a[E] b[E] R[S,3,3] t[S,3] measured[E,3,3] shift[E,3]"
 _pair_jacobians = Function("pair_jacobians", f"{_PAIRS} residual[E,6] by_b[E,6,6] by_a[E,6,6] turn[E,6,6]")
 _pair_rows = Function("pair_rows", f"{_PAIRS} W[E,6,6] white[E,6] by_b[E,6,6] by_a[E,6,6]")
 
+_sure_forms = Function("sure_forms", "Q[E,6,6] v[E,6] least form[E]")
+
 
 def pair_jacobians(
     a: IntArray, b: IntArray, R: FloatArray, t: FloatArray, measured: FloatArray, shift: FloatArray
@@ -31,3 +33,10 @@ def pair_rows(
     white, (by_b, by_a) = np.empty((len(a), 6)), np.empty((2, len(a), 6, 6))
     _pair_rows(*map(np.ascontiguousarray, (a, b, R, t, measured, shift, whitening)), white, by_b, by_a)
     return white, by_b, by_a
+
+
+def sure_forms(Q: FloatArray, v: FloatArray, least: float) -> FloatArray:
+    """The forms v' Q^-1 v (E,) of symmetric Q (E, 6, 6) without eigenvalues below ``least``; -1 where there may be."""
+    form = np.empty(len(v))
+    _sure_forms(*map(np.ascontiguousarray, (Q, v)), least, form)
+    return form

@@ -12,7 +12,7 @@ from adjust.frames.lens_times import LensTimes
 from adjust.lenses.crops import crop_size, cropped_lens
 from adjust.lenses.models import MODELS, camera_constants
 from adjust.model.errors import SurveyError
-from adjust.model.result import Adjustment, ParameterName, adjusted_pose
+from adjust.model.result import Adjustment, ParameterName, adjusted_numbers, adjusted_pose
 from adjust.model.survey import Camera, FloatArray, ImageCrop, Survey
 from adjust.navigation.model import Beacons, Head, HeadCamera, HeadTable
 from adjust.precision.precision import precision_of
@@ -47,7 +47,7 @@ def head_and_beacons(
     for camera in cameras:
         names += [("lens", camera.camera_id), ("station_from_camera", camera.camera_id)]
     if table is not None:
-        table_id = str(next(s for s in survey.stations if s.station_id == station_id).table_id)
+        table_id = str(survey.stations_by_id[station_id].table_id)
         names += [("world_from_table", table_id), ("table_geometry", table_id), ("mount_from_station", station_id)]
     points = [("point", p.point_id) for p in survey.points] if known is None else []
     sizes = _full_sizes(cameras, table, len(points))
@@ -95,18 +95,15 @@ def _camera(adjustment: Adjustment, camera: Camera, epoch_id: str | None) -> Hea
 
 def _table(adjustment: Adjustment, station_id: str) -> HeadTable | None:
     survey: Survey = adjustment.survey
-    station = next((s for s in survey.stations if s.station_id == station_id), None)
+    station = survey.stations_by_id.get(station_id)
     if station is None or station.motion != "table" or station.table_id is None:
         return None
-    table = next(t for t in survey.tables if t.table_id == station.table_id)
+    table = survey.tables_by_id[station.table_id]
     base = adjusted_pose(adjustment.estimates, ("world_from_table", table.table_id), table.world_from_table)
     mount = adjusted_pose(adjustment.estimates, ("mount_from_station", station_id), station.mount_from_station)
     if base is None or mount is None:
         return None
-    values = dict(zip(table.geometry.names, table.geometry.values.tolist(), strict=True))
-    found = adjustment.estimates.get(("table_geometry", table.table_id))
-    if found is not None and not isinstance(found.value, Pose3):
-        values |= dict(zip(found.components, found.value.tolist(), strict=True))
+    values = adjusted_numbers(adjustment.estimates, ("table_geometry", table.table_id), table.geometry)
     return HeadTable(table.axes, base, values, mount)
 
 

@@ -20,6 +20,7 @@ from adjust.spatial.rigid import skew
 
 Jacobians = list[tuple[int, FloatArray]]
 Residual = Callable[[gtsam.Values], tuple[FloatArray, Jacobians]]
+PoseOf = Callable[[gtsam.Values], tuple[Pose3, Jacobians]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,33 +189,29 @@ def pair_factor(observation: Pair, unknowns: Unknowns, state: State, chain: Chai
     measured = observation.b_from_a
     predicted = ChainPose(unknowns, state, chain)
     if isinstance(measured, Rot3):
-        residual = _rotation_residual(predicted, measured)
-        return custom(predicted.keys, observation.cov, residual)
+        turn = _components_residual(predicted, Pose3(measured, np.zeros(3)), np.arange(3))
+        return custom(predicted.keys, observation.cov, turn)
     if simple and all(unknowns.derived(link.slot) is None for link in chain):
         b, a = keys
         if a is not None and b is not None and a != b:
             return gtsam.BetweenFactorPose3(b, a, measured, gaussian(observation.cov))
-    return custom(predicted.keys, observation.cov, _pose_residual(predicted, measured))
+    return custom(predicted.keys, observation.cov, _components_residual(predicted, measured, np.arange(6)))
 
 
-def _pose_residual(predicted: ChainPose, measured: Pose3) -> Residual:
+def _components_residual(predicted: PoseOf, given: Pose3, rows: IntArray) -> Residual:
+    """Some components of a pose's tangent at a given one."""
+
     def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
         pose, jacobians = predicted(values)
         D = np.zeros((6, 6), order="F")
-        r = Pose3.Logmap(measured.between(pose), D)
-        return np.asarray(r), [(k, D @ J) for k, J in jacobians]
+        r = Pose3.Logmap(given.between(pose), D)
+        return np.asarray(r)[rows], [(k, D[rows] @ J) for k, J in jacobians]
 
     return residual
 
 
-def _rotation_residual(predicted: ChainPose, measured: Rot3) -> Residual:
-    def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
-        pose, jacobians = predicted(values)
-        D = np.zeros((3, 3), order="F")
-        r = Rot3.Logmap(measured.between(pose.rotation()), D)
-        return np.asarray(r), [(k, D @ J[:3]) for k, J in jacobians]
-
-    return residual
+def _unknown_pose(key: int) -> PoseOf:
+    return lambda values: (values.atPose3(key), [(key, np.eye(6))])
 
 
 def vector_prior_factor(prior: VectorPrior, vector: VectorMap) -> gtsam.NonlinearFactor:
@@ -252,18 +249,8 @@ def pose_prior_factor(parameter: PoseParameter, key: int) -> gtsam.NonlinearFact
     known = np.isfinite(np.diag(cov))
     if known.all():
         return gtsam.PriorFactorPose3(key, mean, gaussian(cov))
-    return custom([key], cov[np.ix_(known, known)], _components_residual(key, mean, np.flatnonzero(known)))
-
-
-def _components_residual(key: int, given: Pose3, rows: IntArray) -> Residual:
-    """Some components of the tangent at a given pose."""
-
-    def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
-        D = np.zeros((6, 6), order="F")
-        r = Pose3.Logmap(given.between(values.atPose3(key)), D)
-        return np.asarray(r)[rows], [(key, D[rows])]
-
-    return residual
+    residual = _components_residual(_unknown_pose(key), mean, np.flatnonzero(known))
+    return custom([key], cov[np.ix_(known, known)], residual)
 
 
 HOLD = 1e-9
@@ -279,7 +266,7 @@ def hold_factor(unknown: Unknown, held: Sequence[int], value: Pose3 | FloatArray
     if isinstance(value, Pose3):
         if rows == [3, 4, 5]:
             return gtsam.PoseTranslationPrior3D(key, value, gaussian(cov))
-        return custom([key], cov, _components_residual(key, value, np.array(rows)))
+        return custom([key], cov, _components_residual(_unknown_pose(key), value, np.array(rows)))
     wanted, select = np.asarray(value, dtype=float)[rows], np.eye(unknown.dim)[rows]
 
     def point_residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:

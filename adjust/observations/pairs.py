@@ -21,7 +21,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import Pair, frame_text
 from adjust.model.result import ObservationResidual
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
-from adjust.native.pairs import pair_jacobians, pair_rows
+from adjust.native.pairs import pair_jacobians, pair_rows, sure_forms
 from adjust.native.trees import KeyCovariances
 from adjust.observations.factors import Jacobians, ObservationFactor, custom
 from adjust.spatial.rigid_motions import Motions, exp
@@ -351,7 +351,7 @@ class PairBatch:
         """Statistics of all pairs, in use or not; they do not depend on the datum of ``tree``."""
         arrays, a, b, held = self.arrays, self.a_key, self.b_key, self.both_held
         used = np.asarray(arrays.used, dtype=np.bool_)
-        residual, by_b, by_a, turn = self.jacobians(values)
+        residual, _, by_a, turn = self.jacobians(values)
         Q = np.zeros((len(self), 12, 12))
         near = np.flatnonzero(used & ~held)
         Q[near] = tree.pairs(b[near], a[near], 6)
@@ -360,10 +360,9 @@ class PairBatch:
             free = [i for i, k in enumerate(keys) if k != _HELD]
             at = np.concatenate([np.arange(6 * i, 6 * i + 6) for i in free])
             Q[e][np.ix_(at, at)] = tree.joint([keys[i] for i in free])
-        W = arrays.whitening
-        B = np.concatenate([by_b, by_a], axis=2)
-        J = np.concatenate([-turn, np.tile(np.eye(6), (len(a), 1, 1))], axis=2)
-        scatter, own = B @ Q @ np.swapaxes(B, 1, 2), J @ Q @ np.swapaxes(J, 1, 2)
+        W, half = arrays.whitening, Q[:, 6:] - turn @ Q[:, :6]  # the derivative by b is that by a times -turn
+        own = half[:, :, 6:] - half[:, :, :6] @ np.swapaxes(turn, 1, 2)
+        scatter = by_a @ own @ np.swapaxes(by_a, 1, 2)
         sign = np.where(used, -1.0, 1.0)[:, None, None]
         # a row of the whitening that is zero was not measured
         Qvv = sign * (W @ scatter @ np.swapaxes(W, 1, 2)) + np.any(W, axis=2)[..., None] * np.eye(6)
@@ -404,12 +403,14 @@ class PairBatch:
 
 def _quadratic(Q: FloatArray, v: FloatArray) -> tuple[FloatArray, IntArray]:
     """The forms v' Q^+ v (E,) and the rank of Q, eigenvalues below ``UNCONTROLLED`` counting as zero."""
-    w, U = np.linalg.eigh(Q)
+    test, freedom = sure_forms(Q, v, UNCONTROLLED), np.full(len(v), 6, dtype=np.int64)
+    rest = np.flatnonzero(test < 0.0)
+    w, U = np.linalg.eigh(Q[rest])
     kept = w > UNCONTROLLED
-    y = np.einsum("nij,ni->nj", U, v)
-    test = (np.where(kept, y * y, 0.0) / np.where(kept, w, 1.0)).sum(axis=1)
-    freedom = kept.sum(axis=1)
-    return np.where(freedom > 0, test, np.nan), freedom.astype(np.int64)
+    y = np.einsum("nij,ni->nj", U, v[rest])
+    test[rest] = (np.where(kept, y * y, 0.0) / np.where(kept, w, 1.0)).sum(axis=1)
+    freedom[rest] = kept.sum(axis=1)
+    return np.where(freedom > 0, test, np.nan), freedom
 
 
 def simple_pairs(survey: Survey, frames: FrameTree) -> tuple[IntArray, IntArray, IntArray]:

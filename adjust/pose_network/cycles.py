@@ -9,8 +9,8 @@ ones before are one. His proof asks of v only that it lies on the loop, so v nee
 meets every loop (Mehlhorn and Michail 2009, ACM J. Exp. Algorithmics 14).
 
 Whether a loop depends on those found is told by labels of the pairs, sums over GF(2) that vanish for all of these (de
-Pina 1995; Kavitha, Mehlhorn, Michail and Paluch 2008, Algorithmica 52): random ones while many are missing, where what
-does not cancel is eliminated, and then one for each of the missing, which tell what is left to be searched as well.
+Pina 1995; Kavitha, Mehlhorn, Michail and Paluch 2008, Algorithmica 52), 63 random ones: what does not cancel is
+eliminated, and the pairs with a label tell where loops are left. One that is independent cancels once in 10^18.
 """
 
 import heapq
@@ -23,8 +23,6 @@ import numpy as np
 from adjust.model.survey import BoolArray, IntArray
 from adjust.native.loops import horton_loops, label_chords, shortest_loop
 
-_FEW = 63
-"""Loops that are missing, from which each has a label of its own: as many as an integer has bits."""
 _FEWER = 2
 """How many times fewer stations must be to search from them: near ends of a search others are found, as short."""
 
@@ -159,19 +157,15 @@ def shortest_loops(
     walks = *walk, np.full(n, -1, dtype=np.int64), *(np.zeros(n, dtype=np.int64) for _ in range(5))
     every, work = np.array(meeting_stations(*walk[:2]), dtype=np.int64), np.zeros(1, dtype=np.int64)
     drawn = np.random.default_rng(0).integers(1, 2**63 - 1, size=n_loops, dtype=np.int64)
-    label, free, length = np.zeros_like(chord), np.zeros(0, dtype=np.int64), 1
+    label, length = np.zeros_like(chord), 1
     found, start, lengths = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], [0]
     while (missing := n_loops - int(led.sum())) and work[0] < budget and length <= n:
-        if not len(free):
-            if missing <= _FEW:
-                free = np.flatnonzero(~led)
-                drawn[free] = np.left_shift(1, np.arange(missing))
-            label_chords(sets, drawn)
-            label[chords] = drawn
+        label_chords(sets, drawn)
+        label[chords] = drawn
         roots = _through(walk, label, every)
         length = length + 1 if roots is every else shortest_loop(walks, label, roots, budget, work)
         loops, begin = np.empty((missing, length), dtype=np.int64), np.empty(missing, dtype=np.int64)
-        more = horton_loops(walks, sets, (label, free), roots, budget, work, loops, begin) if length else 0
+        more = horton_loops(walks, sets, label, roots, budget, work, loops, begin) if length else 0
         found.append(loops[:more].ravel())
         start.append(begin[:more])
         lengths += [length] * more

@@ -60,7 +60,7 @@ def network_from_survey(survey: Survey, any_datum: bool = False) -> PoseNetwork:
     any_datum: a survey that gives none is solved as a free network. Raises SurveyError for pairs that join other frames
     than fixed stations, IndeterminateError where the survey gives no datum.
     """
-    stations = {s.station_id: s for s in survey.stations}
+    stations = survey.stations_by_id
     if not survey.pairs_join_fixed_stations:
         for pair, ref in ((p, r) for p in survey.pairs for r in (p.a, p.b)):
             if ref.kind != "station" or ref.frame_id not in stations or stations[ref.frame_id].motion != "fixed":

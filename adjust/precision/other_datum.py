@@ -96,13 +96,10 @@ class _Released(Rewriting):
     """Held points and held poses of things in the world are free."""
 
     def __init__(self, survey: Survey) -> None:
-        self.carried = {t.target_id for t in survey.targets if t.station_id is not None}
+        self.survey = survey
 
     def pose(self, name: ParameterName, given: PoseParameter) -> PoseParameter:
-        inside = name[0] in ("station_from_camera", "mount_from_station") or (
-            name[0] == "carrier_from_target" and name[1] in self.carried
-        )
-        return replace(given, treatment="free") if given.treatment == "held" and not inside else given
+        return replace(given, treatment="free") if given.treatment == "held" and in_world(self.survey, name) else given
 
     def point(self, name: ParameterName, given: PointParameter) -> PointParameter:
         return replace(given, treatment="free") if given.treatment == "held" else given
@@ -156,7 +153,7 @@ def _move(
         elif unknown.kind == "pose":
             pose = values.atPose3(unknown.key)
             scaled = Pose3(pose.rotation(), scale * pose.translation())
-            out.update(unknown.key, world.compose(scaled) if in_world(graph, name) else scaled)
+            out.update(unknown.key, world.compose(scaled) if in_world(graph.survey, name) else scaled)
         else:
             out.update(unknown.key, np.asarray(values.atVector(unknown.key) + steps[unknown.key]))
     return out
@@ -181,4 +178,3 @@ def _moved(graph: AdjustmentGraph, estimate: Estimate, values: gtsam.Values, new
         return estimate
     value = np.asarray(values.atVector(unknown.key)) if vector is None else vector.full(values)
     return replace(estimate, value=value, cov=cov)
-

@@ -250,14 +250,9 @@ class Precision(Covariances):
                    for e, (row, k) in enumerate(zip(graph.pairs.rows.tolist(), sizes, strict=True))}  # fmt: skip
         for item in graph.singles:
             if item.kind == "pair":
-                _, M, root = self.influence(item)
-                out[item.ids[0]] = root @ M @ root.T
+                x = self.rows(item)
+                out[item.ids[0]] = x.root @ x.influence @ x.root.T
         return out | dict(self.by_conditions)
-
-    def influence(self, item: ObservationFactor) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Whitened residual (k,), whitened A Q A' (k, k), and the square root information's inverse (k, k)."""
-        rows = self.rows(item)
-        return rows.e, rows.influence, rows.root
 
 
 def precision_of(adjustment: Adjustment) -> Precision:
@@ -306,7 +301,8 @@ def other_residuals(precision: Precision) -> tuple[ObservationResidual, ...]:
         places = (graph.first_pair + graph.pairs.rows).tolist()
         out |= dict(zip(places, graph.pairs.residuals(precision.pairs, graph.survey.pairs), strict=True))
     for i, item in zip(graph.single, graph.singles, strict=True):
-        e, M, root = precision.influence(item)
+        x = precision.rows(item)
+        e, M, root = x.e, x.influence, x.root
         n = len(e)
         Q = np.eye(n) - M if item.used else np.eye(n) + M
         v = root @ e
@@ -382,7 +378,7 @@ def _image_sums(
         return np.asarray(np.bincount(of_point, of_points[which], len(names)), dtype=np.float64)
 
     squares = whitened_squares(images.residuals, graph.square_roots())
-    return total(np.full(len(squares), 2.0)), total(images.redundancy.sum(axis=1)), total(squares)
+    return total(np.full(len(squares), 2.0)), total(images.redundancy @ np.ones(2)), total(squares)
 
 
 def global_test(omega: float, redundancy: int, alpha: float) -> GlobalTest | None:

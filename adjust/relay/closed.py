@@ -22,6 +22,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import Closure, FrameRef, Pair
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.survey import FloatArray, PoseParameter, Station, Survey
+from adjust.pose_network.cycles import connected_parts
 from adjust.precision.precision import Precision, adjusted_motion, global_test
 from adjust.relay.network import network_from_pairs
 from adjust.relay.result import AdjustedPairs, whitening
@@ -67,8 +68,7 @@ def _with_stations_for_eyes(survey: Survey) -> Survey:
 
 def _eye_names(survey: Survey) -> dict[FrameRef, str]:
     """The station that each eye becomes."""
-    cameras = {c.camera_id: c for c in survey.cameras}
-    targets = {t.target_id: t for t in survey.targets}
+    cameras, targets = survey.cameras_by_id, survey.targets_by_id
     seen = {(f.kind, f.frame_id) for f in _frames_of(survey)}
     out: dict[FrameRef, str] = {}
     for ref in (r for p in survey.pairs for r in (p.a, p.b)):
@@ -87,9 +87,9 @@ def _of_epoch(ref: FrameRef, survey: Survey) -> FrameRef:
     """The frame without its epoch, where it does not move between epochs."""
     still = {s.station_id for s in survey.stations if s.motion == "fixed"}
     if ref.kind == "camera":
-        carrier = next(c.station_id for c in survey.cameras if c.camera_id == ref.frame_id)
+        carrier = survey.cameras_by_id[ref.frame_id].station_id
         return replace(ref, epoch_id=None) if carrier in still else ref
-    target = next(t for t in survey.targets if t.target_id == ref.frame_id)
+    target = survey.targets_by_id[ref.frame_id]
     fixed = target.motion != "epoch" and (target.station_id is None or target.station_id in still)
     return replace(ref, epoch_id=None) if fixed else ref
 
@@ -127,24 +127,12 @@ def _frames_in(value: object) -> Iterator[FrameRef]:
 
 def _one_of_each_part(pairs: Sequence[Pair], eyes: set[str]) -> set[str]:
     """The first eye of every part of the pairs in use that has nothing but eyes: their places are relative to it."""
-    part: dict[FrameRef, FrameRef] = {}
-
-    def root(ref: FrameRef) -> FrameRef:
-        part.setdefault(ref, ref)
-        while part[ref] != ref:
-            part[ref] = part[part[ref]]
-            ref = part[ref]
-        return ref
-
-    for pair in pairs:
-        a, b = root(pair.a), root(pair.b)
-        part[b] = a
-    anchored = {root(r) for r in list(part) if not (r.kind == "station" and r.frame_id in eyes)}
-    first: dict[FrameRef, str] = {}
-    for ref in list(part):
-        if root(ref) not in anchored:
-            first.setdefault(root(ref), ref.frame_id)
-    return set(first.values())
+    number = {ref: i for i, ref in enumerate(dict.fromkeys(r for p in pairs for r in (p.a, p.b)))}
+    ends = np.array([(number[p.a], number[p.b]) for p in pairs], dtype=np.int64).reshape(-1, 2)
+    part = dict(zip(number, connected_parts(len(number), *ends.T).tolist(), strict=True))
+    first = {part[ref]: ref.frame_id for ref in reversed(number)}
+    anchored = {part[r] for r in number if not (r.kind == "station" and r.frame_id in eyes)}
+    return {frame_id for p, frame_id in first.items() if p not in anchored}
 
 
 # -- mounts ------------------------------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ so it loses them in large sets: the loop here takes full steps, checks the closu
 were found safe.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -27,7 +28,7 @@ from adjust.observations.factors import Jacobians, custom
 from adjust.pose_network.cycles import connected_parts
 from adjust.pose_network.loops import Loops, evaluate_loops, loop_vectors
 from adjust.relay.loops import LoopBasis, loop_basis, loop_misclosures
-from adjust.relay.network import MeasuredPairs, gtsam_motion, motions_from_values, prior_factor, station_values
+from adjust.relay.network import MeasuredPairs, gtsam_motion, prior_factor, station_values
 from adjust.relay.normal_equations import (
     NormalEquations,
     SparseNormals,
@@ -73,25 +74,21 @@ def adjust_conditions(network: MeasuredPairs, options: ConditionOptions = Condit
     Raises NotConvergedError, naming the loop that closes worst.
     """
     basis = loop_basis(network.topology, _loop_kind(network, options))
-    limit = options.closure * max(1.0, _reach(network))
-    X, root = network.b_from_a, whitening(network.cov)
-    for iteration in range(1, options.max_iterations + 1):
+
+    def step(X: Motions) -> FloatArray:
         w, blocks, r, Q = _linearise(network, basis, X)
         B, normals = condition_matrix(basis, blocks), _normals(basis, blocks, Q)
         multipliers = normals.solve(w.ravel() - B @ r.ravel())
-        d = -r - (Q @ (B.T @ multipliers).reshape(*r.shape, 1))[..., 0]
-        X = X.retract(d)
-        step = float(np.abs(root @ d[..., None]).max())
-        closure = float(np.abs(loop_vectors(basis, X)).max()) if len(basis) else 0.0
-        if not np.isfinite(step):
-            break
-        if closure < limit and step < options.max_step:
-            return _finish(network, basis, X, closure, iteration)
-    worst = loop_misclosures(network)
-    raise NotConvergedError(
-        f"the loops do not close after {options.max_iterations} steps (misclosure left {closure:.2g}, last step "
-        f"{step:.2g} sigma); look for a wrong pair in {worst.text(int(np.argmax(worst.test)))}"
-    )
+        return np.asarray(-r - (Q @ (B.T @ multipliers).reshape(*r.shape, 1))[..., 0])
+
+    found = _closed(network, basis, options, step)
+    if not found.arrived:
+        worst = loop_misclosures(network)
+        raise NotConvergedError(
+            f"the loops do not close after {options.max_iterations} steps (misclosure left {found.closure:.2g}, last "
+            f"step {found.step:.2g} sigma); look for a wrong pair in {worst.text(int(np.argmax(worst.test)))}"
+        )
+    return _finish(network, basis, found)
 
 
 def adjust_condition_factors(
@@ -102,11 +99,28 @@ def adjust_condition_factors(
     Raises SurveyError for more loops than GTSAM eliminates safely, NotConvergedError where they do not close.
     """
     basis = loop_basis(network.topology, _loop_kind(network, options))
-    limit = options.closure * max(1.0, _reach(network))
-    found = _solve_factors(network, basis, limit, options.max_step, options.max_iterations)
+    if len(basis) > MAX_HARD_LOOPS:
+        raise SurveyError(
+            f"{len(basis)} loops are too many hard constraints (at most {MAX_HARD_LOOPS}); use the normal equations of "
+            "the conditions, or the parametric form"
+        )
+    graph, n, dim = condition_graph(network, basis), network.topology.n_pairs, network.dim
+
+    def step(X: Motions) -> FloatArray:
+        delta = graph.linearize(station_values(X)).optimize()
+        return np.array([delta.at(e) for e in range(n)])
+
+    found = _closed(network, basis, options, step)
+    if not found.arrived:
+        raise NotConvergedError(
+            f"the hard loop closures did not settle in {options.max_iterations} steps (misclosure left "
+            f"{found.closure:.2g}, last step {found.step:.2g} sigma); use the normal equations of the conditions, "
+            "which name the loop that closes worst"
+        )
+    marginals = gtsam.Marginals(graph, station_values(found.b_from_a))
+    cov = np.array([marginals.marginalCovariance(e) for e in range(n)])
     joint = _precision(network, basis, found.b_from_a)[1]
-    total = network.dim * len(basis)
-    pairs = adjusted_pairs(network, found.b_from_a, found.cov, total, found.iterations, joint)
+    pairs = adjusted_pairs(network, found.b_from_a, cov, dim * len(basis), found.iterations, joint)
     return ConditionAdjustment(pairs, basis, found.closure)
 
 
@@ -164,12 +178,40 @@ def _normals(basis: LoopBasis, blocks: FloatArray, Q: FloatArray) -> NormalEquat
     return SparseNormals(basis, blocks, Q)
 
 
-def _finish(
-    network: MeasuredPairs, basis: LoopBasis, X: Motions, closure: float, iterations: int
-) -> ConditionAdjustment:
-    normals, joint = _precision(network, basis, X)
+@dataclass(frozen=True, eq=False)
+class _Closed:
+    """Pairs after the last step, the largest misclosure left, and the step in sigmas of the measured pairs."""
+
+    b_from_a: Motions
+    closure: float
+    step: float
+    iterations: int
+    arrived: bool
+
+
+def _closed(
+    network: MeasuredPairs, basis: LoopBasis, options: ConditionOptions, step: Callable[[Motions], FloatArray]
+) -> _Closed:
+    """Full Gauss-Newton steps until all loops close and nothing moves."""
+    limit, root = options.closure * max(1.0, _reach(network)), whitening(network.cov)
+    X, moved, closure = network.b_from_a, np.inf, np.inf
+    for iteration in range(1, options.max_iterations + 1):
+        d = step(X)
+        X = X.retract(d)
+        moved = float(np.abs(root @ d[..., None]).max())
+        closure = float(np.abs(loop_vectors(basis, X)).max()) if len(basis) else 0.0
+        if not np.isfinite(moved):
+            break
+        if closure < limit and moved < options.max_step:
+            return _Closed(X, closure, moved, iteration, True)
+    return _Closed(X, closure, moved, options.max_iterations, False)
+
+
+def _finish(network: MeasuredPairs, basis: LoopBasis, found: _Closed) -> ConditionAdjustment:
+    normals, joint = _precision(network, basis, found.b_from_a)
     cov, total = normals.adjusted_covariances(), network.dim * len(basis)
-    return ConditionAdjustment(adjusted_pairs(network, X, cov, total, iterations, joint), basis, closure)
+    pairs = adjusted_pairs(network, found.b_from_a, cov, total, found.iterations, joint)
+    return ConditionAdjustment(pairs, basis, found.closure)
 
 
 def _precision(network: MeasuredPairs, basis: LoopBasis, X: Motions) -> tuple[NormalEquations, Joint]:
@@ -183,47 +225,6 @@ def _precision(network: MeasuredPairs, basis: LoopBasis, X: Motions) -> tuple[No
 
 
 # -- the conditions as factors of GTSAM's graph -----------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class _FactorSolution:
-    """Adjusted pairs, their covariances (E, dim, dim), the largest misclosure left."""
-
-    b_from_a: Motions
-    cov: FloatArray
-    closure: float
-    iterations: int
-
-
-def _solve_factors(
-    network: MeasuredPairs, basis: LoopBasis, limit: float, max_step: float, max_iterations: int
-) -> _FactorSolution:
-    """Full Gauss-Newton steps until all loops close and nothing moves. Raises SurveyError, NotConvergedError."""
-    if len(basis) > MAX_HARD_LOOPS:
-        raise SurveyError(
-            f"{len(basis)} loops are too many hard constraints (at most {MAX_HARD_LOOPS}); use the normal equations of "
-            "the conditions, or the parametric form"
-        )
-    graph, values = condition_graph(network, basis), station_values(network.b_from_a)
-    n, dim, root = network.topology.n_pairs, network.dim, whitening(network.cov)
-    step = closure = np.inf
-    for iteration in range(1, max_iterations + 1):
-        delta = graph.linearize(values).optimize()
-        values = values.retract(delta)
-        d = np.array([delta.at(e) for e in range(n)])
-        X = motions_from_values(values, n, dim)
-        step = float(np.abs(root @ d[..., None]).max())
-        closure = float(np.abs(loop_vectors(basis, X)).max()) if len(basis) else 0.0
-        if closure < limit and step < max_step:
-            marginals = gtsam.Marginals(graph, values)
-            cov = np.array([marginals.marginalCovariance(e) for e in range(n)])
-            return _FactorSolution(X, cov, closure, iteration)
-        if not np.isfinite(step):
-            break
-    raise NotConvergedError(
-        f"the hard loop closures did not settle in {max_iterations} steps (misclosure left {closure:.2g}, last step "
-        f"{step:.2g} sigma); use the normal equations of the conditions, which name the loop that closes worst"
-    )
 
 
 def condition_graph(network: MeasuredPairs, basis: LoopBasis) -> gtsam.NonlinearFactorGraph:

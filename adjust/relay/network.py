@@ -93,14 +93,6 @@ def station_values(motions: Motions) -> gtsam.Values:
     return values
 
 
-def motions_from_values(values: gtsam.Values, n: int, dim: int) -> Motions:
-    """The rotations or poses under the keys 0 to n - 1."""
-    if dim == 3:
-        return Motions(np.array([values.atRot3(i).matrix() for i in range(n)]).reshape(-1, 3, 3))
-    matrices = np.array([values.atPose3(i).matrix() for i in range(n)]).reshape(-1, 4, 4)
-    return Motions(matrices[:, :3, :3], matrices[:, :3, 3])
-
-
 def prior_factor(key: int, motion: Rot3 | Pose3, cov: FloatArray) -> gtsam.NonlinearFactor:
     """A rotation or pose known with covariance in its tangent."""
     if isinstance(motion, Rot3):

@@ -241,7 +241,7 @@ class NetworkSession:
 
     def survey(self) -> Survey:
         """All pairs and the stations that they reach, as they stand."""
-        pairs, given = (*self._survey.pairs, *self._added), {s.station_id: s for s in self._survey.stations}
+        pairs, given = (*self._survey.pairs, *self._added), self._survey.stations_by_id
         return replace(
             self._survey, stations=tuple(given.get(s, Station(s)) for s in self._ids),
             pairs=tuple(replace(p, used=False) if p.pair_id in self._removed else p for p in pairs),

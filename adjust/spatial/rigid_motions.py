@@ -5,6 +5,7 @@ Exp and Log follow Sola, Deray and Atchuthan (2018, "A micro Lie theory", eqs. 1
 "State Estimation for Robotics", eq. 7.86 for the coupling block).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,32 @@ class Motions:
     def dim(self) -> int:
         """3 for rotations, 6 for rigid motions."""
         return 3 if self.translation is None else 6
+
+    @staticmethod
+    def of(matrices: FloatArray) -> "Motions":
+        """Rigid motions of matrices (n, 4, 4)."""
+        return Motions(matrices[:, :3, :3].copy(), matrices[:, :3, 3].copy())
+
+    @staticmethod
+    def joined(parts: Sequence["Motions"]) -> "Motions":
+        """One after the other."""
+        shifts = [p.translation for p in parts if p.translation is not None]
+        return Motions(np.concatenate([p.rotation for p in parts]), np.concatenate(shifts) if shifts else None)
+
+    @property
+    def shifts(self) -> FloatArray:
+        """Translations (n, 3) m of rigid motions. Raises ValueError for rotations alone."""
+        if self.translation is None:
+            raise ValueError("a rotation alone is no pose")
+        return self.translation
+
+    def matrices(self) -> FloatArray:
+        """The same (n, 4, 4) of rigid motions."""
+        return rigid(self.rotation, self.shifts)
+
+    def rescaled(self, factor: float | FloatArray) -> "Motions":
+        """Rigid motions with their lengths times a factor, or times one of each (n,)."""
+        return Motions(self.rotation, self.shifts * np.reshape(factor, (-1, 1)))
 
     def __len__(self) -> int:
         return len(self.rotation)
@@ -70,7 +97,7 @@ class Motions:
         """Ad (n, dim, dim): ``X Exp(d) X^-1 = Exp(Ad d)``."""
         if self.translation is None:
             return self.rotation
-        return adjoint(rigid(self.rotation, self.translation))
+        return adjoint(self.matrices())
 
 
 def identities(n: int, dim: int) -> Motions:

@@ -6,13 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from gtsam import Pose3
 
+from adjust.graph.datum import in_world
 from adjust.model.result import ParameterName
 from adjust.model.rewriting import Rewriting
 from adjust.model.survey import FloatArray, PointParameter, PoseParameter, Survey
 from adjust.spatial.rigid import align
 from adjust.start.search import Start
-
-_IN_WORLD = ("world_from_station", "world_from_table")
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,20 +76,14 @@ def moved_onto(start: Start, given: GivenStarts, survey: Survey) -> Start:
 
     The inner constraints keep the mean place of the start values, and people expect their own.
     """
-    in_world = {n: p for n, p in start.poses.items() if _is_in_world(n, survey)}
+    placed = {n: p for n, p in start.poses.items() if in_world(survey, n)}
     pairs = [(x, start.points[n]) for n, x in given.points.items() if n in start.points]
-    pairs += [(p.translation(), in_world[n].translation()) for n, p in given.poses.items() if n in in_world]
+    pairs += [(p.translation(), placed[n].translation()) for n, p in given.poses.items() if n in placed]
     if len(pairs) < 3:
         return start
     there, here = (np.array([pair[i] for pair in pairs], dtype=float) for i in (0, 1))
     if min(np.linalg.matrix_rank(x - x.mean(axis=0), tol=1e-6) for x in (there, here)) < 2:
         return start
     move = Pose3(np.ascontiguousarray(align(there, here)))
-    poses = {n: move * p if n in in_world else p for n, p in start.poses.items()}
+    poses = {n: move * p if n in placed else p for n, p in start.poses.items()}
     return replace(start, poses=poses, points={n: np.asarray(move.transformFrom(x)) for n, x in start.points.items()})
-
-
-def _is_in_world(name: ParameterName, survey: Survey) -> bool:
-    if name[0] == "carrier_from_target":
-        return next(t.station_id for t in survey.targets if t.target_id == name[1]) is None
-    return name[0] in _IN_WORLD

@@ -92,10 +92,9 @@ class FrameNetwork:
         self.gauged: list[int] = []
         self.lever = 1.0
         readings = {(r.table_id, r.epoch_id): r.angles for r in survey.table_readings}
-        tables = {t.table_id: t for t in survey.tables}
         for slot, name in enumerate(self.names):
             if name[0] == "table_motion":
-                value: FloatArray | None = table_from_mount(tables[name[1]], readings[(name[1], name[2])])
+                value: FloatArray | None = table_from_mount(survey.tables_by_id[name[1]], readings[(name[1], name[2])])
             else:
                 value = given_pose(self.parameters[name])
             if value is not None:
@@ -272,8 +271,7 @@ def table_from_mount(table: Table, angles: FloatArray) -> FloatArray:
     """Motion (4, 4) of a table at angles (k,) rad with its given geometry (:class:`adjust.model.survey.Table`)."""
     if len(angles) != len(table.axes):
         raise SurveyError(f"table {table.table_id!r} has {len(table.axes)} axes, a reading has {len(angles)} angles")
-    geometry = dict(zip(table.geometry.names, table.geometry.values.tolist(), strict=True))
-    (R,), (t,), _ = table_motions(table.axes, geometry, np.asarray(angles, dtype=float)[None])
+    (R,), (t,), _ = table_motions(table.axes, table.geometry.by_name, np.asarray(angles, dtype=float)[None])
     return rigid(R, t)
 
 

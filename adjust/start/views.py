@@ -11,6 +11,7 @@ from adjust.lenses.models import camera_constants, focal_length_px, lens_model, 
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import BoolArray, Camera, FloatArray, IntArray, Survey
+from adjust.native.parallel import side_by_side
 from adjust.native.views import refine_poses, view_errors, view_offsets
 from adjust.start.closed_forms.absolute_pose import view_poses
 
@@ -125,10 +126,12 @@ def rays_by_block(
     for i, uv in seen.items():
         if len(uv):
             mine.setdefault(survey.image_blocks[i].camera_id, []).append(i)
-    for camera in (c for c in survey.cameras if c.camera_id in mine):
-        of_camera = mine[camera.camera_id]
-        found = rays_of_images(camera, lenses[camera.camera_id], [seen[i] for i in of_camera])
-        for i, of_block in zip(of_camera, found, strict=True):
+    cameras = [c for c in survey.cameras if c.camera_id in mine]
+    found = side_by_side(
+        lambda c: rays_of_images(c, lenses[c.camera_id], [seen[i] for i in mine[c.camera_id]]), cameras
+    )
+    for camera, of_camera in zip(cameras, found, strict=True):
+        for i, of_block in zip(mine[camera.camera_id], of_camera, strict=True):
             if isinstance(of_block, SurveyError):
                 failed[i] = str(of_block)
             else:

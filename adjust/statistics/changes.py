@@ -94,6 +94,7 @@ class ChangeSearch:
         step = s.times_covariance(np.asarray(s.A.T @ np.where(rows, s.e, 0.0)))
         self.A, self.e = s.A, s.e - s.A @ step
         self.epoch, self.epochs = _coded([b.epoch_id for b in adjustment.survey.image_blocks])
+        self.owners = list(self._owners())
         units, self.runs = list(self._units(_MOST_RUNS)), _MOST_RUNS
         shared = None if s.structured is None else len(s.structured.U)
 
@@ -111,7 +112,7 @@ class ChangeSearch:
 
     def left_out(self) -> tuple[str, ...]:
         """For people: between which epochs no change was looked for."""
-        longest = max((len(np.unique(self._epochs_of(rows))) for _, _, rows in self._owners()), default=0)
+        longest = max((len(np.unique(self._epochs_of(rows))) for _, _, rows in self.owners), default=0)
         if longest <= self.runs:
             return ()
         return (f"changes of cameras and targets were looked for at {self.runs - 1} of {longest - 1} borders between "
@@ -147,13 +148,13 @@ class ChangeSearch:
     def _owners(self) -> Iterator[tuple[str, str, IntArray]]:
         """Cameras and targets with their rows."""
         blocks, of_row = self.adjustment.survey.image_blocks, self.condensed.block
-        some = np.zeros(len(blocks), dtype=np.bool_)
-        some[of_row] = True
         for kind in ("camera", "target"):
             names = [b.camera_id if kind == "camera" else b.target_id or "" for b in blocks]
-            for name in dict.fromkeys(n for n, used in zip(names, some, strict=True) if used and n):
-                mine = np.array([n == name for n in names], dtype=np.bool_)
-                yield kind, name, np.flatnonzero(mine[of_row])
+            number = {name: i for i, name in enumerate(dict.fromkeys(names))}
+            of_rows = np.array([number[name] for name in names], dtype=np.int64)[of_row]
+            for name, i in number.items():
+                if name and len(rows := np.flatnonzero(of_rows == i)):
+                    yield kind, name, rows
 
     def _epochs_of(self, rows: IntArray) -> IntArray:
         """Of every image row."""
@@ -164,7 +165,7 @@ class ChangeSearch:
         vectors = self.system.precision.graph.unknowns.vectors
         poses = tuple(zip(POSE_COMPONENTS, POSE_UNITS, strict=True))
         whole = {t.target_id: t.x_in_target for t in survey.targets}
-        for kind, name, rows in self._owners():
+        for kind, name, rows in self.owners:
             run, first = _runs(self._epochs_of(rows), self.epochs, most_runs)
             if kind == "camera":
                 lens = vectors[("lens", name)]

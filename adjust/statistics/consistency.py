@@ -121,7 +121,7 @@ def contributions(adjustment: Adjustment, system: LinearSystem, blocks: IntArray
     if k:
         number = np.repeat(np.arange(len(images.block_ptr) - 1), np.diff(images.block_ptr))
         squares = whitened_squares(images.residuals, graph.square_roots())
-        for out, values in ((n, np.full(len(squares), 2.0)), (r, images.redundancy.sum(axis=1)), (omega, squares)):
+        for out, values in ((n, np.full(len(squares), 2.0)), (r, images.redundancy @ np.ones(2)), (omega, squares)):
             sums = np.bincount(number, np.where(images.used, values, 0.0), len(images.block_ptr) - 1)
             out[:k] = (sums / np.maximum(np.bincount(blocks, minlength=len(sums)), 1))[blocks]  # each part its share
     np.add.at(omega, system.row_of, np.where(system.row_of >= k, system.e**2, 0.0))

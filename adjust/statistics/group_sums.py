@@ -20,7 +20,7 @@ import scipy
 from scipy import sparse
 
 from adjust.model.survey import FloatArray, IntArray
-from adjust.statistics.normal import Normal
+from adjust.statistics.normal import Normal, inverse_of_factor
 from adjust.statistics.system import LinearSystem
 
 _SMALL = 500
@@ -66,12 +66,11 @@ class GroupSums:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """At given factors: q (G,), r (G,), S (G, G) and the step dx (n,)."""
+    """At given factors: q (G,), r (G,) and S (G, G)."""
 
     q: FloatArray
     r: FloatArray
     S: FloatArray
-    dx: FloatArray
 
 
 def group_sums(
@@ -125,7 +124,7 @@ def moments(sums: GroupSums, theta: FloatArray) -> Moments:
     S += _products(X, K, Q, bool(sums.mixed))
     for m, P in zip(sums.mixed, whitened, strict=True):
         _add_mixed(m, P, Q, dx, q, r, S)
-    return Moments(q, r, 0.5 * (S + S.T), dx)
+    return Moments(q, r, 0.5 * (S + S.T))
 
 
 def _inverse(N: FloatArray) -> FloatArray:
@@ -133,9 +132,7 @@ def _inverse(N: FloatArray) -> FloatArray:
     half = scipy.linalg.lapack.dpotrf(np.asfortranarray(N * np.outer(scale, scale)))
     if half[1] != 0:
         raise np.linalg.LinAlgError("the normal matrix of the groups is not positive definite")
-    upper = scipy.linalg.lapack.dpotri(half[0])[0]
-    full = np.triu(upper) + np.triu(upper, 1).T
-    return np.asarray(full * np.outer(scale, scale))
+    return inverse_of_factor(half[0], lower=False) * np.outer(scale, scale)
 
 
 def _own_trace(N: Matrix, Q: FloatArray) -> float:

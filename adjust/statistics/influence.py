@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from scipy import sparse
 
 from adjust.graph.datum import in_world
 from adjust.model.result import ParameterName
@@ -38,14 +39,14 @@ def influences(
     """The unknown and the position that each bias moves most; in the order of ``rows``."""
     system = condensed.system
     c, sigmas = system.columns, np.where(system.sigmas > 0.0, system.sigmas, np.inf)
-    places, coordinates, starts = _positions(system)
+    places, coordinates = _positions(system)
 
     def of(first: int) -> list[Influence]:
         part, out = rows[first : first + _CHUNK], list[Influence]()
         dx = shifts(condensed, part, bias)
         ratio = np.abs(dx)
         ratio /= sigmas[:, None]
-        length, furthest = _furthest(dx, coordinates, starts)
+        length, furthest = _furthest(dx, coordinates)
         for i, (row, j) in enumerate(zip(part, _first_largest(ratio).tolist(), strict=True)):
             name = places[int(furthest[i])] if places else ()
             out.append(Influence(row, c.names[j], c.components[j], c.units[j], float(dx[j, i]), float(ratio[j, i]),
@@ -55,25 +56,25 @@ def influences(
     return tuple(x for part in side_by_side(of, range(0, len(rows), _CHUNK)) for x in part)
 
 
-def _positions(system: LinearSystem) -> tuple[list[ParameterName], IntArray, IntArray]:
-    """Unknowns that are positions in the world, the columns of all their coordinates, where each begins in these."""
-    names, columns, starts = list[ParameterName](), list[int](), list[int]()
+def _positions(system: LinearSystem) -> tuple[list[ParameterName], sparse.csr_matrix]:
+    """Unknowns that are positions in the world, and (p, n) which unknowns are the coordinates of each: ones."""
+    names, columns, ptr = list[ParameterName](), list[int](), [0]
     components = system.columns.components
     for name, at in system.columns.at.items():
-        if name[0] == "point" or in_world(system.precision.graph, name):
+        if name[0] == "point" or in_world(system.precision.graph.survey, name):
             mine = [c for c in at.tolist() if components[c] in ("x", "y", "z", "tx", "ty", "tz")]
             if mine:
                 names.append(name)
-                starts.append(len(columns))
                 columns += mine
-    return names, np.array(columns, dtype=np.int64), np.array(starts, dtype=np.int64)
+                ptr.append(len(columns))
+    return names, sparse.csr_matrix((np.ones(len(columns)), columns, ptr), (len(names), len(components)))
 
 
-def _furthest(dx: FloatArray, columns: IntArray, starts: IntArray) -> tuple[FloatArray, IntArray]:
+def _furthest(dx: FloatArray, coordinates: sparse.csr_matrix) -> tuple[FloatArray, IntArray]:
     """How far the position moves that moves most, and which that is; of every column of dx (n, k)."""
-    if not len(starts):
+    if not coordinates.shape[0]:
         return np.zeros(dx.shape[1]), np.zeros(dx.shape[1], dtype=np.int64)
-    squares = np.add.reduceat(np.square(dx[columns]), starts, axis=0)
+    squares = np.asarray(coordinates @ np.square(dx))
     at = _first_largest(squares)
     return np.sqrt(squares[at, np.arange(len(at))]), at
 

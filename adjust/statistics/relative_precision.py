@@ -142,10 +142,9 @@ def _relative(adjustment: Adjustment, a: _Place, b: _Place, level: float, scaled
     scale = _scale(adjustment, scaled)
     if not np.isfinite(d).all():
         nan, none = np.full((3, 3), np.nan), Ellipsoid(np.zeros(0), np.zeros((3, 0)), level, scaled)
-        return RelativePrecision(a.name, b.name, d, nan, float("nan"), float("nan"), none, None,
+        return RelativePrecision(a.name, b.name, d, nan, float("nan"), float("nan"), none,
                                  cov[:3, :3] if turned else None)  # fmt: skip
-    flat = ellipsoid(own[:2, :2], level, *scale)
     return RelativePrecision(
         a.name, b.name, d, own, length, float(np.sqrt(max(0.0, float(u @ own @ u)))), ellipsoid(own, level, *scale),
-        flat if flat.dimension == 2 else None, cov[:3, :3] if turned else None,
+        cov[:3, :3] if turned else None,
     )  # fmt: skip

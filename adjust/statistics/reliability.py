@@ -82,7 +82,7 @@ def observation_name(adjustment: Adjustment, row: int) -> tuple[str, tuple[str, 
     point = int(block.point_idx[row - int(ptr[b])])
     if block.target_id is None:
         return "image", (block.camera_id, block.epoch_id, "points", adjustment.survey.points[point].point_id)
-    target = next(t for t in adjustment.survey.targets if t.target_id == block.target_id)
+    target = adjustment.survey.targets_by_id[block.target_id]
     return "image", (block.camera_id, block.epoch_id, block.target_id, target.point_ids[point])
 
 
@@ -250,5 +250,3 @@ def _uncontrolled(adjustment: Adjustment, tests: ObservationTests) -> tuple[str,
         part = "" if tests.freedom[row] == 0 else f" ({missing} of {int(tests.n_components[row])} directions)"
         out.append(f"{kind} {' '.join(ids)}{part}")
     return tuple(out)
-
-

@@ -205,8 +205,7 @@ class RelativePrecision:
     """Precision of b relative to a, whatever the datum of position.
 
     difference: (3,) m, b minus a in the world; cov (3, 3) m^2. distance, sigma_distance: m. ellipsoid: relative.
-    horizontal: the relative ellipse of x and y (None where they are held). rotation_cov: (3, 3) rad^2 of b's rotation
-    relative to a, in the tangent of b; None for points.
+    rotation_cov: (3, 3) rad^2 of b's rotation relative to a, in the tangent of b; None for points.
     """
 
     a: ParameterName
@@ -216,7 +215,6 @@ class RelativePrecision:
     distance: float
     sigma_distance: float
     ellipsoid: Ellipsoid
-    horizontal: Ellipsoid | None
     rotation_cov: FloatArray | None
 
 

@@ -6,16 +6,16 @@ import platform
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
 from adjust.model.errors import SurveyError
+from survey.folder.text import NOT_OURS
 from survey.project.detected import read_detected, same_file
 from survey.project.project import IMAGES_FOLDER
 
 _BESIDE = ("covariance.npz", "residuals.csv", "residuals_other.csv", "report.html")
 
 
-def unchanged_solution(folder: Path) -> dict[str, Any] | None:
+def unchanged_solution(folder: Path) -> dict[str, object] | None:
     """What ``results/solution.json`` holds where it was made from the files that are there now, by these versions.
 
     The files read, the images their points come from, the sha256 of all and the versions stand in the solution itself;
@@ -30,7 +30,7 @@ def unchanged_solution(folder: Path) -> dict[str, Any] | None:
         same = same_versions(inputs["versions"]) and _digests(folder, inputs["hashes"]) == inputs["hashes"]
         same = same and _tables(folder) <= set(inputs["hashes"]) and _images_are(folder, inputs["images"])
         return dict(solution) if same else None
-    except (SurveyError, OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except (SurveyError, *NOT_OURS):
         return None  # no results, or not ours: adjusting says what is wrong
 
 
@@ -61,7 +61,7 @@ def _tables(folder: Path) -> set[str]:
     }
 
 
-def _images_are(folder: Path, recorded: Mapping[str, Mapping[str, Any]]) -> bool:
+def _images_are(folder: Path, recorded: Mapping[str, Mapping[str, object]]) -> bool:
     """Whether the images are those of a solution; they are read only where size or time say nothing."""
     hashes = {entry["file"]: entry["sha256"] for entry in recorded.values()}
     images = folder / IMAGES_FOLDER

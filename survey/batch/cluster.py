@@ -12,7 +12,7 @@ _own = threading.local()
 _WAIT_SECONDS = 20
 
 
-def run_on_worker(task: Mapping[str, Any], retries: int) -> dict[str, Any]:
+def run_on_worker(task: Mapping[str, object], retries: int) -> dict[str, object]:
     """What a worker of the cluster does: every thread of it has a process of ours, which stays for the next folder."""
     if not hasattr(_own, "worker"):
         _own.worker = Worker()

@@ -4,7 +4,7 @@ import json
 import os
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 from adjust.model.errors import SurveyError
 from survey.batch.record import Record, record_from
@@ -22,7 +22,7 @@ class Journal:
     Raises BusyError while another batch writes it.
     """
 
-    def __init__(self, folder: Path, kept: list[dict[str, Any]]) -> None:
+    def __init__(self, folder: Path, kept: list[dict[str, object]]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / JOURNAL
         self._lock = FileLock(folder / _LOCK, folder, "batch")
@@ -45,7 +45,7 @@ class Journal:
         self._lock.release()
 
 
-def entry_of(path: Path, inputs: str, record: Record) -> dict[str, Any]:
+def entry_of(path: Path, inputs: str, record: Record) -> dict[str, object]:
     """A line of the journal."""
     return {"path": str(path), "fingerprint": inputs, "record": record.plain()}
 

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from urllib.parse import quote
 
@@ -17,6 +16,7 @@ from survey.batch.run import counts
 from survey.batch.tables import folders_csv, overview_json, short_names, trends_csv
 from survey.batch.trends import LEVEL, Trends
 from survey.folder.replacing import write_set
+from survey.folder.text import time_text
 from survey.report.language import group_name, known, message, speaking, t
 from survey.report.markup import (
     MISSING,
@@ -239,7 +239,7 @@ def _folders(records: Sequence[Record], place: Path) -> Markup:
 
 def write_overview(place: Path, records: Sequence[Record], trends: Trends, language: str = "en") -> dict[str, Path]:
     """Write overview.html, overview.json, folders.csv and trends.csv into ``place``; the paths by name."""
-    date = datetime.now(UTC).isoformat(timespec="seconds")
+    date = time_text()
     place = Path(place).absolute()
     texts = {
         "folders.csv": folders_csv(records),

@@ -19,6 +19,7 @@ from survey.batch.cluster import on_cluster
 from survey.batch.journal import Journal, entry_of, read_journal
 from survey.batch.record import DONE, FAILED, TEST_FAILED, Record, record_from, solved_record
 from survey.batch.worker import Worker, attempts
+from survey.folder.text import NOT_OURS
 
 Told = Callable[[Record], None]
 
@@ -84,7 +85,7 @@ def _known(folder: str, path: Path, options: BatchOptions, before: Mapping[str, 
     solution = unchanged_solution(path)
     if solution is not None:
         written = {p.name: str(p) for p in sorted((path / "results").iterdir()) if not p.name.startswith(".")}
-        with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError):  # not ours: adjust anew
+        with contextlib.suppress(*NOT_OURS):  # not ours: adjust anew
             return record_from(solved_record(folder, solution, written, origin="unchanged").plain())
     found = before.get(str(path))
     if found is None or found[1].state != FAILED or found[1].cause in MAY_PASS:
@@ -104,13 +105,13 @@ def _counts(records: Iterable[Record]) -> str:
     return ", ".join(f"{n} {word}" for n, word in words if n)
 
 
-def _run(tasks: Mapping[int, Mapping[str, Any]], options: BatchOptions) -> Iterator[tuple[int, Record]]:
+def _run(tasks: Mapping[int, Mapping[str, object]], options: BatchOptions) -> Iterator[tuple[int, Record]]:
     if options.scheduler:
         return on_cluster(tasks, options.scheduler, options.retries)
     return _here(tasks, options)
 
 
-def _here(tasks: Mapping[int, Mapping[str, Any]], options: BatchOptions) -> Iterator[tuple[int, Record]]:
+def _here(tasks: Mapping[int, Mapping[str, object]], options: BatchOptions) -> Iterator[tuple[int, Record]]:
     """Each of ``jobs`` threads owns a worker process and waits for it."""
     jobs = max(1, min(options.jobs or cores(), len(tasks)))
     own, workers = threading.local(), []
@@ -122,7 +123,7 @@ def _here(tasks: Mapping[int, Mapping[str, Any]], options: BatchOptions) -> Iter
     pool = ThreadPoolExecutor(jobs, "batch", initializer=prepare)
     try:
 
-        def run(task: Mapping[str, Any]) -> Record:
+        def run(task: Mapping[str, object]) -> Record:
             return attempts(own.worker, task, options.retries)
 
         futures = {pool.submit(run, task): i for i, task in tasks.items()}

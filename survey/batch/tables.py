@@ -1,10 +1,6 @@
 """A batch as text: the table on the screen, ``overview.json``, ``folders.csv`` and ``trends.csv``."""
 
-import csv
-import io
-import json
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -16,15 +12,15 @@ from survey.batch.record import DONE, FAILED, TEST_FAILED, Record
 from survey.batch.run import counts, exit_code
 from survey.batch.trends import LEVEL, Trends
 from survey.folder.plain import plain
-from survey.folder.text import cell_text
+from survey.folder.text import cell_text, csv_text, json_text
 
 STATES = {DONE: "done", FAILED: "error", TEST_FAILED: "does not fit"}
 _MOST_TOLD = 8
 
 
-def row_of(record: Record) -> dict[str, Any]:
+def row_of(record: Record) -> dict[str, object]:
     """What ``--json`` says of a folder: its summary, or why it failed."""
-    row: dict[str, Any] = {"folder": record.folder, "exit_code": record.exit_code, "origin": record.origin,
+    row: dict[str, object] = {"folder": record.folder, "exit_code": record.exit_code, "origin": record.origin,
                            "tries": record.tries, "seconds": round(record.seconds, 3)}  # fmt: skip
     if record.state == FAILED:
         return row | {"cause": record.cause, "error": record.error}
@@ -108,10 +104,10 @@ def overview_json(records: Sequence[Record], trends: Trends) -> str:
                    "points_outside_expected_by_chance": trends.expected, "notes": list(trends.notes),
                    "charts": charts},
     }  # fmt: skip
-    return json.dumps(plain(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    return json_text(plain(value))
 
 
-def _chart(trends: Trends, c: Chart, records: Sequence[Record], names: Sequence[str]) -> dict[str, Any]:
+def _chart(trends: Trends, c: Chart, records: Sequence[Record], names: Sequence[str]) -> dict[str, object]:
     at = [names[int(i)] for i in c.series.epoch]
 
     def named(mask: BoolArray) -> list[str]:
@@ -132,18 +128,17 @@ def _chart(trends: Trends, c: Chart, records: Sequence[Record], names: Sequence[
 
 def folders_csv(records: Sequence[Record]) -> str:
     """One row per folder."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(("folder", "state", "exit_code", "origin", "verdict", "sigma0", "redundancy", "n_observations",
-                     "n_unknowns", "n_not_used", "tries", "seconds", "cause", "message"))  # fmt: skip
+    head = ("folder", "state", "exit_code", "origin", "verdict", "sigma0", "redundancy", "n_observations",
+            "n_unknowns", "n_not_used", "tries", "seconds", "cause", "message")  # fmt: skip
+    rows: list[Sequence[object]] = [head]
     for r in records:
         s = r.summary
         numbers = (s.get("verdict", ""), *(_cell(s.get(k)) for k in (
             "sigma0", "redundancy", "n_observations", "n_unknowns")), _cell(s.get("suspects", {}).get("n_not_used")))
         message = r.error or s.get("reason", "")
-        writer.writerow((cell_text(r.folder), r.state, r.exit_code, r.origin, *numbers, r.tries, f"{r.seconds:.3f}",
-                         cell_text(r.cause), cell_text(message)))  # fmt: skip
-    return out.getvalue()
+        rows.append((cell_text(r.folder), r.state, r.exit_code, r.origin, *numbers, r.tries, f"{r.seconds:.3f}",
+                     cell_text(r.cause), cell_text(message)))  # fmt: skip
+    return csv_text(rows)
 
 
 def _cell(value: float | None) -> str:
@@ -152,15 +147,14 @@ def _cell(value: float | None) -> str:
 
 def trends_csv(records: Sequence[Record], trends: Trends) -> str:
     """One row per number and epoch, with both limits."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(("name", "unit", "folder", "value", "sigma", "mean", "limit_from_sigma", "limit_from_scatter",
-                     "outside_of_sigma_limits", "outside_of_scatter_limits"))  # fmt: skip
+    head = ("name", "unit", "folder", "value", "sigma", "mean", "limit_from_sigma", "limit_from_scatter",
+            "outside_of_sigma_limits", "outside_of_scatter_limits")  # fmt: skip
+    rows: list[Sequence[object]] = [head]
     for c in trends.charts:
         scatter = f"{c.by_scatter:.9g}" if np.isfinite(c.by_scatter) else ""
         for i, epoch in enumerate(c.series.epoch.tolist()):
             folder = cell_text(records[epoch].folder)
-            writer.writerow((cell_text(c.series.name), c.series.unit, folder, f"{c.series.value[i]:.12g}",
-                             f"{c.series.sigma[i]:.9g}", f"{c.mean:.12g}", f"{c.by_sigma[i]:.9g}", scatter,
-                             int(c.outside[i]), int(c.outside_scatter[i])))  # fmt: skip
-    return out.getvalue()
+            rows.append((cell_text(c.series.name), c.series.unit, folder, f"{c.series.value[i]:.12g}",
+                         f"{c.series.sigma[i]:.9g}", f"{c.mean:.12g}", f"{c.by_sigma[i]:.9g}", scatter,
+                         int(c.outside[i]), int(c.outside_scatter[i])))  # fmt: skip
+    return csv_text(rows)

@@ -45,7 +45,7 @@ class Worker:
         """Of the running process."""
         return self._process.pid if self._process is not None else None
 
-    def run(self, task: Mapping[str, Any]) -> Record:
+    def run(self, task: Mapping[str, object]) -> Record:
         """The record of a task. Raises WorkerDiedError where the process ended without one."""
         self._busy = True
         try:
@@ -53,7 +53,7 @@ class Worker:
         finally:
             self._busy = False
 
-    def _answer(self, process: "subprocess.Popen[bytes]", task: Mapping[str, Any]) -> Record:
+    def _answer(self, process: "subprocess.Popen[bytes]", task: Mapping[str, object]) -> Record:
         if process.stdin is None or process.stdout is None:
             raise WorkerDiedError("it has no pipes")
         try:
@@ -134,7 +134,7 @@ def main() -> None:
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a library prints must not get between the answers
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the owner says when to stop
-    tasks: queue.Queue[dict[str, Any]] = queue.Queue()
+    tasks: queue.Queue[dict[str, object]] = queue.Queue()
     threading.Thread(target=_listen, args=(tasks,), daemon=True).start()
     from survey.batch.task import adjust_task
 
@@ -144,7 +144,7 @@ def main() -> None:
         answers.flush()
 
 
-def _listen(tasks: "queue.Queue[dict[str, Any]]") -> None:
+def _listen(tasks: "queue.Queue[dict[str, object]]") -> None:
     """Take tasks in; when the owner is gone nobody wants the answer."""
     for line in sys.stdin.buffer:
         tasks.put(json.loads(line))

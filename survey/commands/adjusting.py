@@ -161,8 +161,9 @@ def declare_report(commands: Commands) -> None:
 def _report(arguments: argparse.Namespace) -> int:
     begin_adjusting()
     require_project(arguments.folder, arguments.out)
-    from survey.jobs.adjusting.job import adjust_job, command_line
+    from survey.jobs.adjusting.job import adjust_job
     from survey.report.language import ReportOptions
+    from survey.solution.earlier.runs import command_line
 
     language = arguments.language if arguments.language != "en" else None
     flags = {"language": language, "pdf": arguments.pdf, "check": arguments.check, "out": arguments.out}

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Any, NoReturn, Protocol, TextIO, cast
+from typing import NoReturn, Protocol, TextIO, cast
 
 from adjust.model.errors import SurveyError
 from survey.folder.kept import require_project as require_project
@@ -34,7 +34,7 @@ class _Shown:
         """As that of a file."""
         return self._out.write(shown(text))
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> object:
         return getattr(self._out, name)
 
 
@@ -99,7 +99,7 @@ def begin_adjusting() -> None:
 class Version(argparse.Action):
     """Prints the version and which vector instructions run, looked up only when it is asked for."""
 
-    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         """Print it and stop."""
         from importlib.metadata import PackageNotFoundError, version
 
@@ -146,7 +146,7 @@ def say(arguments: argparse.Namespace, *lines: str) -> None:
             print(line, file=sys.stderr)
 
 
-def print_json(value: Mapping[str, Any]) -> None:
+def print_json(value: Mapping[str, object]) -> None:
     """The summary as one JSON object on stdout."""
     print(json.dumps(value, indent=1, allow_nan=False))
 
@@ -154,7 +154,7 @@ def print_json(value: Mapping[str, Any]) -> None:
 class Outcome(Protocol):
     """What a job gives back."""
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """As plain values."""
 
     def text(self) -> str:
@@ -170,7 +170,7 @@ def show(arguments: argparse.Namespace, outcome: Outcome, written: Iterable[Path
         say(arguments, *(f"written: {path}" for path in written))
 
 
-def tested(summary: Mapping[str, Any]) -> int:
+def tested(summary: Mapping[str, object]) -> int:
     """Exit code by what the summary of a solution says: cautious sigmas mislead nobody, and are no failure."""
     from survey.solution.verdict import misfits
 

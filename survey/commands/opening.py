@@ -5,7 +5,7 @@ import os
 import signal
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from survey.commands.common import DONE, is_set, not_negative, positive, print_json, require_project, say
 from survey.commands.parser import Commands, project_folder
@@ -125,7 +125,7 @@ def _runs(arguments: argparse.Namespace) -> int:
     return DONE
 
 
-def _done(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
+def _done(arguments: argparse.Namespace) -> tuple[dict[str, object], str]:
     from survey.solution.earlier.changes import solution_changes
     from survey.solution.earlier.runs import list_runs, load_run, pin_run
 

@@ -1,12 +1,11 @@
 """The example "alignment": a board to be made parallel to a levelled turntable by levels and a laser; no images."""
 
-import json
-
 import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model.survey import FloatArray
 from adjust.spatial.vertical import tilted
+from survey.folder.text import json_text
 
 ARCSEC = np.pi / 648000.0
 UP = tilted(np.array([0.0, 0.0, 1.0]), np.array([90.0, -60.0]) * ARCSEC)[0]
@@ -82,7 +81,7 @@ def alignment_files(seed: int, off: FloatArray = OFF) -> dict[str, str]:
         "observations/levels.csv": "\n".join(levels) + "\n",
         "observations/laser_spots.csv": "\n".join(spots) + "\n",
         "observations/table_angles.csv": "\n".join(angles) + "\n",
-        "truth.json": json.dumps(truth, indent=1) + "\n",
+        "truth.json": json_text(truth),
     }
 
 

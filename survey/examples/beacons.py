@@ -1,11 +1,10 @@
 """The example "total-station": the beacons of a laboratory by total station, caliper and levelling; no images."""
 
-import json
-
 import numpy as np
 
 from adjust.model.observations import PositionRef, Reading, ReadingKind
 from adjust.model.survey import FloatArray, Point, Setup, Survey
+from survey.folder.text import json_text
 from survey.simulate.readings import Instruments
 from survey.simulate.scene import Scene, Truth
 
@@ -97,5 +96,5 @@ def beacon_files(seed: int) -> dict[str, str]:
         "survey.toml": text,
         "observations/terrestrial.csv": "\n".join(rows) + "\n",
         "observations/distances.csv": "\n".join(caliper) + "\n",
-        "truth.json": json.dumps({"note": note, "seed": seed, "parameters": parameters}, indent=1) + "\n",
+        "truth.json": json_text({"note": note, "seed": seed, "parameters": parameters}),
     }

@@ -1,6 +1,5 @@
 """What stands in the files of each example folder, images aside; the truth as JSON, which no command reads."""
 
-import json
 from collections.abc import Callable, Iterable
 
 import numpy as np
@@ -9,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from adjust.model.result import ParameterName
 from adjust.model.survey import TABLE_GEOMETRY, Camera, FloatArray, Survey, Target
+from survey.folder.text import json_text
 from survey.project.targets import Charuco, Checkerboard, MarkerGrid, TargetKind
 from survey.simulate.draft import Draft
 from survey.simulate.labs import (
@@ -251,7 +251,7 @@ _ARCSEC = 180.0 / np.pi * 3600.0
 def truth_json(truth: Truth, seed: int) -> str:
     """Every parameter by ``kind/id[/epoch]``, with units in the key names."""
     parameters = {"/".join(name): _value(name, value) for name, value in truth.items()}
-    return json.dumps({"note": _NOTE, "seed": seed, "parameters": parameters}, indent=1) + "\n"
+    return json_text({"note": _NOTE, "seed": seed, "parameters": parameters})
 
 
 def _value(name: ParameterName, value: Pose3 | FloatArray) -> dict[str, object]:

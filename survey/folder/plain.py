@@ -10,7 +10,7 @@ _AS_IT_IS = frozenset((str, int, bool, type(None)))
 _FLOATS = {float}
 
 
-class PlainRecords(Mapping[str, dict[str, Any]]):
+class PlainRecords(Mapping[str, dict[str, object]]):
     """Entries by name whose values are what JSON knows already."""
 
 

@@ -16,7 +16,7 @@ _LARGEST = 1e15
 class Each:
     """A dictionary of any keys, all values of one shape; ``key`` may refuse some."""
 
-    shape: Any
+    shape: object
     key: Callable[[str], bool] = lambda _: True
 
 
@@ -70,7 +70,7 @@ def misfit(value: object, shape: Any, name: str = "") -> str | None:
     return None if fits else _found(name, value)
 
 
-def _of_dictionary(value: object, shape: Mapping[str, Any] | Each, name: str) -> str | None:
+def _of_dictionary(value: object, shape: Mapping[str, object] | Each, name: str) -> str | None:
     if not isinstance(value, dict):
         return _found(name, value)
     if isinstance(shape, Each):

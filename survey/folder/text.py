@@ -1,15 +1,19 @@
 """Files as text: reading with clear errors, writing that never leaves half a file, names for messages."""
 
+import csv
 import difflib
 import errno
 import functools
 import hashlib
+import io
+import json
 import os
 import re
 import stat
 import tempfile
 import threading
 from collections.abc import Iterable
+from datetime import UTC, datetime
 from pathlib import Path
 
 from adjust.model.errors import SurveyError
@@ -18,6 +22,8 @@ from survey.folder.locking import hold, remove_unheld
 LARGEST_FILE = 4 * 2**30  # bytes; longer observations go into several projects
 LARGEST_NUMBER = 1e15  # its square and what is made of it stay finite
 FORBIDDEN_IN_IDS = set('/\\:@,;"|<>*?')
+NOT_OURS = (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, RecursionError, OSError)
+"""What a file raises that is taken for one of this program and is none, or was damaged."""
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what spreadsheets take for the beginning of a formula
 _ASKING = threading.Lock()
 _LONGEST_ID = 120  # bytes: an id with a prefix and an ending is still the name of a file
@@ -95,7 +101,12 @@ def _umask() -> int:
 
 
 def read_bytes(path: Path, largest: int = LARGEST_FILE) -> tuple[bytes, str]:
-    """Content of a file and its sha256; raises SurveyError where it cannot be read, is no file, or over ``largest``."""
+    """:func:`content` of a file and its sha256."""
+    return with_digest(content(path, largest))
+
+
+def content(path: Path, largest: int = LARGEST_FILE) -> bytes:
+    """Bytes of a file; raises SurveyError where it cannot be read, is no file, or over ``largest``."""
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):  # a pipe would never end
@@ -103,10 +114,9 @@ def read_bytes(path: Path, largest: int = LARGEST_FILE) -> tuple[bytes, str]:
         if status.st_size > largest:
             found = f"{status.st_size / 1e6:.0f} MB, more than the {largest / 1e6:.0f} MB that are read"
             raise SurveyError(f"{path}: the file has {found}; check whether it is the right one, or split it")
-        data = path.read_bytes()
+        return path.read_bytes()
     except OSError as error:
         raise SurveyError(f"{path}: cannot be read ({error.strerror}); check the name and the permissions") from error
-    return with_digest(data)
 
 
 def with_digest(data: bytes) -> tuple[bytes, str]:
@@ -124,6 +134,28 @@ def decode(path: Path, data: bytes) -> str:
         line = data.count(b"\n", 0, error.start) + 1
         found = f"byte 0x{data[error.start]:02x}"
         raise SurveyError(f"{path}:{line}: {found} is not UTF-8; save the file with the encoding UTF-8") from error
+
+
+def read_text(path: Path) -> str:
+    """All of a UTF-8 file. Raises as :func:`read_bytes` and :func:`decode`."""
+    return decode(path, read_bytes(path)[0])
+
+
+def csv_text(rows: Iterable[Iterable[object]], ending: str = "\n") -> str:
+    """Rows as CSV, each with its end of line."""
+    out = io.StringIO(newline="")
+    csv.writer(out, lineterminator=ending).writerows(rows)
+    return out.getvalue()
+
+
+def json_text(value: object) -> str:
+    """A document that people read too. Raises ValueError for a number that JSON does not know."""
+    return json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def time_text() -> str:
+    """Now, in UTC, as files say it."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 @functools.lru_cache(1 << 16)

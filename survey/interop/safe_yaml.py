@@ -215,13 +215,13 @@ def _opencv_matrix(dumper: yaml.SafeDumper, matrix: FloatArray) -> yaml.Node:
 _Dumper.add_representer(np.ndarray, _opencv_matrix)
 
 
-def matrix_entry(matrix: FloatArray) -> dict[str, Any]:
+def matrix_entry(matrix: FloatArray) -> dict[str, object]:
     """A matrix (n, m) as OpenCV and ROS have it: rows, cols and its numbers row by row."""
     rows, cols = matrix.shape
     return {"rows": rows, "cols": cols, "data": matrix.ravel().tolist()}
 
 
-def yaml_text(document: Mapping[str, Any]) -> str:
+def yaml_text(document: Mapping[str, object]) -> str:
     """YAML of plain values, numbers with every bit; the innermost lists stand in one line, arrays are as OpenCV's."""
     text: str = yaml.dump(dict(document), Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=2**31,
                           allow_unicode=True)  # fmt: skip

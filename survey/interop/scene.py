@@ -9,7 +9,6 @@ import json
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from gtsam import Pose3
@@ -159,8 +158,8 @@ class _Buffer:
 
     def __init__(self) -> None:
         self.data = b""
-        self.views: list[dict[str, Any]] = []
-        self.accessors: list[dict[str, Any]] = []
+        self.views: list[dict[str, object]] = []
+        self.accessors: list[dict[str, object]] = []
 
     def add(self, array: FloatArray | IntArray, target: int) -> int:
         """An array as an accessor: (n, 3) float positions (target 34962) or indices (34963); its number."""
@@ -168,7 +167,7 @@ class _Buffer:
         plain = np.ascontiguousarray(array, dtype="<f4" if positions else "<u4")
         self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": plain.nbytes, "target": target})
         self.data += plain.tobytes()
-        entry: dict[str, Any] = {"bufferView": len(self.views) - 1, "componentType": 5126 if positions else 5125,
+        entry: dict[str, object] = {"bufferView": len(self.views) - 1, "componentType": 5126 if positions else 5125,
                                  "count": len(plain) if positions else plain.size,
                                  "type": "VEC3" if positions else "SCALAR"}  # fmt: skip
         if positions:
@@ -188,7 +187,7 @@ def glb_bytes(found: Scene) -> bytes:
             kind = 0 if name == "beacons" else 1
             attributes = {"POSITION": buffer.add(x - middle, 34962)}
             meshes.append({"name": name, "primitives": [{"attributes": attributes, "mode": 0, "material": kind}]})
-            node: dict[str, Any] = {"name": name, "mesh": len(meshes) - 1, "translation": middle.tolist()}
+            node: dict[str, object] = {"name": name, "mesh": len(meshes) - 1, "translation": middle.tolist()}
             nodes.append(node | ({"extras": {"ids": list(found.beacons)}} if name == "beacons" else {}))
     if found.ellipsoids:
         vertices, triangles = sphere()
@@ -211,7 +210,7 @@ def glb_bytes(found: Scene) -> bytes:
     # z up to glTF's y up: a quarter turn about x
     root = {"name": "world, z up", "rotation": [-np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)],
             "children": list(range(1, len(nodes) + 1))}  # fmt: skip
-    document: dict[str, Any] = {
+    document: dict[str, object] = {
         "asset": {"version": "2.0", "generator": "labsurvey", "extras": {"about": f"metres; {_said(found)}"}},
         "scene": 0, "scenes": [{"name": found.title or "survey", "nodes": [0]}], "nodes": [root, *nodes],
         "meshes": meshes, "materials": materials, "cameras": cameras, "accessors": buffer.accessors,
@@ -220,13 +219,13 @@ def glb_bytes(found: Scene) -> bytes:
     return _container({k: v for k, v in document.items() if v not in ([], {})}, buffer.data)
 
 
-def _material(name: str) -> dict[str, Any]:
+def _material(name: str) -> dict[str, object]:
     color = [c / 255.0 for c in _COLORS[name]]
     surface = {"baseColorFactor": [*color, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.8}
     return {"name": name, "pbrMetallicRoughness": surface}
 
 
-def _container(document: dict[str, Any], data: bytes) -> bytes:
+def _container(document: dict[str, object], data: bytes) -> bytes:
     """Header and the two chunks, each padded to four bytes (glTF 2.0, section 4)."""
     text = json.dumps(document, allow_nan=False, separators=(",", ":")).encode("utf-8")
     text += b" " * (-len(text) % 4)

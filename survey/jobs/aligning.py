@@ -4,7 +4,6 @@ import csv
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from markupsafe import Markup
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from survey.folder.replacing import changing, replace_parts
-from survey.folder.text import decode, read_bytes
+from survey.folder.text import csv_text, read_text, time_text
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.working_sheet import ARCSEC, STATES, Sheet, angle_text, sheet_text, steps, working_sheets
 from survey.project import atomic_write, read
@@ -81,12 +80,9 @@ def _made(folder: Path, target: Path, place: Path, progress: bool) -> tuple[Adju
         )
     adjustment = adjust_project(project, progress)
     sheets = working_sheets(adjustment, project.alignment_tasks, project.options.alpha, project.options.sigmas)
-    date = datetime.now(UTC).isoformat(timespec="seconds")
+    date = time_text()
     rounds = _with_round(_rounds(target / RESULTS / ROUNDS), sheets, date)
-    stream = io.StringIO(newline="")
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerows([ROUND_COLUMNS, *rounds])
-    atomic_write(place / RESULTS / ROUNDS, stream.getvalue())
+    atomic_write(place / RESULTS / ROUNDS, csv_text([ROUND_COLUMNS, *rounds]))
     page = sheet_html(sheets, project.title or folder.resolve().name, date, rounds)
     atomic_write(place / RESULTS / PAGE, page)
     return adjustment, sheets
@@ -96,7 +92,7 @@ def _rounds(path: Path) -> list[list[str]]:
     if not path.is_file():
         return []
     try:
-        rows = list(csv.reader(io.StringIO(decode(path, read_bytes(path)[0]), newline=""), strict=True))
+        rows = list(csv.reader(io.StringIO(read_text(path), newline=""), strict=True))
     except csv.Error as error:
         raise SurveyError(f"{path}: this is no list of rounds ({error}); remove the file") from error
     if not rows or tuple(rows[0]) != ROUND_COLUMNS or any(len(row) != len(ROUND_COLUMNS) for row in rows):

@@ -10,7 +10,6 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +17,7 @@ from adjust.lenses.crops import possible_sizes
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from survey.folder.replacing import changing, replace_parts
-from survey.folder.text import atomic_write
+from survey.folder.text import atomic_write, time_text
 from survey.jobs.adjusting.board_sizes import wrong_sizes
 from survey.jobs.adjusting.image_defects import defect_warnings, defects
 from survey.project import Definition, SpotBlock, read_definition
@@ -291,7 +290,7 @@ def _keep_decisions(folder: Path, place: Path, state: _State, gone: RowTable) ->
         return
     path = folder / OBSERVATIONS_FOLDER / EXCLUSIONS_FILE
     there = in_force(read_exclusions(path.parent)[0])
-    now = datetime.now(UTC).isoformat(timespec="seconds")
+    now = time_text()
     said = Exclusion(Name("image_point", ""), "used = false in image_points.csv", "", now)
     rows = [Row(True, replace(said, name=name)) for name in dict.fromkeys(names) if name not in there]
     if rows:

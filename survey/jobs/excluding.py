@@ -8,13 +8,12 @@ Nothing is adjusted: every command obeys the file from then on.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from adjust.model.errors import SurveyError
 from survey.folder.replacing import changing, replace_parts
-from survey.folder.text import atomic_write, suggestion
+from survey.folder.text import atomic_write, suggestion, time_text
 from survey.jobs.detecting import author_name
 from survey.project import Project
 from survey.project.exclusions import EXCLUSIONS_FILE, Exclusion, Name, Row, appended, in_force, read_exclusions
@@ -97,7 +96,7 @@ def _outcome(folder: Path, project: Project, rows: Sequence[Row], excluded: bool
 
 def _said(project: Project, name: Name, reason: str, author: str, at: tuple[float, float] | None = None) -> Exclusion:
     who = author or author_name(project.options.identification)
-    return Exclusion(name, reason.strip(), who, datetime.now(UTC).isoformat(timespec="seconds"), at=at)
+    return Exclusion(name, reason.strip(), who, time_text(), at=at)
 
 
 def new_rows(project: Project, names: Sequence[str], reason: str, author: str = "") -> list[Row]:

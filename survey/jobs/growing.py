@@ -11,7 +11,7 @@ from adjust.model.observations import Pair
 from adjust.model.survey import Station
 from adjust.relay.session import Addition, NetworkSession
 from adjust.testing.distributions import chi2
-from survey.folder.text import decode, read_bytes
+from survey.folder.text import read_text
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.adjusting.warm_start import warm_adjustment
 from survey.project import Definition, read, read_definition
@@ -103,7 +103,7 @@ class Growing:
     def _measured(self) -> tuple[Pair, ...]:
         """The pairs of ``new`` as they stand; none while a row is only half written."""
         path = self.new / OBSERVATIONS_FOLDER / "pairs.csv"
-        if not path.is_file() or not (text := decode(path, read_bytes(path)[0])).endswith("\n"):
+        if not path.is_file() or not (text := read_text(path)).endswith("\n"):
             return tuple(self.pairs.values())
         survey = self.definition.survey
         names = Names.of(replace(survey, stations=(*survey.stations, *self._stations())))
@@ -112,7 +112,7 @@ class Growing:
     def _stations(self) -> tuple[Station, ...]:
         """New ones, of which nothing is known."""
         path = self.new / DEFINITION_FILE
-        stations = read_stations(read_toml(path)[0], (), False) if path.is_file() else ()
+        stations = read_stations(read_toml(path)[0].declared_as("root"), (), False) if path.is_file() else ()
         known = {station.station_id for station in self.definition.survey.stations}
         for station in stations:
             where = f"{path}: stations.{station.station_id}:"

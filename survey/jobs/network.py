@@ -12,7 +12,6 @@ from gtsam import Pose3, Rot3
 from adjust.model.errors import SurveyError, listed
 from adjust.model.observations import Pair
 from survey.folder.replacing import complete, place_for, replace_parts
-from survey.jobs.adjusting.job import Clock, command_line
 from survey.jobs.adjusting.outcome import AdjustOutcome, made
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.adjusting.warm_start import warm_adjustment
@@ -33,6 +32,7 @@ from survey.project.tables.reading import Table
 from survey.project.tables.references import Names
 from survey.report.results import RESULTS
 from survey.solution.earlier.previous import Move, Previous, change_dict, change_lines, moves, read_previous
+from survey.solution.earlier.runs import Clock, command_line
 from survey.solution.loops import network_dict, pair_network
 
 _MOST_SHOWN = 8

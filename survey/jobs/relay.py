@@ -17,14 +17,14 @@ from adjust.model.observations import FrameRef, Pair
 from adjust.model.result import Adjustment
 from adjust.model.subsets import in_use
 from adjust.model.survey import FloatArray, Survey
-from adjust.relay.eyes.drift import DriftModel, choose_interval, growth, rescaled, sequences
+from adjust.relay.eyes.drift import DriftModel, choose_interval, growth, sequences
 from adjust.relay.eyes.eyes import EyeAdjustment, EyeOptions, adjust_eyes
 from adjust.relay.eyes.images import eye_sequences
 from adjust.relay.eyes.pairs import EyePairs, LoopedPairs, close_loops, pairs_of
 from adjust.relay.eyes.trajectories import CommonMotions, TimeOffset, Trajectory, time_offset
 from adjust.spatial.rigid import rotation_log
 from adjust.spatial.rigid_motions import Motions
-from survey.folder.text import decode, read_bytes
+from survey.folder.text import read_text
 from survey.project import read
 from survey.project.tables.files import write_table
 from survey.project.tables.pairs import pair_columns
@@ -90,7 +90,7 @@ def tracker_pairs(found: RelayTrackers) -> EyePairs:
 def one_metre(found: RelayTrackers) -> CommonMotions:
     """The motions with all lengths in those of the first tracker."""
     common, scales = found.common, found.joint.scales
-    motions = (rescaled(m, scales.get(e.frame_id, 1.0)) for e, m in zip(common.eyes, common.motions, strict=True))
+    motions = (m.rescaled(scales.get(e.frame_id, 1.0)) for e, m in zip(common.eyes, common.motions, strict=True))
     return replace(common, motions=tuple(motions))
 
 
@@ -131,7 +131,7 @@ def read_trajectories(paths: Mapping[str, Path]) -> tuple[Trajectory, ...]:
     """Trajectory files by the ids of their eyes. Raises SurveyError naming file and line."""
     out = []
     for eye_id, path in paths.items():
-        out.append(read_trajectory(decode(Path(path), read_bytes(Path(path))[0]), eye_id, str(path)))
+        out.append(read_trajectory(read_text(Path(path)), eye_id, str(path)))
     return tuple(out)
 
 

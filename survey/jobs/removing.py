@@ -20,7 +20,6 @@ from adjust.model.survey import Survey
 from adjust.statistics.outliers.supported import supported
 from survey.folder.replacing import complete, copy_folder, place_for, replace_parts
 from survey.folder.text import atomic_write
-from survey.jobs.adjusting.job import Clock, command_line
 from survey.jobs.adjusting.outcome import AdjustOutcome, made
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.adjusting.warm_start import COLD, warm_adjustment
@@ -32,6 +31,7 @@ from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
 from survey.project.reading import read_all
 from survey.report.results import RESULTS
 from survey.solution.earlier.previous import Move, Previous, change_dict, change_lines, moves, read_previous
+from survey.solution.earlier.runs import Clock, command_line
 
 
 @dataclass(frozen=True, eq=False)

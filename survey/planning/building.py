@@ -71,8 +71,9 @@ def build_plan(project: Project, plan: Plan, existing: Adjustment | None, notes:
     planned = _moments(plan.planned.epochs, base, values)
     possible = _moments(plan.candidates.epochs, base, values)
     _check_new(plan, taken, planned + possible)
-    survey = _with_poses(base, planned + possible)
-    everything = _with_readings(survey, [r for m in planned + possible for r in _readings(m, project)])
+    _check_moving(base, planned + possible)
+    readings = tuple(r for m in planned + possible for r in _readings(m, project))
+    everything = replace(base, table_readings=base.table_readings + readings)
     start = _with_moving(values, planned + possible).start()
     seen = _seen(everything, start, planned, plan, project)
     dark = [m.epoch_id for m in planned if not any(b.epoch_id == m.epoch_id for b in seen)]
@@ -80,7 +81,7 @@ def build_plan(project: Project, plan: Plan, existing: Adjustment | None, notes:
         said.append(f"planned epochs that show nothing, left out: {listed(dark, 8)}")
     lit = [m for m in planned if m.epoch_id not in dark]
     whole = replace(
-        survey,
+        base,
         image_blocks=base.image_blocks + seen,
         table_readings=base.table_readings + tuple(r for m in lit for r in _readings(m, project)),
         distances=base.distances + plan.planned.distances,
@@ -200,15 +201,14 @@ def _value(values: _Values, name: ParameterName, parameter: PoseParameter) -> Po
     raise SurveyError(f"{' '.join(name)} has no value to plan with; give translation_mm and a rotation in survey.toml")
 
 
-def _with_poses(survey: Survey, moments: Sequence[Moment]) -> Survey:
-    """The survey; that a fixed station or target is given poses is an error."""
+def _check_moving(survey: Survey, moments: Sequence[Moment]) -> None:
+    """Raise where a fixed station or target is given poses."""
     stations, targets = {s.station_id: s for s in survey.stations}, {t.target_id: t for t in survey.targets}
     for m in moments:
         if m.station_id is not None and stations[m.station_id].motion == "fixed":
             raise SurveyError(f'station {m.station_id} is given poses but is fixed; write motion = "epoch" or "table"')
         if m.target_id is not None and targets[m.target_id].motion == "fixed":
             raise SurveyError(f'target {m.target_id} is given poses but is fixed; write motion = "epoch"')
-    return survey
 
 
 def _with_moving(values: _Values, moments: Sequence[Moment]) -> _Values:
@@ -229,10 +229,6 @@ def _readings(m: Moment, project: Project) -> list[TableReading]:
         raise SurveyError(f"{project.folder}/survey.toml: table {m.table_id} has no sigma_arcsec; planning needs it")
     scale = project.sigmas.scale.get("table", 1.0)
     return [TableReading(m.table_id, m.epoch_id, m.angles, np.diag((scale * sigma) ** 2))]
-
-
-def _with_readings(survey: Survey, readings: Sequence[TableReading]) -> Survey:
-    return replace(survey, table_readings=survey.table_readings + tuple(readings))
 
 
 def _sigma_px(plan: Plan, project: Project) -> float:
@@ -281,18 +277,14 @@ def _seen(
     located = [i for i, p in enumerate(survey.points)
                if p.point_id in start.points or p.x_in_world.treatment == "held"]  # fmt: skip
     wanted = [b for m in moments for b in _wanted(survey, m, sigma, located)]
+    if len(located) < len(survey.points):
+        lost = [p.point_id for i, p in enumerate(survey.points) if i not in located]
+        raise SurveyError(f"{plan.path}: points without coordinates: {listed(lost, 8)}; give x_mm, roughly will do; "
+                          "planning needs a value in survey.toml for everything")  # fmt: skip
     try:
-        return predict(_reachable(survey, start), start, wanted, plan.seeing)
+        return predict(survey, start, wanted, plan.seeing)
     except SurveyError as error:
         raise SurveyError(f"{plan.path}: {error}; planning needs a value in survey.toml for everything") from error
-
-
-def _reachable(survey: Survey, start: StartValues) -> Survey:
-    """Without what has no place yet and therefore cannot be predicted."""
-    lost = [p.point_id for p in survey.points if p.point_id not in start.points and p.x_in_world.treatment != "held"]
-    if not lost:
-        return survey
-    raise SurveyError(f"points without coordinates: {listed(lost, 8)}; give x_mm, roughly will do")
 
 
 def _coordinates(ref: PositionRef, sigma: float) -> Coordinates:

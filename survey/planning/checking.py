@@ -6,7 +6,7 @@
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from adjust.diagnosis.beforehand import Beforehand, Finding, coverage, look_beforehand
 from adjust.model.errors import SurveyError
@@ -37,7 +37,7 @@ class CheckOutcome:
         """Findings that spoil or stop the adjustment."""
         return sum(f.level == "problem" for f in self.beforehand.findings)
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """As plain values."""
         expected = self.beforehand.expected
         counts = {} if expected is None else {

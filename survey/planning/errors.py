@@ -3,7 +3,6 @@
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -35,7 +34,7 @@ class ErrorAnalysis:
     seconds: float
     paths: dict[str, Path] = field(default_factory=dict)
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """As plain values."""
         figures = {_NUMBERS[f.kind]: _entry(f, self.rms_px) for f in self.bounded}
         paper = {_NUMBERS[f.kind]: _entry(f, self.rms_px) for f in self.paper}
@@ -77,7 +76,7 @@ def _unit(f: ErrorFigure) -> tuple[str, float]:
     return ("deg", 180.0 / np.pi) if f.kind == "camera attitude" else ("mm", 1e3)
 
 
-def _entry(f: ErrorFigure, rms_px: float) -> dict[str, Any]:
+def _entry(f: ErrorFigure, rms_px: float) -> dict[str, object]:
     unit, factor = _unit(f)
     median = float(np.median(f.rms / f.sigmas))
     slope = f.slope if np.isfinite(f.slope) else median

@@ -1,6 +1,5 @@
 """The job behind ``labsurvey plan``: predict, choose, budget, simulate, place beacons, and write the page."""
 
-import json
 import sys
 import time
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from adjust.design.selection import Criterion
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from survey.folder.replacing import changing, replace_parts
+from survey.folder.text import json_text
 from survey.jobs.adjusting.steps import adjust_project
 from survey.planning.building import Planned, build_plan
 from survey.planning.navigation import plan_navigation
@@ -133,5 +133,5 @@ def _trials(planned: Planned, expected: Adjustment, request: PlanRequest, progre
 def _make(outcome: PlanningOutcome, place: Path) -> tuple[str, ...]:
     atomic_write(place / "plan.html", plan_page(outcome))
     content = {k: v for k, v in outcome.summary().items() if k not in ("folder", "written", "seconds")}
-    atomic_write(place / "plan.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
+    atomic_write(place / "plan.json", json_text(content))
     return ("plan.html", "plan.json")

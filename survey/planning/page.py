@@ -5,9 +5,8 @@ from gtsam import Pose3
 from markupsafe import Markup
 
 from adjust.design import group_redundancy
-from adjust.precision.precision import precision_of
 from survey.planning.navigation import NavigationOutcome
-from survey.planning.summary import PlanningOutcome, meets, people, pose_sigmas, tolerance_values
+from survey.planning.summary import PlanningOutcome, expected_sigmas, meets, pose_sigmas, tolerance_values
 from survey.report import drawing as d
 from survey.report.charts import Series, bars, chart, seen_map
 from survey.report.language import esc, speaking
@@ -30,7 +29,7 @@ from survey.report.markup import (
 )
 from survey.report.picture import draw, perspective, pictures
 from survey.report.scene import Scene, Spot, scene_of
-from survey.solution.quantities import scale_of
+from survey.solution.quantities import scale_of, sigma_unit_for_people
 
 _MOST_CANDIDATES = 30
 _COLOURS = {"epoch": d.BLUE, "beacon": d.RED, "distance": d.GREEN, "pair": d.ORANGE, "coordinates": d.PURPLE}
@@ -98,16 +97,10 @@ def _seen(o: PlanningOutcome) -> Markup:
 
 
 def _sigmas(o: PlanningOutcome) -> Markup:
-    by_name = precision_of(o.expected).unknowns.by_name
-    rows = []
-    for name in (n for n in by_name if len(n) < 3):
-        estimate, unknown = o.expected.estimates[name], by_name[name]
-        s = np.sqrt(np.maximum(np.diag(estimate.cov), 0.0))
-        cells = []
-        for c, unit in zip(unknown.components, unknown.units, strict=True):
-            label, factor = people(unit)
-            cells.append(f"{c} {sigma_text(factor * float(s[estimate.components.index(c)]))} {label}".strip())
-        rows.append((".".join(name), " \u00a0 ".join(cells)))
+    rows = [
+        (".".join(name), " \u00a0 ".join(f"{c} {sigma_text(sigma)} {unit}".strip() for c, sigma, unit in sigmas))
+        for name, sigmas in expected_sigmas(o) if len(name) < 3
+    ]  # fmt: skip
     said = "One standard deviation, all others unknown too; poses in the tangent, in the frame on the right."
     return section("sigmas", "Expected sigmas", table(("<Unknown", "<Sigmas"), rows), said)
 
@@ -141,7 +134,7 @@ def _selection(o: PlanningOutcome) -> Markup:
     body = figures([drawn]) + table(columns, steps)
     rows = []
     for c, a, b in zip(s.wanted, s.sigmas.tolist(), s.after.tolist(), strict=True):
-        unit, factor = people(c.unit)
+        unit, factor = sigma_unit_for_people(c.unit)
         drop = fixed(100 * (1 - b / a), 1) + " %" if a > 0 else ""
         rows.append((c.text, sigma_text(factor * a), sigma_text(factor * b), unit, drop))
     wanted = table(("<Component", "Before", "After all", "<Unit", "Smaller by"), rows)
@@ -158,12 +151,10 @@ def _tolerances(o: PlanningOutcome) -> Markup:
     if o.budget is None:
         return Markup()
     rows, share = [], o.budget.variances / o.budget.variances.sum(axis=0)
-    for k, (c, r) in enumerate(o.required.items()):
-        unit, factor = people(c.unit)
-        s = float(o.budget.sigmas[k])
-        word = pill("good", "met") if s <= r * (1 + 1e-9) else pill("bad", "not met")
-        parts = [fixed(100 * v, 0) + " %" for v in share[:, k]]
-        rows.append((c.text, sigma_text(factor * r), sigma_text(factor * s), unit, word, *parts))
+    for x, shares in zip(o.requirements, share.T, strict=True):
+        word = pill("good", "met") if x.met else pill("bad", "not met")
+        sigmas = sigma_text(x.factor * x.required), sigma_text(x.factor * x.planned)
+        rows.append((x.component.text, *sigmas, x.unit, word, *(fixed(100 * v, 0) + " %" for v in shares)))
     body = table(("<Component", "Required", "Planned", "<Unit", "<", *map(esc, o.budget.groups)), rows)
     lines = [(t.group, _factor(t.alone), _factor(t.together), t.limiting) for t in o.tolerances]
     body += table(("<Group", "Alone", "Together", "<Limited by"), lines, "Sigmas may be so many times the planned ones")

@@ -14,9 +14,8 @@ from adjust.model.survey import FloatArray, Survey
 from survey.folder.text import id_problem
 from survey.folder.units import to_si
 from survey.planning.plan_navigation import NavigationPlan, read_navigation
-from survey.planning.plan_readings import TERRESTRIAL_KEYS, Terrestrial, few, read_terrestrial, tables_of
+from survey.planning.plan_readings import TERRESTRIAL_KEYS, Terrestrial, few, planned_poses, read_terrestrial, tables_of
 from survey.project.declared.node import Node, read_toml
-from survey.project.declared.poses import POSE_KEYS, read_pose
 from survey.project.tables.references import Names, read_frame, read_position
 
 PLAN_FILE = "plan.toml"
@@ -207,14 +206,7 @@ def _places(node: Node, survey: Survey, kind: str) -> tuple[list[dict[str, Any]]
     key = "station" if node.has("station") else "target"
     known = [s.station_id for s in survey.stations] if key == "station" else [t.target_id for t in survey.targets]
     owner = node.reference(key, known, key)
-    out = []
-    for pose_node in tables_of(node, "poses"):
-        pose_node.allow(*POSE_KEYS)
-        pose = read_pose(pose_node).value
-        if pose is None:
-            raise pose_node.error("a planned pose needs its place and rotation; add them")
-        out.append({f"{key}_id": owner, "pose": pose})
-    return out, None
+    return [{f"{key}_id": owner, "pose": pose} for pose in planned_poses(node)], None
 
 
 def _angles(node: Node, axes: int) -> list[FloatArray]:

@@ -9,10 +9,12 @@ from gtsam import Pose3, Rot3
 
 from adjust.model.survey import FloatArray, Survey
 from survey.folder.units import to_si
-from survey.planning.plan_readings import few, tables_of
+from survey.planning.plan_readings import few, planned_poses
 from survey.project.declared.node import Node
-from survey.project.declared.poses import read_pose, rotation_from_euler
+from survey.project.declared.poses import rotation_from_euler
 
+Criterion = Literal["worst", "mean"]
+_CRITERIA: tuple[Criterion, ...] = ("worst", "mean")
 _NAVIGATION_KEYS = (
     *("station", "sigma_px", "volume_mm", "steps", "attitudes_euler_xyz_deg", "turn_about", "turn_steps", "poses"),
     *("required_rotation_deg", "required_translation_mm", "beacon_sigma_mm", "room_mm", "spacing_mm", "criterion"),
@@ -37,7 +39,7 @@ class NavigationPlan:
     sigma_px: float
     beacon_sigma: float
     camera_sigma: tuple[float, float]
-    criterion: Literal["worst", "mean"]
+    criterion: Criterion
     at_least: int
     spacing: float
     epochs: tuple[str, ...] = ()
@@ -47,7 +49,6 @@ def read_navigation(node: Node, survey: Survey) -> NavigationPlan:
     """The table [navigation] of ``plan.toml``. Raises SurveyError."""
     node.allow(*_NAVIGATION_KEYS)
     stations = tuple(dict.fromkeys(c.station_id for c in survey.cameras))
-    criterion = node.choice("criterion", ("worst", "mean"), "worst")
     poses = _navigation_poses(node)
     if not poses and not node.has("epochs"):
         raise node.error("say where the head will be: poses, volume_mm with attitudes, or planned epochs")
@@ -63,7 +64,7 @@ def read_navigation(node: Node, survey: Survey) -> NavigationPlan:
             node.si("camera_sigma_mm", 0.1, positive=True),
             node.si("camera_sigma_deg", 0.01, positive=True),
         ),
-        "worst" if criterion == "worst" else "mean",
+        node.choice("criterion", _CRITERIA, "worst"),
         node.integer("at_least", 1, 3),
         node.si("spacing_mm", 0.0),
         node.names("epochs", ()),
@@ -71,25 +72,17 @@ def read_navigation(node: Node, survey: Survey) -> NavigationPlan:
 
 
 def _navigation_poses(node: Node) -> tuple[Pose3, ...]:
-    out = []
-    for pose_node in tables_of(node, "poses"):
-        pose = read_pose(pose_node).value
-        if pose is None:
-            raise pose_node.error("a pose needs its place and rotation; add them")
-        out.append(pose)
+    out = planned_poses(node)
     if not node.has("volume_mm"):
         return tuple(out)
     box = to_si(node.numbers("volume_mm", (3, 2)), "mm")
     steps = [int(v) for v in node.numbers("steps", (3,), [2, 2, 2])]
     attitudes = _attitudes(node)
     few(node, math.prod(max(n, 1) for n in steps) * len(attitudes), "steps")
-    lines = [_line(low, high, n) for (low, high), n in zip(box.tolist(), steps, strict=True)]
+    lines = [np.linspace(low, high, n) if n > 1 else np.array([0.5 * (low + high)])
+             for (low, high), n in zip(box.tolist(), steps, strict=True)]  # fmt: skip
     places = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)
     return (*out, *(Pose3(R, x) for x in places.reshape(-1, 3) for R in attitudes))
-
-
-def _line(low: float, high: float, n: int) -> FloatArray:
-    return np.linspace(low, high, n) if n > 1 else np.array([0.5 * (low + high)])
 
 
 def _attitudes(node: Node) -> list[Rot3]:
@@ -112,17 +105,13 @@ def _beacon_places(node: Node) -> FloatArray:
     box = to_si(node.numbers("room_mm", (3, 2)), "mm")
     n = node.integer("places", 2, 6)
     few(node, 6 * n**2, "places")
+    inner = box[:, :1] + (np.arange(n) + 0.5) / n * (box[:, 1:] - box[:, :1])  # none of them in a corner
     out = []
     for axis in range(3):
         u, v = (i for i in range(3) if i != axis)
-        grid = np.stack(np.meshgrid(*(_inner(box[i], n) for i in (u, v)), indexing="ij"), axis=-1).reshape(-1, 2)
+        grid = np.stack(np.meshgrid(inner[u], inner[v], indexing="ij"), axis=-1).reshape(-1, 2)
         for wall in box[axis]:
             x = np.empty((len(grid), 3))
             x[:, axis], x[:, u], x[:, v] = wall, grid[:, 0], grid[:, 1]
             out.append(x)
     return np.concatenate(out)
-
-
-def _inner(edge: FloatArray, n: int) -> FloatArray:
-    """N places along an edge, none of them in a corner."""
-    return np.asarray(edge[0] + (np.arange(n) + 0.5) / n * (edge[1] - edge[0]))

@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
+from gtsam import Pose3
 
 from adjust.design import Candidate
 from adjust.graph.assembly import StartValues
@@ -22,6 +23,7 @@ from adjust.model.observations import (
 from adjust.model.survey import FloatArray, Survey
 from survey.project.declared.instruments import setup_problem
 from survey.project.declared.node import Node
+from survey.project.declared.poses import read_pose
 from survey.project.project import Accuracy, Project
 from survey.project.tables.references import Names, read_position, timed_frame
 from survey.project.tables.terrestrial import ANGLES, READING_KINDS
@@ -57,6 +59,15 @@ def tables_of(node: Node, key: str) -> list[Node]:
     if not isinstance(values, list) or not all(isinstance(v, dict) for v in values):
         raise node.error(f"expected a list of tables; write [[{'.'.join(map(str, (*node.path, key)))}]]", key)
     return [Node(node.file, node.lines, (*node.path, key, i), v) for i, v in enumerate(values)]
+
+
+def planned_poses(node: Node) -> list[Pose3]:
+    """The poses of a list ``[[poses]]``. Raises SurveyError for one without place or rotation."""
+    found = [(pose, read_pose(pose).value) for pose in tables_of(node, "poses")]
+    for pose, value in found:
+        if value is None:
+            raise pose.error("a planned pose needs its place and rotation; add them")
+    return [value for _, value in found if value is not None]
 
 
 def few(node: Node, n: _Count, key: str) -> _Count:
@@ -105,7 +116,7 @@ def terrestrial_candidates(part: Terrestrial) -> list[Candidate]:
 def lengths_between(survey: Survey, start: StartValues) -> Callable[[Reading], float]:
     """Distances (m) between the ends of readings; 0 where one of them is no point of the world."""
     held = {p.point_id: p.x_in_world.value for p in survey.points if p.x_in_world.treatment == "held"}
-    places: dict[str, Any] = {**held, **start.points}
+    places: dict[str, object] = {**held, **start.points}
 
     def length(r: Reading) -> float:
         a, b = (places.get(x.point_id or "") if x.frame is None else None for x in (r.at, r.to))

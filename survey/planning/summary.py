@@ -1,5 +1,6 @@
 """A plan as plain values and as text for the terminal."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,17 +17,32 @@ from adjust.design import (
     group_redundancy,
 )
 from adjust.design.pose_budget import PoseTolerance
-from adjust.model.result import Adjustment
+from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray
 from adjust.precision.precision import precision_of
-from survey.folder.plain import plain
+from survey.folder.plain import attributes, plain
 from survey.planning.building import Planned
 from survey.planning.navigation import NavigationOutcome
 from survey.planning.plan_file import Plan
-from survey.solution.quantities import ARCSEC_PER_RAD, key_of, sigma_unit_for_people
+from survey.solution.quantities import key_of, sigma_unit_for_people
 
 _MOST = 8
-_PEOPLE = {"rad": ("arcsec", ARCSEC_PER_RAD), "m": ("mm", 1e3), "px": ("px", 1.0)}
+
+
+@dataclass(frozen=True)
+class Met:
+    """A component with the sigma that is required of it and the one that is planned (SI), and what people read."""
+
+    component: Component
+    required: float
+    planned: float
+    unit: str
+    factor: float
+
+    @property
+    def met(self) -> bool:
+        """Whether it is as precise as required."""
+        return self.planned <= self.required * (1 + 1e-9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,12 +61,19 @@ class PlanningOutcome:
     budget: Budget | None
     tolerances: tuple[Tolerance, ...]
     trials: Trials | None
-    network: dict[str, Any] | None
+    network: dict[str, object] | None
     navigation: NavigationOutcome | None
     seconds: dict[str, float] = field(default_factory=dict)
     paths: dict[str, Path] = field(default_factory=dict)
 
-    def summary(self) -> dict[str, Any]:
+    @property
+    def requirements(self) -> tuple[Met, ...]:
+        """What is required, beside what is planned."""
+        planned = () if self.budget is None else self.budget.sigmas.tolist()
+        return tuple(Met(c, r, s, *sigma_unit_for_people(c.unit))
+                     for (c, r), s in zip(self.required.items(), planned, strict=self.budget is not None))  # fmt: skip
+
+    def summary(self) -> dict[str, object]:
         """As plain values."""
         return plan_summary(self)
 
@@ -59,20 +82,24 @@ class PlanningOutcome:
         return plan_text(self)
 
 
-def people(unit: str) -> tuple[str, float]:
-    """Unit and factor in which a sigma is read."""
-    return sigma_unit_for_people(unit)
+def expected_sigmas(o: PlanningOutcome) -> Iterator[tuple[ParameterName, list[tuple[str, float, str]]]]:
+    """Of every unknown: its components, their sigmas for people and the units of these."""
+    for name, unknown in precision_of(o.expected).unknowns.by_name.items():
+        estimate = o.expected.estimates[name]
+        s = dict(zip(estimate.components, np.sqrt(np.maximum(np.diag(estimate.cov), 0.0)).tolist(), strict=True))
+        shown = [(c, *sigma_unit_for_people(u)) for c, u in zip(unknown.components, unknown.units, strict=True)]
+        yield name, [(c, factor * s[c], unit) for c, unit, factor in shown]
 
 
-def sigma_of(component: Component, sigma: float) -> str:
+def _sigma_of(component: Component, sigma: float) -> str:
     """``0.12 mm``."""
-    unit, factor = people(component.unit)
+    unit, factor = sigma_unit_for_people(component.unit)
     return f"{factor * sigma:.3g} {unit}".strip()
 
 
-def plan_summary(o: PlanningOutcome) -> dict[str, Any]:
+def plan_summary(o: PlanningOutcome) -> dict[str, object]:
     """All figures by name, units in the keys."""
-    out: dict[str, Any] = {
+    out: dict[str, object] = {
         "folder": str(o.folder),
         "title": o.title,
         "observations": o.expected.n_observations,
@@ -86,7 +113,10 @@ def plan_summary(o: PlanningOutcome) -> dict[str, Any]:
             g: {"observations": n, "redundancy": r, "smallest": float(q[0]), "median": float(q[1])}
             for g, (n, r, q) in group_redundancy(o.expected).items()
         },
-        "sigmas": _sigmas(o),
+        "sigmas": {
+            ".".join(name): {f"sigma_{key_of(c, unit)}": sigma for c, sigma, unit in sigmas}
+            for name, sigmas in expected_sigmas(o)
+        },
         "weak_directions": [
             {"factor": w.factor, "parts": [{"unknown": a, "component": c, "share": s} for a, c, s in w.parts]}
             for w in o.weak
@@ -96,7 +126,7 @@ def plan_summary(o: PlanningOutcome) -> dict[str, Any]:
         "written": {name: str(path) for name, path in o.paths.items()},
     }
     if o.selection is not None:
-        out["selection"] = _selection(o)
+        out["selection"] = _selection(o.selection)
     if o.budget is not None:
         out["tolerances"] = _tolerances(o)
     if o.trials is not None:
@@ -113,61 +143,36 @@ def plan_summary(o: PlanningOutcome) -> dict[str, Any]:
     return out
 
 
-def _sigmas(o: PlanningOutcome) -> dict[str, dict[str, float]]:
-    by_name = precision_of(o.expected).unknowns.by_name
-    out = {}
-    for name, unknown in by_name.items():
-        estimate = o.expected.estimates[name]
-        s = np.sqrt(np.maximum(np.diag(estimate.cov), 0.0))
-        entry = {}
-        for component, unit in zip(unknown.components, unknown.units, strict=True):
-            shown, factor = people(unit)
-            at = estimate.components.index(component)
-            entry[f"sigma_{key_of(component, shown)}"] = float(factor * s[at])
-        out[".".join(name)] = entry
-    return out
-
-
-def _selection(o: PlanningOutcome) -> dict[str, Any]:
-    s = o.selection
-    if s is None:
-        return {}
-
-    def gain(g: Any) -> dict[str, Any]:
-        return {"name": g.name, "kind": g.kind, "ln_det": g.ln_det, "ln_det_all": g.ln_det_all,
-                "mean_variance": g.mean_variance}  # fmt: skip
-
+def _selection(s: Selection) -> dict[str, object]:
+    gain = ("name", "kind", "ln_det", "ln_det_all", "mean_variance")
+    wanted = {}
+    for c, before, after in zip(s.wanted, s.sigmas.tolist(), s.after.tolist(), strict=True):
+        unit, factor = sigma_unit_for_people(c.unit)
+        wanted[c.text] = {f"sigma_{when}_{unit}".rstrip("_"): factor * sigma
+                          for when, sigma in (("before", before), ("after", after))}  # fmt: skip
     return {
         "criterion": s.criterion,
-        "chosen": [gain(g) for g in s.steps],
-        "candidates": [gain(g) for g in s.first],
-        "wanted": {
-            c.text: {f"sigma_before_{people(c.unit)[0]}".rstrip("_"): people(c.unit)[1] * float(a),
-                     f"sigma_after_{people(c.unit)[0]}".rstrip("_"): people(c.unit)[1] * float(b)}
-            for c, a, b in zip(s.wanted, s.sigmas, s.after, strict=True)
-        },
-    }  # fmt: skip
+        "chosen": [attributes(g, *gain) for g in s.steps],
+        "candidates": [attributes(g, *gain) for g in s.first],
+        "wanted": wanted,
+    }
 
 
-def _tolerances(o: PlanningOutcome) -> dict[str, Any]:
-    if o.budget is None:
-        return {}
-    met = o.budget.sigmas <= np.array(list(o.required.values())) * (1 + 1e-9)
+def _tolerances(o: PlanningOutcome) -> dict[str, object]:
     return {
-        "met": bool(met.all()),
+        "met": all(r.met for r in o.requirements),
         "groups": {t.group: {"factor_alone": plain(t.alone), "factor_together": plain(t.together),
                              "limited_by": t.limiting} for t in o.tolerances},
         "components": {
-            c.text: {"required": people(c.unit)[1] * r, "planned": people(c.unit)[1] * float(s),
-                     "unit": people(c.unit)[0]}
-            for (c, r), s in zip(o.required.items(), o.budget.sigmas, strict=True)
+            r.component.text: {"required": r.factor * r.required, "planned": r.factor * r.planned, "unit": r.unit}
+            for r in o.requirements
         },
     }  # fmt: skip
 
 
 def tolerance_values(t: PoseTolerance) -> tuple[str, float, float, float]:
     """Unit for people, then alone, beside, shared in it."""
-    unit, factor = ("deg", 180.0 / np.pi) if t.unit == "rad" else _PEOPLE[t.unit]
+    unit, factor = ("deg", 180.0 / np.pi) if t.unit == "rad" else sigma_unit_for_people(t.unit)
     return unit, factor * t.alone, factor * t.beside, factor * t.shared
 
 
@@ -176,7 +181,7 @@ def pose_sigmas(n: NavigationOutcome) -> tuple[FloatArray, FloatArray]:
     return np.degrees(n.sigmas[:, :3].max(axis=1)), 1e3 * n.sigmas[:, 3:].max(axis=1)
 
 
-def _navigation(n: NavigationOutcome) -> dict[str, Any]:
+def _navigation(n: NavigationOutcome) -> dict[str, object]:
     turn, shift = pose_sigmas(n)
     out: dict[str, Any] = {
         "station": n.station_id,
@@ -232,23 +237,16 @@ def plan_text(o: PlanningOutcome) -> str:
 
 
 def _sigma_lines(o: PlanningOutcome) -> list[str]:
-    by_name = precision_of(o.expected).unknowns.by_name
     out = ["  expected sigmas (a priori)"]
-    names = [n for n in by_name if len(n) < 3]
-    for name in names[: 4 * _MOST]:
-        estimate, unknown = o.expected.estimates[name], by_name[name]
-        s = np.sqrt(np.maximum(np.diag(estimate.cov), 0.0))
-        shown = []
-        for c, unit in zip(unknown.components, unknown.units, strict=True):
-            label, factor = people(unit)
-            shown.append((c, f"{factor * s[estimate.components.index(c)]:.3g}", label))
+    lasting = [(name, sigmas) for name, sigmas in expected_sigmas(o) if len(name) < 3]
+    for name, sigmas in lasting[: 4 * _MOST]:
         groups: dict[str, list[str]] = {}
-        for c, value, label in shown:
-            groups.setdefault(label, []).append(f"{c} {value}")
-        words = "   ".join(" ".join(v) + f" {label}".rstrip() for label, v in groups.items())
+        for c, sigma, unit in sigmas:
+            groups.setdefault(unit, []).append(f"{c} {sigma:.3g}")
+        words = "   ".join(" ".join(v) + f" {unit}".rstrip() for unit, v in groups.items())
         out.append(f"    {'.'.join(name):<28}{words}")
-    if len(names) > 4 * _MOST:
-        out.append(f"    and {len(names) - 4 * _MOST} more, see plan.html")
+    if len(lasting) > 4 * _MOST:
+        out.append(f"    and {len(lasting) - 4 * _MOST} more, see plan.html")
     return out
 
 
@@ -262,7 +260,7 @@ def _selection_lines(o: PlanningOutcome) -> list[str]:
         less = f"-{100 * g.mean_variance:.1f} %"
         out.append(f"    {g.kind + ' ' + g.name:<34}{g.ln_det:>9.3f}{g.ln_det_all:>9.3f}{less:>10}")
     gained = sorted(zip(s.wanted, s.sigmas, s.after, strict=True), key=lambda x: x[2] / x[1] if x[1] > 0 else 1.0)
-    out += [f"    {c.text:<34}{sigma_of(c, a)} -> {sigma_of(c, b)}" for c, a, b in gained[:_MOST]]
+    out += [f"    {c.text:<34}{_sigma_of(c, a)} -> {_sigma_of(c, b)}" for c, a, b in gained[:_MOST]]
     return out
 
 
@@ -270,9 +268,10 @@ def _tolerance_lines(o: PlanningOutcome) -> list[str]:
     if o.budget is None:
         return []
     out = ["", "  required precision"]
-    for (c, r), s in zip(o.required.items(), o.budget.sigmas, strict=True):
-        word = "met" if s <= r * (1 + 1e-9) else "NOT MET"
-        out.append(f"    {c.text:<34}{sigma_of(c, r):>14} required{sigma_of(c, float(s)):>14} planned   {word}")
+    for x in o.requirements:
+        required, planned = (_sigma_of(x.component, sigma) for sigma in (x.required, x.planned))
+        word = "met" if x.met else "NOT MET"
+        out.append(f"    {x.component.text:<34}{required:>14} required{planned:>14} planned   {word}")
     out.append(f"    {'sigmas may be, times the planned':<34}{'alone':>9}{'together':>10}   limited by")
     for t in o.tolerances:
         out.append(f"    {t.group:<34}{_factor(t.alone):>9}{_factor(t.together):>10}   {t.limiting}")

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 from adjust.model.errors import SurveyError, listed
-from survey.folder.text import read_bytes
+from survey.folder.text import NOT_OURS, read_bytes
 
 DETECTED_FILE = "detected.json"
 ImageKey = tuple[str, str]
@@ -61,7 +61,7 @@ def read_detected(folder: Path) -> dict[ImageKey, DetectedImage]:
             if set(entry) != set(kinds) or not all(type(entry[k]) is kind for k, kind in kinds.items()):
                 raise ValueError(f"{name} has other entries")
             out[camera, epoch] = DetectedImage(**entry)
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except NOT_OURS as error:
         raise SurveyError(
             f"{path}: is not what detection writes ({error}); remove it: the points in the tables stay and count as "
             "given, 'labsurvey detect --all' finds them anew"

@@ -29,7 +29,7 @@ from typing import Any
 
 from adjust.model.errors import SurveyError
 from survey.folder.plain import attributes
-from survey.folder.text import decode, read_bytes, suggestion
+from survey.folder.text import csv_text, decode, read_bytes, read_text, suggestion
 from survey.project.tables.reading import LARGEST_ROWS, Layout, check_header
 
 EXCLUSIONS_FILE = "exclusions.csv"
@@ -177,7 +177,7 @@ def appended(path: Path, rows: Sequence[Row]) -> str:
 
     A column that the new rows need and the file has not is added to its header; the cells of old rows are then blank.
     """
-    text = decode(path, read_bytes(path)[0]) if path.is_file() else ""
+    text = read_text(path) if path.is_file() else ""
     cells = [_cells(row) for row in rows]
     if not text.strip():
         header, text = list(EXCLUSIONS.columns), text + ",".join(EXCLUSIONS.columns) + "\n"
@@ -190,10 +190,7 @@ def appended(path: Path, rows: Sequence[Row]) -> str:
         lines[line - 1] = ",".join([lines[line - 1].rstrip("\r\n"), *needed]) + end
         header, text = [*header, *needed], "".join(lines)
     text += "" if text.endswith("\n") else "\n"
-    out = io.StringIO(newline="")
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerows([one[name] for name in header] for one in cells)
-    return text + out.getvalue()
+    return text + csv_text([one[name] for name in header] for one in cells)
 
 
 def _header_of(text: str) -> tuple[list[str], int]:

@@ -14,7 +14,7 @@ from typing import Any
 
 from adjust.model.errors import SurveyError
 from survey.folder.replacing import copy_folder
-from survey.folder.text import atomic_write, decode, read_bytes, suggestion
+from survey.folder.text import atomic_write, csv_text, read_text, suggestion
 from survey.project.declared.node import read_toml
 from survey.project.declared.toml_text import KeyPath, key_lines, toml_text
 from survey.project.detected import ImageKey, file_of
@@ -89,7 +89,7 @@ def check_new(folder: Path, new: Path) -> None:
 
 def _merge_definition(merged: Merged) -> None:
     old_path, new_path = merged.folder / DEFINITION_FILE, merged.new / DEFINITION_FILE
-    text = decode(old_path, read_bytes(old_path)[0])
+    text = read_text(old_path)
     text += "" if text.endswith("\n") else "\n"
     origins: list[Origin] = [(old_path, i + 1) for i in range(text.count("\n"))]
     if new_path.is_file():
@@ -191,7 +191,7 @@ def read_copy(place: Path, project: Project, folder: Path) -> Project:
 
 def point_files(folder: Path) -> list[str]:
     """Point lists that the old survey.toml names; the merged project is read with them."""
-    definition = tomllib.loads(decode(folder / DEFINITION_FILE, read_bytes(folder / DEFINITION_FILE)[0]))
+    definition = tomllib.loads(read_text(folder / DEFINITION_FILE))
     targets = definition.get("targets", {})
     return [t["file"] for t in targets.values() if isinstance(t, dict) and isinstance(t.get("file"), str)]
 
@@ -205,34 +205,32 @@ def _link_into(path: Path, merged: Merged) -> None:
 
 def _merge_table(merged: Merged, old: Path, new: Path, target: Path) -> None:
     new_header, new_rows = table_rows(new)
-    text = decode(old, read_bytes(old)[0]).replace("\r\n", "\n") if old.is_file() else ""
+    text = read_text(old).replace("\r\n", "\n") if old.is_file() else ""
     old_header = next(csv.reader(io.StringIO(text, newline=""), strict=True), new_header)
     header = [*old_header, *(name for name in new_header if name not in old_header)]
     as_it_is = bool(text) and len(header) == len(old_header) and "\r" not in text
-    stream = io.StringIO(newline="")
-    writer = csv.writer(stream, lineterminator="\n")
+    parts = [(new, new_header, new_rows)]
     if as_it_is:  # what is new goes behind what is there
-        stream.write(text if text.endswith("\n") else f"{text}\n")
-        origins: list[Origin] = list(zip(repeat(old), range(1, stream.getvalue().count("\n") + 1)))
-        parts = [(new, new_header, new_rows)]
+        text += "" if text.endswith("\n") else "\n"
+        origins: list[Origin] = list(zip(repeat(old), range(1, text.count("\n") + 1)))
     else:
-        writer.writerow(header)
-        origins = [(old if text else new, 1)]
-        parts = [(old, old_header, table_rows(old)[1] if text else []), (new, new_header, new_rows)]
+        parts.insert(0, (old, old_header, table_rows(old)[1] if text else []))
+        origins, text = [(old if text else new, 1)], csv_text([header])
+    merged_rows: list[list[str]] = []
     for path, names, rows in parts:
         place = {name: i for i, name in enumerate(names)}
         order = [place.get(name) for name in header]
         for line, row in rows:
-            writer.writerow(["" if i is None else row[i] for i in order])
+            merged_rows.append(["" if i is None else row[i] for i in order])
             origins.append((path, line))
     merged.origins[f"{OBSERVATIONS_FOLDER}/{new.name}"] = origins
     merged.rows[new.stem] = len(new_rows)
-    atomic_write(target, stream.getvalue())
+    atomic_write(target, text + csv_text(merged_rows))
 
 
 def table_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Header, and the rows with their lines; what is there was read as a table before."""
-    reader = csv.reader(io.StringIO(decode(path, read_bytes(path)[0]), newline=""), strict=True)
+    reader = csv.reader(io.StringIO(read_text(path), newline=""), strict=True)
     header = next(reader)
     return header, [(reader.line_num, row) for row in reader if row]
 

@@ -115,11 +115,13 @@ class Observed:
             if block.target_id == target:
                 self._mask(found, i, block.point_idx == index)
 
+    def _spots_of(self, found: Hits, which: Iterable[int]) -> None:
+        found.spots.update((i, set(self.spots[i].spot_ids)) for i in which)
+
     def _image(self, found: Hits, camera: str, epoch: str) -> None:
         for i in self._blocks.get((camera, epoch), []):
             self._mask(found, i, np.ones(len(self.survey.image_blocks[i].uv), dtype=np.bool_))
-        for i in self._spots.get((camera, epoch), []):
-            found.spots[i] = set(self.spots[i].spot_ids)
+        self._spots_of(found, self._spots.get((camera, epoch), []))
 
     def _target(self, found: Hits, *parts: str) -> None:
         place = parts[:2] if len(parts) == 3 else None
@@ -140,16 +142,12 @@ class Observed:
 
     def _epoch(self, found: Hits, epoch: str) -> None:
         self._blocks_where(found, lambda b: b.epoch_id == epoch)
-        for i, spot in enumerate(self.spots):
-            if spot.epoch_id == epoch:
-                found.spots[i] = set(spot.spot_ids)
+        self._spots_of(found, (i for i, spot in enumerate(self.spots) if spot.epoch_id == epoch))
         self._others_where(found, lambda ref: ref == epoch or _frame(ref).epoch_id == epoch)
 
     def _camera(self, found: Hits, camera: str) -> None:
         self._blocks_where(found, lambda b: b.camera_id == camera)
-        for i, spot in enumerate(self.spots):
-            if spot.camera_id == camera:
-                found.spots[i] = set(spot.spot_ids)
+        self._spots_of(found, (i for i, spot in enumerate(self.spots) if spot.camera_id == camera))
 
     def _reading(self, found: Hits, table: str, name: str) -> None:
         for which, i in self.readings.get(f"{table}:{name}", []):

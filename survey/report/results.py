@@ -103,9 +103,6 @@ def begun_results(
     """
     files = ResultFiles(place, writing)
     rows = writing.of(lambda: image_rows(adjustment))
-    page = writing.of(
-        lambda: begun_page(adjustment, run, solution_dict(adjustment, run) | dict(more), rows(), options.language)
-    )
     parquet = options.parquet or (place.parent / RESULTS / PARQUET).is_file()  # there: not to be old
     files.begin({
         "covariance.npz": lambda: covariance_npz(adjustment, run.sigmas),
@@ -113,7 +110,8 @@ def begun_results(
         **({PARQUET: lambda: image_residuals_parquet(adjustment)} if parquet else {}),
         "residuals_other.csv": lambda: other_residuals_csv(adjustment),
     })  # fmt: skip
-    return BegunResults(files, page)
+    solution = {**solution_dict(adjustment, run), **more}
+    return BegunResults(files, writing.of(lambda: begun_page(adjustment, run, solution, rows(), options.language)))
 
 
 def finished_results(

@@ -117,13 +117,12 @@ def with_statistics(
     """
     scale, warnings = scale_of(adjustment, run.sigmas), adjustment.warnings
     tried = len(adjustment.diagnosis.lines) if adjustment.diagnosis is not None else 0
-    told = {
+    told: dict[str, Any] = plain({
         "summary": _summary(adjustment, run, scale, found),
         "warnings": [*warnings[:tried], *findings(found.consistency), *warnings[tried:]],
         **statistics_dict(adjustment, found, scale),
-    }
-    out: dict[str, Any] = solution | plain(told)
-    names = list(solution)
+    })  # fmt: skip
+    out, names = solution | told, list(solution)
     return out | {name: out.pop(name) for name in names[names.index("inputs") :]}
 
 
@@ -253,7 +252,7 @@ def _images(adjustment: Adjustment, camera_id: str, sums: tuple[IntArray, FloatA
 
 def _sums_of_blocks(found: ImageResiduals) -> tuple[IntArray, FloatArray]:
     """Points in use and their residuals squared, of every image block (B,)."""
-    squares = np.where(found.used, (found.residuals**2).sum(axis=1), 0.0)
+    squares = np.where(found.used, np.square(found.residuals) @ np.ones(2), 0.0)
     B = len(found.block_ptr) - 1
     block = np.repeat(np.arange(B), np.diff(found.block_ptr))
     n: IntArray = np.bincount(block[found.used], minlength=B)

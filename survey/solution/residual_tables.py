@@ -3,8 +3,6 @@
 Rows are made by the core: a million image points take a fraction of a second.
 """
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain, groupby
@@ -19,7 +17,7 @@ from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.parallel import side_by_side
 from adjust.native.text import NUMBERS, TEXT, WORD, Words, number_rows, record_rows
 from adjust.observations.terrestrial.statistics import reading_names, reading_unit
-from survey.folder.text import cell_text
+from survey.folder.text import cell_text, csv_text
 from survey.project.tables.arrow import parquet_bytes
 from survey.project.tables.reading import TextColumn
 from survey.solution.quantities import units_for_people
@@ -120,13 +118,12 @@ def image_residuals_parquet(adjustment: Adjustment) -> bytes:
 
 def _by_one(adjustment: Adjustment, rows: ImageRows, part: slice, values: FloatArray) -> bytes:
     """Rows of which some number is too large for fixed decimals: all in full."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
+    out = []
     for b, point, row in zip(rows.block[part].tolist(), rows.point[part].tolist(), values.tolist(), strict=True):
         block = adjustment.survey.image_blocks[b]
         names = (block.epoch_id, block.camera_id, block.target_id or "", rows.point_ids[point])
-        writer.writerow((*map(cell_text, names), *("" if not isfinite(v) else repr(v) for v in row[:-1]), int(row[-1])))
-    return out.getvalue().encode()
+        out.append((*map(cell_text, names), *("" if not isfinite(v) else repr(v) for v in row[:-1]), int(row[-1])))
+    return csv_text(out).encode()
 
 
 def _quoted(word: str) -> str:

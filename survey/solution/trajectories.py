@@ -1,6 +1,5 @@
 """A trajectory as files: ``trajectory.csv`` for people and spreadsheets, ``trajectory.json`` with everything."""
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from gtsam import Pose3
 
 from adjust.navigation import EpochPose, NavigationEpoch, Trajectory
 from survey.folder.plain import plain
+from survey.folder.text import json_text
 from survey.project import atomic_write
 from survey.project.tables.files import write_table
 from survey.solution.quantities import ARCSEC_PER_RAD, pose_dict
@@ -64,7 +64,7 @@ def write_trajectory(
     path = folder / "trajectory.json"
     paths = {"trajectory.csv": write_table(folder, "trajectory", table), "trajectory.json": path}
     content = {"summary": dict(summary), "epochs": {e.epoch_id: _entry(e) for e in epochs}}
-    atomic_write(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+    atomic_write(path, json_text(content))
     return paths
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from adjust.model.errors import SurveyError
 from survey.folder.replacing import changing, replace_parts
-from survey.folder.text import atomic_write, decode, read_bytes
+from survey.folder.text import atomic_write, read_text
 from survey.jobs.adjusting.edits import changed_files, kept_name, left_out
 from survey.jobs.detecting import author_name
 from survey.jobs.excluding import FILE, included_rows, new_rows
@@ -125,7 +125,7 @@ class Deciding(Resident):
         """What stands in a file of the folder."""
         if name == DEFINITION_FILE:
             return self.situation.definition_text
-        return decode(self.folder / name, read_bytes(self.folder / name)[0])
+        return read_text(self.folder / name)
 
     @property
     def remedies(self) -> "tuple[Candidate, ...]":

@@ -16,7 +16,7 @@ from survey.folder.plain import plain
 from survey.folder.replacing import changing, replace_parts
 from survey.project.project import DEFINITION_FILE, RESULTS
 from survey.report.language import text_said
-from survey.solution.earlier.runs import remove_empty
+from survey.solution.earlier.runs import Clock, command_line, remove_empty
 from survey.solution.frames import AdjustedFrames
 from survey.solution.quantities import scale_of
 from survey.workbench.deciding import Deciding
@@ -41,7 +41,6 @@ class Jobs(Deciding):
 
     def save(self) -> "AdjustOutcome":
         """Write ``results`` as ``labsurvey adjust`` does, and a run beside the others. Raises as :meth:`exclude`."""
-        from survey.jobs.adjusting.job import Clock, command_line
         from survey.jobs.adjusting.outcome import kept_run, made
 
         with self._lock:

@@ -9,7 +9,7 @@ import numpy as np
 
 from adjust.model.errors import SurveyError
 from adjust.model.survey import IntArray
-from survey.folder.text import read_bytes
+from survey.folder.text import NOT_OURS, read_bytes
 from survey.project.project import RESULTS
 from survey.project.tables.files import read_table
 from survey.project.tables.reading import Layout, Table
@@ -21,7 +21,6 @@ _LAYOUT = Layout(
     ("residual_u_px", "residual_v_px", "sigma_u_px", "sigma_v_px", "redundancy_u", "redundancy_v", "standardized_u",
      "standardized_v", "test"),
 )  # fmt: skip
-_BROKEN = (SurveyError, ValueError, KeyError, TypeError, AttributeError, RecursionError, OSError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +44,7 @@ def kept_results(situation: Situation) -> Kept | None:
         summary = {k: said[k] for k in ("verdict", "reason", "sigma0", "redundancy", "n_observations", "n_unknowns")}
         return Kept(summary, [str(w) for w in found["warnings"]], float(said["suspects"]["image_test_limit"]),
                     float(said["suspects"]["standardized_limit"]), str(found["inputs"]["date"]))  # fmt: skip
-    except _BROKEN:
+    except (SurveyError, *NOT_OURS):
         return None
 
 
@@ -53,7 +52,7 @@ def with_kept(rows: PointRows, situation: Situation) -> PointRows:
     """The rows with what ``results/residuals.csv`` says of them; as they are where it cannot be read."""
     try:
         return _joined(rows, read_table(situation.everything.folder / RESULTS / "residuals.csv", _LAYOUT))
-    except _BROKEN:
+    except (SurveyError, *NOT_OURS):
         return rows
 
 

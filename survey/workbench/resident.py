@@ -14,7 +14,7 @@ from adjust.model.errors import DiagnosedError, SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
 from survey.folder.locking import LOCK, holder_of
-from survey.folder.text import decode, read_bytes
+from survey.folder.text import read_text
 from survey.project.exclusions import in_force, read_exclusions
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
 from survey.project.reading import leaving_out, read_all
@@ -66,7 +66,7 @@ class Resident(Folder):
     def _read(self) -> Situation:
         signature = signature_of(self.folder)  # first: what changes while it is read shows as changed afterwards
         everything = read_all(self.folder)
-        text = decode(self.folder / DEFINITION_FILE, read_bytes(self.folder / DEFINITION_FILE)[0])
+        text = read_text(self.folder / DEFINITION_FILE)
         exclusions = in_force(read_exclusions(self.folder / OBSERVATIONS_FOLDER)[0])
         return Situation(everything, leaving_out(everything, exclusions.values()), text, exclusions, signature)
 

@@ -20,7 +20,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import Camera, FloatArray, LensParameter, PoseParameter, Station, Survey
 from adjust.relay.conditions import adjust_conditions
-from adjust.relay.eyes.drift import fit_drift, rescaled, sequences
+from adjust.relay.eyes.drift import fit_drift, sequences
 from adjust.relay.eyes.eyes import EyeOptions, adjust_eye_motions, adjust_eyes
 from adjust.relay.eyes.pairs import close_loops, pairs_of, triangle_misclosure
 from adjust.relay.eyes.sequences import PoseSequence
@@ -83,7 +83,7 @@ def test_no_white_noise_explains_the_poses(recording: str) -> None:
     times = result.common.times_s[:, 0]
     ids = tuple(f"{t:.2f}" for t in times)
     cov = np.broadcast_to(np.diag(np.repeat([0.01, 0.05], 3) ** 2), (len(ids), 6, 6)).copy()
-    other = rescaled(c.at(times + offset), result.joint.scales[IDS[1]])
+    other = c.at(times + offset).rescaled(result.joint.scales[IDS[1]])
     eyes = [
         PoseSequence(FrameRef("camera", i), ids, (i,) * len(ids), p, cov)
         for i, p in zip(IDS[:2], (a.at(times), other), strict=True)
@@ -228,7 +228,7 @@ def joint_graph(result: RelayTrackers) -> dict[tuple[str, str], tuple[Pose3, Flo
 
 def test_scaled_motions_keep_their_turns() -> None:
     motions = Motions(np.eye(3)[None], np.array([[1.0, 2.0, 3.0]]))
-    scaled = rescaled(motions, 0.5).translation
+    scaled = motions.rescaled(0.5).translation
     assert scaled is not None
     assert scaled[0] == pytest.approx([0.5, 1.0, 1.5])
 

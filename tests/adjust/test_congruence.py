@@ -146,6 +146,13 @@ def pair_network(seed: int, turned: float) -> tuple[Survey, StartValues]:
     return survey, StartValues({}, {("world_from_station", f"R{i}"): p for i, p in enumerate(poses)}, {})
 
 
+def test_epochs_too_large_for_one_matrix_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    result = adjust(*free_hall(1, noise=False))
+    monkeypatch.setattr("adjust.epochs.states._MOST", 35)
+    with pytest.raises(SurveyError, match="15 points and stations are too many"):
+        congruence(result, result)
+
+
 def test_a_station_that_turned() -> None:
     first, second = adjust(*pair_network(1, 0.0)), adjust(*pair_network(2, 4e-4))
     found = congruence(first, second)

@@ -135,7 +135,7 @@ def test_one_factor_serves_several_steps_to_the_same_minimum(monkeypatch: pytest
     monkeypatch.setattr(PairNormals, "_eliminated", counted)
     kept = solve_network(network)
     saved = kept.iterations + 1 - counts["eliminated"]
-    monkeypatch.setattr("adjust.graph.solver._NEAR", 0.0)
+    monkeypatch.setattr("adjust.graph.solver._CLOSE", ())
     fresh = solve_network(network)
     assert saved > 0
     sigmas = np.sqrt(np.diagonal(fresh.station_cov, axis1=1, axis2=2))[:, 3:]

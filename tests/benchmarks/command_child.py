@@ -17,7 +17,11 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from adjust.native import parallel
+from survey.commands.common import begin_adjusting
+
+begin_adjusting()  # as the command does, before NumPy is loaded
+
+from adjust.native import parallel  # noqa: E402
 
 WORKERS = 2
 
@@ -88,9 +92,9 @@ def main() -> None:
     parallel.Beside.__exit__ = lambda self, *_: pool.finished(self)
     plain = parallel.Beside.of
     parallel.Beside.of = lambda self, step: plain(self, step) if self._alone else pool.given(self, step)
-    from survey.jobs.adjusting import job
+    from survey.solution.earlier import runs
 
-    job.time = SimpleNamespace(perf_counter=time.process_time)
+    runs.time = SimpleNamespace(perf_counter=time.process_time)
     from survey.cli import program
 
     sys.argv = ["labsurvey", *sys.argv[1:]]

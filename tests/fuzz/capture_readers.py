@@ -158,11 +158,11 @@ def _held(folder: Path) -> object:
     """Who holds the lock, as another process is told."""
     import fcntl
 
-    from capture.session.folder import lock_holder
+    from survey.folder.locking import SESSION_LOCK, holder_of
 
     with (folder / "lab" / "capture" / "lock").open("rb") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
-        return lock_holder(folder / "lab")
+        return holder_of(folder / "lab" / SESSION_LOCK)
 
 
 def _simulated_lab(path: Path) -> object:

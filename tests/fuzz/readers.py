@@ -75,8 +75,10 @@ def _table(name: str, number: int) -> Callable[[Path], Read]:
 
     def prepare(folder: Path) -> Read:
         from survey.project import reading
+        from survey.project.tables.kinds import KINDS
 
-        beside = {reading._EXTRA.get(Path(name).stem)} | ({"table_angles"} if "laser_spots" in name else set())
+        main = {kind.beside.name: kind.layout.name for kind in KINDS if kind.beside is not None}
+        beside = {main.get(Path(name).stem)} | ({"table_angles"} if "laser_spots" in name else set())
         for other, data in _projects()[number].items():
             if "/" not in other or Path(other).stem in beside:
                 (folder / other).parent.mkdir(exist_ok=True)

@@ -62,4 +62,4 @@ def edits_of(survey: Survey, camera_id: str, epochs: tuple[str, ...], how: Image
 
 
 def _size(survey: Survey, camera_id: str) -> tuple[int, int]:
-    return next(c.image_size for c in survey.cameras if c.camera_id == camera_id)
+    return survey.cameras_by_id[camera_id].image_size

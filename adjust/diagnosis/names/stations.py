@@ -16,6 +16,7 @@ from gtsam import Pose3
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, Rename
 from adjust.diagnosis.screen import Screen, at_best, improvement, screen
+from adjust.diagnosis.sequences import with_pairs
 from adjust.model.observations import FrameRef, Pair, frame_text
 from adjust.model.survey import FloatArray, Survey
 from adjust.spatial.averaging import pose_distance
@@ -55,8 +56,7 @@ def exchanged_stations(case: Case) -> Iterator[Hypothesis]:
 
 def _misses(survey: Survey, found: Screen) -> FloatArray:
     """(p,) mean squares over sigmas of the pairs at a start of the survey, bounded."""
-    at = {o.ids[0]: found.others[i] for i, o in enumerate(found.graph.others) if o.kind == "pair"}
-    return np.array([min(at.get(p.pair_id, 0.0), CAP) for p in survey.pairs])
+    return np.minimum(found.pairs_of(survey), CAP)
 
 
 def _suspects(survey: Survey, misses: FloatArray) -> list[FrameRef]:
@@ -158,10 +158,9 @@ def _matrix(pair: Pair) -> FloatArray:
 
 
 def _exchanged(survey: Survey, a: FrameRef, b: FrameRef, rows: Sequence[int]) -> Survey:
-    other, chosen = {a: b, b: a}, set(rows)
-    pairs = tuple(replace(p, a=other.get(p.a, p.a), b=other.get(p.b, p.b)) if i in chosen else p
-                  for i, p in enumerate(survey.pairs))  # fmt: skip
-    return replace(survey, pairs=pairs)
+    other = {a: b, b: a}
+    pairs = {i: survey.pairs[i] for i in rows}
+    return with_pairs(survey, {i: replace(p, a=other.get(p.a, p.a), b=other.get(p.b, p.b)) for i, p in pairs.items()})
 
 
 def _hypothesis(

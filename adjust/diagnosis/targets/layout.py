@@ -66,7 +66,7 @@ def _normalized(x: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _hypothesis(survey: Survey, target: str, columns: int, square: float, evidence: float) -> Hypothesis:
-    n = next(len(t.point_ids) for t in survey.targets if t.target_id == target)
+    n = len(survey.targets_by_id[target].point_ids)
     rows = -(-n // columns)
     targets = tuple(
         replace(t, x_in_target=lattice(n, columns, square)) if t.target_id == target else t for t in survey.targets

@@ -12,11 +12,11 @@ from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.screen import Screen, at_best
 from adjust.model.observations import Reading
-from adjust.model.survey import FloatArray, IntArray, Survey
-from adjust.statistics.system import linear_system
+from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.statistics.score import LinearScores
 
 _CLEARLY = 3.0
-_MOST = 4
+_FEWEST, _MOST = 3, 4
 _LARGEST = 10.0
 """m: what no height of an instrument or a target, and no reflector's constant, is wrong by."""
 _SEEN = 1e-4
@@ -62,21 +62,19 @@ def _by_scores(case: Case, constants: list[_Constant]) -> list[tuple[float, floa
     and -g / m the constant.
     """
     result = case.result
-    if result is None or len(result.survey.readings) != len(case.survey.readings):
+    if result is None or not constants or len(result.survey.readings) != len(case.survey.readings):
         return []
     if not all(r.used for r in result.survey.readings):
         return []
-    linear = case.linear
-    system = linear.system if linear is not None and linear.result is result else linear_system(result)
-    first = int(system.ptr[len(system.ptr) - 1 - len(case.survey.readings)])
-    sigma = np.array([r.sigma for r in case.survey.readings])
-    B = np.zeros((len(system.e), len(constants)))
-    for k, c in enumerate(constants):
-        B[first + c.rows, k] = c.by / sigma[c.rows]
-    g = B.T @ system.e
-    AtB = np.asarray(system.A.T @ B)
-    m = np.einsum("ij,ij->j", B, B) - np.einsum("ij,ij->j", AtB, system.times_covariance(AtB))
-    sure = m > _SEEN * np.einsum("ij,ij->j", B, B)
+    linear: LinearScores | None = case.linear
+    if linear is None or linear.result is not result:
+        linear = LinearScores(result)
+    ptr, sigma = linear.system.ptr, np.array([r.sigma for r in case.survey.readings])
+    first = int(ptr[len(ptr) - 1 - len(sigma)])
+    columns = [c.by / sigma[c.rows] for c in constants]
+    g, M = linear.apart([(first + c.rows, b[:, None]) for c, b in zip(constants, columns, strict=True)])
+    m = np.diagonal(M)
+    sure = m > _SEEN * np.array([b @ b for b in columns])
     metres = np.where(sure, -g / np.where(sure, m, 1.0), 0.0)
     drop = np.where(sure, g**2 / np.where(sure, m, 1.0), 0.0)
     return [(float(result.omega / max(result.omega - d, 1.0)), float(x)) for d, x in zip(drop, metres, strict=True)]
@@ -89,36 +87,31 @@ def _constants(survey: Survey, before: Screen) -> Iterator[_Constant]:
     A, kinds = batch.A, np.array([r.kind for r in survey.readings])
     setups = np.array([r.setup_id for r in survey.readings])
     targets = np.array([str(r.to.point_id) for r in survey.readings])
-    up_to, up_at = A[:, 5], A[:, 2]  # by the height of the target's and of the instrument's position
+    up_to, up_at, along = A[:, 5], A[:, 2], np.ones(len(A))  # by the heights of the two ends' positions, and by lengths
     tilted = np.isin(kinds, ("zenith", "slope_distance", "height_difference"))
     lengths = np.isin(kinds, ("slope_distance", "horizontal_distance"))
+
+    def constant(
+        name: str, text: str, place: Place, which: BoolArray, by: FloatArray, remedy: str
+    ) -> Iterator[_Constant]:
+        rows = np.flatnonzero(which)
+        if len(rows) >= _FEWEST:
+            yield _Constant(name, text, place, rows, by[rows], remedy)
+
     for setup_id in dict.fromkeys(s for s in setups.tolist() if s):
-        rows = np.flatnonzero((setups == setup_id) & tilted)
-        if len(rows) >= 3:
-            yield _Constant("instrument height", f"the instrument's height at set-up {setup_id}",
-                            Place("setup", (setup_id,), "instrument_height_m"), rows, up_at[rows],
+        mine = setups == setup_id
+        yield from constant("instrument height", f"the instrument's height at set-up {setup_id}",
+                            Place("setup", (setup_id,), "instrument_height_m"), mine & tilted, up_at,
                             "change instrument_height of its rows in terrestrial.csv")  # fmt: skip
-        rows = np.flatnonzero((setups == setup_id) & lengths)
-        if len(rows) >= 3:
-            yield _Constant("prism constant", f"the reflector's constant at set-up {setup_id}",
-                            Place("setup", (setup_id,), "value"), rows, np.ones(len(rows)),
+        yield from constant("prism constant", f"the reflector's constant at set-up {setup_id}",
+                            Place("setup", (setup_id,), "value"), mine & lengths, along,
                             "change the distances of its rows in terrestrial.csv")  # fmt: skip
     for target in dict.fromkeys(targets.tolist()):
-        rows = np.flatnonzero((targets == target) & tilted)
-        if len(rows) >= 3:
-            yield _Constant("target height", f"the target's height on point {target}",
-                            Place("point", (target,), "target_height_m"), rows, up_to[rows],
+        yield from constant("target height", f"the target's height on point {target}",
+                            Place("point", (target,), "target_height_m"), (targets == target) & tilted, up_to,
                             "change target_height of its rows in terrestrial.csv")  # fmt: skip
-    rows = np.flatnonzero(lengths)
-    if len(rows) >= 3:
-        yield _Constant(
-            "prism constant",
-            "the reflector's constant of all distances",
-            Place("instrument", (), ""),
-            rows,
-            np.ones(len(rows)),
-            "give an instrument's distance_offset, or change all distances",
-        )
+    yield from constant("prism constant", "the reflector's constant of all distances", Place("instrument", (), ""),
+                        lengths, along, "give an instrument's distance_offset, or change all distances")  # fmt: skip
 
 
 def _evidence(before: Screen, constant: _Constant) -> tuple[float, float]:

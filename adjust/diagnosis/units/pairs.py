@@ -263,7 +263,7 @@ def _by_start(case: Case) -> _Judge | None:
     before = at_best(case)
     if before is None:
         return None
-    squares, loops = _of_pairs(before, survey), _loop_tests(survey)
+    squares, loops = before.pairs_of(survey), _loop_tests(survey)
     worst = np.argsort(-squares, kind="stable")
     ends = np.array([[p.a.frame_id, p.b.frame_id] for p in survey.pairs])
     ends = np.unique(ends, return_inverse=True)[1].reshape(-1, 2)
@@ -286,7 +286,7 @@ def _by_start(case: Case) -> _Judge | None:
         if there:  # where images tell the poses too, what is meant fits them better than what is read
             still |= np.array(there) <= 1.0
         after = (None if x else screen(_with(survey, new)) for x, new in zip(still, sets, strict=True))
-        return [0.0 if x is None else gain(np.arange(len(squares)), _of_pairs(x, survey)) for x in after]
+        return [0.0 if x is None else gain(np.arange(len(squares)), x.pairs_of(survey)) for x in after]
 
     def gain(rows: IntArray, after: FloatArray) -> float:
         now = squares.copy()
@@ -334,12 +334,6 @@ def miss(motion: Motion, other: FloatArray) -> FloatArray:
     if isinstance(motion, Pose3):
         return np.asarray(Pose3.Logmap(motion.between(Pose3.Expmap(other))))
     return np.asarray(Rot3.Logmap(motion.between(Rot3.Expmap(other))))
-
-
-def _of_pairs(found: Screen, survey: Survey) -> FloatArray:
-    """(p,) squares over sigmas of the pairs, in their order; zero of what is no factor."""
-    at = {o.ids[0]: found.others[i] for i, o in enumerate(found.graph.others) if o.kind == "pair"}
-    return np.array([at.get(p.pair_id, 0.0) for p in survey.pairs])
 
 
 def edits_of(survey: Survey, rows: IntArray, convention: Convention) -> tuple[Edit, ...]:

@@ -88,7 +88,7 @@ def repeated_orientations(survey: Survey) -> dict[str, ParameterName]:
     used |= {level.frame.frame_id for level in survey.levels if level.frame.kind == "station"}
     used |= {ref.frame_id for a in survey.alignments for ref in (a.a, a.b) if ref.kind == "station"}
     used |= {b.carrier_id for b in survey.beams if b.carrier_kind == "station"}
-    stations = {s.station_id: s for s in survey.stations}
+    stations = survey.stations_by_id
     at: dict[str, set[PositionRef]] = {}
     for r in survey.readings:
         if r.setup_id in tilted and r.kind == "direction":

@@ -17,7 +17,6 @@ from adjust.relay.eyes.eyes import EyeAdjustment, EyeOptions, adjust_eye_motions
 from adjust.relay.eyes.sequences import MotionSequence
 from adjust.relay.eyes.solver import EyeProblem, EyeSolution, Weights, linearise
 from adjust.relay.eyes.trajectories import CommonMotions, Trajectory, common_motions
-from adjust.spatial.rigid_motions import Motions
 from adjust.testing.distributions import norm
 
 _PARTS = (slice(0, 3), slice(3, 6))
@@ -157,15 +156,8 @@ def growth(
         for eye in range(1, len(common.eyes)):
             X = adjusted.station_from_eye[np.array([eye])]
             A = common.motions[0]
-            B = rescaled(common.motions[eye], adjusted.scales.get(common.eyes[eye].frame_id, 1.0))
+            B = common.motions[eye].rescaled(adjusted.scales.get(common.eyes[eye].frame_id, 1.0))
             miss = (X.inverse() @ A.inverse() @ X @ B).log()
             rows.append([np.sqrt(np.mean(miss[:, part] ** 2)) for part in _PARTS])
         out.append(rows)
     return np.array(out)
-
-
-def rescaled(motions: Motions, factor: float) -> Motions:
-    """Lengths times a factor."""
-    if motions.translation is None:
-        raise ValueError("rotations alone have no lengths")
-    return Motions(motions.rotation, factor * motions.translation)

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from gtsam import Pose3
+from gtsam import Pose3, Rot3
 
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, Pair
@@ -23,7 +23,6 @@ from adjust.relay.eyes.screening import solve_screened
 from adjust.relay.eyes.sequences import KnownWorlds, MotionSequence, PoseSequence
 from adjust.relay.eyes.setup import EyeSetup, motion_setup, pose_setup
 from adjust.relay.eyes.solver import EyeSolution
-from adjust.relay.network import gtsam_motion
 from adjust.spatial.rigid_motions import Motions
 
 
@@ -165,10 +164,7 @@ def _refuse_weak(setup: EyeSetup, cov: FloatArray, largest: float) -> None:
 
 def as_pose(motions: Motions) -> Pose3:
     """The single motion as GTSAM's type."""
-    pose = gtsam_motion(motions, 0)
-    if not isinstance(pose, Pose3):
-        raise ValueError("a rotation alone is no pose")
-    return pose
+    return Pose3(Rot3(motions.rotation[0]), motions.shifts[0])
 
 
 def symmetric(cov: FloatArray) -> FloatArray:

@@ -6,6 +6,7 @@ Each eye is adjusted by itself; its poses come with their joint covariance.
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
 from gtsam import Pose3
 
 from adjust.adjustment import adjust
@@ -15,8 +16,7 @@ from adjust.model.result import Adjustment
 from adjust.model.survey import Camera, PoseParameter, Station, Survey, Target
 from adjust.relay.eyes.eyes import symmetric
 from adjust.relay.eyes.sequences import PoseSequence
-from adjust.relay.eyes.setup import from_matrix
-from adjust.relay.eyes.solver import stacked
+from adjust.spatial.rigid_motions import Motions
 
 ROOM = "room"  # the world of targets that the survey holds
 
@@ -27,7 +27,7 @@ def camera_sequence(survey: Survey, camera_id: str) -> PoseSequence:
     Targets seen together in an epoch make one world, named after the first of them; targets that the survey holds stand
     in the world "room". The lens is treated as in the survey. Raises SurveyError for targets that move.
     """
-    camera = next((c for c in survey.cameras if c.camera_id == camera_id), None)
+    camera = survey.cameras_by_id.get(camera_id)
     if camera is None:
         raise SurveyError(f"camera {camera_id!r} is not part of the survey; correct the id")
     blocks = _before_targets(survey, camera)
@@ -50,7 +50,7 @@ def _sequence(
     if alone.precision is None or not names:
         raise SurveyError(f"{eye.kind} {eye.frame_id!r}: no epoch is left after adjusting it by itself")
     poses = [alone.estimates[name].value for name in names]
-    found = stacked([from_matrix(p.matrix()) for p in poses if isinstance(p, Pose3)])
+    found = Motions.of(np.array([p.matrix() for p in poses if isinstance(p, Pose3)]))
     ids = tuple(name[2] for name in names)
     cov = symmetric(alone.precision.joint(names))
     return PoseSequence(eye, ids, tuple(world_of[e] for e in ids), found, cov)
@@ -62,7 +62,7 @@ def target_sequence(survey: Survey, target_id: str) -> PoseSequence:
     Of several such cameras the one that saw the block at most epochs counts; it is the world, by its id, and its lens
     is treated as in the survey. Raises SurveyError where no such camera saw the block.
     """
-    target = next((t for t in survey.targets if t.target_id == target_id), None)
+    target = survey.targets_by_id.get(target_id)
     if target is None:
         raise SurveyError(f"target {target_id!r} is not part of the survey; correct the id")
     watched = _watched(survey, target)

@@ -5,13 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.survey import BoolArray, FloatArray, IntArray
-from adjust.pose_network.cycles import adjacency
+from adjust.pose_network.cycles import connected_parts
 from adjust.relay.eyes.sequences import KnownWorlds, MotionSequence, PoseSequence
-from adjust.relay.eyes.solver import EyeConditions, EyeProblem, KnownMotion, stacked
+from adjust.relay.eyes.solver import EyeConditions, EyeProblem, KnownMotion
 from adjust.spatial.rigid_motions import Motions, identities
 from adjust.start.closed_forms.hand_eye import relative_motions, solve_ax_xb
 
@@ -41,13 +42,13 @@ def motion_setup(sequences: Sequence[MotionSequence], free_scales: bool) -> EyeS
     conditions = EyeConditions(
         k, other, eye_k, eye_l, eye_k, eye_l, _scale_idx(eye_k, free_scales), _scale_idx(eye_l, free_scales)
     )
-    _refuse_unlinked(len(eyes), conditions.eye_k, conditions.eye_l, [e.frame_id for e in eyes], "eyes")
+    _refuse_unlinked(len(eyes), conditions.eye_k, conditions.eye_l, [e.frame_id for e in eyes])
     start = identities(len(eyes), 6)
     for a, b in _walk(eye_k, eye_l):
         mine: BoolArray = ((eye_k == a) & (eye_l == b)) | ((eye_k == b) & (eye_l == a))
         of_a, of_b = np.where(eye_k == a, k, other)[mine], np.where(eye_k == a, other, k)[mine]
-        X = _hand_eye(matrices(observed[of_a]), matrices(observed[of_b]), eyes[a], eyes[b])
-        start = _placed(start, b, start[np.array([a])] @ from_matrix(X))
+        X = _hand_eye(observed[of_a].matrices(), observed[of_b].matrices(), eyes[a], eyes[b])
+        start = _placed(start, b, start[np.array([a])] @ X)
     free = np.arange(len(eyes)) > 0
     return EyeSetup(eyes, EyeProblem(observed, cov, conditions, start, free, (), len(scaled)), names, True, {}, scaled)
 
@@ -82,7 +83,7 @@ def pose_setup(sequences: Sequence[PoseSequence], known: Sequence[KnownWorlds]) 
 
 def _known(a: int, b: int, relation: KnownWorlds, free: BoolArray) -> KnownMotion:
     """A relation to the held world; between two free ones there is no datum that makes it one unknown's."""
-    motion = from_matrix(relation.a_from_b.matrix())
+    motion = _one(relation.a_from_b)
     if not free[a]:
         return KnownMotion(b, motion, np.asarray(relation.cov))
     if not free[b]:
@@ -99,7 +100,7 @@ def _pose_start(
     known: list[tuple[int, int, KnownWorlds]], eyes: tuple[FrameRef, ...],
 ) -> tuple[Motions, BoolArray]:  # fmt: skip
     """Start values of eyes and worlds, one eye after the other; holds one world of each part that hangs together."""
-    _refuse_unlinked(n_eyes, c.eye_k, c.eye_l, [e.frame_id for e in eyes], "eyes")
+    _refuse_unlinked(n_eyes, c.eye_k, c.eye_l, [e.frame_id for e in eyes])
     U = identities(len(free), 6)
     free = free.copy()
     links = [(int(a), int(b)) for a, b in zip(c.world_k, c.world_l, strict=True)] + [(a, b) for a, b, _ in known]
@@ -116,18 +117,18 @@ def _pose_start(
     set_worlds = {int(i) for i in np.flatnonzero(~free) if i >= n_eyes}
     for a, b, relation in known:
         if a in set_worlds and b not in set_worlds:
-            U = _placed(U, b, U[np.array([a])] @ from_matrix(relation.a_from_b.matrix()))
+            U = _placed(U, b, U[np.array([a])] @ _one(relation.a_from_b))
             set_worlds.add(b)
         elif b in set_worlds and a not in set_worlds:
-            U = _placed(U, a, U[np.array([b])] @ from_matrix(relation.a_from_b.matrix()).inverse())
+            U = _placed(U, a, U[np.array([b])] @ _one(relation.a_from_b).inverse())
             set_worlds.add(a)
     return _worlds_started(c, observed, U, set_worlds), free
 
 
-def _hand_eye(a: FloatArray, b: FloatArray, eye_a: FrameRef, eye_b: FrameRef) -> FloatArray:
-    """``a_from_b`` (4, 4) from motions; what is undetermined is named with the eyes."""
+def _hand_eye(a: FloatArray, b: FloatArray, eye_a: FrameRef, eye_b: FrameRef) -> Motions:
+    """``a_from_b`` from motions (n, 4, 4); what is undetermined is named with the eyes."""
     try:
-        return solve_ax_xb(a, b)[0]
+        return Motions.of(solve_ax_xb(a, b)[0][None])
     except SurveyError as error:
         raise SurveyError(f"eyes {eye_a.frame_id} and {eye_b.frame_id}: {error}") from None
 
@@ -141,7 +142,7 @@ def _eye_from_eye(
     eyes: tuple[FrameRef, FrameRef],
 ) -> Motions:
     """``a_from_b`` of two eyes: directly where their worlds are the same or known, else from the motions."""
-    relation = {(a, b): from_matrix(r.a_from_b.matrix()) for a, b, r in known}
+    relation = {(a, b): _one(r.a_from_b) for a, b, r in known}
     relation |= {(b, a): m.inverse() for (a, b), m in relation.items()}
     direct = []
     for i in range(len(A)):
@@ -151,18 +152,18 @@ def _eye_from_eye(
             one = np.array([i])
             direct.append(A[one].inverse() @ Z @ B[one])
     if direct:
-        return medoid(stacked(direct))
+        return medoid(Motions.joined(direct))
     motions = []
     for key in dict.fromkeys(zip(wa.tolist(), wb.tolist(), strict=True)):
         rows = np.flatnonzero((wa == key[0]) & (wb == key[1]))
         if len(rows) > 1:
-            motions.append(relative_motions(matrices(A[rows]), matrices(B[rows])))
+            motions.append(relative_motions(A[rows].matrices(), B[rows].matrices()))
     if not motions:
         raise SurveyError(
             "two eyes never saw the same two worlds twice: nothing turns; take several epochs before unmoved targets"
         )
     a, b = (np.concatenate([m[j] for m in motions]) for j in (0, 1))
-    return from_matrix(_hand_eye(a, b, *eyes))
+    return _hand_eye(a, b, *eyes)
 
 
 def _worlds_started(c: EyeConditions, observed: Motions, U: Motions, done: set[int]) -> Motions:
@@ -182,17 +183,15 @@ def _worlds_started(c: EyeConditions, observed: Motions, U: Motions, done: set[i
         if not reach:
             return U
         for world, found in reach.items():
-            U = _placed(U, world, medoid(stacked(found)))
+            U = _placed(U, world, medoid(Motions.joined(found)))
             done.add(world)
 
 
 def medoid(motions: Motions) -> Motions:
     """The one whose rotations and shifts are nearest to all others, lengths taken in their own spread."""
-    if motions.translation is None:
-        raise ValueError("a rotation alone is no pose")
     between = np.einsum("nij,mij->nm", motions.rotation, motions.rotation)
     angle = np.arccos(np.clip((between - 1.0) / 2.0, -1.0, 1.0))
-    shift = np.linalg.norm(motions.translation[:, None] - motions.translation[None], axis=-1)
+    shift = np.linalg.norm(motions.shifts[:, None] - motions.shifts[None], axis=-1)
     cost = np.median(angle, axis=1) / (np.median(angle) + 1e-12) + np.median(shift, axis=1) / (np.median(shift) + 1e-12)
     return motions[np.array([int(np.argmin(cost))])]
 
@@ -232,9 +231,9 @@ def _star(rows: dict[str, list[tuple[int, int]]]) -> tuple[IntArray, IntArray, I
 def _observed(parts: Sequence[Motions], covs: Sequence[FloatArray]) -> tuple[Motions, FloatArray]:
     """All observations, their covariances as blocks where no sequence has a joint one."""
     if all(c.ndim == 3 for c in covs):
-        return stacked(parts), np.concatenate(covs)
+        return Motions.joined(parts), np.concatenate(covs)
     full = [c if c.ndim == 2 else scipy.linalg.block_diag(*c) for c in covs]
-    return stacked(parts), np.asarray(scipy.linalg.block_diag(*full))
+    return Motions.joined(parts), np.asarray(scipy.linalg.block_diag(*full))
 
 
 def _walk(a: IntArray, b: IntArray) -> list[tuple[int, int]]:
@@ -254,47 +253,25 @@ def _walk(a: IntArray, b: IntArray) -> list[tuple[int, int]]:
     return out
 
 
-def _refuse_unlinked(n: int, a: IntArray, b: IntArray, ids: list[str], what: str) -> None:
+def _refuse_unlinked(n: int, a: IntArray, b: IntArray, ids: list[str]) -> None:
     reached = {0} | {y for _, y in _walk(a, b)}
     lost = [ids[i] for i in range(n) if i not in reached]
     if lost:
         raise SurveyError(
-            f"the {what} {', '.join(lost)} share no epoch with {ids[0]}; take epochs in which both see something"
+            f"the eyes {', '.join(lost)} share no epoch with {ids[0]}; take epochs in which both see something"
         )
 
 
 def _first_of_parts(n: int, links: list[tuple[int, int]], n_eyes: int, preferred: list[int]) -> list[int]:
     """One world of each part that hangs together; those with known relations first."""
     a, b = (np.array([link[i] for link in links], dtype=np.int64) for i in (0, 1))
-    ptr, neighbour, _ = adjacency(n, a, b)
-    out: list[int] = []
-    seen: set[int] = set(range(n_eyes))
-    for first in [*preferred, *range(n_eyes, n)]:
-        if first in seen:
-            continue
-        out.append(first)
-        stack = [first]
-        while stack:
-            here = stack.pop()
-            if here in seen:
-                continue
-            seen.add(here)
-            stack += [int(x) for x in neighbour[ptr[here] : ptr[here + 1]]]
-    return out
+    part = connected_parts(n, a, b).tolist()
+    first = {part[i]: i for i in reversed([*preferred, *range(n_eyes, n)])}
+    return list(first.values())
 
 
-def matrices(motions: Motions) -> FloatArray:
-    """(n, 4, 4)."""
-    if motions.translation is None:
-        raise ValueError("a rotation alone is no pose")
-    out = np.tile(np.eye(4), (len(motions), 1, 1))
-    out[:, :3, :3], out[:, :3, 3] = motions.rotation, motions.translation
-    return out
-
-
-def from_matrix(matrix: FloatArray) -> Motions:
-    """One motion from (4, 4)."""
-    return Motions(matrix[None, :3, :3].copy(), matrix[None, :3, 3].copy())
+def _one(pose: Pose3) -> Motions:
+    return Motions.of(pose.matrix()[None])
 
 
 def _placed(motions: Motions, idx: int, one: Motions) -> Motions:

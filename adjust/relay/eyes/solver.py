@@ -10,7 +10,6 @@ linearised at the adjusted observations (Koch 1999, section 3.9.2; Helmert 1872)
 with all true poses as unknowns.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -121,7 +120,7 @@ def linearise(problem: EyeProblem, U: Motions, scales: FloatArray, v: FloatArray
     """The conditions at unknowns ``U`` and observations moved by ``v`` (n, 6)."""
     c = problem.conditions
     moved = problem.observed.retract(v)
-    Pk, Pl = (_scaled(moved[i], s, scales) for i, s in ((c.k_idx, c.scale_k), (c.l_idx, c.scale_l)))
+    Pk, Pl = (moved[i].rescaled(_factor(s, scales)) for i, s in ((c.k_idx, c.scale_k), (c.l_idx, c.scale_l)))
     back = Pk.inverse() @ U[c.world_k].inverse() @ U[c.world_l] @ Pl
     C = U[c.eye_l].inverse() @ U[c.eye_k] @ back
     f = C.log()
@@ -155,12 +154,6 @@ def linearise(problem: EyeProblem, U: Motions, scales: FloatArray, v: FloatArray
     )
 
 
-def _scaled(poses: Motions, idx: IntArray, scales: FloatArray) -> Motions:
-    if poses.translation is None:
-        raise ValueError("eyes are found from poses, not from rotations alone")
-    return Motions(poses.rotation, poses.translation * _factor(idx, scales)[:, None])
-
-
 def _factor(idx: IntArray, scales: FloatArray) -> FloatArray:
     return np.asarray(np.exp(np.append(scales, 0.0)[idx]))  # -1 takes the zero at the end
 
@@ -175,9 +168,7 @@ def _unscaled(idx: IntArray, scales: FloatArray) -> FloatArray:
 
 def _stretch(pose: Motions) -> FloatArray:
     """Derivative (m, 6) of a pose in its tangent by the exponent of its lengths."""
-    if pose.translation is None:
-        raise ValueError("eyes are found from poses, not from rotations alone")
-    turned = (np.swapaxes(pose.rotation, -1, -2) @ pose.translation[..., None])[..., 0]
+    turned = (np.swapaxes(pose.rotation, -1, -2) @ pose.shifts[..., None])[..., 0]
     return np.concatenate([np.zeros_like(turned), turned], axis=1)
 
 
@@ -278,9 +269,3 @@ def _finish(problem: EyeProblem, U: Motions, scales: FloatArray, v: FloatArray, 
     return EyeSolution(
         problem, U, scales, cov, v, w, test, np.asarray(influence), omega, redundancy, iterations
     )  # fmt: skip
-
-
-def stacked(parts: Sequence[Motions]) -> Motions:
-    """Motions one after the other."""
-    shifts = [p.translation for p in parts if p.translation is not None]
-    return Motions(np.concatenate([p.rotation for p in parts]), np.concatenate(shifts))

@@ -38,9 +38,7 @@ class Trajectory:
             )
         i = np.clip(np.searchsorted(t, times_s, side="right") - 1, 0, len(t) - 2)
         share = (times_s - t[i]) / (t[i + 1] - t[i])
-        R, x = self.world_from_eye.rotation, self.world_from_eye.translation
-        if x is None:
-            raise ValueError("a trajectory has positions")
+        R, x = self.world_from_eye.rotation, self.world_from_eye.shifts
         turn = rotation_log(np.swapaxes(R[i], -1, -2) @ R[i + 1])
         return Motions(R[i] @ rotation_exp(share[:, None] * turn), x[i] + share[:, None] * (x[i + 1] - x[i]))
 

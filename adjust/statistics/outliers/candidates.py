@@ -48,17 +48,16 @@ def candidates(graph: AdjustmentGraph, images: bool = True) -> Candidates:
     survey = graph.survey
     ptr = np.cumsum([0] + [len(b.uv) for b in survey.image_blocks if images])
     tables: dict[tuple[str, ...], int] = {(r.table_id, r.epoch_id): i for i, r in enumerate(survey.table_readings)}
-    n_image, count = int(ptr[-1]), dict.fromkeys(_FIELD, 0)
-    place: dict[int, tuple[str, int]] = {}
-    for i, (kind, ids) in enumerate(graph.of_others(lambda o: (o.kind, o.ids), lambda p: ("pair", (p.pair_id,)))):
+    n_image, place, rows = int(ptr[-1]), dict[int, tuple[str, int]](), dict[str, list[int]]()
+    for i, kind in enumerate(graph.of_others(lambda o: o.kind, lambda _: "pair")):
+        rows.setdefault(kind, []).append(n_image + i)
+    for kind, mine in rows.items():
         if kind == "table":
-            place[n_image + i] = ("table_readings", tables[ids])
+            place |= {o: ("table_readings", tables[graph.other(o - n_image).ids]) for o in mine}
         elif kind in _FIELD:
-            place[n_image + i] = (_FIELD[kind], count[kind])
-            count[kind] += 1
-    for kind, n in count.items():
-        if n not in (0, len(getattr(survey, _FIELD[kind]))):
-            raise ValueError(f"{n} factors of kind {kind} for {len(getattr(survey, _FIELD[kind]))} observations")
+            if len(mine) != (n := len(getattr(survey, _FIELD[kind]))):
+                raise ValueError(f"{len(mine)} factors of kind {kind} for {n} observations")
+            place |= {o: (_FIELD[kind], k) for k, o in enumerate(mine)}
     first = n_image + graph.n_others
     place |= {first + i: (_READINGS, i) for i in range(len(survey.readings))}
     return Candidates(place, n_image, first + len(survey.readings), tuple(ptr.tolist()))

@@ -229,7 +229,8 @@ def typical(tests: Verdicts) -> FloatArray:
     n = np.bincount(tests.group[tests.used & (tests.freedom > 0)], minlength=len(factor))
     for g in np.flatnonzero(n >= MANY).tolist():
         mine = tests.used & (tests.group == g) & (tests.freedom > 0)
-        ratio = tests.statistic[mine] / chi2.ppf(0.5, tests.freedom[mine])
+        freedom, of = np.unique(tests.freedom[mine], return_inverse=True)
+        ratio = tests.statistic[mine] / chi2.ppf(0.5, freedom)[of]
         if np.mean(ratio > 1.0) > 0.5 + 1.5 / np.sqrt(n[g]):  # three sigmas of a fair coin
             factor[g] = max(1.0, float(np.median(ratio)))
     return factor

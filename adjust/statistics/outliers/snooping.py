@@ -260,7 +260,7 @@ class Snooping:
 def _influences(precision: Precision) -> tuple[list[FloatArray], BoolArray]:
     """Whitened A Q A' (k, k) of everything but image points in the solution, and which of it that uses (M,)."""
     graph, readings = precision.graph, precision.graph.terrestrial
-    found = [precision.influence(item)[1] for item in graph.others]
+    found = [precision.rows(item).influence for item in graph.others]
     used = np.array([item.used for item in graph.others], dtype=np.bool_)
     if readings is None:
         return found, used

@@ -31,7 +31,7 @@ from adjust.model.survey import (
     Station,
     Survey,
 )
-from survey.folder.text import atomic_write, id_problem
+from survey.folder.text import atomic_write, csv_text, id_problem
 from survey.interop.cameras.colmap_model import ColmapCamera, ColmapModel, read_model
 from survey.interop.cameras.rig import lens_of
 from survey.interop.cameras.values import BROWN_8, FISHEYE_4, CameraValues, MappedLens, mapped_lens
@@ -336,11 +336,7 @@ def _seen(
 
 def names_csv(names: dict[int, str]) -> str:
     """The table that keeps the names of points, which COLMAP has no place for."""
-    out = io.StringIO(newline="")
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(("point3D_id", "name"))
-    writer.writerows(sorted(names.items()))
-    return out.getvalue()
+    return csv_text([("point3D_id", "name"), *sorted(names.items())])
 
 
 def write_colmap(values: CameraValues, folder: Path, text: bool = False) -> tuple[dict[str, int], tuple[str, ...]]:

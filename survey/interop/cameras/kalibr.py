@@ -6,7 +6,6 @@ a block of markers can; its tags carry a double black frame.
 """
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from gtsam import Pose3
@@ -87,7 +86,7 @@ def kalibr_files(values: CameraValues, station: str | None) -> tuple[dict[str, s
 
 def camchain_text(found: RigValues) -> str:
     """The camchain: cameras in order as cam0, cam1 ..., their own names as topics."""
-    chain: dict[str, Any] = {}
+    chain: dict[str, object] = {}
     before: Pose3 | None = None
     for i, (camera, lens) in enumerate(zip(found.rig.cameras, found.lenses, strict=True)):
         fisheye, pose = lens.model == "fisheye", camera.rig_from_camera or Pose3()

@@ -4,16 +4,14 @@
 from the corner of the first pixel, half a pixel off ours. Lenses: OPENCV (k1 k2 p1 p2 k3) and OPENCV_FISHEYE.
 """
 
-import json
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 from gtsam import Pose3
 
 from adjust.model.observations import FrameRef
 from adjust.model.survey import LensParameter, PoseParameter, Survey
-from survey.folder.text import id_problem
+from survey.folder.text import id_problem, json_text
 from survey.interop.cameras.rig import lens_of, moving_camera, pose_of
 from survey.interop.cameras.values import BROWN_5, FISHEYE_4, CameraValues, MappedLens, mapped_lens
 from survey.interop.networks.foreign import ForeignNetwork
@@ -106,14 +104,14 @@ def nerf_files(values: CameraValues, station: str | None) -> tuple[dict[str, str
     frames = []
     for camera_id, epoch in seen:
         pose = values.world_from(FrameRef("camera", camera_id, epoch)) * _OPENGL
-        frame: dict[str, Any] = {"file_path": f"images/{camera_id}/{epoch}.png"}
+        frame: dict[str, object] = {"file_path": f"images/{camera_id}/{epoch}.png"}
         frame |= _lens_keys(lenses[camera_id], cameras[camera_id].image_size)
         frames.append(frame | {"transform_matrix": [[float(v) for v in row] for row in pose.matrix()]})
-    text = json.dumps({"frames": frames}, ensure_ascii=False, allow_nan=False, indent=1) + "\n"
+    text = json_text({"frames": frames})
     return {"": text}, tuple(lens.note for lens in lenses.values() if lens.note)
 
 
-def _lens_keys(lens: MappedLens, size: tuple[int, int]) -> dict[str, Any]:
+def _lens_keys(lens: MappedLens, size: tuple[int, int]) -> dict[str, object]:
     fisheye = lens.model == "fisheye"
     fx, fy, u0, v0 = lens.array("fx", "fy", "u0", "v0").tolist()
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")

@@ -12,7 +12,6 @@ fisheye.
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from gtsam import Pose3
@@ -147,7 +146,7 @@ def _motion(pose: Pose3) -> dict[str, Value]:
     return {"R": pose.rotation().matrix(), "T": np.asarray(pose.translation()).reshape(3, 1)}
 
 
-def opencv_yaml(values: Mapping[str, Any]) -> str:
+def opencv_yaml(values: Mapping[str, object]) -> str:
     """What cv2.FileStorage reads; arrays (n, m) as its matrices."""
     return "%YAML:1.0\n---\n" + yaml_text(values)
 
@@ -212,7 +211,7 @@ def mc_calib_files(values: CameraValues, station: str | None) -> tuple[dict[str,
 def mc_calib_text(found: RigValues) -> str:
     """What MC-Calib and cv2.FileStorage read."""
     base = (found.rig.cameras[0].rig_from_camera or Pose3()).inverse()
-    document: dict[str, Any] = {"nb_camera": len(found.lenses)}
+    document: dict[str, object] = {"nb_camera": len(found.lenses)}
     for i, (camera, lens) in enumerate(zip(found.rig.cameras, found.lenses, strict=True)):
         fisheye = lens.model == "fisheye"
         k = lens.array(*(("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")))

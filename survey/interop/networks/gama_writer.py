@@ -130,12 +130,12 @@ def _cluster(survey: Survey, members: Sequence[Reading]) -> list[str]:
     return [*lines, "</obs>"]
 
 
-def _reading(reading: Reading) -> dict[str, Any]:
+def _reading(reading: Reading) -> dict[str, object]:
     angular = reading.kind in ANGLES
     value = reading.value % (2.0 * np.pi) if reading.kind in ("direction", "azimuth") else reading.value
     sigma = reading.sigma / (CC if angular else MM)
     # the point of a direction set stands with the set
-    attributes: dict[str, Any] = {} if reading.kind == "direction" else {"from": reading.at.point_id}
+    attributes: dict[str, object] = {} if reading.kind == "direction" else {"from": reading.at.point_id}
     if reading.second is not None:
         attributes |= {"bs": reading.to.point_id, "fs": reading.second.point_id}
     else:

@@ -1,10 +1,9 @@
 """A network as one JSON document: points, readings, baselines, coordinates, and the adjusted points with covariance."""
 
-import json
-from typing import Any
-
-from adjust.model.observations import PositionRef
+from adjust.model.observations import PositionRef, Reading
+from adjust.model.survey import Point
 from survey.folder.plain import plain
+from survey.folder.text import json_text
 from survey.interop.networks.values import NetworkValues, between_points, point_of
 from survey.project.tables.terrestrial import ANGLES, HEIGHTS
 
@@ -41,17 +40,17 @@ def network_json(network: NetworkValues) -> str:
         ],
         "adjusted": _adjusted(network),
     }  # fmt: skip
-    return json.dumps(document, ensure_ascii=False, allow_nan=False, indent=1) + "\n"
+    return json_text(document)
 
 
 def _ids(positions: tuple[PositionRef, ...]) -> list[str | None]:
     return [point_of(p) for p in positions]
 
 
-def _point(network: NetworkValues, point: Any) -> dict[str, Any]:
+def _point(network: NetworkValues, point: Point) -> dict[str, object]:
     x = network.x.get(point.point_id)
     parameter = point.x_in_world
-    out = {"treatment": parameter.treatment, "held": list(parameter.held)}
+    out: dict[str, object] = {"treatment": parameter.treatment, "held": list(parameter.held)}
     if x is not None:
         out["x_m"] = plain(x)
     if parameter.prior_cov is not None:
@@ -59,16 +58,16 @@ def _point(network: NetworkValues, point: Any) -> dict[str, Any]:
     return out
 
 
-def _reading(r: Any) -> dict[str, Any]:
+def _reading(r: Reading) -> dict[str, object]:
     unit = "rad" if r.kind in ANGLES else "m"
-    out = {"id": r.reading_id, "kind": r.kind, "from": r.at.point_id, "to": r.to.point_id}
+    out: dict[str, object] = {"id": r.reading_id, "kind": r.kind, "from": r.at.point_id, "to": r.to.point_id}
     out |= {"second": r.second.point_id} if r.second else {}
     out |= {"setup": r.setup_id} if r.setup_id else {}
     out |= {f"value_{unit}": r.value, f"sigma_{unit}": r.sigma, "group": r.group, "used": r.used}
     return out | {f"{name}_m": height for name in HEIGHTS if (height := getattr(r, name))}
 
 
-def _adjusted(network: NetworkValues) -> dict[str, Any] | None:
+def _adjusted(network: NetworkValues) -> dict[str, object] | None:
     if not network.adjusted:
         return None
     return {

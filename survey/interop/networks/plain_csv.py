@@ -17,7 +17,7 @@ import numpy as np
 
 from adjust.model.observations import CoordinateDifferences, Coordinates, Reading, ReadingKind
 from adjust.model.survey import Bearings, FloatArray
-from survey.folder.text import suggestion
+from survey.folder.text import csv_text, suggestion
 from survey.interop.networks.draft import AXES, NetworkDraft, Vectors
 from survey.interop.networks.foreign import (
     ARCSEC,
@@ -190,12 +190,8 @@ def plain_csv(network: NetworkValues) -> str:
     for name, cov in network.covs.items():
         sigma = dict(zip((f"sigma_{a}_mm" for a in AXES), _texts(np.sqrt(np.diag(cov)) / MM), strict=True))
         rows.append({"kind": "adjusted", "from_id": name, **_xyz(network.x[name]), **sigma})
-    stream = io.StringIO(newline="")
     used = [c for c in COLUMNS if any(row.get(c) for row in rows)]
-    writer = csv.DictWriter(stream, used, restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({k: v for k, v in row.items() if v} for row in rows)
-    return stream.getvalue()
+    return csv_text([used, *([row.get(c) or "" for c in used] for row in rows)])
 
 
 def _texts(values: FloatArray) -> list[str]:

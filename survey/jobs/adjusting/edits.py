@@ -1,7 +1,6 @@
 """The edits of a hypothesis as texts of the project's files: everything that is not concerned stays to the letter."""
 
 import csv
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +21,7 @@ from adjust.diagnosis.hypothesis import (
 )
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
-from survey.folder.text import decode, read_bytes
+from survey.folder.text import csv_text, read_text
 from survey.folder.units import from_si, to_si
 from survey.project.declared.editing import with_product, with_value
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
@@ -96,7 +95,7 @@ def _text(path: Path, chosen: Hypothesis) -> str:
                           f"{chosen.change}")  # fmt: skip
     if not path.exists():
         raise SurveyError(f"{path}: this project has no such table; {chosen.change}")
-    return decode(path, read_bytes(path)[0])
+    return read_text(path)
 
 
 def _edited(path: Path, text: str, edit: Edit, chosen: Hypothesis) -> str:
@@ -174,6 +173,4 @@ def _mapped_sigmas(row: Mapping[str, str], by: FloatArray) -> dict[str, str]:
 
 def _row(cells: Sequence[str], before: str) -> str:
     """A row as a line, with the end of the line that it had."""
-    out = io.StringIO()
-    csv.writer(out, lineterminator=before[len(before.rstrip("\r\n")) :]).writerow(cells)
-    return out.getvalue()
+    return csv_text([cells], before[len(before.rstrip("\r\n")) :])

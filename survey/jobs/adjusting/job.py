@@ -1,14 +1,8 @@
 """The main job: read, detect, adjust, write. What comes after reading is loaded while tables become observations."""
 
-import os
-import shlex
-import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from adjust.model.errors import SurveyError
@@ -18,24 +12,10 @@ from survey.jobs.detecting import detect_in, detect_job, remember_images
 from survey.project import read
 from survey.project.project import RESULTS
 from survey.report.language import ENGLISH_PAGE, ReportOptions
-from survey.solution.earlier.runs import remove_empty
+from survey.solution.earlier.runs import Clock, command_line, remove_empty
 
 if TYPE_CHECKING:
     from survey.jobs.adjusting.outcome import AdjustOutcome
-
-
-class Clock:
-    """How long each step took."""
-
-    def __init__(self, seconds: Mapping[str, float] = MappingProxyType({})) -> None:
-        self.seconds: dict[str, float] = dict(seconds)
-
-    @contextmanager
-    def step(self, name: str) -> Iterator[None]:
-        """Time what is done inside."""
-        begin = time.perf_counter()
-        yield
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
 
 
 def adjust_job(
@@ -96,19 +76,3 @@ def _load() -> None:
     """What a project is adjusted and tested with; with one thread that is loaded when it is asked for."""
     for name in ("scipy.special", "scipy.linalg", "survey.jobs.adjusting.outcome", "survey.jobs.adjusting.steps"):
         import_module(name)
-
-
-def command_line(command: str, folder: Path, *words: str | Path, **flags: object) -> str:
-    """A command as it can be given again, with its options; folders by their names, as results may be moved."""
-    said = [f"--{name}" if value is True else f"--{name} {_shown(value)}" for name, value in flags.items() if value]
-    return " ".join(["labsurvey", command, _shown(folder), *map(_shown, words), *said])
-
-
-def _shown(value: object) -> str:
-    return shlex.quote(plain_name(value) if isinstance(value, Path) else
-                       str(value).encode("utf-8", "surrogateescape").decode("utf-8", "replace"))  # fmt: skip
-
-
-def plain_name(folder: Path) -> str:
-    """The name alone: results of a copied folder stay the same; by its bytes: a terminal without UTF-8 garbles it."""
-    return os.fsencode(folder.resolve().name).decode("utf-8", "replace")

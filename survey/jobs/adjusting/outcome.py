@@ -2,7 +2,6 @@
 
 import platform
 from dataclasses import asdict, dataclass, field, replace
-from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -11,15 +10,14 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from adjust.native.parallel import Beside
 from survey.folder.replacing import replace_parts
-from survey.folder.text import atomic_write
-from survey.jobs.adjusting.job import Clock, plain_name
+from survey.folder.text import atomic_write, time_text
 from survey.jobs.detecting import author_name
 from survey.project import Project
 from survey.project.project import RESULTS
 from survey.report.language import ENGLISH_PAGE, ReportOptions
 from survey.report.results import RunInfo, begun_results, finished_results, summary_text
 from survey.report.unsolved import JSON, PAGE, unsolved_files
-from survey.solution.earlier.runs import record_run
+from survey.solution.earlier.runs import Clock, plain_name, record_run
 from survey.solution.quantities import USUAL, scale_of
 from survey.solution.statistics import Statistics, statistics_of
 
@@ -117,7 +115,7 @@ def run_info(project: Project, seconds: dict[str, float], command: str = "") -> 
             continue
     chosen = replace(project.options, tolerances=(), identification=())
     options = {k: v for k, v in asdict(chosen).items() if v not in ((), None)} | {"datum": project.survey.datum.kind}
-    date = datetime.now(UTC).isoformat(timespec="seconds")
+    date = time_text()
     name = plain_name(project.folder)
     said = project.options.identification
     sigmas = project.options.sigmas or USUAL

@@ -10,7 +10,7 @@ import numpy as np
 
 from adjust.diagnosis.diagnosis import Diagnosis
 from adjust.diagnosis.hypothesis import ChangeReadings, Edit, Hypothesis, LeaveOut, Place, Rename, ScaleKey, SetKey
-from survey.folder.text import decode, read_bytes
+from survey.folder.text import read_text
 from survey.project.declared.editing import LENGTHS
 from survey.project.declared.toml_text import key_lines
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER, Project
@@ -53,7 +53,7 @@ class _Files:
     def keys(self) -> dict[tuple[str | int, ...], int]:
         """Lines of the keys of ``survey.toml``."""
         path = self.folder / DEFINITION_FILE
-        return key_lines(decode(path, read_bytes(path)[0]))
+        return key_lines(read_text(path))
 
     def table(self, name: str) -> Table | None:
         """A table, None where the project has none."""

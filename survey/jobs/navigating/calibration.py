@@ -15,6 +15,7 @@ from adjust.model.survey import FloatArray
 from adjust.navigation import Beacons, Head, HeadCamera, HeadTable
 from survey.folder.arrays import packed_arrays, read_arrays
 from survey.folder.shapes import POSITIVE, WHOLE, Either, misfit
+from survey.folder.text import NOT_OURS
 from survey.project import atomic_write
 
 
@@ -70,7 +71,7 @@ def kept(path: Path, key: str) -> Calibration | None:
         if _problem(about, arrays) is not None or about["key"] != key:
             return None
         return _restored(about, arrays)
-    except (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError):
+    except NOT_OURS:
         return None  # whatever is wrong with the file, the calibration is only made anew
 
 

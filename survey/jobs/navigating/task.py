@@ -15,7 +15,7 @@ from adjust.model.subsets import in_use, points_read, with_points
 from adjust.model.survey import Survey
 from adjust.navigation import NavigationEpoch, Spots, head_of
 from adjust.statistics.outliers.supported import supported
-from survey.folder.text import decode, read_bytes
+from survey.folder.text import read_text
 from survey.jobs.navigating.lenses import with_images_left
 from survey.project import Project
 
@@ -95,7 +95,7 @@ def chosen_times(epochs: Sequence[str], request: NavigateRequest) -> list[float]
         return None if step is None else [i * step for i in range(len(epochs))]
     if request.interval_s is not None:
         raise SurveyError("give either the interval between epochs or a table of their times, not both")
-    rows = list(csv.DictReader(decode(request.times, read_bytes(request.times)[0]).splitlines()))
+    rows = list(csv.DictReader(read_text(request.times).splitlines()))
     if not rows or not {"epoch_id", "time_s"} <= set(rows[0]):
         raise SurveyError(f"{request.times}:1: the columns epoch_id and time_s are needed")
     found: dict[str, float] = {}

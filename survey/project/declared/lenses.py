@@ -6,7 +6,6 @@ import numpy as np
 
 from adjust.lenses.models import MODELS
 from adjust.model.survey import FloatArray, ImageCrop, LensDrift, LensParameter, LensSharing, Tie, VectorPrior
-from survey.folder.text import suggestion
 from survey.project.declared.declarations import CROP_UNITS
 from survey.project.declared.node import Node
 from survey.project.declared.vectors import read_vector, vector_to_toml
@@ -73,9 +72,7 @@ def _drift(node: Node, free: tuple[str, ...]) -> LensDrift:
         return LensDrift(parameters, (), None, reference)
     if not begins:
         raise node.error("name the epochs at which a new block begins, or write with_temperature = true", "begins")
-    for name in steps.values:
-        if name not in parameters:
-            raise steps.error(f"unknown key; {suggestion(name, parameters)}", name)
+    steps.allow(*parameters)
     if not steps.values:
         return LensDrift(parameters, begins)
     return LensDrift(parameters, begins, np.array([steps.number(name) for name in parameters]))
@@ -88,17 +85,11 @@ def _balance(node: Node, model: str) -> float:
     return node.number("balance_radius_mm")
 
 
-def _known(node: Node, names: tuple[str, ...]) -> None:
-    for name in node.values:
-        if name not in names:
-            raise node.error(f"unknown lens parameter; {suggestion(name, names)}", name)
-
-
 def _values(
     node: Node, model: str, names: tuple[str, ...], free: tuple[str, ...], ties: tuple[Tie, ...]
 ) -> FloatArray | None:
     table = node.table("values")
-    _known(table, names)
+    table.allow(*names, what="lens parameter")
     tied = {tie.name for tie in ties}
     for name in _ESSENTIAL[model]:
         if name in table.values or name in tied or (not table.values and name in free):
@@ -111,7 +102,7 @@ def _values(
 
 def _prior(node: Node, names: tuple[str, ...], free: tuple[str, ...]) -> VectorPrior | None:
     table = node.table("prior")
-    _known(table, names)
+    table.allow(*names, what="lens parameter")
     if not table.values:
         return None
     has_matrix = node.has("prior_covariance")
@@ -137,7 +128,7 @@ def _prior(node: Node, names: tuple[str, ...], free: tuple[str, ...]) -> VectorP
 
 def _ties(node: Node, names: tuple[str, ...], free: tuple[str, ...]) -> tuple[Tie, ...]:
     table = node.table("tie")
-    _known(table, names)
+    table.allow(*names, what="lens parameter")
     ties = []
     for name in table.values:
         entry = table.table(name)

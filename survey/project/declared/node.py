@@ -115,11 +115,11 @@ class Node:
         """What makes an error of a problem at a key below this table."""
         return lambda problem: self.error(problem, *keys)
 
-    def allow(self, *known: str) -> None:
+    def allow(self, *known: str, what: str = "key") -> None:
         """Raise at the first key that is not ``known``."""
         for key in self.values:
             if key not in known:
-                raise self.error(f"unknown key; {suggestion(key, known)}", key)
+                raise self.error(f"unknown {what}; {suggestion(key, known)}", key)
 
     def has(self, *keys: str) -> bool:
         """Whether any of the keys is given."""

@@ -16,7 +16,6 @@ from adjust.model.survey import (
     VectorPrior,
 )
 from adjust.model.tables import HARMONICS, HIGHEST, harmonic_names, in_order, unit_of
-from survey.folder.text import suggestion
 from survey.project.declared.clocks import read_clock
 from survey.project.declared.lenses import read_lens, read_size
 from survey.project.declared.node import Node
@@ -114,9 +113,8 @@ def _read_geometry(node: Node, n_axes: int) -> VectorParameter:
     free = geometry.references("free", known, "table parameter", base[:2] if n_axes == 2 else ())
     free = (*free, *(n for n in _harmonics(node.table("harmonics"), n_axes) if n not in free))
     values = {name: geometry.si(key, 0.0) for key, name in keys.items()}
+    sigma.allow(*keys)
     for key in sigma.values:
-        if key not in keys:
-            raise sigma.error(f"unknown key; {suggestion(key, keys)}", key)
         if keys[key] not in free:
             raise sigma.error(f"{keys[key]} has a sigma but is not free; add it to geometry.free", key)
     names = tuple(in_order([n for n in known if n in base or n in free or values[n]]))

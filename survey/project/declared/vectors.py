@@ -10,7 +10,6 @@ import numpy as np
 
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, VectorParameter, VectorPrior
-from survey.folder.text import suggestion
 from survey.folder.units import from_si
 from survey.project.declared.node import Node
 
@@ -44,9 +43,8 @@ def read_vector(
             values[i] = node.si(key_of(name, units))
     table = node.table("sigma")
     keys = {key_of(name, units): name for name in names}
+    table.allow(*keys)
     for key in table.values:
-        if key not in keys:
-            raise table.error(f"unknown key; {suggestion(key, keys)}", key)
         if keys[key] not in chosen:
             raise table.error(f"{keys[key]} has a sigma but is not free; add it to free", key)
         if np.isnan(values[names.index(keys[key])]):

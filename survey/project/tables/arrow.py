@@ -3,7 +3,6 @@
 What Arrow does not read as Python would (or not at all) is left to the readers that say what is wrong and where.
 """
 
-import csv
 import io
 import re
 from collections.abc import Iterable, Sequence
@@ -17,7 +16,7 @@ import numpy.typing as npt
 from adjust.model.errors import SurveyError
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.native.parallel import workers
-from survey.folder.text import LARGEST_NUMBER, utf8
+from survey.folder.text import LARGEST_NUMBER, csv_text, utf8
 from survey.project.tables.reading import LARGEST_ROWS, Columns, Layout, TextColumn, check_header, check_rows, first_row
 
 LARGE = 2**20  # bytes of CSV, cells to write / 10: below, loading Arrow (30 ms) costs more than it saves
@@ -149,9 +148,7 @@ def _dictionary(column: TextColumn) -> Any:
 def _quoted(name: str) -> str:
     if _PLAIN(name):
         return name
-    out = io.StringIO(newline="")
-    csv.writer(out, lineterminator="\n").writerow((name, ""))  # a row of one blank would be quoted
-    return out.getvalue().removesuffix(",\n")
+    return csv_text([(name, "")]).removesuffix(",\n")  # a row of one blank would be quoted
 
 
 def _strings(texts: Iterable[str]) -> Any:

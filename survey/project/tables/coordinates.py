@@ -8,7 +8,6 @@ import numpy as np
 from adjust.model.names import natural_key
 from adjust.model.observations import CoordinateDifferences, Coordinates, position_text
 from adjust.model.survey import FloatArray
-from survey.folder.text import suggestion
 from survey.folder.units import from_si, to_si
 from survey.project.project import Sigmas
 from survey.project.tables.covariance import joint_problem, read_triples, sigmas_and_correlations
@@ -77,11 +76,10 @@ def read_coordinates(table: Table, names: Names, sigmas: Sigmas) -> tuple[Coordi
 def _add_coordinate_entries(extra: Table, sets: Mapping[str, _Set], members: Mapping[tuple[str, str], int]) -> None:
     """Put the covariances between different points into their sets."""
     columns = [extra.text(name).values() for name in COORDINATES_COVARIANCE.ids]
+    known = dict.fromkeys(name for name in sets if not name.startswith(_ALONE))
     values = to_si(extra.numbers("covariance_mm2"), "mm2").tolist()
     for row, (set_id, a, a_axis, b, b_axis) in enumerate(zip(*columns, strict=True)):
-        if set_id not in sets:
-            known = (name for name in sets if not name.startswith(_ALONE))
-            raise extra.error(row, f"set_id: unknown set {set_id!r}; {suggestion(set_id, known)}")
+        extra.require(row, "set_id", "set", set_id, known)
         for point in (a, b):
             if (set_id, point) not in members:
                 raise extra.error(row, f"a_id, b_id: set {set_id!r} has no coordinates of {point!r} in coordinates.csv")
@@ -134,8 +132,7 @@ def _add_difference_entries(extra: Table, ids: tuple[str, ...], of_row: dict[int
     values = to_si(extra.numbers("covariance_mm2"), "mm2").tolist()
     for row, (a, a_axis, b, b_axis) in enumerate(zip(*columns, strict=True)):
         for column, name in (("a_id", a), ("b_id", b)):
-            if name not in row_of:
-                raise extra.error(row, f"{column}: unknown difference {name!r}; {suggestion(name, row_of)}")
+            extra.require(row, column, "difference", name, row_of)
         if of_row[row_of[a]] is not of_row[row_of[b]]:
             raise extra.error(row, f"{a!r} and {b!r} are not in one set; give them the same set_id")
         ends = (a, a_axis, row_of[a]), (b, b_axis, row_of[b])

@@ -5,7 +5,7 @@ import csv
 import io
 import itertools
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,17 @@ import numpy as np
 
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, IntArray
-from survey.folder.text import LARGEST_NUMBER, atomic_write, decode, formula_problem, read_bytes, utf8, with_digest
+from adjust.native.parallel import Beside
+from survey.folder.text import (
+    LARGEST_NUMBER,
+    atomic_write,
+    content,
+    csv_text,
+    decode,
+    formula_problem,
+    utf8,
+    with_digest,
+)
 from survey.project.tables.arrow import LARGE, csv_columns, csv_rows, parquet_bytes, parquet_columns
 from survey.project.tables.reading import Columns, Layout, Table, TextColumn, check_header, check_rows, first_row
 
@@ -27,20 +37,26 @@ def read_table(path: Path, layout: Layout, instead: str | None = None) -> Table:
 
     instead: what is to stand in it, not yet written.
     """
-    data, digest = read_bytes(path) if instead is None else with_digest(instead.encode())
+    data = content(path) if instead is None else instead.encode()
+    with Beside() as hashing:
+        digest = hashing.of(lambda: with_digest(data)[1])
+        return _read(path, layout, data, digest)
+
+
+def _read(path: Path, layout: Layout, data: bytes, digest: Callable[[], str]) -> Table:
     if path.suffix == ".parquet":
         columns = parquet_columns(path, data, layout)
-        return _table(path, layout, digest, np.arange(1, len(next(iter(columns.values()))) + 1), columns)
+        return _table(path, layout, digest(), np.arange(1, len(next(iter(columns.values()))) + 1), columns)
     plain = csv_columns(data, layout)
     if plain is not None:
-        return _table(path, layout, digest, np.arange(2, len(next(iter(plain.values()))) + 2), plain)
+        return _table(path, layout, digest(), np.arange(2, len(next(iter(plain.values()))) + 2), plain)
     text = decode(path, data)
     if not text.strip():
         raise SurveyError(f"{path}:1: the file is empty; the first line names the columns: {','.join(layout.required)}")
     check_rows(path, text.count("\n"))
     header, chunks = csv_chunks(path, text)
     check_header(path, header, layout)
-    return _assemble(path, layout, digest, header, chunks)
+    return _assemble(path, layout, digest(), header, chunks)
 
 
 def _assemble(path: Path, layout: Layout, digest: str, header: Sequence[str], chunks: Iterable[Chunk]) -> Table:
@@ -192,14 +208,11 @@ def _names(column: Sequence[str] | TextColumn | FloatArray) -> Sequence[str]:
 
 
 def _csv(columns: Columns) -> bytes:
-    stream = io.StringIO(newline="")
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(columns)
+    header = csv_text([columns])
     doubles = all(c.dtype == np.float64 for c in columns.values() if isinstance(c, np.ndarray))
     if doubles and 10 * len(columns) * max(map(len, columns.values()), default=0) > LARGE:
-        return utf8(stream.getvalue()) + csv_rows(columns)
-    writer.writerows(zip(*(cells_of(column) for column in columns.values()), strict=True))
-    return utf8(stream.getvalue())
+        return utf8(header) + csv_rows(columns)
+    return utf8(header + csv_text(zip(*(cells_of(column) for column in columns.values()), strict=True)))
 
 
 def cells_of(column: Sequence[str] | TextColumn | FloatArray) -> Sequence[object]:

@@ -7,7 +7,7 @@ import numpy as np
 from adjust.model.names import natural_key
 from adjust.model.observations import Alignment, LaserSpot, Level, OnSurface, frame_text, position_text
 from adjust.model.survey import FloatArray
-from survey.folder.text import LARGEST_NUMBER, suggestion
+from survey.folder.text import LARGEST_NUMBER
 from survey.folder.units import from_si, to_si
 from survey.project.project import Sigmas
 from survey.project.tables.covariance import covariance_from_sigmas, sigmas_and_correlations, table_correlations
@@ -16,6 +16,7 @@ from survey.project.tables.reading import (
     Columns,
     Layout,
     Table,
+    both_or_each,
     filled,
     first_row,
     group_columns,
@@ -145,12 +146,7 @@ def read_laser_spots(table: Table, names: Names, sigmas: Sigmas) -> tuple[LaserS
     """Laser spots sorted by id."""
     ids, epochs = table.unique_ids("spot_id"), table.ids("epoch_id").values()
     beams, targets = table.text("beam_id").values(), table.text("target_id").values()
-    both = table.positive("sigma_mm")
-    each = np.stack([table.positive("sigma_x_mm"), table.positive("sigma_y_mm")], axis=1)
-    twice = ~np.isnan(both) & ~np.isnan(each).all(axis=1)
-    if twice.any():
-        raise table.error(first_row(twice), "sigma_mm and sigma_x_mm are both given; keep one of the two")
-    sigma = to_si(np.where(np.isnan(each), both[:, None], each), "mm")
+    sigma = to_si(both_or_each(table, "sigma_mm", ("sigma_x_mm", "sigma_y_mm")), "mm")
     needed(table, sigma.sum(axis=1), np.ones(len(table), dtype=bool), "sigma: is blank; fill in sigma_mm")
     cov = covariance_from_sigmas(sigma, table_correlations(table, ("rho_xy",)))
     xy = to_si(np.stack([table.numbers("x_mm"), table.numbers("y_mm")], axis=1), "mm")
@@ -159,11 +155,8 @@ def read_laser_spots(table: Table, names: Names, sigmas: Sigmas) -> tuple[LaserS
     on_table = {(r.table_id, r.epoch_id) for r in names.survey.table_readings}
     spots = []
     for row, spot_id in enumerate(ids):
-        if beams[row] not in known:
-            raise table.error(row, f"beam_id: unknown beam {beams[row]!r}; {suggestion(beams[row], known)}")
-        if targets[row] not in names.target_points:
-            found = suggestion(targets[row], names.target_points)
-            raise table.error(row, f"target_id: unknown target {targets[row]!r}; {found}")
+        table.require(row, "beam_id", "beam", beams[row], known)
+        table.require(row, "target_id", "target", targets[row], names.target_points)
         beam = known[beams[row]]
         if beam.carrier_kind == "mount" and (beam.carrier_id, epochs[row]) not in on_table:
             found = f"table {beam.carrier_id!r} has no reading at epoch {epochs[row]!r}"
@@ -182,8 +175,7 @@ def read_on_surfaces(table: Table, names: Names, sigmas: Sigmas) -> tuple[OnSurf
     known = {surface.surface_id for surface in names.survey.surfaces}
     result = []
     for row, (surface_id, text) in enumerate(zip(surfaces, texts, strict=True)):
-        if surface_id not in known:
-            raise table.error(row, f"surface_id: unknown surface {surface_id!r}; {suggestion(surface_id, known)}")
+        table.require(row, "surface_id", "surface", surface_id, known)
         position = timed_position(text, names, table.fail(row, "point_id"))
         item = OnSurface(surface_id, position, sigma[row], float(offset[row]), groups[row], used[row])
         result.append(((natural_key(surface_id), natural_key(text)), item))

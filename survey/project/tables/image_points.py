@@ -178,9 +178,8 @@ def _point_positions(table: Table, targets: TextColumn, names: Names) -> IntArra
         target_code, point_code = divmod(int(pairs[i]), len(points.names))
         target_id, point_id = targets.names[target_code], points.names[point_code]
         row = int(first[i])
-        if target_id and target_id not in names.target_points:
-            near = suggestion(target_id, names.target_points)
-            raise table.error(row, f"target_id: unknown target {target_id!r}; {near}")
+        if target_id:
+            table.require(row, "target_id", "target", target_id, names.target_points)
         known = names.target_points[target_id] if target_id else names.points
         if point_id not in known:
             owner = f"target {target_id!r} has no point {point_id!r}" if target_id else f"unknown point {point_id!r}"

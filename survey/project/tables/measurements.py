@@ -7,11 +7,10 @@ import numpy as np
 from adjust.model.names import natural_key
 from adjust.model.observations import Distance, TableReading, position_text
 from adjust.model.survey import FloatArray
-from survey.folder.text import suggestion
 from survey.folder.units import from_si, to_si
 from survey.project.project import Sigmas
 from survey.project.tables.covariance import covariance_from_sigmas, sigmas_and_correlations, table_correlations
-from survey.project.tables.reading import FLAGS, Columns, Layout, Table, first_row, group_columns, marks
+from survey.project.tables.reading import FLAGS, Columns, Layout, Table, both_or_each, first_row, group_columns, marks
 from survey.project.tables.references import Names, read_ends
 
 ANGLES = Layout(
@@ -32,8 +31,7 @@ def read_angles(table: Table, names: Names, sigmas: Sigmas) -> tuple[TableReadin
     groups, _, scale = marks(table, "table", sigmas.scale)
     lines: dict[tuple[str, str], int] = {}
     for row, (epoch_id, table_id) in enumerate(zip(epochs, tables, strict=True)):
-        if table_id not in axes:
-            raise table.error(row, f"table_id: unknown table {table_id!r}; {suggestion(table_id, axes)}")
+        table.require(row, "table_id", "table", table_id, axes)
         key = (table_id, epoch_id)
         if key in lines:
             raise table.error(row, f"epoch {epoch_id!r} of table {table_id!r} stands already in line {lines[key]}")
@@ -55,12 +53,7 @@ def read_angles(table: Table, names: Names, sigmas: Sigmas) -> tuple[TableReadin
 
 def _angle_sigmas(table: Table, row_axes: list[int], sigmas: Sigmas) -> FloatArray:
     """Sigmas (n, 2) rad of the readings, from the row or else from survey.toml; nan beside a table's one axis."""
-    both = table.positive("sigma_arcsec")
-    each = np.stack([table.positive("sigma_axis1_arcsec"), table.positive("sigma_axis2_arcsec")], axis=1)
-    twice = ~np.isnan(both) & ~np.isnan(each).all(axis=1)
-    if twice.any():
-        raise table.error(first_row(twice), "sigma_arcsec and sigma_axis1_arcsec are both given; keep one of the two")
-    result = to_si(np.where(np.isnan(each), both[:, None], each), "arcsec")
+    result = to_si(both_or_each(table, "sigma_arcsec", ("sigma_axis1_arcsec", "sigma_axis2_arcsec")), "arcsec")
     for row, (table_id, k) in enumerate(zip(table.text("table_id").values(), row_axes, strict=True)):
         if np.isnan(result[row]).all() and table_id in sigmas.tables:
             result[row, :k] = sigmas.tables[table_id]

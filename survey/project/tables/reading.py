@@ -5,7 +5,7 @@ of several columns, each with its unit; angles also as text.
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -100,6 +100,11 @@ class Table:
     def fail(self, row: int, column: str) -> Callable[[str], SurveyError]:
         """What makes an error of a problem with a column of a row."""
         return lambda problem: self.error(row, f"{column}: {problem}")
+
+    def require(self, row: int, column: str, what: str, name: str, known: Collection[str]) -> None:
+        """Raise where a name in a column is none of those that are known."""
+        if name not in known:
+            raise self.error(row, f"{column}: unknown {what} {name!r}; {suggestion(name, known)}")
 
     def text(self, column: str) -> TextColumn:
         """A text column; blank where the file does not have it."""
@@ -207,6 +212,15 @@ def quantity(table: Table, name: str, units: Sequence[str], positive: bool = Fal
             source = column
         out = np.where(np.isnan(values), out, values)
     return out
+
+
+def both_or_each(table: Table, both: str, each: Sequence[str]) -> FloatArray:
+    """Positive numbers (n, k) from the columns ``each`` or, for all of them, from ``both``; raises where two say it."""
+    one, own = table.positive(both), np.stack([table.positive(name) for name in each], axis=1)
+    twice = ~np.isnan(one) & ~np.isnan(own).all(axis=1)
+    if twice.any():
+        raise table.error(first_row(twice), f"{both} and {each[0]} are both given; keep one of the two")
+    return np.where(np.isnan(own), one[:, None], own)
 
 
 def dms_angles(table: Table, column: str) -> FloatArray:

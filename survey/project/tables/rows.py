@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from survey.folder.text import decode, read_bytes
+from survey.folder.text import csv_text, read_text
 from survey.project.detected import ImageKey
 from survey.project.tables.files import cells_of, read_table
 from survey.project.tables.reading import Columns, Layout, Table
@@ -102,11 +102,7 @@ class RowTable:
 
     def text(self) -> str:
         """The table as CSV."""
-        stream = io.StringIO(newline="")
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(self.header)
-        writer.writerows(self.rows)
-        return stream.getvalue()
+        return csv_text([self.header, *self.rows])
 
 
 def _in_order(table: RowTable, header: Sequence[str]) -> list[Sequence[Any]]:
@@ -135,7 +131,7 @@ def row_table(folder: Path | None, layout: Layout, columns: Columns | None = Non
     csv_path, parquet = ((folder or Path()) / f"{layout.name}.{ending}" for ending in ("csv", "parquet"))
     if csv_path.is_file():
         read_table(csv_path, layout)  # its faults, with their lines
-        reader = csv.reader(io.StringIO(decode(csv_path, read_bytes(csv_path)[0]), newline=""), strict=True)
+        reader = csv.reader(io.StringIO(read_text(csv_path), newline=""), strict=True)
         return RowTable(layout, tuple(next(reader)), tuple(row for row in reader if row))
     if parquet.is_file():
         table = read_table(parquet, layout)

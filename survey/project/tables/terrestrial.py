@@ -7,7 +7,7 @@ import numpy as np
 from adjust.model.names import natural_key
 from adjust.model.observations import PositionRef, Reading, ReadingCovariance, ReadingKind, position_text
 from adjust.model.survey import FloatArray
-from survey.folder.text import choice_hint, suggestion
+from survey.folder.text import choice_hint
 from survey.folder.units import from_si, to_si
 from survey.project.declared.instruments import setup_problem
 from survey.project.project import Accuracy, Sigmas
@@ -187,8 +187,7 @@ def read_reading_covariances(extra: Table, readings: Sequence[Reading]) -> tuple
     pairs = zip(extra.text("a_id").values(), extra.text("b_id").values(), extra.numbers("rho").tolist(), strict=True)
     for row, (a, b, value) in enumerate(pairs):
         for column, name in (("a_id", a), ("b_id", b)):
-            if name not in by_id:
-                raise extra.error(row, f"{column}: unknown reading {name!r}; {suggestion(name, by_id)}")
+            extra.require(row, column, "reading", name, by_id)
             lines.setdefault(name, row)
         if a == b or not -1.0 < value < 1.0:
             found = f"rho: found {value:g}; a correlation lies between -1 and 1"

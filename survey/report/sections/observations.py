@@ -196,8 +196,9 @@ def every_observation(c: Context) -> Markup:
         | (_coded(names[x]) if x in _NAMES else _numeric(x, numbers[x], _digits(x, numbers, values))) for x in COLUMNS
     ]  # fmt: skip
     n_images = len(c.adjustment.image_residuals.test)
-    readings = ["" if k < n_images else name_of_residual(c.adjustment.other_residuals[k - n_images])
-                for k in values[10].astype(int).tolist()]  # fmt: skip
+    seen, of = np.unique(values[10].astype(int), return_inverse=True)
+    each = ["" if k < n_images else name_of_residual(c.adjustment.other_residuals[k - n_images]) for k in seen.tolist()]
+    readings = [each[i] for i in of.tolist()]
     data = {"rows": len(chosen), "columns": made, "flags": values[9].astype(int).tolist(),
             "places": _coded(readings), "at": [COLUMNS.index("Where"), COLUMNS.index("Point")]}  # fmt: skip
     said = t(

@@ -14,7 +14,7 @@ from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray
 from adjust.spatial.averaging import mean_pose
 from survey.folder.locking import settled
-from survey.folder.text import read_bytes
+from survey.folder.text import NOT_OURS, read_bytes
 from survey.project import Project
 from survey.project.declared.poses import rotation_from_quaternion
 from survey.project.project import RESULTS
@@ -23,7 +23,6 @@ from survey.solution.quantities import ARCSEC_PER_RAD, SigmaKind, key_of, unit_f
 
 # what damaged or foreign content makes the readers below raise
 _MOST_MOVES, _MOST_SHOWN = 200, 8
-_NOT_OURS = (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, RecursionError, OSError)
 _POSES = {
     "cameras": ("station_from_camera",),
     "stations": ("world_from_station", "mount_from_station"),
@@ -121,7 +120,7 @@ def _read_previous(project: Project) -> Previous:
         found = json.loads(read_bytes(path)[0])
         previous = _previous(found, read_covariances(archive))
         hashes = {str(name): str(digest) for name, digest in found["inputs"]["hashes"].items()}
-    except _NOT_OURS as error:
+    except NOT_OURS as error:
         raise SurveyError(f"{path}: cannot be read as a solution ({error}); {again}") from error
     changed = sorted(k for k in {*hashes, *project.inputs} if hashes.get(k) != project.inputs.get(k))
     if changed:

@@ -8,11 +8,15 @@ Images are never kept.
 
 import hashlib
 import json
+import os
 import re
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+import shlex
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,7 +27,7 @@ from adjust.model.result import Adjustment, Estimate, ParameterName
 from survey.folder.arrays import packed_arrays, read_arrays
 from survey.folder.plain import plain
 from survey.folder.replacing import changing, replace_parts
-from survey.folder.text import atomic_write, decode, read_bytes
+from survey.folder.text import NOT_OURS, atomic_write, json_text, read_bytes, read_text
 from survey.project.exclusions import Exclusion, Name
 from survey.project.project import DEFINITION_FILE, RESULTS
 from survey.solution.covariances import covariance_arrays
@@ -36,7 +40,36 @@ RUNS, MOST = "runs", 50
 _RUN, _ESTIMATES, _SOLUTION = "run.json", "estimates.npz", "solution.json"
 _FILES = (_RUN, _ESTIMATES, _SOLUTION, DEFINITION_FILE)
 _ARRAYS = ("parameters", "names", "units", "status", "start", "block", "covariance", "value_start", "values")
-_BROKEN = (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, RecursionError, OSError)
+
+
+class Clock:
+    """How long each step took."""
+
+    def __init__(self, seconds: Mapping[str, float] = MappingProxyType({})) -> None:
+        self.seconds: dict[str, float] = dict(seconds)
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        """Time what is done inside."""
+        begin = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+
+
+def command_line(command: str, folder: Path, *words: str | Path, **flags: object) -> str:
+    """A command as it can be given again, with its options; folders by their names, as results may be moved."""
+    said = [f"--{name}" if value is True else f"--{name} {_shown(value)}" for name, value in flags.items() if value]
+    return " ".join(["labsurvey", command, _shown(folder), *map(_shown, words), *said])
+
+
+def _shown(value: object) -> str:
+    return shlex.quote(plain_name(value) if isinstance(value, Path) else
+                       str(value).encode("utf-8", "surrogateescape").decode("utf-8", "replace"))  # fmt: skip
+
+
+def plain_name(folder: Path) -> str:
+    """The name alone: results of a copied folder stay the same; by its bytes: a terminal without UTF-8 garbles it."""
+    return os.fsencode(folder.resolve().name).decode("utf-8", "replace")
 
 
 @dataclass(frozen=True)
@@ -81,7 +114,7 @@ def record_run(
                tuple(one.exclusion for one in run.left_out), fingerprint)  # fmt: skip
     into = place / RUNS / f"{number:04d}"
     into.mkdir(parents=True)
-    atomic_write(into / _RUN, json.dumps(said.as_dict(), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    atomic_write(into / _RUN, json_text(said.as_dict()))
     atomic_write(into / _SOLUTION, (place / RESULTS / _SOLUTION).read_bytes())
     atomic_write(into / _ESTIMATES, _estimates_npz(adjustment.estimates.values()))
     atomic_write(into / DEFINITION_FILE, read_bytes(folder / DEFINITION_FILE)[0])
@@ -129,14 +162,14 @@ def _read(path: Path) -> Run:
         hashes = {str(k): str(v) for k, v in found["hashes"].items()}
         return Run(number=int(path.parent.name), pinned=found["pinned"] is True, summary=dict(found["summary"]),
                    hashes=hashes, exclusions=left, **texts)  # fmt: skip
-    except _BROKEN as error:
+    except NOT_OURS as error:
         raise SurveyError(f"{path}: cannot be read as a run ({error}); remove its folder") from error
 
 
 def definition_of(folder: Path, number: int) -> str:
     """The text of survey.toml at a run."""
     path = folder / RUNS / f"{find_run(folder, number).number:04d}" / DEFINITION_FILE
-    return decode(path, read_bytes(path)[0])
+    return read_text(path)
 
 
 def load_run(folder: Path, number: int) -> Snapshot:
@@ -144,7 +177,7 @@ def load_run(folder: Path, number: int) -> Snapshot:
     run, path = find_run(folder, number), folder / RUNS / f"{number:04d}" / _ESTIMATES
     try:
         return Snapshot({e.name: e for e in _estimates(read_arrays(path, _ARRAYS))}, run.summary)
-    except _BROKEN as error:
+    except NOT_OURS as error:
         raise SurveyError(f"{path}: cannot be read as a run ({error}); remove its folder") from error
 
 
@@ -154,7 +187,7 @@ def pin_run(folder: Path, number: int, pinned: bool = True) -> Run:
         said = find_run(folder, number).as_dict() | {"pinned": pinned}
         into = place / RUNS / f"{number:04d}"
         into.mkdir(parents=True)
-        atomic_write(into / _RUN, json.dumps(said, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+        atomic_write(into / _RUN, json_text(said))
         replace_parts(folder)
     return find_run(folder, number)
 
