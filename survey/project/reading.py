@@ -57,18 +57,19 @@ def read_definition(folder: Path) -> Definition:
         return _read_definition(Path(folder))[0]
 
 
-def read(folder: Path, then: Callable[[], object] = lambda: None) -> Project:
+def read(folder: Path, then: Callable[[bool], object] = lambda _: None) -> Project:
     """Read a whole project folder; tables of observations that are not there yet are empty. Raises SurveyError.
 
     What ``exclusions.csv`` leaves out is not used. ``notes`` say which of its rows name nothing, ``image_notes``
-    which images are not those any more that the points come from. then: called when all files are read.
+    which images are not those any more that the points come from. then: called when all files are read, with whether
+    there are image points.
     """
     project = read_all(folder, then=then)
     return leaving_out(project, in_force(read_exclusions(project.folder / OBSERVATIONS_FOLDER)[0]).values())
 
 
 def read_all(
-    folder: Path, texts: Mapping[str, str] = MappingProxyType({}), then: Callable[[], object] = lambda: None
+    folder: Path, texts: Mapping[str, str] = MappingProxyType({}), then: Callable[[bool], object] = lambda _: None
 ) -> Project:
     """:func:`read`, with what is excluded as if it were not.
 
@@ -81,7 +82,7 @@ def read_all(
         _, digest = read_exclusions(place)
         known = read_detected(place)
         images = _image_news(definition, tables, known)
-    then()
+    then("image_points" in tables)
     project = _observed(definition, root, tables)
     hashes = dict(sorted({**project.inputs, f"{OBSERVATIONS_FOLDER}/{EXCLUSIONS_FILE}": digest}.items()))
     if digest:

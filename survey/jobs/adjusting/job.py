@@ -47,7 +47,7 @@ def adjust_job(
                     detect_job(folder, progress=progress, everything=redetect)
 
         with Beside() as loading, clock.step("read"):
-            project = read(folder, (lambda: loading.of(_load)) if workers() > 1 else lambda: None)
+            project = read(folder, lambda images: loading.of(lambda: _load(images)) if workers() > 1 else None)
         nothing_yet = bool(project.images) and not (project.survey.image_blocks or project.spots)
         if redetect or project.to_detect or (nothing_yet and not project.detected):
             detected()
@@ -72,7 +72,8 @@ def adjust_job(
     return outcome.at(target)
 
 
-def _load() -> None:
+def _load(images: bool) -> None:
     """What a project is adjusted and tested with; with one thread that is loaded when it is asked for."""
-    for name in ("scipy.special", "scipy.linalg", "survey.jobs.adjusting.outcome", "survey.jobs.adjusting.steps"):
+    algebra = ("scipy.linalg",) if images else ()
+    for name in ("scipy.special", *algebra, "survey.jobs.adjusting.outcome", "survey.jobs.adjusting.steps"):
         import_module(name)
