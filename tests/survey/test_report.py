@@ -13,6 +13,7 @@ from adjust.model.result import Adjustment, ImageResiduals
 from adjust.model.survey import Survey
 from survey.project.detected import DetectedImage
 from survey.report import drawing, markup
+from survey.report import page as page_module
 from survey.report.charts import CameraResiduals, histogram, mean_field, vector_field
 from survey.report.context import worst
 from survey.report.language import esc
@@ -195,6 +196,11 @@ def test_report_of_nothing_but_a_title() -> None:
     assert "Nothing was tested" in words
     assert "Cameras" not in words
     assert "Full lab" in summary_text(empty_adjustment(), RUN)
+
+
+def test_what_is_made_before_the_statistics_does_not_ask_for_them() -> None:
+    asking = {anchor for _, anchor, make in page_module._SECTIONS if "statistics" in make.__code__.co_names}
+    assert asking == page_module._OF_STATISTICS
 
 
 def test_report_is_the_same_every_time(adjustment: Adjustment, page: str) -> None:
