@@ -138,4 +138,5 @@ def _step(
     damped = csc_array(normal + csc_array((damping, (np.arange(size), np.arange(size))), shape=(size, size)))
     from scipy.sparse.linalg import splu  # here: a survey without images starts without it
 
-    return np.asarray(-splu(damped).solve(right.ravel()).reshape(-1, 6))
+    factor = splu(damped, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return np.asarray(-factor.solve(right.ravel()).reshape(-1, 6))
