@@ -27,6 +27,8 @@ from adjust.precision.cliques import Cliques
 
 _COLUMNS = 96
 """Columns that go through the tree at once."""
+_MANY = 20
+"""Keys that are looked up one by one, of a joint covariance."""
 
 
 class TreeCovariance:
@@ -92,10 +94,18 @@ class TreeCovariance:
     def joint(self, keys: Sequence[int]) -> FloatArray:
         """Joint covariance of any unknowns, stacked in this order; fast where they share a clique."""
         numbers = [self.number[k] for k in keys]
-        deepest = int(self.cliques.home[numbers].max())
-        if not self._across and not set(self.cliques.keys_in(deepest).tolist()).issuperset(numbers):
+        c = self.cliques
+        deepest = int(c.home[numbers].max())
+        together = set(c.keys_in(deepest).tolist()).issuperset(numbers)
+        if not self._across and not together:
             return self._apart(numbers)
-        at = np.concatenate([[0], np.cumsum(self.cliques.dims[numbers])])
+        at = np.concatenate([[0], np.cumsum(c.dims[numbers])])
+        if together and len(numbers) > _MANY and 2 * at[-1] >= c.width[deepest]:  # all of the clique at once
+            inside = c.keys_in(deepest)
+            begin = np.zeros(len(c.dims), dtype=np.int64)
+            begin[inside] = np.cumsum(c.dims[inside]) - c.dims[inside]
+            rows = np.repeat(begin[numbers] - at[:-1], c.dims[numbers]) + np.arange(at[-1])
+            return np.asarray(clique_covariance(self.arrays, c.n_front, deepest)[np.ix_(rows, rows)])
         out = np.empty((at[-1], at[-1]))
         for i, a in enumerate(numbers):
             for j, b in enumerate(numbers[: i + 1]):
