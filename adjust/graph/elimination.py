@@ -3,13 +3,17 @@
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import gtsam
 import numpy as np
+from scipy import sparse
 
 from adjust.model.survey import IntArray
 from adjust.native.elimination import CliquePattern, clique_pattern
+
+if TYPE_CHECKING:
+    from scipy.sparse.linalg import SuperLU
 
 _Found = TypeVar("_Found")
 _LARGE = 2000
@@ -45,6 +49,13 @@ class Elimination:
             return tree, tree.optimize()
         except RuntimeError:
             return None
+
+
+def positive_definite_lu(N: sparse.csc_array) -> "SuperLU":
+    """The factor of a sparse matrix (n, n), positive definite: pivots stay on the diagonal, whatever their size."""
+    from scipy.sparse.linalg import splu  # here: small surveys start without it
+
+    return splu(N, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
 def pose_cliques(

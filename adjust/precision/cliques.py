@@ -86,9 +86,10 @@ class Cliques:
         """Key of every row in a stacked vector of all unknowns."""
         return np.repeat(np.arange(len(self.dims)), self.dims)
 
-    def rows_of(self, keys: IntArray) -> IntArray:
-        """Rows of keys in a stacked vector of all unknowns."""
-        start, dims = np.repeat(self.first[keys], self.dims[keys]), self.dims[keys]
+    def rows_of(self, keys: IntArray, first: IntArray | None = None) -> IntArray:
+        """Rows of keys in a stacked vector of all unknowns, or in one where they begin elsewhere, at first (K,)."""
+        dims = self.dims[keys]
+        start = np.repeat((self.first if first is None else first)[keys], dims)
         return np.asarray(start + np.arange(len(start)) - np.repeat(np.cumsum(dims) - dims, dims))
 
     @cached_property

@@ -70,7 +70,7 @@ class TreeCovariance:
             others = [b for a in some for b in apart[a]]
             up, down = (self.cliques.ancestors(set(home[of].tolist())) for of in (some, some + others))
             first, rows = self.cliques.gathered(down)
-            columns = np.concatenate([np.arange(first[a], first[a] + dims[a]) for a in some])
+            columns = self.cliques.rows_of(np.array(some, dtype=np.int64), first)
             x = np.zeros((rows, len(columns)))
             x[columns, np.arange(len(columns))] = 1.0
             solve_cliques(self.arrays, up, down, first, self.cliques.data, x)
@@ -93,22 +93,18 @@ class TreeCovariance:
 
     def joint(self, keys: Sequence[int]) -> FloatArray:
         """Joint covariance of any unknowns, stacked in this order; fast where they share a clique."""
-        numbers = [self.number[k] for k in keys]
-        c = self.cliques
+        c, numbers = self.cliques, np.array([self.number[k] for k in keys], dtype=np.int64)
         deepest = int(c.home[numbers].max())
-        together = set(c.keys_in(deepest).tolist()).issuperset(numbers)
+        together = set(c.keys_in(deepest).tolist()).issuperset(numbers.tolist())
         if not self._across and not together:
             return self._apart(numbers)
         at = np.concatenate([[0], np.cumsum(c.dims[numbers])])
         if together and len(numbers) > _MANY and 2 * at[-1] >= c.width[deepest]:  # all of the clique at once
-            inside = c.keys_in(deepest)
-            begin = np.zeros(len(c.dims), dtype=np.int64)
-            begin[inside] = np.cumsum(c.dims[inside]) - c.dims[inside]
-            rows = np.repeat(begin[numbers] - at[:-1], c.dims[numbers]) + np.arange(at[-1])
+            rows = c.rows_of(numbers, c.gathered(np.zeros(0, dtype=np.int64), deepest)[0])
             return np.asarray(clique_covariance(self.arrays, c.n_front, deepest)[np.ix_(rows, rows)])
         out = np.empty((at[-1], at[-1]))
-        for i, a in enumerate(numbers):
-            for j, b in enumerate(numbers[: i + 1]):
+        for i, a in enumerate(numbers.tolist()):
+            for j, b in enumerate(numbers[: i + 1].tolist()):
                 block = self._block(a, b)
                 if block is None:
                     return self._apart(numbers)
@@ -116,15 +112,14 @@ class TreeCovariance:
                 out[at[j] : at[j + 1], at[i] : at[i + 1]] = block.T
         return out
 
-    def _apart(self, numbers: list[int]) -> FloatArray:
+    def _apart(self, numbers: IntArray) -> FloatArray:
         """Joint covariance of unknowns of different cliques: columns of the inverse, on their ways to the root only.
 
         Of the last one none: its own covariance is known, and the rest is in the columns of the others. Of most
         unknowns the whole matrix is less work.
         """
         c = self.cliques
-        rows = [np.arange(c.first[k], c.first[k + 1]) for k in numbers]
-        every, asked = np.concatenate(rows), np.concatenate(rows[:-1])
+        every, asked = c.rows_of(numbers), c.rows_of(numbers[:-1])
         if 2 * len(every) > self.n:
             return np.asarray(self.full()[np.ix_(every, every)])
         x = np.zeros((self.n, len(asked)))
@@ -132,8 +127,8 @@ class TreeCovariance:
         home = c.home[numbers].tolist()
         solve_cliques(self.arrays, c.ancestors(set(home[:-1])), c.ancestors(set(home)), c.first, c.data, x)
         out, n = np.empty((len(every),) * 2), len(asked)
-        out[:, :n], out[:n, n:] = x[every], x[rows[-1]].T
-        out[n:, n:] = self._block(numbers[-1], numbers[-1])
+        out[:, :n], out[:n, n:] = x[every], x[every[n:]].T
+        out[n:, n:] = self._block(int(numbers[-1]), int(numbers[-1]))
         return np.asarray(0.5 * (out + out.T))
 
     def rows(self, keys: Sequence[int]) -> IntArray:

@@ -12,9 +12,8 @@ import gtsam
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
-from scipy.sparse.linalg import splu
 
-from adjust.graph.elimination import Elimination
+from adjust.graph.elimination import Elimination, positive_definite_lu
 from adjust.model.survey import FloatArray, IntArray
 from adjust.observations.factors import Jacobians, custom
 from adjust.precision.tree import TreeCovariance
@@ -52,8 +51,7 @@ class SparseNormals:
         self.basis, self.blocks, self.Q = basis, blocks, Q
         B = condition_matrix(basis, blocks)
         N = (B @ block_diagonal(Q) @ B.T).tocsc()
-        # N is positive definite: pivots stay on the diagonal, whatever their size
-        self.factor = splu(N, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        self.factor = positive_definite_lu(N)
 
     def solve(self, right: FloatArray) -> FloatArray:
         """N^-1 applied to ``right``."""

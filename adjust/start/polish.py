@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csc_array
 
+from adjust.graph.elimination import positive_definite_lu
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.spatial.averaging import pose_distance
 from adjust.spatial.rigid import adjoint, inverse, rigid, rotation_exp, rotation_log, skew
@@ -136,7 +137,4 @@ def _step(
     diagonal = normal.diagonal()
     damping = _DAMPING * diagonal + 1e-12 * float(diagonal.max())
     damped = csc_array(normal + csc_array((damping, (np.arange(size), np.arange(size))), shape=(size, size)))
-    from scipy.sparse.linalg import splu  # here: a survey without images starts without it
-
-    factor = splu(damped, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return np.asarray(-factor.solve(right.ravel()).reshape(-1, 6))
+    return np.asarray(-positive_definite_lu(damped).solve(right.ravel()).reshape(-1, 6))

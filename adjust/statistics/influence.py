@@ -81,5 +81,5 @@ def _furthest(dx: FloatArray, coordinates: sparse.csr_matrix) -> tuple[FloatArra
 
 def _first_largest(values: FloatArray) -> IntArray:
     """Of every column (k,) the row of its largest value; ``argmax`` takes ten times as long along the first axis."""
-    rows, columns = np.nonzero(values == values.max(axis=0))
+    rows, columns = np.nonzero(~(values < values.max(axis=0)))  # what is no number is the largest, as for argmax
     return rows[np.unique(columns, return_index=True)[1]]

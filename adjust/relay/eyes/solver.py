@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
-from scipy.sparse.linalg import splu
 
+from adjust.graph.elimination import positive_definite_lu
 from adjust.model.errors import NotConvergedError
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.spatial.rigid_motions import Motions, right_jacobian, right_jacobian_inverse
@@ -189,9 +189,7 @@ class Weights:
             Q = sp.bsr_array((np.ascontiguousarray(problem.cov), np.arange(n), np.arange(n + 1)), shape=(6 * n, 6 * n))
             self.QBt = (Q @ self.B.T).tocsc()
             self.M = (self.B @ self.QBt).tocsc()
-            self.factor = splu(
-                self.M, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-            )
+            self.factor = positive_definite_lu(self.M)
             self.solve = self.factor.solve
         else:
             self.QBt = np.asarray(problem.cov @ self.B.T.toarray())
