@@ -423,24 +423,16 @@ def _known_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> Rows
 def bundle_rows(bundle: BundleBatch, n: int, key_columns: KeyColumns) -> Rows:
     """Whitened rows of the image points of unknown points, used or not, in the order of the bundle's blocks."""
     bundle.whitened_squares()  # leaves the rows of all points, used or not, with their own weights
-    k = len(bundle.point)
-    local, points = Entries(), Entries()
-    for camera in np.unique(bundle.camera_of):
-        mine, lens = np.flatnonzero(bundle.camera_of == camera), int(bundle.state.lenses.n_free[camera])
-        local.add_many(mine, np.tile(int(bundle.lens_at[camera]) + np.arange(lens), (len(mine), 1)),
-                       bundle.A[mine, :, :lens])  # fmt: skip
-    local.add_many(np.arange(k), bundle.pose_at[:, None] + np.arange(6), bundle.A[:, :, MAX_LENS : MAX_LENS + 6])
-    by_point = bundle.A[:, :, MAX_LENS + 3 : MAX_LENS + 6]
-    tied = np.flatnonzero(bundle.point_at >= 0)
-    local.add_many(tied, bundle.point_at[tied][:, None] + np.arange(3), by_point[tied])
+    k, points = len(bundle.point), Entries()
     of_point = np.full((len(bundle.point_ids), 3), -1, dtype=np.int64)
     for i in bundle.reduced:
         of_point[i] = key_columns[bundle.point_key[i]]
-    points.add_many(np.arange(k), np.where(bundle.point_at[:, None] >= 0, -1, of_point[bundle.point]), by_point)
+    points.add_many(np.arange(k), np.where(bundle.point_at[:, None] >= 0, -1, of_point[bundle.point]),
+                    bundle.A[:, :, MAX_LENS + 3 : MAX_LENS + 6])  # fmt: skip
     columns = np.concatenate([key_columns[key] for key in bundle.order])
     kept = columns >= 0
     select = sparse.csr_matrix((np.ones(int(kept.sum())), (np.flatnonzero(kept), columns[kept])), (len(columns), n))
-    A_keys = local.matrix((2 * k, bundle.n_local)) @ bundle.local_from_keys() @ select + points.matrix((2 * k, n))
+    A_keys = bundle.local_rows() @ bundle.local_from_keys() @ select + points.matrix((2 * k, n))
     order = bundle_order(bundle)
     return A_keys.tocsr()[order], bundle.A[:, :, MAX_LENS + 6].ravel()[order]
 
