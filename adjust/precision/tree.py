@@ -152,6 +152,13 @@ class TreeCovariance:
         solve_cliques(self.arrays, every, every, self.cliques.first, self.cliques.data, x)
         return x
 
+    def drawn(self, w: FloatArray) -> FloatArray:
+        """R^-1 w (n, m): errors with the whole covariance matrix, where w are independent with unit variance."""
+        x, c = np.array(w), self.cliques
+        none, every = np.zeros(0, dtype=np.int64), np.arange(len(c), dtype=np.int64)
+        solve_cliques(self.arrays, none, every, c.first, c.data, x)
+        return x
+
     def among(self, A: sparse.csr_array) -> FloatArray:
         """A Q A' (m, m) of the rows of A (m, n), without forming Q.
 
@@ -209,21 +216,6 @@ class TreeCovariance:
                 Q[:done, own] = across.T
                 Q[own, own] += across[:, rows[nf:]] @ T.T
         return Q
-
-    def given_separators(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What does not follow from the separator of its clique, as all between it and the cliques that are not below.
-
-        Of columns (n, k) that part, and of every unknown the variance (n,) that is left: inf where a clique has others
-        of its own, with which it may share anything.
-        """
-        left, own, cliques = np.array(columns), np.full(self.n, np.inf), self.cliques
-        for c in range(len(cliques)):
-            nf, n, at = int(cliques.front[c]), int(cliques.width[c]), int(cliques.at[c])
-            A, rows = cliques.data[at : at + nf * n].reshape(nf, n), cliques.rows_of(cliques.keys_in(c))
-            left[rows[:nf]] -= A[:, nf:] @ columns[rows[nf:]]
-            if cliques.n_front[c] == 1:
-                own[rows[:nf]] = (np.triu(A[:, :nf]) ** 2).sum(axis=1)
-        return left, own
 
     def pairs(self, first: IntArray, second: IntArray, dim: int) -> FloatArray:
         """Joint covariances (p, 2 dim, 2 dim) of pairs of keys that share a factor; -1 stands for a constant.

@@ -15,7 +15,6 @@ import numpy.typing as npt
 from scipy import sparse
 
 from adjust.graph.assembly import AdjustmentGraph
-from adjust.graph.datum import gauge
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.lenses import MAX_LENS
@@ -134,12 +133,9 @@ class LinearSystem:
         stacked, entries = self.precision.stacked, (rows.data, self._stacked[rows.indices], rows.indptr)
         return stacked.among(sparse.csr_array(entries, (rows.shape[0], stacked.n)))
 
-    @cached_property
-    def most_correlated(self) -> FloatArray:
-        """Of the components of two unknowns the larger of their bounds (n,) is one of their correlation; or inf."""
-        sigmas = np.zeros(self.precision.stacked.n)
-        sigmas[self._stacked] = self.sigmas
-        return self.precision.stacked.most_correlated(sigmas)[self._stacked]
+    def drawn(self, k: int) -> FloatArray:
+        """Errors (n, k) of k solutions, drawn with the covariance in the survey's datum; always the same."""
+        return self.precision.stacked.drawn(k)[self._stacked]
 
     @cached_property
     def normal(self) -> Normal:
@@ -182,11 +178,7 @@ class LinearSystem:
         of_size: dict[int, list[int]] = {}
         names = [self.columns.names[first] for first in columns[:, 0].tolist()] if columns.size else []
         for i, name in enumerate(names):
-            free = self.columns.free[name]
-            if by_name[name].key in self.precision.hidden:
-                out[i] = self.precision.cov(by_name[name].key)[free[:, None], free]
-            else:
-                of_size.setdefault(by_name[name].dim, []).append(i)
+            of_size.setdefault(by_name[name].dim, []).append(i)
         for dim, rows in of_size.items():
             found = self.precision.covs(np.array([by_name[names[i]].key for i in rows]), dim)
             for i, Q in zip(rows, found, strict=True):
@@ -491,13 +483,12 @@ def _reading_rows(graph: AdjustmentGraph, values: gtsam.Values, n: int, key_colu
 
 
 def _datum(precision: Precision, n: int, key_columns: KeyColumns) -> tuple[sparse.csr_matrix, FloatArray]:
-    datum = precision.solved.datum
-    if datum is None:
+    datum, transformation = precision.solved.datum, precision.transformation
+    if datum is None or transformation is None:
         return sparse.csr_matrix((0, n)), np.zeros((n, 0))
     entries, motions = Entries(), np.zeros((n, datum.defect))
     for key, rows in datum.rows.items():
         entries.add(np.arange(datum.defect), key_columns[key], rows / datum.sigma)
     for key, columns in key_columns.items():
-        moved = gauge(precision.graph, precision.graph.unknowns.by_key[key], precision.solved.values) @ datum.directions
-        motions[columns[columns >= 0]] = moved[columns >= 0]
+        motions[columns[columns >= 0]] = transformation.motions[key][columns >= 0]
     return entries.matrix((datum.defect, n)), motions

@@ -87,7 +87,7 @@ class BundleBatch(BundleLayout):
         if jacobians and self.by_rows:
             self.G = self.local_from_keys()
             J = np.column_stack([(self.local_rows() @ self.G).toarray(), self.A[:, :, MAX_LENS + 6].ravel()])
-            R = np.linalg.qr(J, mode="r") if len(J) > self.n_rows else J
+            R: FloatArray = np.asarray(np.linalg.qr(J, mode="r") if len(J) > self.n_rows else J)
             self._serve_rows(R[:, :-1], R[:, -1])
         elif jacobians:
             self._condense(values, damping)
