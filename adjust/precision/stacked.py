@@ -95,9 +95,12 @@ class Stacked:
         out, in_tree = np.zeros((A.shape[0],) * 2), by_column[:, : self.tree.n].tocsr()
         for below, mine, interface in self._parts:
             hidden = by_column[:, mine]
-            rows = np.unique(hidden.indices)
+            number = np.bincount(hidden.indices, minlength=len(out))
+            rows = np.flatnonzero(number)
             if len(rows):
-                own, over = below.among(hidden.tocsr()[rows].toarray())
+                number[rows], dense = np.arange(len(rows)), np.zeros((len(rows), below.n))
+                dense[number[hidden.indices], np.repeat(np.arange(below.n), np.diff(hidden.indptr))] = hidden.data
+                own, over = below.among(dense)
                 out[np.ix_(rows, rows)] += own
                 places = np.repeat(rows, len(interface)), np.tile(interface, len(rows))
                 in_tree = in_tree + sparse.csr_array((over.ravel(), places), in_tree.shape)

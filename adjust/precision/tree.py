@@ -181,7 +181,8 @@ class TreeCovariance:
             x = np.ascontiguousarray(sparse.csr_array(entries, (mine.shape[0], n + len(Q))).toarray().T)
             solve_cliques(self.arrays, up, none, first, c.data, x)
             U, left = x[:n], x[n:]
-            out[i : i + _COLUMNS, i : i + _COLUMNS] = U.T @ U + left.T @ (Q @ left)
+            own = U.T @ U + left.T @ (Q @ left)
+            out[i : i + _COLUMNS, i : i + _COLUMNS] = 0.5 * (own + own.T)
             if m <= _COLUMNS:
                 break
             way = np.zeros(len(c), dtype=np.bool_)
@@ -189,10 +190,12 @@ class TreeCovariance:
             rows = np.flatnonzero(way[home])
             for k, (before, V, held) in enumerate(done):
                 _, here, there = np.intersect1d(rows, before, assume_unique=True, return_indices=True)
-                out[i : i + _COLUMNS, k * _COLUMNS : (k + 1) * _COLUMNS] = U[here].T @ V[there] + left.T @ held
+                across = U[here].T @ V[there] + left.T @ held
+                out[i : i + _COLUMNS, k * _COLUMNS : (k + 1) * _COLUMNS] = across
+                out[k * _COLUMNS : (k + 1) * _COLUMNS, i : i + _COLUMNS] = across.T
             done.append((rows, U, Q @ left))
         back = np.argsort(order)
-        return np.asarray((np.tril(out) + np.tril(out, -1).T)[np.ix_(back, back)])
+        return np.asarray(out[np.ix_(back, back)])
 
     def full(self) -> FloatArray:
         """The whole covariance matrix (n, n) of all unknowns, rows as :meth:`places` says, parents before children.

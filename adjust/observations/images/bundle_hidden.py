@@ -169,7 +169,10 @@ class BundleHidden:
         """Of rows A (m, n) over what is hidden: A Q A' (m, m) were the interface held, and what they are over it."""
         b, right = self.batch, np.ascontiguousarray(A.T)
         nh, u = b.n_hidden, self.on_poses(right)
-        own = A[:, nh:] @ (b.Vi @ right[nh:].reshape(-1, 3, len(A))).reshape(-1, len(A))
+        half = np.swapaxes(np.linalg.cholesky(b.Vi), 1, 2) @ right[nh:].reshape(-1, 3, len(A))
+        half = half.reshape(-1, len(A))
+        own = half.T @ half
         if nh:
-            own += u[:nh].T @ (self._hidden_poses_given_interface()[1] @ u[:nh])
+            half = scipy.linalg.lapack.dtrtrs(b.C, u[:nh] / b.scale[:nh, None], lower=0, trans=1)[0]
+            own += half.T @ half
         return own, self.on_interface(u).T
