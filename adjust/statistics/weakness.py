@@ -19,7 +19,7 @@ _MOST, _KEPT = 200, 4000
 _SHARE = 0.1
 _WHOLE = 10_000
 """Unknowns up to which all may share something, where small sets meet in few others."""
-_WORK, _SOLVED = 150_000_000, 5_000_000
+_WORK, _SOLVED = 100_000_000, 5_000_000
 """Correlations that are looked at in drawn solutions, and those in columns of the covariance matrix."""
 _DRAWS, _SURE = 64, 7.0
 """Drawn solutions, and by how many sigmas what they tell may be wrong."""
