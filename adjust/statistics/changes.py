@@ -220,8 +220,8 @@ class ChangeSearch:
         wide = sparse.csr_matrix((u.B[order].ravel(), columns[order].ravel(), ptr), (len(length), J * q))
         wide.eliminate_zeros()
         X = (self.A.T @ wide).tocsr()
-        P = _from_runs_on(_by_run(u, u.B))
-        g = _from_runs_on(_by_run(u, self.e[u.rows, None]))[:, :, 0]
+        both = _from_runs_on(_by_run(u, np.column_stack([u.B, self.e[u.rows]])))
+        P, g = both[:, :, :q], both[:, :, q]
         taken = _taken(self.system, X, J)[1 if J > 1 else 0 :]
         size = np.sqrt(np.einsum("jqq->jq", P))
         scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
