@@ -3,6 +3,9 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+from gtsam import Pose3, Rot3
+
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 
@@ -131,3 +134,10 @@ class Hypothesis:
     def changed(self) -> Survey | None:
         """The survey to be tried; None where the change turns out not to be possible."""
         return self.survey() if callable(self.survey) else self.survey
+
+
+def motion_text(motion: Pose3) -> str:
+    """By how many millimetres and degrees, in its own axes."""
+    shift = ", ".join(f"{1e3 * v:.2f}" for v in motion.translation())
+    angle = np.degrees(np.linalg.norm(Rot3.Logmap(motion.rotation())))
+    return f"by ({shift}) mm and {angle:.3f} deg in its own axes"

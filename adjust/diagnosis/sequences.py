@@ -6,7 +6,7 @@ in the base (closed form: Shah 2013, in :mod:`adjust.start.closed_forms.hand_eye
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Literal
 
@@ -15,7 +15,6 @@ from gtsam import Pose3, Rot3
 
 from adjust.diagnosis.case import Case
 from adjust.model.errors import SurveyError
-from adjust.model.observations import Pair
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.spatial.averaging import mean_pose, mean_poses, pose_distance
 from adjust.spatial.rigid import inverse
@@ -158,14 +157,6 @@ def hand_poses(survey: Survey) -> dict[str, dict[str, tuple[int, Pose3]]]:
         elif pair.a.epoch_id and not pair.b.epoch_id:
             out.setdefault(pair.a.frame_id, {})[pair.a.epoch_id] = (i, pair.b_from_a.inverse())
     return out
-
-
-def with_pairs(survey: Survey, new: Mapping[int, Pair]) -> Survey:
-    """The survey with other pairs at these positions."""
-    pairs = list(survey.pairs)
-    for i, pair in new.items():
-        pairs[i] = pair
-    return replace(survey, pairs=tuple(pairs))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,7 @@
-"""A survey with other parameters: the one walk over its lenses, poses, tables, warps and points by their names."""
+"""A survey with other parameters: the one walk over its lenses, poses, tables, warps and points by their names.
+
+And with other rows of one of its lists.
+"""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -75,3 +78,16 @@ class Rewriting:
         name = ("carrier_from_target", t.target_id)
         return replace(t, warp=warp, carrier_from_target=self.pose(name, t.carrier_from_target),
                        epochs=self.epochs(name, t.epochs, t.carrier_from_target))  # fmt: skip
+
+
+def with_rows(survey: Survey, field: str, new: Mapping[int, object]) -> Survey:
+    """The survey with others at these positions of one of its lists: "readings", "image_blocks", "targets" ..."""
+    fields: Fields = {field: tuple(new.get(i, row) for i, row in enumerate(getattr(survey, field)))}
+    return replace(survey, **fields)
+
+
+def with_changed(survey: Survey, field: str, owner: str, **changes: object) -> Survey:
+    """The survey with other values of one thing: of ``targets`` that whose ``target_id`` is ``owner``."""
+    key = f"{field.removesuffix('s')}_id"
+    rows = {i: replace(x, **changes) for i, x in enumerate(getattr(survey, field)) if getattr(x, key) == owner}
+    return with_rows(survey, field, rows)

@@ -9,9 +9,8 @@ from gtsam import Pose3
 
 from adjust.diagnosis.bodies.series import Step
 from adjust.diagnosis.bodies.split import split_camera
-from adjust.diagnosis.bodies.targets import motion_text
-from adjust.diagnosis.hypothesis import Edit, Hypothesis, LeaveOut, Place
-from adjust.diagnosis.images.maps import TURNED, turned
+from adjust.diagnosis.hypothesis import Edit, Hypothesis, LeaveOut, Place, motion_text
+from adjust.diagnosis.images import TURNED, turned
 from adjust.diagnosis.lens_keys import block_keys, crop_keys, key_text
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey

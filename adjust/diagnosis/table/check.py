@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from gtsam import Pose3
 
+from adjust.diagnosis.hypothesis import motion_text
 from adjust.diagnosis.table.fit import fit_table
 from adjust.diagnosis.table.places import (
     Places,
@@ -27,7 +28,7 @@ from adjust.diagnosis.table.views import TableViews, table_views
 from adjust.model.errors import SurveyError, listed
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray, Survey, Table
-from adjust.spatial.rigid import inverse, rotation_log
+from adjust.spatial.rigid import inverse
 
 _UNEXPLAINED_RAD = np.radians(1.0)
 _SHOWN = 12
@@ -179,17 +180,12 @@ def _moved_text(views: TableViews, found: Places) -> str:
     a, b = moved, second
     if views.epoch[later].mean() < views.epoch[first].mean():
         a, b, later = second, moved, first
-    D = inverse(found.fit.table_from_place[a]) @ found.fit.table_from_place[b]
+    how = motion_text(Pose3(inverse(found.fit.table_from_place[a]) @ found.fit.table_from_place[b]))
     epochs = [views.epoch_ids[e] for e in np.unique(views.epoch[later])]
     return (
         f"{' '.join(views.outer_ids[moved])} was moved between images: at epochs {listed(epochs, _SHOWN)} it stands "
-        f"elsewhere than at the others, {_motion_text(D)}; give it a name of its own there, or leave these epochs out"
+        f"elsewhere than at the others, {how}; give it a name of its own there, or leave these epochs out"
     )
-
-
-def _motion_text(D: FloatArray) -> str:
-    shift = ", ".join(f"{1e3 * v:.2f}" for v in D[:3, 3])
-    return f"by ({shift}) mm and {np.degrees(np.linalg.norm(rotation_log(D[:3, :3]))):.2f} deg in its own axes"
 
 
 def _epoch_lines(views: TableViews, found: Places) -> list[str]:
@@ -240,10 +236,10 @@ def _epoch_text(views: TableViews, found: Places, e: int, rows: IntArray, again:
             return f"{_view_text(views, row)} is mis-detected: {how}"
     if again.explains:
         return _reading_text(views, e, again)
-    D = displacement(views, found, int(rows[0]))
+    moved = motion_text(Pose3(displacement(views, found, int(rows[0]))))
     return (
         f"{_view_text(views, int(rows[0]))}: {' '.join(views.outer_ids[views.outer[rows[0]]])} appears displaced "
-        f"{_motion_text(D)}, which no reading of table {views.table.table_id} explains: it was moved at epoch {epoch}, "
+        f"{moved}, which no reading of table {views.table.table_id} explains: it was moved at epoch {epoch}, "
         "or is mis-detected there; leave the image out"
     )
 

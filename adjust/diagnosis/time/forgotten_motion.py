@@ -5,12 +5,12 @@ fits its own image.
 """
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, SetKey
+from adjust.model.rewriting import with_changed
 from adjust.model.survey import FloatArray, Survey
 from adjust.spatial.averaging import mean_pose
 from adjust.spatial.rigid import inverse
@@ -35,11 +35,11 @@ def forgotten_motion(case: Case) -> Iterator[Hypothesis]:
             if ratio > _CLEARLY:
                 most, n = moves.get(key, (0.0, 0))
                 moves[key] = max(most, ratio), n + len(poses) - 1
-    for which, made in ((1, _target), (0, _station)):
+    for which, kind, share in ((1, "target", 1.0), (0, "station", 0.9)):
         for owner in dict.fromkeys(key[which] for key in moves):
             ratios, numbers = zip(*(found for key, found in moves.items() if key[which] == owner), strict=True)
             if sum(numbers) >= _FEWEST:
-                yield made(survey, owner, max(ratios))
+                yield _moving(survey, kind, owner, share * max(ratios))
 
 
 def _poses(case: Case) -> dict[tuple[str, str], tuple[FloatArray, float, float]]:
@@ -63,20 +63,10 @@ def _scatter(target_from_camera: FloatArray, error_rad: float) -> float:
     return float(np.median(apart) / lever / max(10.0 * error_rad, 1e-5))
 
 
-def _target(survey: Survey, target_id: str, evidence: float) -> Hypothesis:
-    targets = tuple(replace(t, motion="epoch") if t.target_id == target_id else t for t in survey.targets)
+def _moving(survey: Survey, kind: str, owner: str, evidence: float) -> Hypothesis:
     return Hypothesis(
-        "motion forgotten", f"target {target_id} moves between epochs, but is said to stand still",
-        f'write motion = "epoch" below [targets.{target_id}] in survey.toml', Place("target", (target_id,), "motion"),
-        replace(survey, targets=targets), (SetKey(("targets", target_id, "motion"), "epoch"),), evidence, 6,
-    )  # fmt: skip
-
-
-def _station(survey: Survey, station_id: str, evidence: float) -> Hypothesis:
-    stations = tuple(replace(s, motion="epoch") if s.station_id == station_id else s for s in survey.stations)
-    return Hypothesis(
-        "motion forgotten", f"station {station_id} moves between epochs, but is said to stand still",
-        f'write motion = "epoch" below [stations.{station_id}] in survey.toml',
-        Place("station", (station_id,), "motion"), replace(survey, stations=stations),
-        (SetKey(("stations", station_id, "motion"), "epoch"),), 0.9 * evidence, 6,
+        "motion forgotten", f"{kind} {owner} moves between epochs, but is said to stand still",
+        f'write motion = "epoch" below [{kind}s.{owner}] in survey.toml', Place(kind, (owner,), "motion"),
+        with_changed(survey, f"{kind}s", owner, motion="epoch"), (SetKey((f"{kind}s", owner, "motion"), "epoch"),),
+        evidence, 6,
     )  # fmt: skip

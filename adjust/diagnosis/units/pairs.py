@@ -14,9 +14,10 @@ from gtsam import Pose3, Rot3
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import ChangeColumns, Edit, ExchangeColumns, Hypothesis, Place
 from adjust.diagnosis.screen import Screen, at_best, screen
-from adjust.diagnosis.sequences import Link, fitted, links, typical, with_pairs
+from adjust.diagnosis.sequences import Link, fitted, links, typical
 from adjust.diagnosis.units.conventions import Scope, shrinking
 from adjust.model.errors import SurveyError
+from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.spatial.rigid_motions import Motions
 from adjust.spatial.rotation_forms import euler_from_matrix, matrix_from_euler, quaternion_wxyz
@@ -192,7 +193,7 @@ def mended(survey: Survey, rows: IntArray, convention: Convention) -> Survey | N
 
 
 def _with(survey: Survey, new: Mapping[int, Motion]) -> Survey:
-    return with_pairs(survey, {i: replace(survey.pairs[i], b_from_a=motion) for i, motion in new.items()})
+    return with_rows(survey, "pairs", {i: replace(survey.pairs[i], b_from_a=m) for i, m in new.items()})
 
 
 def _scopes(survey: Survey, worst: IntArray) -> Iterator[Scope]:
