@@ -9,8 +9,18 @@ from gtsam import Pose3
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect
-from adjust.diagnosis.hypothesis import Edit, Hypothesis, LeaveOut, Place, motion_text
-from adjust.diagnosis.lens_keys import block_keys, crop_keys, key_text
+from adjust.diagnosis.hypothesis import (
+    CENTRE,
+    FOCAL,
+    Edit,
+    Hypothesis,
+    LeaveOut,
+    Place,
+    block_keys,
+    crop_keys,
+    found_by,
+    motion_text,
+)
 from adjust.diagnosis.prediction import Linear, Prediction, adjusted_values
 from adjust.model.observations import FrameRef, ImageBlock, Pair
 from adjust.model.result import Adjustment, ParameterName
@@ -19,7 +29,6 @@ from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.statistics.normal import DENSE
 from adjust.statistics.score import Part, Score, drift_times
 
-FOCAL, CENTRE = ("fx", "fy", "c"), ("u0", "v0", "xp", "yp")
 _FEWEST = 4
 _ELIMINATIONS = 12.5
 """Eliminations of the whole system that all courses together may cost in surveys of many unknowns."""
@@ -194,10 +203,8 @@ def _step(survey: Survey, course: _Course, cut: int, first: Score, looked_at: in
         return f"{what.format(thing)} {before} {since}{_amount(course.name[0], theta, sigmas)}{alike}"
 
     keys = _lens_keys(survey, course, since, first)
-    change = f"leave out what was observed from {since} on, or give it a name of its own there"
-    change = f"let the adjustment find it: {key_text(keys)}; or {change}" if keys else change
-    edits = keys or _edits(survey, course, later)
-    hypothesis = Hypothesis(name, "", change, place, survey, edits, 1.0, 1, looked_at)
+    change = found_by(keys, f"leave out what was observed from {since} on, or give it a name of its own there")
+    hypothesis = Hypothesis(name, "", change, place, survey, keys or _edits(survey, course, later), 1.0, 1, looked_at)
     chosen = frozenset(later)
     return Effect(
         hypothesis, first,

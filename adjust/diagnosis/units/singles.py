@@ -11,7 +11,7 @@ import numpy as np
 from adjust.diagnosis.hypothesis import ChangeReadings, Edit, Hypothesis, Place
 from adjust.diagnosis.ranking import Candidate
 from adjust.diagnosis.units.conventions import MISREADINGS, Misreading, slips
-from adjust.diagnosis.units.pairs import CONVENTIONS, edits_of, mended, miss
+from adjust.diagnosis.units.motions import CONVENTIONS, edits_of, mended, miss
 from adjust.model.observations import Distance, Reading
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.rewriting import with_rows
