@@ -158,9 +158,7 @@ class _Search:
         return out
 
     def _register_positions(self, frames: FrameTree) -> None:
-        refs = [ref for d in self.survey.distances for ref in (d.a, d.b)]
-        refs += [ref for c in self.survey.coordinates for ref in c.positions]
-        refs += position_refs(self.survey) + reading_refs(self.survey)
+        refs = position_refs(self.survey) + reading_refs(self.survey)
         for frame in [*frame_refs(self.survey), *(ref.frame for ref in refs if ref.frame is not None)]:
             frames.world_from(frame)
 
