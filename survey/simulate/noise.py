@@ -6,8 +6,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.design.noise import moved, with_drawn_priors
-from adjust.design.readings import draw
+from adjust.design.noise import draw, moved, with_drawn_priors
 from adjust.model.observations import Pair, TableReading
 from adjust.model.survey import FloatArray, Survey
 from survey.simulate.readings import fresh_readings
