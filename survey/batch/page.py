@@ -8,10 +8,9 @@ from urllib.parse import quote
 import numpy as np
 from markupsafe import Markup
 
-from survey.batch.causes import CAUSES
 from survey.batch.charts import control_chart
 from survey.batch.control import ONE_SIDE, TREND, Chart
-from survey.batch.record import FAILED, TEST_FAILED, Record
+from survey.batch.record import CAUSES, FAILED, TEST_FAILED, Record
 from survey.batch.run import counts
 from survey.batch.tables import folders_csv, overview_json, short_names, trends_csv
 from survey.batch.trends import LEVEL, Trends
