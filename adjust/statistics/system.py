@@ -380,7 +380,7 @@ class Entries:
             return sparse.csr_matrix(shape)
         r, c, v = (np.concatenate(x) for x in zip(*self.parts, strict=True))
         if (r[1:] >= r[:-1]).all():  # row by row already
-            ptr = np.searchsorted(r, np.arange(shape[0] + 1))
+            ptr = np.cumsum(np.bincount(r + 1, minlength=shape[0] + 1))
             out = sparse.csr_matrix((v, c, ptr), shape=shape)
             out.sum_duplicates()
             return out
