@@ -32,6 +32,8 @@ from adjust.statistics.score import Part, Score, drift_times
 _FEWEST = 4
 _ELIMINATIONS = 12.5
 """Eliminations of the whole system that all courses together may cost in surveys of many unknowns."""
+_ROWS = 20_000
+"""Of courses that are looked at together."""
 _BOUND = 50.0  # of the square of one image point
 _MOVED = {  # name of the unknown: of the mistake, kind of the thing, what happened to it
     "station_from_camera": ("camera moved", "camera", "camera {} was moved on its station"),
@@ -72,21 +74,38 @@ class _Course:
 
 def steps(case: Case, linear: Linear) -> Iterator[Effect]:
     """The best step of every unknown that is the same for several epochs, and the drift of every lens."""
+    for courses in _alike(_affordable(case, linear)):
+        for course, found in zip(courses, linear.steps([c.parts for c in courses]), strict=True):
+            if found:
+                cut = max(found, key=lambda t: found[t].drop)
+                yield _step(case.survey, course, cut, found[cut], len(found))
+            if course.name[0] == "lens":
+                yield _drift(case.survey, course, linear.drift(course.parts))
+
+
+def _affordable(case: Case, linear: Linear) -> Iterator[_Course]:
+    """Those of several epochs, as many as columns of the covariance matrix cost no more than some adjustments."""
     n, tree = len(linear.system.columns), linear.system.precision.tree
-    # columns of the covariance matrix: as many as it has, or as cost no more than some adjustments
     room = min(float(n), tree.cliques.columns_for(_ELIMINATIONS)) if n > DENSE else np.inf
     for course in _courses(linear):
         room -= sum(B.shape[1] for _, B in course.parts)
         if not case.few("what moved from some epoch on, of things that fit better than others", int(room < 0.0), 0):
             return
-        if len(course.parts) < _FEWEST:
-            continue
-        found = linear.steps(course.parts)
-        if found:
-            cut = max(found, key=lambda t: found[t].drop)
-            yield _step(case.survey, course, cut, found[cut], len(found))
-        if course.name[0] == "lens":
-            yield _drift(case.survey, course, linear.drift(course.parts))
+        if len(course.parts) >= _FEWEST:
+            yield course
+
+
+def _alike(courses: Iterator[_Course]) -> Iterator[list[_Course]]:
+    """Together those with derivatives by as many numbers, as long as they have no more rows than make it worth it."""
+    some, n = list[_Course](), 0
+    for course in courses:
+        if some and (n > _ROWS or course.parts[0][1].shape[1] != some[0].parts[0][1].shape[1]):
+            yield some
+            some, n = [], 0
+        some.append(course)
+        n += sum(len(rows) for rows, _ in course.parts)
+    if some:
+        yield some
 
 
 def _courses(
@@ -124,8 +143,8 @@ def _worst_first(linear: Linear) -> list[ParameterName]:
     at = linear.system.columns.at
     if len(linear.system.columns) <= DENSE:
         return list(at)
-    some = [name for name in at if name[0] in _MOVED or name[0] == "lens"]
-    misfit = {name: float(np.mean(linear.e[linear.rows_of(at[name])] ** 2)) for name in some if len(at[name])}
+    some = [name for name in at if len(at[name]) and (name[0] in _MOVED or name[0] == "lens")]
+    misfit = dict(zip(some, linear.mean_squares([at[name] for name in some]).tolist(), strict=True))
     return sorted(misfit, key=lambda name: -misfit[name])
 
 
