@@ -100,7 +100,8 @@ def _global_test(test: dict[str, Any] | None) -> Markup:
         d.rect(x["lower"], 22, x["upper"] - x["lower"], 12, d.GREEN, ' fill-opacity="0.22" rx="2"'),
         d.line(x["one"], 20, x["one"], 36, d.GREY),
         d.dot(x["omega"], 28, 5.5, colour),
-        d.text(min(max(x["omega"], 70.0), width - 70.0), 14, f"omega / r = {m.general(marks['omega'])}", "middle", 11.5, colour),
+        d.text(min(max(x["omega"], 70.0), width - 70.0), 14, f"omega / r = {m.general(marks['omega'])}", "middle",
+               11.5, colour),
     ]
     if x["upper"] - x["lower"] > 110:
         parts += [d.text(x[k], 50, m.general(marks[k]), "middle") for k in ("lower", "upper")]
