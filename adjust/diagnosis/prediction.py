@@ -24,8 +24,11 @@ from adjust.native.lenses import FISHEYE
 from adjust.observations.clocks import between, nearest
 from adjust.spatial.rigid import inverse, rigid, transform
 from adjust.statistics.score import LinearScores
+from adjust.testing.criteria import sidak
+from adjust.testing.distributions import chi2
 
 Altered = Mapping[ParameterName, Pose3 | FloatArray]
+_ALPHA = 1e-4
 Links = tuple[tuple[ParameterName, bool], ...]
 """A chain: of every link its name, and whether it is inverted."""
 
@@ -261,6 +264,10 @@ class Prediction:
 @dataclass(frozen=True, eq=False)
 class Linear(LinearScores):
     """The adjustment that is diagnosed as a linear system: scores of changes of things whose images it predicts."""
+
+    def clear(self, drop: float, freedom: int, looked_at: int) -> bool:
+        """Whether a drop of v'Pv passes its test at a level shared by so many hypotheses (chi-square, Sidak 1967)."""
+        return drop > self.scale * float(chi2.isf(sidak(_ALPHA, looked_at), freedom))
 
     @cached_property
     def prediction(self) -> Prediction:

@@ -200,9 +200,7 @@ class GraphBuilder:
         return self.frames.relative(ref.frame, FrameRef("world"))
 
     def _chains_of_others(self) -> tuple[dict[PositionRef, Chain | None], dict[int, Chain]]:
-        refs = [r for d in self.survey.distances for r in (d.a, d.b)]
-        refs += [r for c in self.survey.coordinates for r in c.positions]
-        refs += position_refs(self.survey) + reading_refs(self.survey)
+        refs = position_refs(self.survey) + reading_refs(self.survey)
         positions = {ref: self._position_chain(ref) for ref in refs}
         if not self.survey.pairs:
             return positions, {}

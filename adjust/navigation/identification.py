@@ -17,7 +17,7 @@ from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.navigation import FoundArrays, SkyArrays, search
 from adjust.navigation.fit import PoseFit, Prior, fit_pose, fit_without_outliers, local, log_evidence
 from adjust.navigation.model import NavigateOptions
-from adjust.navigation.precision import spot_noise
+from adjust.navigation.precision import own_covariance
 from adjust.navigation.system import Sightings, System, evaluate, station_rays, visible
 from adjust.spatial.rigid import rigid
 from adjust.testing.distributions import chi2
@@ -294,8 +294,7 @@ def _posterior(system: System, seen: Sightings, match: IntArray, prior: Prior) -
     fit = fit_pose(system, seen, used, match[used], prior.pose, prior)
     if fit is None:
         return None
-    own = fit.G @ spot_noise(seen, fit.used) @ fit.G.T + fit.G_prior @ prior.cov @ fit.G_prior.T
-    return Prior(fit.pose, own, fit.B, np.arange(6))
+    return Prior(fit.pose, own_covariance(seen, fit, prior), fit.B, np.arange(6))
 
 
 def _judged(
@@ -346,7 +345,7 @@ def _grown(
 ) -> PoseFit:
     """Name the spots that the pose explains and the coarse consensus left out."""
     for _ in range(len(seen.uv) - len(fit.used) - len(rejected)):
-        prior = Prior(fit.pose, fit.G @ spot_noise(seen, fit.used) @ fit.G.T, fit.B, np.arange(6))
+        prior = Prior(fit.pose, own_covariance(seen, fit, None), fit.B, np.arange(6))
         distance, support = gate_distances(system, seen, prior, options)
         distance[~(allowed_namings(system, seen) & (support > 0.0))] = np.inf
         distance[fit.used] = np.inf

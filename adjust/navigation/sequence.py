@@ -187,10 +187,10 @@ def _next_state(
 
 
 def _labels(
-    system: System, seen: Sightings, epoch: NavigationEpoch, fit: PoseFit
+    system: System, seen: Sightings, epoch: NavigationEpoch, used: IntArray, beacon: IntArray
 ) -> tuple[tuple[str | None, ...], ...]:
     out: list[list[str | None]] = [[None] * len(s.uv) for s in epoch.spots]
-    for i, b in zip(fit.used, fit.beacon, strict=True):
+    for i, b in zip(used, beacon, strict=True):
         out[seen.block[i]][seen.row[i]] = system.beacons.beacon_ids[b]
     return tuple(tuple(row) for row in out)
 
@@ -201,9 +201,9 @@ def _pose3(pose: FloatArray) -> Pose3:
 
 def _solution(system: System, seen: Sightings, epoch: NavigationEpoch, candidate: Candidate) -> Solution:
     fit = candidate.fit
+    labels = _labels(system, seen, epoch, fit.used, fit.beacon)
     return Solution(
-        _pose3(fit.pose), fit.cov, _labels(system, seen, epoch, fit), fit.chi_square, fit.redundancy, candidate.score,
-        candidate.probability,
+        _pose3(fit.pose), fit.cov, labels, fit.chi_square, fit.redundancy, candidate.score, candidate.probability,
     )  # fmt: skip
 
 
@@ -215,7 +215,7 @@ def _result(
     several = tuple(_solution(system, seen, epoch, c) for c in candidates[: at.options.max_alternatives])
     result = EpochPose(
         epoch.epoch_id, "fixed", bridge if prior is not None else "", _pose3(fit.pose), fit.cov,
-        _labels(system, seen, epoch, fit),
+        _labels(system, seen, epoch, fit.used, fit.beacon),
         tuple((epoch.spots[seen.block[i]].camera_id, int(seen.row[i])) for i in best.rejected),
         fit.chi_square, fit.redundancy, best.probability, shares(system, seen, fit, prior),
     )  # fmt: skip
@@ -255,11 +255,8 @@ def _undetermined(system: System, seen: Sightings, epoch: NavigationEpoch, prior
     start = _facing(system, seen, used) if prior is None else prior.pose
     pose = some_pose(system, seen, used, beacon, start)
     cov, names = open_directions(system, seen, used, beacon, pose, prior)
-    labels: list[list[str | None]] = [[None] * len(s.uv) for s in epoch.spots]
-    for i in used:
-        labels[seen.block[i]][seen.row[i]] = system.beacons.beacon_ids[seen.label[i]]
-    return EpochPose(epoch.epoch_id, "undetermined", "", _pose3(pose), cov, tuple(map(tuple, labels)),
-                     undetermined=names)  # fmt: skip
+    labels = _labels(system, seen, epoch, used, beacon)
+    return EpochPose(epoch.epoch_id, "undetermined", "", _pose3(pose), cov, labels, undetermined=names)
 
 
 def _facing(system: System, seen: Sightings, used: IntArray) -> FloatArray:

@@ -20,6 +20,7 @@ from adjust.diagnosis.prediction import Linear
 from adjust.diagnosis.sequences import hand_poses
 from adjust.model.observations import ImageBlock, TableReading
 from adjust.model.result import Adjustment
+from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, Survey
 from adjust.statistics.score import Score, drift_times
 
@@ -158,13 +159,13 @@ def _by_tracks(
     factor, of_time = spoken(case.survey)
 
     def mended(_: Adjustment, theta: FloatArray) -> Survey:
-        blocks = list(case.survey.image_blocks)
+        blocks = {}
         for i, (k, n, speed, bend) in _motion(case.survey).items():
-            camera = blocks[i].camera_id
-            if camera in cameras:
-                late = (theta[cameras.index(camera)] * weight(k, n, blocks[i], heights[camera]))[:, None]
-                blocks[i] = replace(blocks[i], uv=blocks[i].uv - late * speed + 0.5 * late**2 * bend)
-        return replace(case.survey, image_blocks=tuple(blocks))
+            b = case.survey.image_blocks[i]
+            if b.camera_id in cameras:
+                late = (theta[cameras.index(b.camera_id)] * weight(k, n, b, heights[b.camera_id]))[:, None]
+                blocks[i] = replace(b, uv=b.uv - late * speed + 0.5 * late**2 * bend)
+        return with_rows(case.survey, "image_blocks", blocks)
 
     def said(theta: FloatArray, sigmas: FloatArray) -> str:
         sizes = zip(cameras, factor * theta, factor * sigmas, strict=True)

@@ -13,6 +13,7 @@ from adjust.diagnosis.prediction import Linear
 from adjust.diagnosis.trial import misfit_of
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
+from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, Survey
 from adjust.precision.precision import noise_of
 from adjust.statistics.score import Score
@@ -153,7 +154,5 @@ def of_others(linear: Linear, kind: str, shifts: Mapping[tuple[str, ...], FloatA
 
 def shifted_back(survey: Survey, shifts: Shifts, theta: FloatArray) -> Survey:
     """The survey with its image points where they are without these shifts."""
-    blocks = tuple(
-        replace(b, uv=b.uv - shifts[i] @ theta) if i in shifts else b for i, b in enumerate(survey.image_blocks)
-    )
-    return replace(survey, image_blocks=blocks)
+    blocks = {i: survey.image_blocks[i] for i in shifts}
+    return with_rows(survey, "image_blocks", {i: replace(b, uv=b.uv - shifts[i] @ theta) for i, b in blocks.items()})

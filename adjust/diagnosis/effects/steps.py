@@ -7,23 +7,33 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3
 
-from adjust.diagnosis.bodies.targets import motion_text
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect
-from adjust.diagnosis.hypothesis import Edit, Hypothesis, LeaveOut, Place
-from adjust.diagnosis.lens_keys import block_keys, crop_keys, key_text
+from adjust.diagnosis.hypothesis import (
+    CENTRE,
+    FOCAL,
+    Edit,
+    Hypothesis,
+    LeaveOut,
+    Place,
+    block_keys,
+    crop_keys,
+    found_by,
+    motion_text,
+)
 from adjust.diagnosis.prediction import Linear, Prediction, adjusted_values
-from adjust.diagnosis.sequences import with_pairs
 from adjust.model.observations import FrameRef, ImageBlock, Pair
 from adjust.model.result import Adjustment, ParameterName
+from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.statistics.normal import DENSE
 from adjust.statistics.score import Part, Score, drift_times
 
-FOCAL, CENTRE = ("fx", "fy", "c"), ("u0", "v0", "xp", "yp")
 _FEWEST = 4
 _ELIMINATIONS = 12.5
 """Eliminations of the whole system that all courses together may cost in surveys of many unknowns."""
+_ROWS = 20_000
+"""Of courses that are looked at together."""
 _BOUND = 50.0  # of the square of one image point
 _MOVED = {  # name of the unknown: of the mistake, kind of the thing, what happened to it
     "station_from_camera": ("camera moved", "camera", "camera {} was moved on its station"),
@@ -64,21 +74,38 @@ class _Course:
 
 def steps(case: Case, linear: Linear) -> Iterator[Effect]:
     """The best step of every unknown that is the same for several epochs, and the drift of every lens."""
+    for courses in _alike(_affordable(case, linear)):
+        for course, found in zip(courses, linear.steps([c.parts for c in courses]), strict=True):
+            if found:
+                cut = max(found, key=lambda t: found[t].drop)
+                yield _step(case.survey, course, cut, found[cut], len(found))
+            if course.name[0] == "lens":
+                yield _drift(case.survey, course, linear.drift(course.parts))
+
+
+def _affordable(case: Case, linear: Linear) -> Iterator[_Course]:
+    """Those of several epochs, as many as columns of the covariance matrix cost no more than some adjustments."""
     n, tree = len(linear.system.columns), linear.system.precision.tree
-    # columns of the covariance matrix: as many as it has, or as cost no more than some adjustments
     room = min(float(n), tree.cliques.columns_for(_ELIMINATIONS)) if n > DENSE else np.inf
     for course in _courses(linear):
         room -= sum(B.shape[1] for _, B in course.parts)
         if not case.few("what moved from some epoch on, of things that fit better than others", int(room < 0.0), 0):
             return
-        if len(course.parts) < _FEWEST:
-            continue
-        found = linear.steps(course.parts)
-        if found:
-            cut = max(found, key=lambda t: found[t].drop)
-            yield _step(case.survey, course, cut, found[cut], len(found))
-        if course.name[0] == "lens":
-            yield _drift(case.survey, course, linear.drift(course.parts))
+        if len(course.parts) >= _FEWEST:
+            yield course
+
+
+def _alike(courses: Iterator[_Course]) -> Iterator[list[_Course]]:
+    """Together those with derivatives by as many numbers, as long as they have no more rows than make it worth it."""
+    some, n = list[_Course](), 0
+    for course in courses:
+        if some and (n > _ROWS or course.parts[0][1].shape[1] != some[0].parts[0][1].shape[1]):
+            yield some
+            some, n = [], 0
+        some.append(course)
+        n += sum(len(rows) for rows, _ in course.parts)
+    if some:
+        yield some
 
 
 def _courses(
@@ -116,8 +143,8 @@ def _worst_first(linear: Linear) -> list[ParameterName]:
     at = linear.system.columns.at
     if len(linear.system.columns) <= DENSE:
         return list(at)
-    some = [name for name in at if name[0] in _MOVED or name[0] == "lens"]
-    misfit = {name: float(np.mean(linear.e[linear.rows_of(at[name])] ** 2)) for name in some if len(at[name])}
+    some = [name for name in at if len(at[name]) and (name[0] in _MOVED or name[0] == "lens")]
+    misfit = dict(zip(some, linear.mean_squares([at[name] for name in some]).tolist(), strict=True))
     return sorted(misfit, key=lambda name: -misfit[name])
 
 
@@ -195,10 +222,8 @@ def _step(survey: Survey, course: _Course, cut: int, first: Score, looked_at: in
         return f"{what.format(thing)} {before} {since}{_amount(course.name[0], theta, sigmas)}{alike}"
 
     keys = _lens_keys(survey, course, since, first)
-    change = f"leave out what was observed from {since} on, or give it a name of its own there"
-    change = f"let the adjustment find it: {key_text(keys)}; or {change}" if keys else change
-    edits = keys or _edits(survey, course, later)
-    hypothesis = Hypothesis(name, "", change, place, survey, edits, 1.0, 1, looked_at)
+    change = found_by(keys, f"leave out what was observed from {since} on, or give it a name of its own there")
+    hypothesis = Hypothesis(name, "", change, place, survey, keys or _edits(survey, course, later), 1.0, 1, looked_at)
     chosen = frozenset(later)
     return Effect(
         hypothesis, first,
@@ -334,27 +359,24 @@ def _mended(
     if course.kind == "image":
         return _mended_images(survey, result, course, weights, theta)
     if course.kind == "pair":
-        return with_pairs(survey, _mended_pairs(survey, course, weights, theta))
-    chosen = frozenset(weights)
-    readings = tuple(
-        replace(r, value=r.value + float(theta[0])) if r.reading_id in chosen else r for r in survey.readings
-    )
-    return replace(survey, readings=readings)
+        return with_rows(survey, "pairs", _mended_pairs(survey, course, weights, theta))
+    late = {i: r for i, r in enumerate(survey.readings) if r.reading_id in weights}
+    return with_rows(survey, "readings", {i: replace(r, value=r.value + float(theta[0])) for i, r in late.items()})
 
 
 def _mended_images(
     survey: Survey, result: Adjustment, course: _Course, weights: Mapping[str, float], theta: FloatArray
 ) -> Survey:
-    prediction, blocks = Prediction(survey, adjusted_values(result)), []
+    prediction, blocks = Prediction(survey, adjusted_values(result)), dict[int, ImageBlock]()
     values: dict[float, Pose3 | FloatArray] = {}
-    for block in survey.image_blocks:
+    for i, block in enumerate(survey.image_blocks):
         w = weights.get(block.epoch_id, 0.0)
         if w and _concerns(block, course):
             altered = values.setdefault(w, _altered(result, course, w * theta))
             now, then = prediction.uv(block), prediction.uv(block, {course.name: altered})
-            block = block if now is None or then is None else replace(block, uv=block.uv - then + now)
-        blocks.append(block)
-    return replace(survey, image_blocks=tuple(blocks))
+            if now is not None and then is not None:
+                blocks[i] = replace(block, uv=block.uv - then + now)
+    return with_rows(survey, "image_blocks", blocks)
 
 
 def _concerns(block: ImageBlock, course: _Course) -> bool:

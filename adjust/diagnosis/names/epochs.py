@@ -16,6 +16,7 @@ from adjust.diagnosis.hypothesis import Hypothesis, LeaveOut, Place, Rename
 from adjust.diagnosis.sequences import MOST, Link, Shift, links, shifts
 from adjust.model.errors import listed
 from adjust.model.observations import FrameRef, ImageBlock, Pair, TableReading
+from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, Survey
 from adjust.spatial.averaging import mean_pose
 from adjust.spatial.rigid import inverse
@@ -140,11 +141,8 @@ def _listed(some: tuple[str, ...], every: tuple[str, ...]) -> str:
 def exchanged_cameras(survey: Survey, a: str, b: str, epochs: tuple[str, ...]) -> Survey:
     """The survey with the images of two cameras exchanged at these epochs."""
     other, chosen = {a: b, b: a}, set(epochs)
-    blocks = tuple(
-        replace(x, camera_id=other[x.camera_id]) if x.camera_id in other and x.epoch_id in chosen else x
-        for x in survey.image_blocks
-    )
-    return replace(survey, image_blocks=blocks)
+    mine = {i: x for i, x in enumerate(survey.image_blocks) if x.camera_id in other and x.epoch_id in chosen}
+    return with_rows(survey, "image_blocks", {i: replace(x, camera_id=other[x.camera_id]) for i, x in mine.items()})
 
 
 def _twice(survey: Survey) -> Iterator[Hypothesis]:

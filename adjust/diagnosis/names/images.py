@@ -13,6 +13,7 @@ from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, LeaveOut, Place, Rename
 from adjust.diagnosis.prediction import Prediction
 from adjust.model.observations import ImageBlock
+from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, Survey
 from adjust.statistics.score import ratio
 
@@ -52,10 +53,6 @@ def misnamed_images(case: Case) -> Iterator[Hypothesis]:
 def _bounded(squares: FloatArray | None, block: ImageBlock, scale: float) -> FloatArray:
     """Of a block, bounded: the bound where it cannot be predicted."""
     return np.full(len(block.uv), 2.0 * CAP) if squares is None else np.fmin(squares / scale, 2.0 * CAP)
-
-
-def _renamed(survey: Survey, blocks: dict[int, ImageBlock]) -> Survey:
-    return replace(survey, image_blocks=tuple(blocks.get(i, b) for i, b in enumerate(survey.image_blocks)))
 
 
 def _better(now: Now, other: dict[int, ImageBlock]) -> tuple[list[int], float]:
@@ -159,7 +156,7 @@ def exchange(
     return Hypothesis(
         name, f"{things} {a} and {b} are called by each other's names in {len(blocks)} images, the first at epoch "
         f"{epochs[0]}: wrong names, or they changed places", f"exchange them in {column} of image_points.csv",
-        Place(column.removesuffix("_id"), (a, b), column, epochs), _renamed(survey, blocks),
+        Place(column.removesuffix("_id"), (a, b), column, epochs), with_rows(survey, "image_blocks", blocks),
         tuple(Rename("image_points", column, other, {"camera_id": (c,), "epoch_id": e}) for c, e in at.items()),
         evidence, 1, looked_at,
     )  # fmt: skip
@@ -185,7 +182,7 @@ def _cameras(now: Now) -> Iterator[Hypothesis]:
         yield Hypothesis(
             "images of another camera", f"the images of camera {camera} at epochs {', '.join(epochs)} are those of "
             f"camera {other}", f"move them to images/{other}", Place("camera", (camera, other), "", tuple(epochs)),
-            _renamed(survey, chosen),
+            with_rows(survey, "image_blocks", chosen),
             (Rename("image_points", "camera_id", {camera: other}, {"epoch_id": tuple(epochs)}),), now.ratio(gain), 1,
             len(bad) * len(survey.cameras),
         )  # fmt: skip

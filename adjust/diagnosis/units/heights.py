@@ -12,6 +12,7 @@ from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.screen import Screen, at_best
 from adjust.model.observations import Reading
+from adjust.model.rewriting import with_rows
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.statistics.score import LinearScores
 
@@ -139,16 +140,12 @@ def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
 
 def _changed(survey: Survey, constant: _Constant, metres: float) -> Survey:
     """With the constant as it probably was; its readings then fit without it."""
-    rows = set(constant.rows.tolist())
 
-    def mended(i: int) -> Reading:
-        r = survey.readings[i]
-        if i not in rows:
-            return r
+    def mended(r: Reading) -> Reading:
         if constant.name == "instrument height":
             return replace(r, instrument_height=r.instrument_height + metres)
         if constant.name == "target height":
             return replace(r, target_height=r.target_height + metres)
         return replace(r, value=r.value - metres)
 
-    return replace(survey, readings=tuple(mended(i) for i in range(len(survey.readings))))
+    return with_rows(survey, "readings", {i: mended(survey.readings[i]) for i in constant.rows.tolist()})

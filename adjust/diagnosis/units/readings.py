@@ -24,6 +24,7 @@ from adjust.diagnosis.units.conventions import (
     slips,
 )
 from adjust.model.observations import Reading
+from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, IntArray, Survey
 
 _CLEARLY = 3.0
@@ -115,9 +116,8 @@ def _possible(survey: Survey, scope: Scope, values: FloatArray) -> Iterator[Misr
 def mended(survey: Survey, rows: IntArray, misreading: Misreading) -> Survey:
     """The survey with these readings as they were meant."""
     values = misreading.mend(np.array([survey.readings[i].value for i in rows]))
-    new = dict(zip(rows.tolist(), values.tolist(), strict=True))
-    readings = tuple(replace(r, value=new[i]) if i in new else r for i, r in enumerate(survey.readings))
-    return replace(survey, readings=readings)
+    new = zip(rows.tolist(), values.tolist(), strict=True)
+    return with_rows(survey, "readings", {i: replace(survey.readings[i], value=v) for i, v in new})
 
 
 def _evidence(survey: Survey, before: Screen | None, values: FloatArray, ways: Sequence[_Way]) -> list[float]:
