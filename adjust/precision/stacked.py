@@ -98,9 +98,9 @@ class Stacked:
             number = np.bincount(hidden.indices, minlength=len(out))
             rows = np.flatnonzero(number)
             if len(rows):
-                number[rows], dense = np.arange(len(rows)), np.zeros((len(rows), below.n))
-                dense[number[hidden.indices], np.repeat(np.arange(below.n), np.diff(hidden.indptr))] = hidden.data
-                own, over = below.among(dense)
+                number[rows], right = np.arange(len(rows)), np.zeros((below.n, len(rows)))
+                right[np.repeat(np.arange(below.n), np.diff(hidden.indptr)), number[hidden.indices]] = hidden.data
+                own, over = below.among(right)
                 out[np.ix_(rows, rows)] += own
                 places = np.repeat(rows, len(interface)), np.tile(interface, len(rows))
                 in_tree = in_tree + sparse.csr_array((over.ravel(), places), in_tree.shape)

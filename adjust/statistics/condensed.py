@@ -220,5 +220,5 @@ def _unknown(
     kept["shape"].append(np.zeros((len(local), N_SHAPE)))
     blocks.append(number[of_row])
     groups = [b.group for b in bundle.blocks]
-    A = sparse.diags(used) @ A
-    return ImageRows(A.tocsr(), e * used, lengths.astype(np.int64), np.ones(len(groups), dtype=np.bool_), groups)
+    A = A if used.all() else (sparse.diags(used) @ A).tocsr()
+    return ImageRows(A, e * used, lengths.astype(np.int64), np.ones(len(groups), dtype=np.bool_), groups)

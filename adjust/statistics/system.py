@@ -432,7 +432,7 @@ def bundle_rows(bundle: BundleBatch, n: int, key_columns: KeyColumns) -> Rows:
     columns = np.concatenate([key_columns[key] for key in bundle.order])
     kept = columns >= 0
     select = sparse.csr_matrix((np.ones(int(kept.sum())), (np.flatnonzero(kept), columns[kept])), (len(columns), n))
-    A_keys = bundle.local_rows() @ bundle.local_from_keys() @ select + points.matrix((2 * k, n))
+    A_keys = bundle.local_rows() @ (bundle.local_from_keys() @ select) + points.matrix((2 * k, n))
     order = bundle_order(bundle)
     return A_keys.tocsr()[order], bundle.A[:, :, MAX_LENS + 6].ravel()[order]
 

@@ -165,12 +165,11 @@ class BundleHidden:
         dX = b.points_following(np.asarray(b.G @ d), np.zeros_like(own)) + own
         return np.concatenate([d[:nh], dX.reshape(-1, k)])
 
-    def among(self, A: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Of rows A (m, n) over what is hidden: A Q A' (m, m) were the interface held, and what they are over it."""
-        b, right = self.batch, np.ascontiguousarray(A.T)
+    def among(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Of rows over what is hidden, right (n, m): A Q A' (m, m) were the interface held; what they are over it."""
+        b, m = self.batch, right.shape[1]
         nh, u = b.n_hidden, self.on_poses(right)
-        half = np.swapaxes(np.linalg.cholesky(b.Vi), 1, 2) @ right[nh:].reshape(-1, 3, len(A))
-        half = half.reshape(-1, len(A))
+        half = (np.swapaxes(np.linalg.cholesky(b.Vi), 1, 2) @ right[nh:].reshape(-1, 3, m)).reshape(-1, m)
         own = half.T @ half
         if nh:
             half = scipy.linalg.lapack.dtrtrs(b.C, u[:nh] / b.scale[:nh, None], lower=0, trans=1)[0]
