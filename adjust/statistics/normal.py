@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 from scipy import sparse
 
-from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import side_by_side
 from adjust.precision.s_transformation import without_datum_rows
 
@@ -105,18 +105,18 @@ class Arrow:
         return Inverse(sparse.csr_matrix((values, (i, j)), (self.n, self.n)), U, member)
 
 
-def _in_core(N: sparse.csc_matrix) -> BoolArray:
-    """Which unknowns (n,) so many others touch that they are the core, if it has one."""
+def _core(N: sparse.csc_matrix) -> IntArray:
+    """Unknowns that many others touch."""
     degree = np.diff(N.indptr)
-    return np.asarray(degree > 2 * np.median(degree))
+    return np.flatnonzero(degree > 2 * np.median(degree))
 
 
 def _arrow(scaled: sparse.csc_matrix) -> Arrow | None:
     """The matrix as an arrow, where it is one."""
     from scipy.sparse.csgraph import connected_components
 
-    inside = _in_core(scaled)
-    core, rest = np.flatnonzero(inside), np.flatnonzero(~inside)
+    core = _core(scaled)
+    rest = np.delete(np.arange(scaled.shape[0]), core)
     if not 0 < len(core) <= DENSE:
         return None
     N = scaled.tocsr()
@@ -207,7 +207,7 @@ class Normal:
     @cached_property
     def structured(self) -> Inverse | None:
         """The same as a sum, where many small sets of unknowns share few others: linear in n. None for others."""
-        shared = int(np.count_nonzero(_in_core(self._scaled)))
+        shared = len(_core(self._scaled))
         if shared > _WIDEST or shared * self.n > _ROOM or self._arrow is None:
             return None
         return self._arrow.inverse(self.scale)
