@@ -171,7 +171,7 @@ def _of_structure(found: _Structure, sigma: FloatArray, limit: float) -> _Found:
 
 def _within(system: LinearSystem, index: IntArray, limit: float) -> _Found:
     """Pairs of components of one unknown that is not compared with others."""
-    others = set(system.columns.names[i] for i in index.tolist())
+    others = {system.columns.names[i] for i in index.tolist()}
     apart = [at for name, at in system.columns.at.items() if len(at) > 1 and name not in others]
     out: _Found = []
     for k in sorted({len(at) for at in apart}):

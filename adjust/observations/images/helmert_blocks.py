@@ -52,15 +52,13 @@ def runs_of_epochs(blocks: Sequence[ImageBlock]) -> IntArray:
     """
     number: dict[str, int] = {}
     epoch = np.array([number.setdefault(b.epoch_id, len(number)) for b in blocks], dtype=np.int64)
-    run, points = epoch // _EPOCHS, [np.unique(b.point_idx) for b in blocks]
-
-    def columns(mine: IntArray) -> float:
-        seen = np.unique(np.concatenate([points[k] for k in mine]))
-        return 6.0 * len(np.unique(epoch[mine])) + 3.0 * len(seen)
-
-    of_run = [np.flatnonzero(run == i) for i in range(int(run.max(initial=-1)) + 1)]
-    work = sum(4.0 * sum(len(points[k]) for k in mine) * columns(mine) ** 2 for mine in of_run)
-    return run if len(of_run) > 1 and work < _GAIN * _work(columns(np.arange(len(blocks))), 0.0) else np.zeros_like(run)
+    run, work = epoch // _EPOCHS, list[float]()
+    for mine in [run == i for i in range(len(number) // _EPOCHS + 1)] + [run >= 0]:  # last all of them
+        seen = np.concatenate([np.zeros(0, dtype=np.int64), *(blocks[k].point_idx for k in np.flatnonzero(mine))])
+        columns = 6.0 * len(np.unique(epoch[mine])) + 3.0 * len(np.unique(seen))
+        work.append(4.0 * len(seen) * columns**2)
+    whole = float(_work(columns, 0.0))
+    return run if sum(work[:-1]) < _GAIN * whole else np.zeros_like(run)
 
 
 def _cut(incidence: sparse.csr_array, hidden: FloatArray) -> BoolArray | None:
