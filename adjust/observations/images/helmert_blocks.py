@@ -46,19 +46,20 @@ def helmert_blocks(owner: IntArray, seen: Sequence[IntArray], hidden: FloatArray
 
 
 def runs_of_epochs(blocks: Sequence[ImageBlock]) -> IntArray:
-    """Run (B,) of image blocks that hide nothing: few epochs each where their own rows are less work than one matrix.
-
-    What an epoch has of its own is then eliminated with those of its run, and not with all.
-    """
+    """Run (B,) of image blocks that hide nothing: some epochs each, where rows are less work than one matrix."""
     number: dict[str, int] = {}
     epoch = np.array([number.setdefault(b.epoch_id, len(number)) for b in blocks], dtype=np.int64)
-    run, work = epoch // _EPOCHS, list[float]()
-    for mine in [run == i for i in range(len(number) // _EPOCHS + 1)] + [run >= 0]:  # last all of them
-        seen = np.concatenate([np.zeros(0, dtype=np.int64), *(blocks[k].point_idx for k in np.flatnonzero(mine))])
-        columns = 6.0 * len(np.unique(epoch[mine])) + 3.0 * len(np.unique(seen))
-        work.append(4.0 * len(seen) * columns**2)
-    whole = float(_work(columns, 0.0))
-    return run if sum(work[:-1]) < _GAIN * whole else np.zeros_like(run)
+    point = np.concatenate([np.zeros(0, dtype=np.int64), *(b.point_idx for b in blocks)])
+    of_point, work = np.repeat(epoch, [len(b.point_idx) for b in blocks]), 0.0
+
+    def columns(mine: BoolArray) -> float:
+        return 6.0 * len(np.unique(of_point[mine])) + 3.0 * len(np.unique(point[mine]))
+
+    for i in range(len(number) // _EPOCHS + 1):
+        mine = of_point // _EPOCHS == i
+        work += 4.0 * np.count_nonzero(mine) * columns(mine) ** 2
+    less = work < _GAIN * float(_work(columns(of_point >= 0), 0.0))
+    return epoch // _EPOCHS if less else np.zeros_like(epoch)
 
 
 def _cut(incidence: sparse.csr_array, hidden: FloatArray) -> BoolArray | None:
