@@ -85,7 +85,7 @@ def summary(c: Context) -> Markup:
 def _global_test(test: dict[str, Any] | None) -> Markup:
     if test is None:
         return m.note(t("No global test: there is no redundancy."))
-    width, height, left = 700.0, 58.0, 20.0
+    width, height, left = 400.0, 58.0, 20.0  # also on a telephone seen as a whole
     r = test["redundancy"]
     # the scale is the variance factor omega / r; its interval and the value always fit
     marks = {k: test[k] / r for k in ("lower", "upper", "omega")}
@@ -100,7 +100,8 @@ def _global_test(test: dict[str, Any] | None) -> Markup:
         d.rect(x["lower"], 22, x["upper"] - x["lower"], 12, d.GREEN, ' fill-opacity="0.22" rx="2"'),
         d.line(x["one"], 20, x["one"], 36, d.GREY),
         d.dot(x["omega"], 28, 5.5, colour),
-        d.text(x["omega"], 14, f"omega / r = {m.general(marks['omega'])}", "middle", 11.5, colour),
+        d.text(min(max(x["omega"], 70.0), width - 70.0), 14, f"omega / r = {m.general(marks['omega'])}", "middle",
+               11.5, colour),
     ]
     if x["upper"] - x["lower"] > 110:
         parts += [d.text(x[k], 50, m.general(marks[k]), "middle") for k in ("lower", "upper")]
@@ -115,7 +116,7 @@ def _global_test(test: dict[str, Any] | None) -> Markup:
         upper=m.general(test["upper"], 6), level=m.general(100 * (1 - test["alpha"])),
     )  # fmt: skip
     drawn = d.svg(width, height, parts, t("Global test"))
-    return m.element("p", sentence, "lead") + m.element("div", drawn, "wide")
+    return m.element("p", sentence, "lead") + m.element("div", drawn)
 
 
 def groups(c: Context) -> Markup:
