@@ -12,7 +12,7 @@ import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
-from adjust.diagnosis.names.images import exchange
+from adjust.diagnosis.names.images import POINTS, exchange, points_exchanged
 from adjust.diagnosis.prediction import Prediction
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.start.closed_forms.triangulation import intersect
@@ -76,16 +76,9 @@ def exchanged_in_images(case: Case) -> Iterator[Hypothesis]:
             right = np.isin(every, one) == (rays.points[every] == name)
             found.append((gain, a, b, sorted(set(rays.blocks[every[~right]].tolist()))))
     for _, a, b, blocks in sorted(found, key=lambda f: -f[0])[:_MOST]:
-        yield _exchanged(case.survey, a, b, blocks, len(pairs))
-
-
-def _exchanged(survey: Survey, a: int, b: int, blocks: list[int], looked_at: int) -> Hypothesis:
-    ids, swap = [p.point_id for p in survey.points], np.arange(len(survey.points))
-    swap[[a, b]] = b, a
-    new = {i: replace(survey.image_blocks[i], point_idx=swap[survey.image_blocks[i].point_idx]) for i in blocks}
-    names = {ids[a]: ids[b], ids[b]: ids[a]}
-    return exchange(survey, (ids[a], ids[b]), names, new, ("points exchanged", "point_id", "points"), _EVIDENCE,
-                    looked_at)  # fmt: skip
+        ids = case.survey.points[a].point_id, case.survey.points[b].point_id
+        new = points_exchanged(case.survey, a, b, blocks)
+        yield exchange(case.survey, ids, new, POINTS, _EVIDENCE, len(pairs))
 
 
 def _rays(case: Case) -> Rays | None:
