@@ -96,11 +96,8 @@ def _hypotheses(
 
 def _sky(system: System) -> FloatArray:
     """Solid angle (c,) of each camera's image, about."""
-    out = []
-    for camera in system.head.cameras:
-        focal = focal_length_px(MODELS[camera.model], camera.lens, camera.constants)
-        out.append(camera.image_size[0] * camera.image_size[1] / focal**2)
-    return np.array(out)
+    focal = [focal_length_px(MODELS[c.model], c.lens, c.constants) for c in system.head.cameras]
+    return np.asarray(image_areas(system) / np.array(focal) ** 2)
 
 
 def _triples(ray: FloatArray) -> IntArray:

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.diagnosis.beforehand.finding import Finding
 from adjust.diagnosis.case import Case
-from adjust.diagnosis.hypothesis import Hypothesis
+from adjust.diagnosis.hypothesis import Finding, Hypothesis
 from adjust.diagnosis.names.given import wrong_given
 from adjust.diagnosis.units.conventions import ANGLES, LENGTH_RATIOS, LENGTHS, SLIPS
 from adjust.diagnosis.units.readings import misread_readings
