@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from adjust.model.survey import FloatArray, IntArray
+from adjust.navigation.evidence import Candidate
 from adjust.navigation.fit import PoseFit, Prior, fit_pose, local
-from adjust.navigation.identification import Candidate, with_prior, without_prior
+from adjust.navigation.identification import with_prior, without_prior
 from adjust.navigation.model import (
     Beacons,
     Bridge,

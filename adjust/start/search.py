@@ -25,7 +25,8 @@ from adjust.observations.terrestrial.building import reading_refs
 from adjust.spatial.averaging import pose_distance, typical_distance
 from adjust.spatial.rigid import as_pose3, rigid
 from adjust.start.gauge import fix_one_gauge
-from adjust.start.lenses import Sighting, start_lens
+from adjust.start.lens_images import Sighting
+from adjust.start.lenses import start_lens
 from adjust.start.motion import solve_motion
 from adjust.start.network import ChainObservation, FrameNetwork, partial_pose
 from adjust.start.points import PARALLAX, improve, intersect_points, orient_second, resect
