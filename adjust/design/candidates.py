@@ -29,6 +29,7 @@ from adjust.model.result import ParameterName
 from adjust.model.rewriting import Fields
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Point, Survey
 from adjust.observations.factors import ObservationFactor
+from adjust.statistics.outliers.candidates import FIELDS
 from adjust.statistics.system import Columns, ItemRows, points_apart, survey_rows
 
 _RANK = 1e-10
@@ -58,12 +59,7 @@ class Candidate:
     on_surfaces: tuple[OnSurface, ...] = ()
 
 
-_LISTS = {
-    "pair": "pairs", "distance": "distances", "coordinates": "coordinates", "level": "levels",
-    "alignment": "alignments", "laser": "laser_spots", "surface": "on_surfaces",
-    "coordinate_difference": "coordinate_differences", "reading": "readings", "table": "table_readings",
-}  # fmt: skip
-"""Fields of a survey by the kind of their rows."""
+_IN_ORDER = FIELDS | {"reading": "readings"}
 
 
 def with_candidates(survey: Survey, candidates: Sequence[Candidate]) -> Survey:
@@ -77,7 +73,7 @@ def with_candidates(survey: Survey, candidates: Sequence[Candidate]) -> Survey:
             blocks.append(replace(b, point_idx=moved))
     lists: Fields = {
         name: getattr(survey, name) + tuple(x for c in candidates for x in getattr(c, name))
-        for name in _LISTS.values()
+        for name in (*_IN_ORDER.values(), "table_readings")
     }
     return replace(survey, points=tuple(points), image_blocks=tuple(blocks), **lists)
 
@@ -186,13 +182,12 @@ def _names_of(survey: Survey, start: StartValues) -> tuple[ParameterName, ...]:
 def _owners(survey: Survey, candidates: Sequence[Candidate], design: DesignMatrix) -> list[int | None]:
     """For each of the design's observations the candidate that brings it, None for what is planned anyway."""
     images: list[int | None] = [None] * len(survey.image_blocks)
-    in_order = {kind: name for kind, name in _LISTS.items() if kind != "table"}
-    ordered: dict[str, list[int | None]] = {k: [None] * len(getattr(survey, name)) for k, name in in_order.items()}
+    ordered: dict[str, list[int | None]] = {k: [None] * len(getattr(survey, name)) for k, name in _IN_ORDER.items()}
     readings: dict[tuple[str, ...], int] = {}
     points: dict[tuple[str, ...], int] = {}
     for i, c in enumerate(candidates):
         images += [i] * len(c.image_blocks)
-        for kind, name in in_order.items():
+        for kind, name in _IN_ORDER.items():
             ordered[kind] += [i] * len(getattr(c, name))
         readings |= {(r.table_id, r.epoch_id): i for r in c.table_readings}
         points |= {("point", p.point_id): i for p in c.points}
