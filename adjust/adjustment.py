@@ -217,7 +217,7 @@ def assemble(
         readings = reading_residuals(graph.terrestrial, precision.tree, solved.values)
     every = others if readings is None else JoinedResiduals(others, graph.survey, readings)
     with Beside() as made:
-        summed = made.of(lambda: group_summaries(graph, images, others, readings))
+        summed = made.of(lambda: group_summaries(precision, images, others, readings))
         unknowns, groups = estimates(precision), summed()
     n_observations = sum(g.n_observations for g in groups)
     n_unknowns = graph.unknowns.n_unknowns

@@ -27,6 +27,7 @@ from adjust.model.result import (
     ObservationResidual,
     ParameterName,
     ReadingResiduals,
+    arrays_of,
 )
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.point_tests import AdjustedPoints, residual_tests
@@ -294,12 +295,14 @@ def image_residuals(precision: Precision) -> ImageResiduals:
     return ImageResiduals(ptr, points.v, *residual_tests(points), points.used)
 
 
-def other_residuals(precision: Precision) -> tuple[ObservationResidual, ...]:
+def other_residuals(precision: Precision) -> Sequence[ObservationResidual]:
     """The same for every observation that is neither an image point nor a reading."""
     graph, out = precision.graph, dict[int, ObservationResidual]()
     if graph.pairs is not None:
-        places = (graph.first_pair + graph.pairs.rows).tolist()
-        out |= dict(zip(places, graph.pairs.residuals(precision.pairs, graph.survey.pairs), strict=True))
+        of_pairs = graph.pairs.residuals(precision.pairs, graph.survey.pairs)
+        if not graph.singles:
+            return of_pairs
+        out |= dict(zip((graph.first_pair + graph.pairs.rows).tolist(), of_pairs, strict=True))
     for i, item in zip(graph.single, graph.singles, strict=True):
         x = precision.rows(item)
         e, M, root = x.e, x.influence, x.root
@@ -327,13 +330,13 @@ def adjusted_motion(observed: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def group_summaries(
-    graph: AdjustmentGraph,
+    precision: Precision,
     images: ImageResiduals,
     others: Sequence[ObservationResidual],
     readings: ReadingResiduals | None = None,
 ) -> tuple[GroupSummary, ...]:
     """Observations, redundancy and weighted square sum of every group, in order of appearance."""
-    sums: dict[str, list[float]] = {}
+    graph, sums = precision.graph, dict[str, list[float]]()
 
     def add(group: str, n: int, r: float, omega: float) -> None:
         total = sums.setdefault(group, [0.0, 0.0, 0.0])
@@ -342,24 +345,26 @@ def group_summaries(
     names = list(dict.fromkeys(block.group for block in graph.survey.image_blocks))
     for group, *sums_of_group in zip(names, *_image_sums(graph, images, names), strict=True):
         add(group, *sums_of_group)
-    of_pairs = {} if graph.pairs is None else graph.pairs.squares(others[graph.first_pair :])
-    alone = iter(graph.singles)
-    for i, item in enumerate(others):
-        square = of_pairs.get(i - graph.first_pair)
-        factor = next(alone) if square is None else None
-        if item.used:
-            if factor is not None:
-                e = noise_of(factor).whiten(item.residual)
-                square = float(e @ e)
-            add(item.group, len(item.residual), sum(item.redundancy.tolist()), square or 0.0)
+    arrays, squares = arrays_of(others), np.zeros(len(others))
+    for i, item in zip(graph.single, graph.singles, strict=True):
+        e = precision.rows(item).e
+        squares[i] = e @ e
+    if graph.pairs is not None:
+        squares[graph.first_pair + graph.pairs.rows] = graph.pairs.squares(precision.pairs)
+    shares = np.bincount(arrays.observation, arrays.redundancies, len(others)).tolist()
+    every = zip(graph.of_others(lambda o: o.group, lambda p: p.group), arrays.n_components.tolist(), shares,
+                squares.tolist(), arrays.used.tolist(), strict=True)  # fmt: skip
+    for group, n, share, square, used in every:
+        if used:
+            add(group, n, share, square)
     if readings is not None:
         of_group: dict[str, list[int]] = {}
         for i, reading in enumerate(graph.survey.readings):
             of_group.setdefault(reading.group, []).append(i)
         for group, mine in of_group.items():
             taken = np.array(mine)[readings.used[mine]]
-            squares = float(readings.weighted_square[taken].sum())
-            add(group, len(taken), float(readings.redundancy[taken].sum()), squares)
+            square = float(readings.weighted_square[taken].sum())
+            add(group, len(taken), float(readings.redundancy[taken].sum()), square)
     return tuple(GroupSummary(g, int(n), r, omega) for g, (n, r, omega) in sums.items())
 
 

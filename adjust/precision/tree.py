@@ -20,6 +20,7 @@ from adjust.native.trees import (
     fill_block,
     invert_cliques,
     joint_blocks,
+    sets_among,
     solve_cliques,
 )  # fmt: skip
 from adjust.observations.images.reduction import Leaves
@@ -100,7 +101,9 @@ class TreeCovariance:
             return self._apart(numbers)
         at = np.concatenate([[0], np.cumsum(c.dims[numbers])])
         if together and len(numbers) > _MANY and 2 * at[-1] >= c.width[deepest]:  # all of the clique at once
-            rows = c.rows_of(numbers, c.gathered(np.zeros(0, dtype=np.int64), deepest)[0])
+            inside, first = c.keys_in(deepest), np.zeros(len(c.dims), dtype=np.int64)
+            first[inside] = np.cumsum(c.dims[inside]) - c.dims[inside]
+            rows = c.rows_of(numbers, first)
             return np.asarray(clique_covariance(self.arrays, c.n_front, deepest)[np.ix_(rows, rows)])
         out = np.empty((at[-1], at[-1]))
         for i, a in enumerate(numbers.tolist()):
@@ -152,38 +155,40 @@ class TreeCovariance:
         solve_cliques(self.arrays, every, every, self.cliques.first, self.cliques.data, x)
         return x
 
-    def among(self, A: sparse.csr_array) -> FloatArray:
-        """A Q A' (m, m) of the rows of A (m, n), without forming Q.
+    def each_among(self, A: sparse.csr_array, ptr: IntArray) -> list[FloatArray]:
+        """A Q A' (m, m) of sets of the rows of A, set i from ``ptr[i]`` on, without forming Q.
 
         U'U with R'U = A', on the ways to the first clique that holds all that is left of A', and this with the joint
         covariance of its keys; to the roots where there is none.
         """
-        c = self.cliques
-        home, m = c.home[c.key_of], A.shape[0]
-        top = c.common(np.unique(c.key_of[A.indices]))
-        of_row = np.maximum.reduceat(np.append(home[A.indices], 0), A.indptr[:-1]) if m else np.zeros(0)
+        c, i8 = self.cliques, np.int64
+        rows = ptr.astype(i8), A.indptr.astype(i8), A.indices.astype(i8), np.asarray(A.data, dtype=float)
+        return sets_among(*rows, self.arrays, c.parents, c.n_front, c.key_of, c.first, c.data)
+
+    def among(self, A: sparse.csr_array) -> FloatArray:
+        """The same of all rows of A (m, n): of many some at once, on their ways to the roots."""
+        c, m = self.cliques, A.shape[0]
+        if m <= _COLUMNS:
+            return self.each_among(A, np.array([0, m]))[0]
+        home = c.home[c.key_of]
+        of_row = np.maximum.reduceat(np.append(home[A.indices], 0), A.indptr[:-1])
         order = np.argsort(of_row, kind="stable")  # neighbours in the tree side by side
         A, out = A[order], np.zeros((m, m))
-        Q = np.zeros((0, 0)) if top < 0 else clique_covariance(self.arrays, c.n_front, top)
-        none, done = np.zeros(0, dtype=np.int64), list[tuple[IntArray, FloatArray, FloatArray]]()
+        none, done = np.zeros(0, dtype=np.int64), list[tuple[IntArray, FloatArray]]()
         for i in range(0, m, _COLUMNS):
             mine = A[i : i + _COLUMNS]
-            up = c.ancestors(set(home[mine.indices].tolist()), top)
-            first, n = c.gathered(up, top)
+            up = c.ancestors(set(home[mine.indices].tolist()))
+            first, n = c.gathered(up)
             entries = mine.data, (first - c.first[:-1])[c.key_of[mine.indices]] + mine.indices, mine.indptr
-            x = np.ascontiguousarray(sparse.csr_array(entries, (mine.shape[0], n + len(Q))).toarray().T)
-            solve_cliques(self.arrays, up, none, first, c.data, x)
-            U, left = x[:n], x[n:]
-            out[i : i + _COLUMNS, i : i + _COLUMNS] = U.T @ U + left.T @ (Q @ left)
-            if m <= _COLUMNS:
-                break
+            U = np.ascontiguousarray(sparse.csr_array(entries, (mine.shape[0], n)).toarray().T)
+            solve_cliques(self.arrays, up, none, first, c.data, U)
             way = np.zeros(len(c), dtype=np.bool_)
             way[up] = True
             rows = np.flatnonzero(way[home])
-            for k, (before, V, held) in enumerate(done):
+            done.append((rows, U))
+            for k, (before, V) in enumerate(done):
                 _, here, there = np.intersect1d(rows, before, assume_unique=True, return_indices=True)
-                out[i : i + _COLUMNS, k * _COLUMNS : (k + 1) * _COLUMNS] = U[here].T @ V[there] + left.T @ held
-            done.append((rows, U, Q @ left))
+                out[i : i + _COLUMNS, k * _COLUMNS : (k + 1) * _COLUMNS] = U[here].T @ V[there]
         back = np.argsort(order)
         return np.asarray((np.tril(out) + np.tril(out, -1).T)[np.ix_(back, back)])
 

@@ -30,6 +30,7 @@ from adjust.testing.quadratic_forms import pseudo_squares
 _SEEN = 1e-4
 """Share of a column that no unknown takes over, below which it is not told from rounding."""
 _MOST_RUNS = 256
+"""Of a system without structure, where every run is compared with every other."""
 _ROOM = 2e7
 """Numbers that all possible changes may need."""
 _MOST, _MOST_OF_ONE = 20, 2
@@ -95,8 +96,10 @@ class ChangeSearch:
         self.A, self.e = s.A, s.e - s.A @ step
         self.epoch, self.epochs = _coded([b.epoch_id for b in adjustment.survey.image_blocks])
         self.owners = list(self._owners())
-        units, self.runs = list(self._units(_MOST_RUNS)), _MOST_RUNS
         shared = None if s.structured is None else len(s.structured.U)
+        read = {r.epoch_id for r in adjustment.survey.table_readings}
+        self.runs = _MOST_RUNS if shared is None else max(2, len(self.epochs), len(read))
+        units = list(self._units(self.runs))
 
         def numbers(runs: Sequence[int]) -> float:
             """That M of every unit needs, or what it is made of."""
@@ -105,7 +108,7 @@ class ChangeSearch:
 
         if numbers([len(u.epochs) for u in units]) > _ROOM:
             share = _ROOM / numbers([1] * len(units))
-            self.runs = int(np.clip(share if shared is not None else np.sqrt(share), 2, _MOST_RUNS))
+            self.runs = int(np.clip(share if shared is not None else np.sqrt(share), 2, self.runs))
             units = list(self._units(self.runs))
         self.candidates = side_by_side(lambda u: self._candidates(_by_runs(u)), units)
         self.n_tests = sum(len(c.g) for c in self.candidates)
@@ -217,8 +220,8 @@ class ChangeSearch:
         wide = sparse.csr_matrix((u.B[order].ravel(), columns[order].ravel(), ptr), (len(length), J * q))
         wide.eliminate_zeros()
         X = (self.A.T @ wide).tocsr()
-        P = _from_runs_on(_by_run(u, u.B))
-        g = _from_runs_on(_by_run(u, self.e[u.rows, None]))[:, :, 0]
+        both = _from_runs_on(_by_run(u, np.column_stack([u.B, self.e[u.rows]])))
+        P, g = both[:, :, :q], both[:, :, q]
         taken = _taken(self.system, X, J)[1 if J > 1 else 0 :]
         size = np.sqrt(np.einsum("jqq->jq", P))
         scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)

@@ -7,6 +7,7 @@ influences, the search for outliers) needs them apart. Rows are linearised at th
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import gtsam
@@ -133,6 +134,13 @@ class LinearSystem:
             return np.asarray(rows @ self.normal.solve(rows.T.toarray()))
         stacked, entries = self.precision.stacked, (rows.data, self._stacked[rows.indices], rows.indptr)
         return stacked.among(sparse.csr_array(entries, (rows.shape[0], stacked.n)))
+
+    def among_each(self, rows: sparse.csr_matrix, ptr: IntArray) -> list[FloatArray]:
+        """The same of sets of rows, set i from ``ptr[i]`` on."""
+        if len(self.columns) <= PLAIN or self.precision.hidden:
+            return [self.among(rows[i:j]) for i, j in pairwise(ptr.tolist())]
+        entries = rows.data, self._stacked[rows.indices], rows.indptr
+        return self.precision.tree.each_among(sparse.csr_array(entries, (rows.shape[0], self.precision.tree.n)), ptr)
 
     @cached_property
     def most_correlated(self) -> FloatArray:
@@ -380,7 +388,7 @@ class Entries:
             return sparse.csr_matrix(shape)
         r, c, v = (np.concatenate(x) for x in zip(*self.parts, strict=True))
         if (r[1:] >= r[:-1]).all():  # row by row already
-            ptr = np.searchsorted(r, np.arange(shape[0] + 1))
+            ptr = np.cumsum(np.bincount(r + 1, minlength=shape[0] + 1))
             out = sparse.csr_matrix((v, c, ptr), shape=shape)
             out.sum_duplicates()
             return out

@@ -199,7 +199,7 @@ def _places(node: Node, survey: Survey, kind: str) -> tuple[list[dict[str, Any]]
         return [{}] * hand.count, hand
     if kind == "table":
         table = node.reference("table", (t.table_id for t in survey.tables), "table")
-        axes = next(len(t.axes) for t in survey.tables if t.table_id == table)
+        axes = len(survey.tables_by_id[table].axes)
         return [{"table_id": table, "angles": a} for a in _angles(node, axes)], None
     if node.has("station") == node.has("target"):
         raise node.error("poses are of one thing; name a station or a target", "poses")

@@ -70,7 +70,7 @@ def _by_hand(survey: Survey, expected: Adjustment) -> Iterator[Moments]:
 
 def _can_be_held(survey: Survey, camera: Camera, target: Target) -> bool:
     """Whether either moves between epochs, and not both; and the camera has seen it."""
-    station = next(s for s in survey.stations if s.station_id == camera.station_id)
+    station = survey.stations_by_id[camera.station_id]
     seen = any((b.camera_id, b.target_id) == (camera.camera_id, target.target_id) for b in survey.image_blocks)
     return seen and target.station_id is None and (target.motion == "epoch") != (station.motion != "fixed")
 

@@ -223,11 +223,11 @@ def _published(solution: dict[str, Any]) -> Iterator[str]:
             values = (_number(e[f"{which}_{unit}"], 11, digits) for which in ("published", "joint"))
             sigmas = (e[f"{which}_sigma_{small}"] for which in ("claimed", "published", "joint"))
             (value, other), (claimed, own, joint) = values, map(_number, sigmas, (10, 9, 9), [fine] * 3)
-            off = _number(e[f"difference_{small}"], 11, fine)
+            apart = _number(e[f"difference_{small}"], 11, fine)
             place = f"{_cut(pose, 22)} {name} {unit}"
-            yield f"  {place:<30}{value}{claimed}{own}{other}{joint}{off}{_number(e['sigma_ratio'], 7, 1)}"
-        yield "  claimed: as each step states it, σ: through all steps; of angles σ and differences, published minus joint,"
-        yield "  are turns about the axes in arcsec: near ry = 90 or -90 deg the angles rx and rz themselves differ by more"
+            yield f"  {place:<30}{value}{claimed}{own}{other}{joint}{apart}{_number(e['sigma_ratio'], 7, 1)}"
+        yield "  claimed: as each step states it, σ: through all steps; difference: published minus joint; σ and"
+        yield "  differences of angles in arcsec, of turns about the axes: near ry = ±90° rx and rz differ by more"
     if "pairs" in found:
         pairs, steps = found["pairs"], found["pairs"]["steps"]["weighted"]
         said = f"{pairs['n_loops']} loops closed in {steps['iterations']} iterations"

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from gtsam import Pose3
 
+from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import CENTRE, FOCAL
 from adjust.diagnosis.prediction import Linear
 from adjust.model.result import ParameterName
@@ -13,6 +14,11 @@ from adjust.model.survey import IntArray, Survey
 from adjust.statistics.normal import DENSE
 from adjust.statistics.score import Part
 
+_FEWEST = 4
+_ELIMINATIONS = 12.5
+"""Eliminations of the whole system that all courses together may cost in surveys of many unknowns."""
+_ROWS = 20_000
+"""Of courses that are looked at together."""
 MOVED = {  # name of the unknown: of the mistake, kind of the thing, what happened to it
     "station_from_camera": ("camera moved", "camera", "camera {} was moved on its station"),
     "carrier_from_target": ("target moved", "target", "target {} was moved"),
@@ -50,6 +56,31 @@ class Course:
         return self.name[0].endswith("_body") or isinstance(self.linear.result.estimates[self.name].value, Pose3)
 
 
+def affordable(case: Case, linear: Linear) -> Iterator[Course]:
+    """Those of several epochs, as many as columns of the covariance matrix cost no more than some adjustments."""
+    n, tree = len(linear.system.columns), linear.system.precision.tree
+    room = min(float(n), tree.cliques.columns_for(_ELIMINATIONS)) if n > DENSE else np.inf
+    for course in courses(linear):
+        room -= sum(B.shape[1] for _, B in course.parts)
+        if not case.few("what moved from some epoch on, of things that fit better than others", int(room < 0.0), 0):
+            return
+        if len(course.parts) >= _FEWEST:
+            yield course
+
+
+def alike(every: Iterator[Course]) -> Iterator[list[Course]]:
+    """Together those with derivatives by as many numbers, as long as they have no more rows than make it worth it."""
+    some, n = list[Course](), 0
+    for course in every:
+        if some and (n > _ROWS or course.parts[0][1].shape[1] != some[0].parts[0][1].shape[1]):
+            yield some
+            some, n = [], 0
+        some.append(course)
+        n += sum(len(rows) for rows, _ in course.parts)
+    if some:
+        yield some
+
+
 def courses(
     linear: Linear, only: ParameterName | None = None, components: tuple[str, ...] | None = None
 ) -> Iterator[Course]:
@@ -85,8 +116,8 @@ def _worst_first(linear: Linear) -> list[ParameterName]:
     at = linear.system.columns.at
     if len(linear.system.columns) <= DENSE:
         return list(at)
-    some = [name for name in at if name[0] in MOVED or name[0] == "lens"]
-    misfit = {name: float(np.mean(linear.e[linear.rows_of(at[name])] ** 2)) for name in some if len(at[name])}
+    some = [name for name in at if len(at[name]) and (name[0] in MOVED or name[0] == "lens")]
+    misfit = dict(zip(some, linear.mean_squares([at[name] for name in some]).tolist(), strict=True))
     return sorted(misfit, key=lambda name: -misfit[name])
 
 

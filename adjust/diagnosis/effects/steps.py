@@ -8,7 +8,7 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.diagnosis.case import Case
-from adjust.diagnosis.effects.courses import MOVED, Course, courses, standing
+from adjust.diagnosis.effects.courses import MOVED, Course, affordable, alike, courses, standing
 from adjust.diagnosis.effects.effect import Effect
 from adjust.diagnosis.hypothesis import (
     CENTRE,
@@ -26,32 +26,20 @@ from adjust.model.observations import FrameRef, ImageBlock, Pair
 from adjust.model.result import Adjustment
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, Survey
-from adjust.statistics.normal import DENSE
 from adjust.statistics.score import Part, Score, drift_times
 
-_FEWEST = 4
-_ELIMINATIONS = 12.5
-"""Eliminations of the whole system that all courses together may cost in surveys of many unknowns."""
 _BOUND = 50.0  # of the square of one image point
 
 
 def steps(case: Case, linear: Linear) -> Iterator[Effect]:
     """The best step of every unknown that is the same for several epochs, and the drift of every lens."""
-    n, tree = len(linear.system.columns), linear.system.precision.tree
-    # columns of the covariance matrix: as many as it has, or as cost no more than some adjustments
-    room = min(float(n), tree.cliques.columns_for(_ELIMINATIONS)) if n > DENSE else np.inf
-    for course in courses(linear):
-        room -= sum(B.shape[1] for _, B in course.parts)
-        if not case.few("what moved from some epoch on, of things that fit better than others", int(room < 0.0), 0):
-            return
-        if len(course.parts) < _FEWEST:
-            continue
-        found = linear.steps(course.parts)
-        if found:
-            cut = max(found, key=lambda t: found[t].drop)
-            yield _step(case.survey, course, cut, found[cut], len(found))
-        if course.name[0] == "lens":
-            yield _drift(case.survey, course, linear.drift(course.parts))
+    for some in alike(affordable(case, linear)):
+        for course, found in zip(some, linear.steps([c.parts for c in some]), strict=True):
+            if found:
+                cut = max(found, key=lambda t: found[t].drop)
+                yield _step(case.survey, course, cut, found[cut], len(found))
+            if course.name[0] == "lens":
+                yield _drift(case.survey, course, linear.drift(course.parts))
 
 
 def _step(survey: Survey, course: Course, cut: int, first: Score, looked_at: int) -> Effect:
