@@ -14,7 +14,8 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.names.images import POINTS, exchange, points_exchanged
 from adjust.diagnosis.prediction import Prediction
-from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.model.subsets import with_points
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.start.closed_forms.triangulation import intersect
 from adjust.start.views import focal_px, rays_by_block
 
@@ -84,7 +85,7 @@ def exchanged_in_images(case: Case) -> Iterator[Hypothesis]:
 def _rays(case: Case) -> Rays | None:
     """Of all image points of the world whose cameras are placed without them; None where there are none."""
     survey = case.survey
-    values = case.rough(without_world(survey))
+    values = case.rough(with_points(survey, ()))
     if values is None:
         return None
     prediction = Prediction(survey, values)
@@ -100,10 +101,3 @@ def _rays(case: Case) -> Rays | None:
             o = np.tile(-pose[:3, :3].T @ pose[:3, 3], (n, 1))
             parts.append((np.full(n, i), block.point_idx, o, rays @ pose[:3, :3], np.full(n, focal)))
     return Rays(*(np.concatenate(x) for x in zip(*parts, strict=True))) if parts else None
-
-
-def without_world(survey: Survey) -> Survey:
-    """The survey with its targets, tables and stations alone: no points of the world, and what is measured to them."""
-    blocks = tuple(b for b in survey.image_blocks if b.target_id is not None)
-    return replace(survey, points=(), image_blocks=blocks, distances=(), coordinates=(), coordinate_differences=(),
-                   readings=(), reading_covariances=(), alignments=(), laser_spots=(), on_surfaces=())  # fmt: skip

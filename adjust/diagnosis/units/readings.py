@@ -169,15 +169,10 @@ def _fits_as_it_is(before: Screen, rows: IntArray) -> bool:
 def _hypothesis(survey: Survey, scope: Scope, misreading: Misreading, evidence: float, looked_at: int) -> Hypothesis:
     ids = tuple(survey.readings[i].reading_id for i in scope.rows)
     return Hypothesis(
-        misreading.name, _cause(scope, misreading), _remedy(misreading), scope.place,
+        misreading.name, f"{scope.text}: {misreading.text('their')}", _remedy(misreading), scope.place,
         mended(survey, scope.rows, misreading), (ChangeReadings(ids, misreading.factor, misreading.offset),), evidence,
         1, max(looked_at, 1), penalty=shrinking(misreading.factor, len(scope.rows)),
     )  # fmt: skip
-
-
-def _cause(scope: Scope, misreading: Misreading) -> str:
-    what = "its decimal point" if misreading.name == "slipped decimal" else "their values"
-    return f"{scope.text}: {what} {misreading.said}"
 
 
 def _remedy(misreading: Misreading) -> str:
