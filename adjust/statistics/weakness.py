@@ -71,32 +71,16 @@ def correlations(
     every unknown with each other.
     """
     system = system or linear_system(adjustment)
-    n, index = len(system.columns), compared_columns(system, limit)[0]
-    number = np.full(n, -1)
-    number[index] = np.arange(len(index))
+    index = compared_columns(system, limit)[0]
     whole = system.covariance if _as_a_whole(system) else None
     sigma = np.maximum(system.sigmas if whole is None else np.sqrt(np.maximum(np.diag(whole), 0.0)), 1e-150)
     structure = _structure(system, limit)
     if structure is not None:
         return _named(system, _of_structure(structure, sigma, limit))
-
-    def above(first: int) -> list[tuple[int, int, float]]:
-        part = index[first : first + AT_ONCE]
-        rows = np.arange(n) if n > len(index) else index[: first + len(part)]
-        C = (system.through_tree(_units(system, part)) if whole is None else whole[:, part])[rows]
-        C /= sigma[rows, None]
-        C /= sigma[part]
-        size = np.abs(C)
-        size[number[rows][:, None] >= number[part]] = 0.0  # each pair once, nothing with itself
-        high = size >= limit
-        if (k := int(np.count_nonzero(high))) > _MOST:
-            high = size >= np.partition(size[high], k - _MOST)[k - _MOST]
-        a, b = np.nonzero(high) if k else np.zeros((2, 0), dtype=np.int64)
-        return list(zip(rows[a].tolist(), part[b].tolist(), C[a, b].tolist(), strict=True))
-
-    found = [x for part in side_by_side(above, range(0, len(index), AT_ONCE)) for x in part]
-    if len(index) < n:
-        found += _within(system, number, limit)
+    bound = system.most_correlated if whole is None else np.full(len(sigma), np.inf)
+    found = _of_columns(system, whole, sigma, index[np.argsort(-bound[index], kind="stable")], bound, limit)
+    if len(index) < len(sigma):
+        found += _within(system, index, limit)
     return _named(system, found)
 
 
@@ -106,6 +90,38 @@ _Found = list[tuple[int, int, float]]
 def _named(system: LinearSystem, found: _Found) -> tuple[Correlation, ...]:
     c, order = system.columns, sorted(found, key=lambda x: (-abs(x[2]), x[0], x[1]))[:_MOST]
     return tuple(Correlation(c.names[i], c.components[i], c.names[j], c.components[j], x) for i, j, x in order)
+
+
+def _of_columns(
+    system: LinearSystem, whole: FloatArray | None, sigma: FloatArray, index: IntArray, bound: FloatArray, limit: float
+) -> _Found:
+    """Of these columns with all: those among the largest. index: by ``bound`` (n,) on what each may correlate.
+
+    What is below the last of the largest that are known is not looked at.
+    """
+    least = limit
+
+    def above(first: int) -> _Found:
+        nonlocal least
+        part = index[first : first + AT_ONCE]
+        part = part[bound[part] >= least]
+        if not len(part):
+            return []
+        C = system.through_tree(_units(system, part)) if whole is None else whole[:, part]
+        C = C / sigma[part]
+        C /= sigma[:, None]
+        size = np.abs(C)
+        size[index[:first]] = 0.0  # each pair once, nothing with itself
+        size[part] = np.tril(size[part], -1)
+        high = size >= least
+        if (k := int(np.count_nonzero(high))) > _MOST:
+            least = max(least, float(np.partition(size[high], k - _MOST)[k - _MOST]))
+            high &= size >= least
+        a, b = np.nonzero(high) if k else np.zeros((2, 0), dtype=np.int64)
+        pairs = np.sort([a, part[b]], axis=0)
+        return list(zip(*pairs.tolist(), C[a, b].tolist(), strict=True))
+
+    return [x for found in side_by_side(above, range(0, len(index), AT_ONCE)) for x in found]
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,9 +165,10 @@ def _of_structure(found: _Structure, sigma: FloatArray, limit: float) -> _Found:
     return out + [x for part in side_by_side(above, range(0, len(sharing), AT_ONCE)) for x in part]
 
 
-def _within(system: LinearSystem, number: IntArray, limit: float) -> list[tuple[int, int, float]]:
+def _within(system: LinearSystem, compared: IntArray, limit: float) -> list[tuple[int, int, float]]:
     """Pairs of components of one unknown that is not compared with others."""
-    apart = [at for at in system.columns.at.values() if len(at) > 1 and (number[at] < 0).all()]
+    seen = np.isin(np.arange(len(system.columns)), compared)
+    apart = [at for at in system.columns.at.values() if len(at) > 1 and not seen[at].any()]
     out = list[tuple[int, int, float]]()
     for k in sorted({len(at) for at in apart}):
         columns = np.array([at for at in apart if len(at) == k])
