@@ -78,10 +78,8 @@ def correlations(
     if structure is not None:
         return _named(system, _of_structure(structure, sigma, limit))
     bound = system.most_correlated if whole is None else np.full(len(sigma), np.inf)
-    found = _of_columns(system, whole, sigma, index[np.argsort(-bound[index], kind="stable")], bound, limit)
-    if len(index) < len(sigma):
-        found += _within(system, index, limit)
-    return _named(system, found)
+    ordered = index[np.argsort(-bound[index], kind="stable")]
+    return _named(system, _within(system, limit) + _of_columns(system, whole, sigma, ordered, bound, limit))
 
 
 _Found = list[tuple[int, int, float]]
@@ -95,11 +93,13 @@ def _named(system: LinearSystem, found: _Found) -> tuple[Correlation, ...]:
 def _of_columns(
     system: LinearSystem, whole: FloatArray | None, sigma: FloatArray, index: IntArray, bound: FloatArray, limit: float
 ) -> _Found:
-    """Of these columns with all: those among the largest. index: by ``bound`` (n,) on what each may correlate.
+    """Of these columns with those of other unknowns: those among the largest. index: by ``bound`` (n,) on any of it.
 
     What is below the last of the largest that are known is not looked at.
     """
-    least = limit
+    least, unknown = limit, np.empty(len(sigma), dtype=np.int64)
+    for i, at in enumerate(system.columns.at.values()):
+        unknown[at] = i
 
     def above(first: int) -> _Found:
         nonlocal least
@@ -118,6 +118,8 @@ def _of_columns(
             least = max(least, float(np.partition(size[high], k - _MOST)[k - _MOST]))
             high &= size >= least
         a, b = np.nonzero(high) if k else np.zeros((2, 0), dtype=np.int64)
+        other = unknown[a] != unknown[part[b]]
+        a, b = a[other], b[other]
         pairs = np.sort([a, part[b]], axis=0)
         return list(zip(*pairs.tolist(), C[a, b].tolist(), strict=True))
 
@@ -165,11 +167,10 @@ def _of_structure(found: _Structure, sigma: FloatArray, limit: float) -> _Found:
     return out + [x for part in side_by_side(above, range(0, len(sharing), AT_ONCE)) for x in part]
 
 
-def _within(system: LinearSystem, compared: IntArray, limit: float) -> list[tuple[int, int, float]]:
-    """Pairs of components of one unknown that is not compared with others."""
-    seen = np.isin(np.arange(len(system.columns)), compared)
-    apart = [at for at in system.columns.at.values() if len(at) > 1 and not seen[at].any()]
-    out = list[tuple[int, int, float]]()
+def _within(system: LinearSystem, limit: float) -> _Found:
+    """Pairs of components of one unknown."""
+    apart = [at for at in system.columns.at.values() if len(at) > 1]
+    out: _Found = []
     for k in sorted({len(at) for at in apart}):
         columns = np.array([at for at in apart if len(at) == k])
         C = system.own_covariances(columns)
