@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 from gtsam import Pose3, Rot3
@@ -138,6 +139,22 @@ class Hypothesis:
     def changed(self) -> Survey | None:
         """The survey to be tried; None where the change turns out not to be possible."""
         return self.survey() if callable(self.survey) else self.survey
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing to mend or to measure, told before anything is adjusted.
+
+    level: ``problem`` spoils or stops the adjustment, ``weak`` weakens it.
+
+    kind: short and constant, for programs. ids: what it concerns. found: what is the matter. remedy: what to do.
+    """
+
+    level: Literal["problem", "weak"]
+    kind: str
+    ids: tuple[str, ...]
+    found: str
+    remedy: str
 
 
 def motion_text(motion: Pose3) -> str:

@@ -112,8 +112,7 @@ def _mirrored(case: Case, camera: str, blocks: list[int], whole: bool, how: Imag
     onwards = all(i in bad for i in mine if i >= first and i in case.views and _is_flat(case.views[i].x))
     chosen = [i for i in mine if whole or i in bad or (onwards and i >= first)]
     epochs = tuple(dict.fromkeys(survey.image_blocks[i].epoch_id for i in chosen))
-    n = sum(b.camera_id == camera for b in case.survey.image_blocks)
-    which = "all its images" if whole else f"{len(epochs)} of its {n} images ({epochs[0]} ... {epochs[-1]})"
+    which = "all its images" if whole else f"{len(epochs)} of its {len(mine)} images ({epochs[0]} ... {epochs[-1]})"
     return Hypothesis(
         "images mirrored",
         f"camera {camera}: {which} are mirrored, {how.text}: they show the front of flat targets from behind",

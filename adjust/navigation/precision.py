@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from gtsam import Pose3
 
-from adjust.lenses.models import MODELS, project
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native import navigation as native
 from adjust.navigation.fit import PoseFit, Prior, fit_pose
@@ -135,21 +134,10 @@ def expected_precision(
     return tuple(out)
 
 
-def _images(system: System, pose: FloatArray, camera: IntArray, beacon: IntArray) -> FloatArray:
-    """Image points (n, 2) px of beacons in view."""
-    uv = np.zeros((len(camera), 2))
-    q = (system.beacons.x_in_world[beacon] - pose[:3, 3]) @ pose[:3, :3]
-    for c, own in enumerate(system.head.cameras):
-        rows = camera == c
-        if rows.any():
-            p = (q[rows] - system.camera_t[c]) @ system.camera_R[c]
-            uv[rows] = project(MODELS[own.model], own.lens, own.constants, p)
-    return uv
-
-
 def _expected(system: System, pose: Pose3, camera: IntArray, beacon: IntArray, sigma_px: float) -> Expected:
     n, ids = len(camera), system.beacons.beacon_ids
-    seen = sightings_of(system, camera, beacon, _images(system, pose.matrix(), camera, beacon), sigma_px)
+    predicted = evaluate(system, pose.matrix(), camera, beacon, np.zeros((n, 2)))[0]
+    seen = sightings_of(system, camera, beacon, predicted.reshape(n, 2), sigma_px)
     names = tuple(ids[b] for b in sorted(set(beacon.tolist())))
     fit = fit_pose(system, seen, np.arange(n), beacon, pose.matrix()) if n >= 3 else None
     if fit is None:

@@ -110,8 +110,10 @@ class TreeCovariance:
     def times(self, columns: FloatArray) -> FloatArray:
         """The whole covariance matrix times columns (n, m), without forming it."""
         x = np.array(columns, dtype=float, order="C")
-        every = np.arange(len(self.cliques), dtype=np.int64)
-        solve_cliques(self.arrays, every, every, self.cliques.first, self.cliques.data, x)
+        c, every = self.cliques, np.arange(len(self.cliques), dtype=np.int64)
+        begun = set(c.home[c.key_of[x.any(axis=1)]].tolist())
+        up = every if 2 * len(begun) > len(c) else c.ancestors(begun)
+        solve_cliques(self.arrays, up, every, c.first, c.data, x)
         return x
 
     def drawn(self, w: FloatArray) -> FloatArray:

@@ -23,11 +23,12 @@ from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.observations.geometry.building import frame_refs, position_refs
 from adjust.observations.terrestrial.building import reading_refs
 from adjust.spatial.averaging import pose_distance, typical_distance
-from adjust.spatial.rigid import rigid
+from adjust.spatial.rigid import as_pose3, rigid
 from adjust.start.gauge import fix_one_gauge
-from adjust.start.lenses import Sighting, start_lens
+from adjust.start.lens_images import Sighting
+from adjust.start.lenses import start_lens
 from adjust.start.motion import solve_motion
-from adjust.start.network import ChainObservation, FrameNetwork, as_pose3, partial_pose
+from adjust.start.network import ChainObservation, FrameNetwork, partial_pose
 from adjust.start.points import PARALLAX, improve, intersect_points, orient_second, resect
 from adjust.start.polish import polish
 from adjust.start.positions import PointField, Positions, Sight, point_field, undetermined

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.design.expectation import expect, weak_directions
-from adjust.diagnosis.beforehand.finding import Finding
 from adjust.diagnosis.beforehand.images import moved, pictured
 from adjust.diagnosis.beforehand.observations import observed
 from adjust.diagnosis.beforehand.values import valued
 from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import Finding
 from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey

@@ -88,8 +88,7 @@ def _misread(o: Distance | Reading, way: Misreading, changed: Survey) -> Hypothe
     named, table, name = (f"reading {o.reading_id}", "terrestrial", o.reading_id) if isinstance(o, Reading) else (
         f"distance {o.distance_id}", "distances", o.distance_id)  # fmt: skip
     edits: tuple[Edit, ...] = (ChangeReadings((name,), way.factor, way.offset, table),)
-    what = "its decimal point" if way.name == "slipped decimal" else "its values"
     return Hypothesis(
-        way.name, f"{named}: {what} {way.said}", f"write {way.factor * o.value + way.offset:.9g} (SI) in {table}.csv",
+        way.name, f"{named}: {way.text('its')}", f"write {way.factor * o.value + way.offset:.9g} (SI) in {table}.csv",
         Place("reading", (name,), "value"), changed, edits,
     )  # fmt: skip
