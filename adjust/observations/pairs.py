@@ -400,7 +400,7 @@ class PairBatch:
             pair = pairs[rows[e]]
             return ("pair", pair.group, _ids(pair), *said[sizes[e]])
 
-        return Residuals(arrays, named)
+        return Residuals(arrays, named, len(self))
 
 
 def _quadratic(Q: FloatArray, v: FloatArray) -> tuple[FloatArray, IntArray]:
