@@ -83,6 +83,7 @@ class ReadingResiduals:
     sigma: a priori, with the target's centring. residual: adjusted minus observed.
     redundancy: diag(Q_vv P). test: w^2 with w = (P v)_i / sqrt((P Q_vv P)_ii), chi-square with one degree of freedom,
     the square of ``standardized`` but for readings with a joint covariance. weighted_square: shares of v'Pv.
+    influence: diag(A Q A'), whitened.
     """
 
     observed: FloatArray
@@ -94,6 +95,7 @@ class ReadingResiduals:
     test: FloatArray
     weighted_square: FloatArray
     used: BoolArray
+    influence: FloatArray
 
 
 @dataclass(frozen=True, eq=False)

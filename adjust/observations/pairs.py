@@ -9,7 +9,7 @@ chi-square with the rank of Q_vv degrees of freedom (Baarda 1968; Koch 1999, sec
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 
 import gtsam
 import numpy as np
@@ -388,19 +388,16 @@ class PairBatch:
             standardized = np.where(seen, v / np.sqrt(np.where(seen, spread, 1.0)), np.nan)
         turned = Motions(self.arrays.rotations @ exp(v[:, :3]).rotation).log()
         adjusted[~self.arrays.is_pose, :3] = turned[~self.arrays.is_pose]
-        sizes, rows = np.where(self.arrays.is_pose, 6, 3), self.rows.tolist()
+        sizes = np.where(self.arrays.is_pose, 6, 3)
         measured = np.arange(6) < sizes[:, None]
         columns = self.arrays.logs, adjusted, v, sigma, stats.redundancy, standardized
         most = np.where(measured, stats.redundancy, -np.inf).max(axis=1)
         arrays = OtherArrays(sizes, self.arrays.used, stats.test, most, *(x[measured] for x in columns))
-        said = {k: (POSE_COMPONENTS[:k], POSE_UNITS[:k]) for k in (3, 6)}
-        sizes = sizes.tolist()
+        return Residuals(arrays, partial(_named, [pairs[row] for row in self.rows.tolist()], sizes.tolist()), len(self))
 
-        def named(e: int) -> Named:
-            pair = pairs[rows[e]]
-            return ("pair", pair.group, _ids(pair), *said[sizes[e]])
 
-        return Residuals(arrays, named, len(self))
+def _named(pairs: Sequence[Pair], sizes: Sequence[int], e: int) -> Named:
+    return "pair", pairs[e].group, _ids(pairs[e]), POSE_COMPONENTS[: sizes[e]], POSE_UNITS[: sizes[e]]
 
 
 def _quadratic(Q: FloatArray, v: FloatArray) -> tuple[FloatArray, IntArray]:

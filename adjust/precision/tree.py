@@ -144,6 +144,13 @@ class TreeCovariance:
         solve_cliques(self.arrays, up, every, c.first, c.data, x)
         return x
 
+    def drawn(self, w: FloatArray) -> FloatArray:
+        """R^-1 w (n, m): errors with the whole covariance matrix, where w are independent with unit variance."""
+        x, c = np.array(w), self.cliques
+        none, every = np.zeros(0, dtype=np.int64), np.arange(len(c), dtype=np.int64)
+        solve_cliques(self.arrays, none, every, c.first, c.data, x)
+        return x
+
     def each_among(self, A: sparse.csr_array, ptr: IntArray) -> list[FloatArray]:
         """A Q A' (m, m) of sets of the rows of A, set i from ``ptr[i]`` on, without forming Q.
 
@@ -174,12 +181,15 @@ class TreeCovariance:
             way = np.zeros(len(c), dtype=np.bool_)
             way[up] = True
             rows = np.flatnonzero(way[home])
-            done.append((rows, U))
             for k, (before, V) in enumerate(done):
                 _, here, there = np.intersect1d(rows, before, assume_unique=True, return_indices=True)
-                out[i : i + _COLUMNS, k * _COLUMNS : (k + 1) * _COLUMNS] = U[here].T @ V[there]
+                across = U[here].T @ V[there]
+                out[i : i + _COLUMNS, k * _COLUMNS : (k + 1) * _COLUMNS] = across
+                out[k * _COLUMNS : (k + 1) * _COLUMNS, i : i + _COLUMNS] = across.T
+            done.append((rows, U))
+            out[i : i + _COLUMNS, i : i + _COLUMNS] = U.T @ U
         back = np.argsort(order)
-        return np.asarray((np.tril(out) + np.tril(out, -1).T)[np.ix_(back, back)])
+        return np.asarray(out[np.ix_(back, back)])
 
     def full(self) -> FloatArray:
         """The whole covariance matrix (n, n) of all unknowns, rows as :meth:`places` says, parents before children.
@@ -203,21 +213,6 @@ class TreeCovariance:
                 Q[:done, own] = across.T
                 Q[own, own] += across[:, rows[nf:]] @ T.T
         return Q
-
-    def given_separators(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What does not follow from the separator of its clique, as all between it and the cliques that are not below.
-
-        Of columns (n, k) that part, and of every unknown the variance (n,) that is left: inf where a clique has others
-        of its own, with which it may share anything.
-        """
-        left, own, cliques = np.array(columns), np.full(self.n, np.inf), self.cliques
-        for c in range(len(cliques)):
-            nf, n, at = int(cliques.front[c]), int(cliques.width[c]), int(cliques.at[c])
-            A, rows = cliques.data[at : at + nf * n].reshape(nf, n), cliques.rows_of(cliques.keys_in(c))
-            left[rows[:nf]] -= A[:, nf:] @ columns[rows[nf:]]
-            if cliques.n_front[c] == 1:
-                own[rows[:nf]] = (np.triu(A[:, :nf]) ** 2).sum(axis=1)
-        return left, own
 
     def pairs(self, first: IntArray, second: IntArray, dim: int) -> FloatArray:
         """Joint covariances (p, 2 dim, 2 dim) of pairs of keys that share a factor; -1 stands for a constant.

@@ -143,7 +143,7 @@ class _Link:
 
 def _links(survey: Survey, pairs: Sequence[Pair], ends: _Ends, dim: int) -> list[_Link]:
     """What is known without pairs, where it closes loops."""
-    given, stations = _given(survey, ends, dim), {s.station_id: s for s in survey.stations}
+    given, stations = _given(survey, ends, dim), survey.stations_by_id
     fixed = [s for s in given if s != _WORLD] if len(given) > 1 else []
     out = [_Link(s, _WORLD, ("world_from_station", s), stations[s].world_from_station) for s in fixed]
     frames, rig = dict[str, FrameRef](), dict[str, list[_Link]]()

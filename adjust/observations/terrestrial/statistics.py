@@ -6,6 +6,7 @@ the standardized residual where readings are not correlated (Baarda 1968; Foerst
 
 from collections.abc import Sequence
 from dataclasses import fields
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -61,7 +62,7 @@ def reading_residuals(batch: TerrestrialBatch, tree: KeyCovariances, values: gts
     observed = batch.layout.arrays.observed
     return ReadingResiduals(
         observed, observed + batch.residual, batch.residual.copy(), sigma, redundancy, standardized, test,
-        e**2, used,
+        e**2, used, influence,
     )  # fmt: skip
 
 
@@ -101,12 +102,12 @@ def joined_residuals(
     components = "observed", "adjusted", "residual", "sigma", "redundancy", "standardized"
     last = np.ones(len(r.used), dtype=np.int64), r.used, r.test, r.redundancy, *(getattr(r, x) for x in components)
     arrays = OtherArrays(*(np.concatenate([getattr(a, f.name), x]) for f, x in zip(fields(a), last, strict=True)))
+    return Residuals(arrays, partial(_named, first, survey.readings), n)
 
-    def named(i: int) -> Named:
-        if i < n:
-            o = first[i]
-            return o.kind, o.group, o.ids, o.components, o.units
-        x = survey.readings[i - n]
-        return x.kind, x.group, reading_names(x), (x.kind,), (reading_unit(x.kind),)
 
-    return Residuals(arrays, named, n)
+def _named(first: Sequence[ObservationResidual], readings: Sequence[Reading], i: int) -> Named:
+    if i < len(first):
+        o = first[i]
+        return o.kind, o.group, o.ids, o.components, o.units
+    x = readings[i - len(first)]
+    return x.kind, x.group, reading_names(x), (x.kind,), (reading_unit(x.kind),)
