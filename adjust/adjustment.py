@@ -157,14 +157,14 @@ def _trusted(survey: Survey, given: GivenStarts, options: AdjustOptions) -> Begu
     """Start values; what the search refused gets a second chance with the lenses that the rest determines."""
     found = _found(survey, given)
     if not found.excluded_blocks or not options.reject_blocks:
-        return Begun(survey, start_values(found), (), _misfit_px(found))
+        return Begun(survey, found, (), _misfit_px(found))
     kept = _without(survey, found.excluded_blocks)
-    graph = GraphBuilder(kept, found.lenses).build(start_values(found))
+    graph = GraphBuilder(kept, found.lenses).build(found)
     values = solve(graph, options.solve).values
     lenses = {c.camera_id: graph.unknowns.vectors[("lens", c.camera_id)].full(values) for c in survey.cameras}
     cameras = tuple(replace(c, lens=replace(c.lens, values=lenses[c.camera_id])) for c in survey.cameras)
     again = _found(replace(survey, cameras=cameras), given)
-    return Begun(_without(survey, again.excluded_blocks), start_values(again), again.reasons, _misfit_px(again))
+    return Begun(_without(survey, again.excluded_blocks), again, again.reasons, _misfit_px(again))
 
 
 def _found(survey: Survey, given: GivenStarts) -> Start:
@@ -179,11 +179,6 @@ def _misfit_px(found: Start) -> float:
     out = set(found.excluded_blocks)
     rms = [v for i, v in enumerate(found.block_rms_px) if i not in out and not np.isnan(v)]
     return float(np.median(rms)) if rms else 0.0
-
-
-def start_values(found: Start) -> StartValues:
-    """The start as the graph takes it."""
-    return StartValues(found.lenses, found.poses, found.points, found.vectors)
 
 
 def _without(survey: Survey, excluded: Sequence[int]) -> Survey:
@@ -222,7 +217,7 @@ def assemble(
         readings = reading_residuals(graph.terrestrial, precision.tree, solved.values)
     every = others if readings is None else JoinedResiduals(others, graph.survey, readings)
     with Beside() as made:
-        summed = made.of(lambda: group_summaries(graph, images, others, readings))
+        summed = made.of(lambda: group_summaries(precision, images, others, readings))
         unknowns, groups = estimates(precision), summed()
     n_observations = sum(g.n_observations for g in groups)
     n_unknowns = graph.unknowns.n_unknowns

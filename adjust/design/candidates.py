@@ -2,14 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from scipy import sparse
 from scipy.linalg import qr
 
 from adjust.design.exact import exact
-from adjust.design.rows import DesignMatrix, design_matrix
-from adjust.graph.assembly import StartValues
+from adjust.graph.assembly import AdjustmentGraph, StartValues
 from adjust.graph.building import GraphBuilder
 from adjust.model.errors import SurveyError
 from adjust.model.observations import (
@@ -28,7 +28,9 @@ from adjust.model.observations import (
 from adjust.model.result import ParameterName
 from adjust.model.rewriting import Fields
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Point, Survey
-from adjust.statistics.system import Columns
+from adjust.observations.factors import ObservationFactor
+from adjust.statistics.outliers.candidates import FIELDS
+from adjust.statistics.system import Columns, ItemRows, points_apart, survey_rows
 
 _RANK = 1e-10
 
@@ -57,12 +59,7 @@ class Candidate:
     on_surfaces: tuple[OnSurface, ...] = ()
 
 
-_LISTS = {
-    "pair": "pairs", "distance": "distances", "coordinates": "coordinates", "level": "levels",
-    "alignment": "alignments", "laser": "laser_spots", "surface": "on_surfaces",
-    "coordinate_difference": "coordinate_differences", "reading": "readings", "table": "table_readings",
-}  # fmt: skip
-"""Fields of a survey by the kind of their rows."""
+_IN_ORDER = FIELDS | {"reading": "readings"}
 
 
 def with_candidates(survey: Survey, candidates: Sequence[Candidate]) -> Survey:
@@ -76,9 +73,60 @@ def with_candidates(survey: Survey, candidates: Sequence[Candidate]) -> Survey:
             blocks.append(replace(b, point_idx=moved))
     lists: Fields = {
         name: getattr(survey, name) + tuple(x for c in candidates for x in getattr(c, name))
-        for name in _LISTS.values()
+        for name in (*_IN_ORDER.values(), "table_readings")
     }
     return replace(survey, points=tuple(points), image_blocks=tuple(blocks), **lists)
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """The rows (k,) of one observation.
+
+    kind, number: image block ``survey.image_blocks[number]``, or ``graph.others[number]`` under its kind, or
+    ``survey.readings[number]`` under kind "reading".
+    """
+
+    kind: str
+    number: int
+    rows: IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class DesignMatrix:
+    """All observations of a survey at given values: A (m, n), zero in the rows of what is not used."""
+
+    graph: AdjustmentGraph
+    columns: Columns
+    A: sparse.csr_matrix
+    observations: tuple[Observed, ...]
+
+    def normal(self) -> FloatArray:
+        """Normal matrix (n, n) of all observations."""
+        return np.asarray((self.A.T @ self.A).toarray())
+
+
+def design_matrix(survey: Survey, start: StartValues) -> DesignMatrix:
+    """Whitened rows of every observation of the survey at ``start``; nothing is condensed or hidden.
+
+    So sets of observations can be weighed against each other. Raises SurveyError where a value is missing.
+    """
+    graph = GraphBuilder(survey, start.lenses).build(start)
+    graph.prepare(graph.start, jacobians=False)
+
+    def of_item(item: ObservationFactor) -> ItemRows:
+        linear = item.factor.linearize(graph.start)
+        A, b = linear.jacobian()
+        return list(linear.keys()), A, -b
+
+    found = survey_rows(graph, graph.start, points_apart, of_item)
+    used = np.repeat(found.used, np.diff(found.ptr)).astype(float)
+    blocks = np.cumsum([0, *(len(b.uv) for b in survey.image_blocks)])
+    kinds = [("image", i) for i in range(len(survey.image_blocks))]
+    kinds += list(zip(graph.of_others(lambda o: o.kind, lambda _: "pair"), range(graph.n_others), strict=True))
+    kinds += [("reading", i) for i in range(len(survey.readings))]
+    ends = pairwise([*found.ptr[blocks].tolist(), *found.ptr[found.n_image + 1 :].tolist()])
+    parts = tuple(Observed(kind, i, np.arange(a, b)) for (kind, i), (a, b) in zip(kinds, ends, strict=True))
+    return DesignMatrix(graph, found.columns, (sparse.diags(used) @ found.A).tocsr(), parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,13 +182,12 @@ def _names_of(survey: Survey, start: StartValues) -> tuple[ParameterName, ...]:
 def _owners(survey: Survey, candidates: Sequence[Candidate], design: DesignMatrix) -> list[int | None]:
     """For each of the design's observations the candidate that brings it, None for what is planned anyway."""
     images: list[int | None] = [None] * len(survey.image_blocks)
-    in_order = {kind: name for kind, name in _LISTS.items() if kind != "table"}
-    ordered: dict[str, list[int | None]] = {k: [None] * len(getattr(survey, name)) for k, name in in_order.items()}
+    ordered: dict[str, list[int | None]] = {k: [None] * len(getattr(survey, name)) for k, name in _IN_ORDER.items()}
     readings: dict[tuple[str, ...], int] = {}
     points: dict[tuple[str, ...], int] = {}
     for i, c in enumerate(candidates):
         images += [i] * len(c.image_blocks)
-        for kind, name in in_order.items():
+        for kind, name in _IN_ORDER.items():
             ordered[kind] += [i] * len(getattr(c, name))
         readings |= {(r.table_id, r.epoch_id): i for r in c.table_readings}
         points |= {("point", p.point_id): i for p in c.points}

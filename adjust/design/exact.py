@@ -7,13 +7,18 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.design.prediction import Predictor
-from adjust.design.readings import exact_readings
 from adjust.graph.assembly import StartValues
 from adjust.lenses.models import MODELS, camera_constants, project
-from adjust.model.observations import Coordinates, Distance, ImageBlock, Pair
+from adjust.model.errors import SurveyError
+from adjust.model.observations import Distance, ImageBlock, OnSurface, Pair
 from adjust.model.result import ParameterName
 from adjust.model.rewriting import Rewriting, Vector
-from adjust.model.survey import PointParameter, PoseParameter, Survey
+from adjust.model.survey import FloatArray, PointParameter, PoseParameter, Survey
+from adjust.observations.factors import ObservationFactor
+from adjust.precision.precision import noise_of
+
+_KINDS = ("level", "alignment", "laser", "surface")
+_NO_RESIDUAL_M = 1e-7
 
 
 def exact(survey: Survey, start: StartValues) -> Survey:
@@ -22,15 +27,28 @@ def exact(survey: Survey, start: StartValues) -> Survey:
     Raises SurveyError for an image point that these values put behind its camera, and for a point that should lie on a
     line but does not.
     """
-    p = Predictor(survey, start)
+    p, s = Predictor(survey, start), survey
+    wrong = {kind: [_residual(p, o) for o in p.graph.others if o.kind == kind] for kind in _KINDS}
     return replace(
         _Exact(p)(survey),
-        image_blocks=tuple(_block(p, b) for b in survey.image_blocks),
-        table_readings=tuple(replace(r, angles=p.reading(r)) for r in survey.table_readings),
-        pairs=tuple(_pair(p, pair) for pair in survey.pairs),
-        distances=tuple(_distance(p, d) for d in survey.distances),
-        coordinates=tuple(_coordinates(p, c) for c in survey.coordinates),
-        **exact_readings(p),
+        image_blocks=tuple(_block(p, b) for b in s.image_blocks),
+        table_readings=tuple(replace(r, angles=p.angles(r)) for r in s.table_readings),
+        pairs=tuple(_pair(p, pair) for pair in s.pairs),
+        distances=tuple(replace(d, value=_apart(p, d)) for d in s.distances),
+        coordinates=tuple(replace(c, values=np.array([p.position(ref) for ref in c.positions])) for c in s.coordinates),
+        readings=p.readings(),
+        coordinate_differences=tuple(
+            replace(d, values=np.array([p.position(b) - p.position(a) for a, b in zip(d.at, d.to, strict=True)]))
+            for d in s.coordinate_differences
+        ),
+        levels=tuple(replace(x, value=x.value + float(w[0])) for x, w in zip(s.levels, wrong["level"], strict=True)),
+        alignments=tuple(
+            replace(x, value=_moved(x.value, x.cov, w)) for x, w in zip(s.alignments, wrong["alignment"], strict=True)
+        ),
+        laser_spots=tuple(replace(x, xy=x.xy + w) for x, w in zip(s.laser_spots, wrong["laser"], strict=True)),
+        on_surfaces=tuple(
+            replace(x, offset=_offset(x, w)) for x, w in zip(s.on_surfaces, wrong["surface"], strict=True)
+        ),
     )
 
 
@@ -48,12 +66,31 @@ def _pair(p: Predictor, pair: Pair) -> Pair:
     return replace(pair, b_from_a=motion if isinstance(pair.b_from_a, Pose3) else motion.rotation())
 
 
-def _distance(p: Predictor, d: Distance) -> Distance:
-    return replace(d, value=float(np.linalg.norm(p.position(d.b) - p.position(d.a))))
+def _apart(p: Predictor, d: Distance) -> float:
+    return float(np.linalg.norm(p.position(d.b) - p.position(d.a)))
 
 
-def _coordinates(p: Predictor, c: Coordinates) -> Coordinates:
-    return replace(c, values=np.array([p.position(ref) for ref in c.positions]))
+def _residual(p: Predictor, item: ObservationFactor) -> FloatArray:
+    b = np.asarray(item.factor.linearize(p.values).jacobian()[1])  # whitened, observed minus predicted
+    return np.asarray(-np.linalg.solve(noise_of(item).R(), b))
+
+
+def _moved(value: FloatArray, cov: FloatArray, residual: FloatArray) -> FloatArray:
+    out = np.array(value, dtype=float)
+    out[np.isfinite(np.diag(cov))] += residual
+    return out
+
+
+def _offset(o: OnSurface, residual: FloatArray) -> float:
+    if len(residual) == 1:
+        return float(o.offset + residual[0])
+    if (far := float(np.linalg.norm(residual))) > _NO_RESIDUAL_M:
+        name = o.position.point_id or "a position"
+        raise SurveyError(
+            f"{name} is to lie on line {o.surface_id!r}, but its coordinates are {1e3 * far:.3g} mm off; give it "
+            "coordinates on the line"
+        )
+    return float(o.offset)
 
 
 class _Exact(Rewriting):

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.design.readings import disturbed_readings, draw
+from adjust.design.prediction import Predictor
+from adjust.graph.assembly import StartValues
 from adjust.lenses.models import MODELS
 from adjust.model.observations import ImageBlock
 from adjust.model.result import ParameterName
@@ -20,20 +21,59 @@ Truth = Mapping[ParameterName, Pose3 | FloatArray]
 def disturbed(survey: Survey, rng: Rng, sigmas: FloatArray | None = None) -> Survey:
     """The survey with noisy observations; means of priors are observations too.
 
-    sigmas: (N,) of the readings, where they are not simply those that each has.
+    sigmas: (N,) of the readings, where they are not simply those that each has. Positions that lie on a line by
+    definition stay there.
     """
     of_readings = np.array([r.sigma for r in survey.readings]) if sigmas is None else sigmas
-    again = replace(
+    s = replace(
         survey,
         image_blocks=tuple(_block(b, rng) for b in survey.image_blocks),
         table_readings=tuple(replace(r, angles=r.angles + draw(r.cov, rng)) for r in survey.table_readings),
         pairs=tuple(replace(p, b_from_a=moved(p.b_from_a, draw(p.cov, rng))) for p in survey.pairs),
         distances=tuple(replace(d, value=d.value + d.sigma * rng.standard_normal()) for d in survey.distances),
-        coordinates=tuple(
-            replace(c, values=c.values + draw(c.cov, rng).reshape(-1, 3)) for c in survey.coordinates
+        coordinates=tuple(replace(c, values=c.values + draw(c.cov, rng).reshape(-1, 3)) for c in survey.coordinates),
+    )
+    s = with_drawn_priors(s, rng)
+    drawn = of_readings * rng.standard_normal(len(of_readings))
+    noise = dict(zip((r.reading_id for r in s.readings), drawn, strict=True))
+    for c in s.reading_covariances:
+        noise |= dict(zip(c.reading_ids, draw(c.cov, rng), strict=True))
+    return replace(
+        s,
+        readings=tuple(replace(r, value=r.value + float(noise[r.reading_id])) for r in s.readings),
+        coordinate_differences=tuple(
+            replace(d, values=d.values + draw(d.cov, rng).reshape(-1, 3)) for d in s.coordinate_differences
         ),
-    )  # fmt: skip
-    return replace(with_drawn_priors(again, rng), **disturbed_readings(survey, of_readings, rng))
+        levels=tuple(replace(x, value=x.value + x.sigma * rng.standard_normal()) for x in s.levels),
+        alignments=tuple(replace(x, value=x.value + draw(x.cov, rng)) for x in s.alignments),
+        laser_spots=tuple(replace(x, xy=x.xy + draw(x.cov, rng)) for x in s.laser_spots),
+        on_surfaces=tuple(replace(x, offset=x.offset + x.sigma * rng.standard_normal()) for x in s.on_surfaces),
+    )
+
+
+def displaced(survey: Survey, start: StartValues, rng: Rng) -> Survey:
+    """The survey with its readings as instruments read them that stand a little beside their points, as they will."""
+    sigmas = {s.setup_id: np.array([s.centring_sigma] * 2 + [s.height_sigma]) for s in survey.setups}
+    if not any(s.any() for s in sigmas.values()):
+        return survey
+    true: dict[ParameterName, FloatArray] = {
+        ("centring", i): s * rng.standard_normal(3) for i, s in sigmas.items() if s.any()
+    }
+    before = Predictor(survey, start)
+    for name, vector in before.graph.unknowns.vectors.items():
+        if name[0] == "orientation":  # as it is, not as the readings to come would show it
+            true[name] = vector.full(before.values)
+    there = replace(start, vectors={**start.vectors, **true})
+    return replace(survey, readings=Predictor(survey, there).readings())
+
+
+def draw(cov: FloatArray, rng: Rng) -> FloatArray:
+    """(n,) with covariance (n, n); zero where nothing is known (infinite) and where a component is exact."""
+    noise = np.zeros(len(cov))
+    known = np.flatnonzero(np.isfinite(np.diag(cov)) & (np.diag(cov) > 0.0))
+    if len(known):
+        noise[known] = np.linalg.cholesky(cov[np.ix_(known, known)]) @ rng.standard_normal(len(known))
+    return noise
 
 
 def _block(block: ImageBlock, rng: Rng) -> ImageBlock:

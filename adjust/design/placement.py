@@ -14,7 +14,7 @@ from gtsam import Pose3
 from adjust.model.errors import SurveyError
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.navigation.model import Beacons, Head
-from adjust.navigation.system import System, evaluate, make_system, visible
+from adjust.navigation.system import System, evaluate, in_view, make_system, visible
 
 _START = np.array([3.0] * 3 + [10.0] * 3)  # rad and m: what an attitude and a place can be off at all
 _LEAST_GAIN = 1e-6
@@ -108,17 +108,18 @@ class _Board:
         self.weight = 1.0 / (6.0 * weight**2)
 
     def _fill(self, k: int, system: System, pose: FloatArray, sigma: float) -> None:
-        camera, beacon = (a.astype(np.int64) for a in np.nonzero(visible(system, pose)))
+        camera, beacon = in_view(system, pose)
         if not len(camera):
             return
         _, H, M, _ = evaluate(system, pose, camera, beacon, np.zeros((len(camera), 2)))
         J = np.hstack([H, M]).reshape(len(camera), 2, self.dim)
-        by_point = _by_point(system, pose, camera, beacon)
+        # px/m by the beacon: moving the head by d in its own frame is moving the beacon by -R d
+        by_point = -J[:, :, 3:6] @ pose[:3, :3].T
         for b in np.unique(beacon).tolist():
             mine = np.flatnonzero(beacon == b)
-            own = np.concatenate([by_point[i] for i in mine])
+            own = np.concatenate(by_point[mine])
             noise = self.options.sigma_px**2 * np.eye(len(own)) + sigma**2 * own @ own.T
-            rows = np.linalg.solve(np.linalg.cholesky(noise), np.concatenate([J[i] for i in mine]))
+            rows = np.linalg.solve(np.linalg.cholesky(noise), np.concatenate(J[mine]))
             self.rows[k, b, : len(rows)] = rows
 
     def check(self, n: int) -> None:
@@ -132,15 +133,6 @@ class _Board:
             )
         if n < self.options.at_least:
             raise SurveyError(f"{n} beacons in all; every pose has to see {self.options.at_least}: allow more")
-
-
-def _by_point(system: System, pose: FloatArray, camera: IntArray, beacon: IntArray) -> list[FloatArray]:
-    """Derivatives (2, 3) px/m of the image points by the beacon's coordinates, by small moves of the head.
-
-    Moving the head by d in its own frame is moving the beacon by -R d: the translation columns of H tell it.
-    """
-    _, H, _, _ = evaluate(system, pose, camera, beacon, np.zeros((len(camera), 2)))
-    return [-H[2 * i : 2 * i + 2, 3:] @ pose[:3, :3].T for i in range(len(H) // 2)]
 
 
 class _State:

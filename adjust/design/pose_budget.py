@@ -7,21 +7,21 @@ pose that is weighted by all covariances, as navigation does it, is never worse.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from gtsam import Pose3
 
-from adjust.lenses.models import MODELS, lens_derivatives
+from adjust.lenses.models import MODELS, lens_residuals
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, IntArray
+from adjust.navigation.fit import fit_pose, local
 from adjust.navigation.model import Beacons, Head
-from adjust.navigation.system import make_system, visible
-from adjust.spatial.rigid import rotation_exp, rotation_log, skew
+from adjust.navigation.system import evaluate, in_view, make_system, sightings_of
+from adjust.spatial.rigid import rotation_exp
 
 SOURCES = ("spots", "beacons", "camera positions", "camera attitudes")
 UNITS = ("px", "m", "m", "rad")
-_ITERATIONS = 8
 _OPEN = 1e-9
 
 
@@ -64,13 +64,12 @@ class PoseTolerance:
 
 def pose_budget(head: Head, beacons: Beacons, poses: Sequence[Pose3]) -> PoseBudget:
     """Propagate unit errors of every source at poses ``world_from_station``. Raises SurveyError for an open pose."""
-    system = make_system(head, beacons)
+    x = np.asarray(beacons.x_in_world)
+    system = make_system(*_with_errors(head, x, 1.0))
     full = np.empty((len(poses), len(SOURCES), 6, 6))
     for k, pose in enumerate(poses):
-        camera, beacon = (a.astype(np.int64) for a in np.nonzero(visible(system, pose.matrix())))
-        H, parts = np.zeros((0, 6)), list[FloatArray]()
-        if len(camera):
-            H, *parts = _jacobians(head, pose.matrix(), camera, beacon, np.asarray(beacons.x_in_world))
+        camera, beacon = in_view(system, pose.matrix())
+        _, H, M, _ = evaluate(system, pose.matrix(), camera, beacon, np.zeros((len(camera), 2)))
         N = H.T @ H
         scale = np.sqrt(np.diag(N)) + 1e-300
         if len(H) < 6 or np.linalg.eigvalsh(N / np.outer(scale, scale))[0] < _OPEN:
@@ -79,9 +78,20 @@ def pose_budget(head: Head, beacons: Beacons, poses: Sequence[Pose3]) -> PoseBud
                 "(labsurvey plan FOLDER --place), or leave the pose out"
             )
         G = np.linalg.solve(N, H.T)
-        full[k] = [G @ F @ F.T @ G.T for F in (np.eye(len(H)), *parts)]
+        by = M @ system.F_inverse  # derivatives by the calibration, then by the beacons
+        turns = (system.lens_at + system.n_lens)[:, None] + np.arange(3)
+        parts = (np.eye(len(H)), by[:, system.beacon_at :], by[:, (turns + 3).ravel()], by[:, turns.ravel()])
+        full[k] = [G @ F @ F.T @ G.T for F in parts]
     unit = np.diagonal(full, axis1=2, axis2=3).copy()
-    return PoseBudget(head, tuple(poses), np.asarray(beacons.x_in_world), unit, full)
+    return PoseBudget(head, tuple(poses), x, unit, full)
+
+
+def _with_errors(head: Head, x: FloatArray, sigma: float) -> tuple[Head, Beacons]:
+    """With this sigma (rad, m) of each component of the cameras' poses and of the beacons, and no other error."""
+    variances = [np.concatenate([np.zeros(len(c.lens)), np.full(6, sigma**2)]) for c in head.cameras]
+    table = np.zeros(len(head.cov) - sum(map(len, variances)))
+    cov = np.diag(np.concatenate([*variances, table]))
+    return replace(head, cov=cov), Beacons(tuple(f"b{i}" for i in range(len(x))), x, sigma**2 * np.eye(3 * len(x)))
 
 
 def pose_tolerances(
@@ -101,45 +111,23 @@ def pose_tolerances(
 
 
 def simulate_poses(found: PoseBudget, sigmas: FloatArray, n_trials: int, seed: int = 0) -> FloatArray:
-    """Errors (q, t, 6) of poses solved anew from spots of disturbed cameras and beacons, the exact model throughout."""
+    """Errors (q, t, 6) of poses solved anew from spots of disturbed cameras and beacons, the exact model throughout.
+
+    Raises SurveyError where the spots of a trial lead to no pose.
+    """
     out = np.empty((len(found.poses), n_trials, 6))
-    system = make_system(found.head, _exact(found.x_in_world))
+    system = make_system(*_with_errors(found.head, found.x_in_world, 0.0))
     for k, pose in enumerate(found.poses):
-        rng = np.random.default_rng([seed, k])
-        camera, beacon = (a.astype(np.int64) for a in np.nonzero(visible(system, pose.matrix())))
-        spots = _disturbed_spots(found, pose.matrix(), camera, beacon, sigmas, n_trials, rng)
-        out[k] = _solved(found, pose.matrix(), camera, beacon, spots)
+        rng, true = np.random.default_rng([seed, k]), pose.matrix()
+        camera, beacon = in_view(system, true)
+        spots = _disturbed_spots(found, true, camera, beacon, sigmas, n_trials, rng)
+        for i, uv in enumerate(spots):
+            seen = sightings_of(system, camera, beacon, uv, 1.0)
+            fit = fit_pose(system, seen, np.arange(len(camera)), beacon, true)
+            if fit is None:
+                raise SurveyError(f"pose {k + 1}: spots with errors of these sizes lead to no pose; ask for less")
+            out[k, i] = local(true, fit.pose)
     return out
-
-
-def _exact(x: FloatArray) -> Beacons:
-    return Beacons(tuple(f"b{i}" for i in range(len(x))), x, np.zeros((3 * len(x),) * 2))
-
-
-def _jacobians(
-    head: Head, pose: FloatArray, camera: IntArray, beacon: IntArray, x: FloatArray
-) -> tuple[FloatArray, ...]:
-    """Derivatives of the spots (2n,) by the pose (6), by beacons (3m), camera positions (3c), camera attitudes (3c)."""
-    n, m, c = len(camera), len(x), len(head.cameras)
-    R, t = pose[:3, :3], pose[:3, 3]
-    H, by_b = np.zeros((n, 2, 6)), np.zeros((n, 2, 3 * m))
-    by_p, by_a = np.zeros((n, 2, 3 * c)), np.zeros((n, 2, 3 * c))
-    for k, own in enumerate(head.cameras):
-        rows = np.flatnonzero(camera == k)
-        if not len(rows):
-            continue
-        Rc, tc = own.station_from_camera.rotation().matrix(), own.station_from_camera.translation()
-        q = (x[beacon[rows]] - t) @ R
-        p = (q - tc) @ Rc
-        by_x = lens_derivatives(MODELS[own.model], own.lens, own.constants, p, np.zeros((len(rows), 2)))[2]
-        by_q = by_x @ Rc.T
-        H[rows] = np.concatenate([by_q @ skew(q), -by_q], axis=2)
-        for i, row in enumerate(rows):
-            b = 3 * int(beacon[row])
-            by_b[row, :, b : b + 3] = by_q[i] @ R.T
-        by_p[rows, :, 3 * k : 3 * k + 3] = -by_q
-        by_a[rows, :, 3 * k : 3 * k + 3] = by_x @ skew(p)
-    return tuple(a.reshape(2 * n, -1) for a in (H, by_b, by_p, by_a))
 
 
 def _disturbed_spots(
@@ -164,36 +152,5 @@ def _disturbed_spots(
 def _images(head: Head, k: int, p: FloatArray) -> FloatArray:
     own = head.cameras[k]
     flat = p.reshape(-1, 3)
-    uv = lens_derivatives(MODELS[own.model], own.lens, own.constants, flat, np.zeros((len(flat), 2)))[0]
+    uv = lens_residuals(MODELS[own.model], own.lens, own.constants, flat, np.zeros((len(flat), 2)))
     return np.asarray(uv.reshape(*p.shape[:-1], 2))
-
-
-def _solved(
-    found: PoseBudget, pose: FloatArray, camera: IntArray, beacon: IntArray, spots: FloatArray
-) -> FloatArray:
-    """Errors (t, 6) of least-squares poses, all trials side by side, from the true pose on by Gauss-Newton."""
-    n_trials = len(spots)
-    R, t = np.tile(pose[:3, :3], (n_trials, 1, 1)), np.tile(pose[:3, 3], (n_trials, 1))
-    for _ in range(_ITERATIONS):
-        residual, H = np.zeros(spots.shape), np.zeros((*spots.shape, 6))
-        for k, own in enumerate(found.head.cameras):
-            rows = np.flatnonzero(camera == k)
-            if not len(rows):
-                continue
-            Rc, tc = own.station_from_camera.rotation().matrix(), own.station_from_camera.translation()
-            q = np.einsum("tnj,tjk->tnk", found.x_in_world[beacon[rows]][None] - t[:, None], R)
-            p = ((q - tc) @ Rc).reshape(-1, 3)
-            uv, _, by_x = lens_derivatives(
-                MODELS[own.model], own.lens, own.constants, p, spots[:, rows].reshape(-1, 2).copy()
-            )
-            by_q = by_x @ Rc.T
-            residual[:, rows] = uv.reshape(n_trials, len(rows), 2)
-            both = np.concatenate([by_q @ skew(q.reshape(-1, 3)), -by_q], axis=2)
-            H[:, rows] = both.reshape(n_trials, len(rows), 2, 6)
-        A = H.reshape(n_trials, -1, 6)
-        AT = A.transpose(0, 2, 1)
-        step = -np.linalg.solve(AT @ A, AT @ residual.reshape(n_trials, -1, 1))[..., 0]
-        t = t + np.einsum("tij,tj->ti", R, step[:, 3:])
-        R = R @ rotation_exp(step[:, :3])
-    turn = rotation_log(pose[:3, :3].T @ R)
-    return np.concatenate([turn, (t - pose[:3, 3]) @ pose[:3, :3]], axis=1)

@@ -12,7 +12,7 @@ from adjust.graph.building import GraphBuilder
 from adjust.lenses.models import MODELS, camera_constants, lens_residuals, project
 from adjust.model.boards import deformed, warming_of
 from adjust.model.errors import SurveyError
-from adjust.model.observations import FrameRef, ImageBlock, PositionRef, TableReading
+from adjust.model.observations import FrameRef, ImageBlock, PositionRef, Reading, TableReading
 from adjust.model.survey import BoolArray, Camera, FloatArray, Point, Survey, Target
 from adjust.native.lenses import FISHEYE
 from adjust.observations.factors import ChainPose
@@ -108,10 +108,24 @@ class Predictor:
             cosine = np.abs(cosine)
         return np.asarray(cosine >= np.cos(seeing.widest_incidence))
 
-    def reading(self, reading: TableReading) -> FloatArray:
+    def angles(self, reading: TableReading) -> FloatArray:
         """Angles (k,) rad of a table at an epoch."""
         unknown = self.graph.unknowns.by_name.get(("table_angles", reading.table_id, reading.epoch_id))
         return reading.angles if unknown is None else np.asarray(self.values.atVector(unknown.key))
+
+    def readings(self) -> tuple[Reading, ...]:
+        """All readings as they would be read, rad and m, horizontal angles in (-pi, pi]."""
+        batch = self.graph.terrestrial
+        if batch is None:
+            return ()
+        batch.evaluate(self.values)
+        misses = batch.residual.tolist()
+        return tuple(replace(r, value=r.value + w) for r, w in zip(self.survey.readings, misses, strict=True))
+
+    def reading_sigmas(self) -> FloatArray:
+        """Sigmas (N,) of all readings with the centring of their targets, rad and m."""
+        batch = self.graph.terrestrial
+        return np.zeros(0) if batch is None else np.array(batch.with_sigmas_at(self.values)[0].sigma)
 
     def position(self, ref: PositionRef) -> FloatArray:
         """World coordinates (3,) m."""

@@ -14,8 +14,8 @@ import gtsam
 import numpy as np
 
 from adjust.design.expectation import shared_names
-from adjust.design.noise import disturbed
-from adjust.design.readings import displaced, reading_sigmas
+from adjust.design.noise import displaced, disturbed
+from adjust.design.prediction import Predictor
 from adjust.frames.unknowns import Unknown
 from adjust.graph.assembly import StartValues
 from adjust.graph.building import GraphBuilder
@@ -74,7 +74,7 @@ def run_trials(
     jobs = [(seed, k, min(_CHUNK, n - k)) for k in range(0, n, _CHUNK)]
     count = min(n_workers or workers(), len(jobs))
     done: list[tuple[FloatArray, float] | str] = []
-    task = _Task(ideal, start, names, reading_sigmas(ideal, start))
+    task = _Task(ideal, start, names, Predictor(ideal, start).reading_sigmas())
     if count <= 1:
         for job in jobs:
             done += task(job)

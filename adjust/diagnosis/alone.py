@@ -16,7 +16,8 @@ from adjust.model.result import ParameterName
 from adjust.model.survey import Camera, FloatArray, Survey
 from adjust.spatial.averaging import mean_pose
 from adjust.spatial.rigid import inverse
-from adjust.start.lenses import Sighting, start_lens
+from adjust.start.lens_images import Sighting
+from adjust.start.lenses import start_lens
 from adjust.start.views import View, Views, focal_px, joined, make_views, rays_by_block
 
 

@@ -39,21 +39,14 @@ class Between:
     cause: str
     change: str
     ids: tuple[str, ...]
-    before: float
-    statistic: float
-    p: float
     parameters: int
+    before: float = 1.0
+    statistic: float = 1.0
+    p: float = 1.0
 
 
-@dataclass(frozen=True, eq=False)
-class _Trial:
-    name: str
-    cause: str
-    change: str
-    ids: tuple[str, ...]
-    after: EpochState
-    directions: FloatArray
-    parameters: int
+_Trial = tuple[Between, EpochState, FloatArray]
+"""A cause, the second epoch as it would be without it, and what moves freely between the two (7, k)."""
 
 
 def causes_between(
@@ -69,23 +62,22 @@ def causes_between(
     if not all(np.isfinite(origin(v)).all() for s in (both.before, both.after) for v in s.values):
         return ()  # rotations alone have neither places nor scale
     whole = replace(options, search=False, reference=None)
-    for trial in _trials(both, found):
-        try:
-            after = aligned(both.before, trial.after, trial.directions, range(len(both.names)))
-            test = compare(both.names, both.before, after, trial.directions, both.pooled, whole).before
-        except SurveyError:  # a motion more than the common points can carry
-            continue
-        if test.p > _FITS:
-            out.append(Between(trial.name, trial.cause, trial.change, trial.ids, found.before.statistic,
-                               test.statistic, test.p, trial.parameters))  # fmt: skip
+    for make in (_exchanged, _scaled, _mirrored, _elsewhere):
+        for cause, after, directions in make(both, found):
+            try:
+                after = aligned(both.before, after, directions, range(len(both.names)))
+                test = compare(both.names, both.before, after, directions, both.pooled, whole).before
+            except SurveyError:  # a motion more than the common points can carry
+                continue
+            if test.p > _FITS:
+                out.append(replace(cause, before=found.before.statistic, statistic=test.statistic, p=test.p))
     return tuple(sorted(out, key=lambda b: (b.parameters, b.statistic)))
 
 
-def _trials(both: Common, found: Congruence) -> Iterator[_Trial]:
-    yield from _exchanged(both, found)
-    yield from _scaled(both, found)
-    yield from _mirrored(both, found)
-    yield from _elsewhere(both, found)
+def _places(both: Common) -> tuple[FloatArray, FloatArray]:
+    """(n, 3) m before and after."""
+    before, after = (np.array([origin(v) for v in s.values]) for s in (both.before, both.after))
+    return before, after
 
 
 def _exchanged(both: Common, found: Congruence) -> Iterator[_Trial]:
@@ -100,17 +92,17 @@ def _exchanged(both: Common, found: Congruence) -> Iterator[_Trial]:
             other = {a: b, b: a}
             order = [other.get(n, n) for n in both.names]
             after = replace(both.after.part(order), names=both.names)
-            yield _Trial(
+            yield Between(
                 "names exchanged", f"{a[1]} and {b[1]} are called by each other's names in {found.epochs[1]}",
-                f"exchange them in the tables of {found.epochs[1]}", (a[1], b[1]), after, both.directions, 1,
-            )  # fmt: skip
+                f"exchange them in the tables of {found.epochs[1]}", (a[1], b[1]), 1,
+            ), after, both.directions  # fmt: skip
 
 
 def _scaled(both: Common, found: Congruence) -> Iterator[_Trial]:
     """One scale of all lengths: a unit, or what gives the scale."""
-    x, y = (np.array([origin(v) for v in s.values]) for s in (both.before, both.after))
-    if len(x) < 3:
+    if len(both.names) < 3:
         return
+    x, y = _places(both)
     i, j = np.triu_indices(len(x), 1)
     was, now = (np.linalg.norm(p[i] - p[j], axis=1) for p in (x, y))
     good = (was > 0.0) & (now > 0.0)
@@ -118,18 +110,13 @@ def _scaled(both: Common, found: Congruence) -> Iterator[_Trial]:
     after = moved(both.after, np.array([0.0, 0, 0, 0, 0, 0, np.log(ratio)]))
     unit = next((said for said, r in LENGTH_RATIOS.items() if abs(ratio / r - 1.0) < _EXACT), None)
     epoch = found.epochs[1]
-    cause = (
-        f"all lengths of {epoch} {unit}"
-        if unit
-        else f"all lengths of {epoch} are {1e6 * (1.0 / ratio - 1.0):+.1f} ppm longer than those of {found.epochs[0]}"
-    )
-    change = (
-        f"correct the unit in {epoch}"
-        if unit
-        else ("compare what gives the scale in both: board or scale bar, its temperature, the distance meter")
-    )
-    yield _Trial("unit of lengths" if unit else "scale", cause, change, (), after,
-                 _with(both.directions, _SCALE), 1 if unit else 2)  # fmt: skip
+    if unit:
+        cause = Between("unit of lengths", f"all lengths of {epoch} {unit}", f"correct the unit in {epoch}", (), 1)
+    else:
+        longer = f"{1e6 * (1.0 / ratio - 1.0):+.1f} ppm longer than those of {found.epochs[0]}"
+        cause = Between("scale", f"all lengths of {epoch} are {longer}", "compare what gives the scale in both: board "
+                        "or scale bar, its temperature, the distance meter", (), 2)  # fmt: skip
+    yield cause, after, _with(both.directions, _SCALE)
 
 
 def _mirrored(both: Common, found: Congruence) -> Iterator[_Trial]:
@@ -140,28 +127,29 @@ def _mirrored(both: Common, found: Congruence) -> Iterator[_Trial]:
     many = np.kron(np.eye(len(both.names)), S)
     flipped = replace(both.after, values=tuple(S @ origin(v) for v in both.after.values),
                       cov=many @ both.after.cov @ many.T)  # fmt: skip
-    x, y = (np.array([origin(v) for v in s.values]) for s in (both.before, flipped))
+    x, y = _places(replace(both, after=flipped))
     epoch = found.epochs[1]
-    yield _Trial("mirrored", f"{epoch} is the mirror image of {found.epochs[0]}: one of the two is left-handed",
-                 f"exchange x and y, or turn one axis round, in the given coordinates of {epoch}; or correct its sense "
-                 "of bearings", (), _moved_by(flipped, align(x, y)), _with(both.directions, _RIGID), 2)  # fmt: skip
+    cause = Between("mirrored", f"{epoch} is the mirror image of {found.epochs[0]}: one of the two is left-handed",
+                    f"exchange x and y, or turn one axis round, in the given coordinates of {epoch}; or correct its "
+                    "sense of bearings", (), 2)  # fmt: skip
+    yield cause, _moved_by(flipped, align(x, y)), _with(both.directions, _RIGID)
 
 
 def _elsewhere(both: Common, found: Congruence) -> Iterator[_Trial]:
     """All of it moved and turned as one: not what stands there, but what holds it."""
-    if both.directions.shape[1] >= 6:
+    if both.directions.shape[1] >= 6 or len(both.names) < 3:
         return
-    x, y = (np.array([origin(v) for v in s.values]) for s in (both.before, both.after))
-    if len(x) < 3:
-        return
+    x, y = _places(both)
     move = align(x, y)
     shift = float(np.linalg.norm(transform(move, y) - y, axis=1).max())
     turn = float(np.degrees(np.linalg.norm(rotation_log(move[:3, :3]))))
     names = listed([n[1] for n in both.names], 4)
-    yield _Trial("another datum", f"all of {found.epochs[1]} ({names}) moved as one, by up to {1e3 * shift:.4g} mm and "
-                 f"{turn:.3g} deg: its datum is another, not its parts", "hold the same things at the same values in "
-                 "both epochs, or compare with inner constraints ([datum] kind = \"inner\")", (),
-                 _moved_by(both.after, move), _with(both.directions, _RIGID), 3)  # fmt: skip
+    cause = Between(
+        "another datum", f"all of {found.epochs[1]} ({names}) moved as one, by up to {1e3 * shift:.4g} mm and "
+        f"{turn:.3g} deg: its datum is another, not its parts", "hold the same things at the same values in both "
+        "epochs, or compare with inner constraints ([datum] kind = \"inner\")", (), 3,
+    )  # fmt: skip
+    yield cause, _moved_by(both.after, move), _with(both.directions, _RIGID)
 
 
 def _moved_by(state: EpochState, move: FloatArray) -> EpochState:

@@ -59,8 +59,7 @@ class Budget:
             if (iteration >= _HOPELESS and omega > most) or (iteration >= _BEGUN and omega > lost):
                 raise SurveyError("it leads away")
 
-        clocks = [o.clock for of in (survey.cameras, survey.tables, survey.stations) for o in of]
-        if any(clock is not None for clock in clocks):
+        if any(o.clock is not None for of in (survey.cameras, survey.tables, survey.stations) for o in of):
             first, step = _CLOCKS * first, _CLOCKS * step
         self.spend(first)
         return adjust(survey, start, options, went)

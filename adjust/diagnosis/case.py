@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from adjust.adjustment import AdjustOptions, start_values
+from adjust.adjustment import AdjustOptions
 from adjust.diagnosis.alone import completed, own_lenses, single_views
 from adjust.diagnosis.budget import REST, SCORES, START, STEP, Budget
 from adjust.diagnosis.prediction import Altered, Linear, adjusted_values, started_values
@@ -55,7 +55,7 @@ class Case:
         share = blocks[0] / blocks[1] if blocks[0] and blocks[1] else 1.0
         if blocks[0] or survey.pairs:
             return self._adjusted(survey, None, _OWN, (START + REST) * share, STEP * share)
-        return self._adjusted(survey, start_values(find_start(survey)), _OWN, START + REST)
+        return self._adjusted(survey, find_start(survey), _OWN, START + REST)
 
     def _near(
         self, survey: Survey, result: Adjustment, most: float = np.inf, options: AdjustOptions = _NEAR
@@ -116,7 +116,7 @@ class Case:
 
     def _started(self, survey: Survey) -> StartValues:
         self.budget.spend(START if survey.image_blocks else 0.1)
-        return start_values(find_start(survey))
+        return find_start(survey)
 
     @cached_property
     def views(self) -> Mapping[int, View]:
@@ -127,6 +127,16 @@ class Case:
     def lenses(self) -> Mapping[str, FloatArray]:
         """The lens (n,) of each camera, from its own images alone; a camera without any is not there."""
         return own_lenses(self.survey, {} if self.result is None else values_of(self.result).lenses)
+
+    @cached_property
+    def views_of(self) -> Mapping[tuple[str, str], Mapping[str, View]]:
+        """The same that have a pose, by camera and target, of each by epoch."""
+        out: dict[tuple[str, str], dict[str, View]] = {}
+        for i, view in sorted(self.views.items()):
+            block = self.survey.image_blocks[i]
+            if len(view.poses):
+                out.setdefault((block.camera_id, str(block.target_id)), {})[block.epoch_id] = view
+        return out
 
     def without_each(self, field_name: str) -> Iterator[tuple[str, Altered]]:
         """(id, start values of the survey without its images), where there are any; field_name: target_id, camera_id.

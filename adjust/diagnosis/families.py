@@ -6,8 +6,7 @@ from adjust.diagnosis import effects
 from adjust.diagnosis.bodies import changed_bodies, lost_cameras
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
-from adjust.diagnosis.images.mirrored import mirrored_images
-from adjust.diagnosis.images.turned import turned_alone
+from adjust.diagnosis.images import mirrored_images, turned_alone
 from adjust.diagnosis.names.epochs import misplaced_epochs
 from adjust.diagnosis.names.given import wrong_given
 from adjust.diagnosis.names.images import misnamed_images

@@ -2,9 +2,17 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
+import numpy as np
+from gtsam import Pose3, Rot3
+
+from adjust.lenses.models import MODELS
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
+
+FOCAL, CENTRE = ("fx", "fy", "c"), ("u0", "v0", "xp", "yp")
+"""Components of lenses that focus or zoom change, and another crop of the sensor."""
 
 
 @dataclass(frozen=True)
@@ -131,3 +139,62 @@ class Hypothesis:
     def changed(self) -> Survey | None:
         """The survey to be tried; None where the change turns out not to be possible."""
         return self.survey() if callable(self.survey) else self.survey
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing to mend or to measure, told before anything is adjusted.
+
+    level: ``problem`` spoils or stops the adjustment, ``weak`` weakens it.
+
+    kind: short and constant, for programs. ids: what it concerns. found: what is the matter. remedy: what to do.
+    """
+
+    level: Literal["problem", "weak"]
+    kind: str
+    ids: tuple[str, ...]
+    found: str
+    remedy: str
+
+
+def motion_text(motion: Pose3) -> str:
+    """By how many millimetres and degrees, in its own axes."""
+    shift = ", ".join(f"{1e3 * v:.2f}" for v in motion.translation())
+    angle = np.degrees(np.linalg.norm(Rot3.Logmap(motion.rotation())))
+    return f"by ({shift}) mm and {angle:.3f} deg in its own axes"
+
+
+def block_keys(survey: Survey, camera_id: str, names: Sequence[str], begins: Sequence[str]) -> tuple[Edit, ...]:
+    """``lens.drift``: parameters in blocks that begin at these epochs; none where it is there, or none is free."""
+    lens = survey.cameras_by_id[camera_id].lens
+    changing = tuple(x for x in names if x in lens.free)
+    if lens.drift is not None or not changing:
+        return ()
+    path = ("cameras", camera_id, "lens", "drift")
+    return SetKey((*path, "parameters"), changing), SetKey((*path, "begins"), tuple(begins))
+
+
+def crop_keys(
+    survey: Survey, camera_id: str, epoch_id: str, scale: float = 1.0, shift: Sequence[float] | FloatArray = (0.0, 0.0)
+) -> tuple[Edit, ...]:
+    """``lens.crops``: from this epoch on images of another size, or whose points moved by ``shift`` px.
+
+    None where images are cropped already, or the lens is in mm.
+    """
+    camera = survey.cameras_by_id[camera_id]
+    if camera.lens.crops or MODELS[camera.lens.model].in_mm:
+        return ()
+    path = ("cameras", camera_id, "lens", "crops", epoch_id)
+    resized = scale != 1.0
+    values = {"scale": scale} if resized else {"left_px": -float(shift[0]), "top_px": -float(shift[1])}
+    return (
+        SetKey((*path, "free"), ("scale",) if resized else ("left", "top")),
+        *(SetKey((*path, key), float(f"{value:.6g}")) for key, value in values.items()),
+        SetKey((*path, "size_px"), tuple(round(scale * n) for n in camera.image_size)),
+    )
+
+
+def found_by(keys: Sequence[Edit], change: str) -> str:
+    """What is to be changed, where the adjustment finds it by keys of one table of ``survey.toml`` as well."""
+    table = next((".".join(key.path[:-1]) for key in keys if isinstance(key, SetKey)), "")
+    return f"let the adjustment find it: {table}; or {change}" if table else change

@@ -9,7 +9,7 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Edit, Hypothesis, SetKey
 from adjust.diagnosis.trial import misfit_of
 from adjust.frames.runs import within_motion
-from adjust.model.clocks import INTERVALS, clock_text, epoch_times
+from adjust.model.clocks import INTERVALS, clock_text, clocks_of, epoch_times
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import Camera, Clock, Station, Survey, Table, VectorParameter
@@ -64,13 +64,10 @@ def spoken(survey: Survey) -> tuple[float, str]:
 
 def edits(survey: Survey, freed: Freed, jitter: float = 0.0) -> tuple[Edit, ...]:
     """The keys of a project that make them so."""
-    owners: dict[ParameterName, Clock | None] = {("camera_clock", c.camera_id): c.clock for c in survey.cameras}
-    owners |= {("table_clock", t.table_id): t.clock for t in survey.tables}
-    owners |= {("pose_clock", s.station_id): s.clock for s in survey.stations}
-    timed = epoch_times(survey).unit != INTERVALS
+    clocks, timed = dict(clocks_of(survey)), epoch_times(survey).unit != INTERVALS
     out: list[Edit] = []
     for name, free in freed.items():
-        old, path = owners.get(name), (_TABLES[name[0]], name[1], "clock")
+        old, path = clocks.get(name), (_TABLES[name[0]], name[1], "clock")
         before = () if old is None else old.parameters.free
         out.append(SetKey((*path, "free"), (*before, *(x for x in free if x not in before))))
         if jitter > 0.0:

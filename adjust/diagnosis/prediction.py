@@ -24,8 +24,11 @@ from adjust.native.lenses import FISHEYE
 from adjust.observations.clocks import between, nearest
 from adjust.spatial.rigid import inverse, rigid, transform
 from adjust.statistics.score import LinearScores
+from adjust.testing.criteria import sidak
+from adjust.testing.distributions import chi2
 
 Altered = Mapping[ParameterName, Pose3 | FloatArray]
+_ALPHA = 1e-4
 Links = tuple[tuple[ParameterName, bool], ...]
 """A chain: of every link its name, and whether it is inverted."""
 
@@ -174,7 +177,7 @@ class Prediction:
         """(4, 4) of a link; None where there is no value of it."""
         if name not in self._poses:
             value = self.values.get(name)
-            moved = self._table_motions.get(name) if name[0] == "table_motion" else None
+            moved = self._table_motion(name) if name[0] == "table_motion" else None
             self._poses[name] = value.matrix() if isinstance(value, Pose3) else moved
         return self._poses[name]
 
@@ -210,21 +213,16 @@ class Prediction:
     def _times(self) -> LensTimes:
         return LensTimes(self.survey)
 
-    @cached_property
-    def _table_motions(self) -> dict[ParameterName, FloatArray]:
-        """(4, 4) of every table at every epoch at which its angles are known."""
-        out: dict[ParameterName, FloatArray] = {}
-        for table in self.survey.tables:
-            mine, geometry = [], self.values.get(("table_geometry", table.table_id))
-            for r in self.survey.table_readings if geometry is not None and not isinstance(geometry, Pose3) else ():
-                angles = self.values.get(("table_angles", r.table_id, r.epoch_id), r.angles)
-                if r.table_id == table.table_id and not isinstance(angles, Pose3):
-                    mine.append((("table_motion", r.table_id, r.epoch_id), np.asarray(angles, float)))
-            if mine:
-                g = dict(zip(table.geometry.names, np.asarray(geometry), strict=True))
-                R, t, _ = table_motions(table.axes, g, np.array([angles for _, angles in mine]))
-                out.update(zip([name for name, _ in mine], rigid(R, t), strict=True))
-        return out
+    def _table_motion(self, name: ParameterName) -> FloatArray | None:
+        """(4, 4) of a table at an epoch; None where its geometry or its angles are not known."""
+        geometry, table = self._value(("table_geometry", name[1]), {}), self.survey.tables_by_id[name[1]]
+        angles = self._value(("table_angles", *name[1:]), {})
+        if angles is None:
+            angles = next((r.angles for r in self.survey.table_readings if (r.table_id, r.epoch_id) == name[1:]), None)
+        if geometry is None or angles is None:
+            return None
+        (R,), (t,), _ = table_motions(table.axes, dict(zip(table.geometry.names, geometry, strict=True)), angles[None])
+        return rigid(R, t)
 
     def _moved_body(self, block: ImageBlock, pose: FloatArray, altered: Altered) -> FloatArray:
         station = altered.get(("station_body", self.survey.cameras_by_id[block.camera_id].station_id))
@@ -261,6 +259,10 @@ class Prediction:
 @dataclass(frozen=True, eq=False)
 class Linear(LinearScores):
     """The adjustment that is diagnosed as a linear system: scores of changes of things whose images it predicts."""
+
+    def clear(self, drop: float, freedom: int, looked_at: int) -> bool:
+        """Whether a drop of v'Pv passes its test at a level shared by so many hypotheses (chi-square, Sidak 1967)."""
+        return drop > self.scale * float(chi2.isf(sidak(_ALPHA, looked_at), freedom))
 
     @cached_property
     def prediction(self) -> Prediction:

@@ -11,7 +11,6 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from adjust.adjustment import start_values
 from adjust.diagnosis.case import CAP, Case
 from adjust.graph.assembly import AdjustmentGraph, StartValues, values_of
 from adjust.graph.building import GraphBuilder
@@ -222,7 +221,7 @@ def _given(survey: Survey) -> StartValues | None:
 
 def _start(survey: Survey) -> StartValues | None:
     try:
-        return start_values(find_start(survey))
+        return find_start(survey)
     except (SurveyError, RuntimeError):  # GTSAM raises the latter where a convention that is not meant fits nothing
         return None
 

@@ -6,7 +6,7 @@ in the base (closed form: Shah 2013, in :mod:`adjust.start.closed_forms.hand_eye
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Literal
 
@@ -15,9 +15,8 @@ from gtsam import Pose3, Rot3
 
 from adjust.diagnosis.case import Case
 from adjust.model.errors import SurveyError
-from adjust.model.observations import Pair
 from adjust.model.survey import FloatArray, IntArray, Survey
-from adjust.spatial.averaging import mean_pose, mean_poses, pose_distance
+from adjust.spatial.averaging import mean_pose, mean_poses, pose_distance, typical_distance
 from adjust.spatial.rigid import inverse
 from adjust.start.closed_forms.hand_eye import solve_ax_zb
 
@@ -50,7 +49,7 @@ class Link:
     @cached_property
     def lever(self) -> float:
         """m: the target's distance."""
-        return float(np.median(np.linalg.norm(self.first[:, :3, 3], axis=1)))
+        return typical_distance(self.first)
 
     def joins(self, misses: FloatArray) -> bool:
         """Whether sequences that miss each other by so much (n,) m may belong together."""
@@ -71,8 +70,7 @@ class Fit:
 
     def misses(self, first: FloatArray, second: FloatArray) -> FloatArray:
         """(n,) m: how far first and second are apart, a turn counted at the target's distance."""
-        lever = float(np.median(np.linalg.norm(first[:, :3, 3], axis=1)))
-        return pose_distance(inverse(self.left @ second @ self.right) @ first, np.eye(4), lever)
+        return pose_distance(inverse(self.left @ second @ self.right) @ first, np.eye(4), typical_distance(first))
 
 
 def fitted(kind: str, first: FloatArray, second: FloatArray) -> Fit | None:
@@ -80,8 +78,7 @@ def fitted(kind: str, first: FloatArray, second: FloatArray) -> Fit | None:
     if len(first) < 3:
         return None
     if kind == "rig":
-        lever = float(np.median(np.linalg.norm(first[:, :3, 3], axis=1)))
-        return Fit(mean_pose(first @ inverse(second), lever)[0], np.eye(4))
+        return Fit(mean_pose(first @ inverse(second), typical_distance(first))[0], np.eye(4))
     try:
         right, left, _ = solve_ax_zb(first, second)
     except (SurveyError, np.linalg.LinAlgError):
@@ -97,22 +94,13 @@ def typical(misses: FloatArray) -> float:
 @lru_cache(maxsize=2)
 def links(case: Case) -> tuple[Link, ...]:
     """The rigs and hands of a survey that have five epochs or more in common."""
-    seen = _views_by_thing(case)
+    seen = {key: {e: v.poses[0] for e, v in views.items()} for key, views in case.views_of.items()}
     error = float(np.median([v.error_px[0] / v.focal_px for v in case.views.values() if len(v.poses)] or [0.0]))
     return *_rigs(case.survey, seen, error), *_hands(case.survey, seen, error)
 
 
-def _views_by_thing(case: Case) -> dict[tuple[str, str], dict[str, FloatArray]]:
-    """camera_from_target by (camera, target), then by epoch."""
-    out: dict[tuple[str, str], dict[str, FloatArray]] = {}
-    for i, view in sorted(case.views.items()):
-        block = case.survey.image_blocks[i]
-        if len(view.poses):
-            out.setdefault((block.camera_id, str(block.target_id)), {})[block.epoch_id] = view.poses[0]
-    return out
-
-
 _Views = Mapping[tuple[str, str], Mapping[str, FloatArray]]
+"""``camera_from_target`` by camera and target, then by epoch."""
 
 
 def _rigs(survey: Survey, seen: _Views, error: float) -> Iterator[Link]:
@@ -158,14 +146,6 @@ def hand_poses(survey: Survey) -> dict[str, dict[str, tuple[int, Pose3]]]:
         elif pair.a.epoch_id and not pair.b.epoch_id:
             out.setdefault(pair.a.frame_id, {})[pair.a.epoch_id] = (i, pair.b_from_a.inverse())
     return out
-
-
-def with_pairs(survey: Survey, new: Mapping[int, Pair]) -> Survey:
-    """The survey with other pairs at these positions."""
-    pairs = list(survey.pairs)
-    for i, pair in new.items():
-        pairs[i] = pair
-    return replace(survey, pairs=tuple(pairs))
 
 
 @dataclass(frozen=True)

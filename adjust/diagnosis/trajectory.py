@@ -12,7 +12,7 @@ import numpy as np
 
 from adjust.diagnosis.case import CAP
 from adjust.diagnosis.hypothesis import ChangeColumns, Edit, Rename
-from adjust.diagnosis.images.maps import MIRRORED, TURNED, ImageMap
+from adjust.diagnosis.images import MIRRORED, TURNED, ImageMap
 from adjust.diagnosis.units.conventions import ANGLE_RATIOS
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
@@ -23,8 +23,6 @@ from adjust.testing.distributions import chi2
 _TRIED, _MOST_BEACONS, _SHOWN = 4, 4, 3
 _ALPHA, _EXPLAINED, _BAD = 1e-4, 0.5, 3.0
 """Level shared by all that is tried; share of the misfit that a cause takes away; misfit over its count looked into."""
-
-Change = Callable[[NavigationEpoch], NavigationEpoch]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +38,13 @@ class OfTrajectory:
     kind: str
     ids: tuple[str, ...]
     edits: tuple[Edit, ...]
-    explained: float
-    statistic: float
-    critical: float
+    explained: float = 0.0
+    statistic: float = 0.0
+    critical: float = 0.0
+
+
+Change = Callable[[NavigationEpoch], NavigationEpoch]
+_Trial = tuple[OfTrajectory, Change]
 
 
 def causes_of_trajectory(
@@ -63,30 +65,23 @@ def causes_of_trajectory(
         n = float(sum(2 * len(s.uv) for e in some for s in e.spots))
         if base < _BAD * n:
             return ()
-        trials = list(_trials(head, beacons, some, first, alone, image_sizes))
-        after = [_sum(navigate(head, beacons, [t.make(e) for e in some], alone)) for t in trials]
+        asked = [_forgotten(epoch, pose) for epoch, pose in zip(some, first.epochs, strict=True)]
+        rows = _Rows(epochs)
+        trials = [
+            *_of_images(some, image_sizes, rows), *_of_beacons(some, navigate(head, beacons, asked, alone), rows),
+            *_of_tables(some, rows),
+        ]  # fmt: skip
+        after = [_sum(navigate(head, beacons, [make(e) for e in some], alone)) for _, make in trials]
     except SurveyError:
         return ()
     scale = max(1.0, min([*after, base]) / n)
     critical = float(chi2.isf(sidak(_ALPHA, len(trials)), 1))
     out = []
-    for trial, left in zip(trials, after, strict=True):
-        share = (base - left) / max(base - n, 1.0)
-        if (base - left) / scale > critical and share > _EXPLAINED:
-            out.append(OfTrajectory(trial.name, trial.cause, trial.change, trial.kind, trial.ids, trial.edits(epochs),
-                                    min(1.0, share), (base - left) / scale, critical))  # fmt: skip
+    for (cause, _), left in zip(trials, after, strict=True):
+        share, drop = (base - left) / max(base - n, 1.0), (base - left) / scale
+        if drop > critical and share > _EXPLAINED:
+            out.append(replace(cause, explained=min(1.0, share), statistic=drop, critical=critical))
     return tuple(sorted(out, key=lambda c: -c.statistic)[:_SHOWN])
-
-
-@dataclass(frozen=True, eq=False)
-class _Trial:
-    name: str
-    cause: str
-    change: str
-    kind: str
-    ids: tuple[str, ...]
-    make: Change
-    edits: Callable[[Sequence[NavigationEpoch]], tuple[Edit, ...]] = lambda _: ()
 
 
 def _sum(found: Trajectory) -> float:
@@ -102,69 +97,79 @@ def _misfit(pose: EpochPose) -> float:
     return known + 2.0 * CAP * (len(spots) if pose.status == "none" else without)
 
 
-def _trials(
-    head: Head, beacons: Beacons, some: Sequence[NavigationEpoch], found: Trajectory, alone: NavigateOptions,
-    image_sizes: Mapping[str, tuple[int, int]],
-) -> Iterator[_Trial]:  # fmt: skip
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """The rows of a project that these epochs are."""
+
+    epochs: Sequence[NavigationEpoch]
+
+    def renamed(self, column: str, other: Mapping[str, str]) -> tuple[Edit, ...]:
+        """Ids of a column called otherwise."""
+        return (Rename(self._spots, column, other, self._where()),)
+
+    def mapped(self, camera: str, how: ImageMap, size: tuple[int, int]) -> tuple[Edit, ...]:
+        """Image points of a camera mapped back."""
+        where = self._where(camera_id=(camera,))
+        return (ChangeColumns(self._spots, ("u_px", "v_px"), how.matrix, how.offset(size), where),)
+
+    def angles(self, by: FloatArray) -> tuple[Edit, ...]:
+        """Readings of the table times a matrix (k, k)."""
+        columns = tuple(f"axis{i + 1}_deg" for i in range(len(by)))
+        return (ChangeColumns("table_angles", columns, by, np.zeros(len(by)), self._where()),)
+
+    @property
+    def _spots(self) -> str:
+        named = any(s.beacon_ids is not None for e in self.epochs for s in e.spots)
+        return "image_points" if named else "spots"
+
+    def _where(self, **more: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
+        return {**more, "epoch_id": tuple(e.epoch_id for e in self.epochs)}
+
+
+def _spots(of: Callable[[Spots], Spots]) -> Change:
+    return lambda epoch: replace(epoch, spots=tuple(map(of, epoch.spots)))
+
+
+def _of_images(
+    some: Sequence[NavigationEpoch], image_sizes: Mapping[str, tuple[int, int]], rows: _Rows
+) -> Iterator[_Trial]:
+    """Images of a camera mirrored or turned; those of two exchanged."""
     cameras = list(dict.fromkeys(s.camera_id for e in some for s in e.spots))
     for camera in cameras:
-        for one in MIRRORED:
-            yield _mapped(camera, "images mirrored", "mirrored", one, image_sizes[camera])
-        for one in TURNED.values():
-            yield _mapped(camera, "images turned", "turned", one, image_sizes[camera])
+        for what, how in (*(("mirrored", m) for m in MIRRORED), *(("turned", t) for t in TURNED.values())):
+            yield OfTrajectory(
+                f"images {what}", f"camera {camera}: its images of the epochs navigated are {what}: {how.text}",
+                f"bring them back as they were when camera {camera} was calibrated, and detect them again", "camera",
+                (camera,), rows.mapped(camera, how, image_sizes[camera]),
+            ), _mapped(camera, how, image_sizes[camera])  # fmt: skip
     for a, b in combinations(cameras, 2):
-        yield _Trial(
+        yield OfTrajectory(
             "cameras exchanged", f"cameras {a} and {b} have each other's images at the epochs navigated",
-            f"exchange them between images/{a} and images/{b}", "camera", (a, b), _renamed_cameras({a: b, b: a}),
-            _rename_edits("camera_id", {a: b, b: a}),
-        )  # fmt: skip
-    yield from _beacons(head, beacons, some, found, alone)
-    yield from _tables(some)
+            f"exchange them between images/{a} and images/{b}", "camera", (a, b),
+            rows.renamed("camera_id", {a: b, b: a}),
+        ), _cameras_renamed({a: b, b: a})  # fmt: skip
 
 
-def _mapped(camera: str, name: str, what: str, how: ImageMap, size: tuple[int, int]) -> _Trial:
-    A, b = how.matrix, how.offset(size)
-
-    def make(epoch: NavigationEpoch) -> NavigationEpoch:
-        return replace(epoch, spots=tuple(
-            replace(s, uv=s.uv @ A.T + b, cov=A @ s.cov @ A.T) if s.camera_id == camera else s
-            for s in epoch.spots))  # fmt: skip
-
-    def edits(epochs: Sequence[NavigationEpoch]) -> tuple[Edit, ...]:
-        where = {"camera_id": (camera,), "epoch_id": tuple(e.epoch_id for e in epochs)}
-        named = any(s.beacon_ids is not None for e in epochs for s in e.spots)
-        return (ChangeColumns("image_points" if named else "spots", ("u_px", "v_px"), A, b, where),)
-
-    return _Trial(name, f"camera {camera}: its images of the epochs navigated are {what}: {how.text}",
-                  f"bring them back as they were when camera {camera} was calibrated, and detect them again",
-                  "camera", (camera,), make, edits)  # fmt: skip
+def _mapped(camera: str, how: ImageMap, size: tuple[int, int]) -> Change:
+    return _spots(lambda s: how.back(s, size) if s.camera_id == camera else s)
 
 
-def _renamed_cameras(other: Mapping[str, str]) -> Change:
-    def make(epoch: NavigationEpoch) -> NavigationEpoch:
-        spots = tuple(replace(s, camera_id=other.get(s.camera_id, s.camera_id)) for s in epoch.spots)
-        return replace(epoch, spots=spots)
-
-    return make
+def _cameras_renamed(other: Mapping[str, str]) -> Change:
+    return _spots(lambda s: replace(s, camera_id=other.get(s.camera_id, s.camera_id)))
 
 
-def _rename_edits(column: str, other: Mapping[str, str]) -> Callable[[Sequence[NavigationEpoch]], tuple[Edit, ...]]:
-    def edits(epochs: Sequence[NavigationEpoch]) -> tuple[Edit, ...]:
-        named = any(s.beacon_ids is not None for e in epochs for s in e.spots)
-        where = {"epoch_id": tuple(e.epoch_id for e in epochs)}
-        return (Rename("image_points" if named else "spots", column, other, where),)
+def _beacons_renamed(other: Mapping[str, str]) -> Change:
+    def spots(s: Spots) -> Spots:
+        ids = s.beacon_ids
+        return s if ids is None else replace(s, beacon_ids=tuple(other.get(str(i), i) for i in ids))
 
-    return edits
+    return _spots(spots)
 
 
-def _beacons(
-    head: Head, beacons: Beacons, some: Sequence[NavigationEpoch], found: Trajectory, alone: NavigateOptions
-) -> Iterator[_Trial]:  # fmt: skip
-    """Names of spots exchanged: those that were refused, for what the others say that they are."""
-    poses = {e.epoch_id: e for e in found.epochs}
-    asked = [_forgotten(epoch, poses[epoch.epoch_id]) for epoch in some]
+def _of_beacons(some: Sequence[NavigationEpoch], told: Trajectory, rows: _Rows) -> Iterator[_Trial]:
+    """Names of spots exchanged: those that were refused, for what the others say that they are (``told``)."""
     meant: Counter[tuple[str, str]] = Counter()
-    for epoch, pose in zip(some, navigate(head, beacons, asked, alone).epochs, strict=True):
+    for epoch, pose in zip(some, told.epochs, strict=True):
         for s, labels in zip(epoch.spots, pose.labels, strict=True):
             for name, label in zip(s.beacon_ids or (), labels, strict=False):
                 if name is not None and label is not None and name != label:
@@ -172,17 +177,10 @@ def _beacons(
                     meant[a, b] += 1
     for (a, b), _ in meant.most_common(_MOST_BEACONS):
         other = {a: b, b: a}
-
-        def spot(s: Spots, other: Mapping[str, str] = other) -> Spots:
-            ids = s.beacon_ids
-            return s if ids is None else replace(s, beacon_ids=tuple(other.get(str(i), i) for i in ids))
-
-        def make(epoch: NavigationEpoch, spot: Callable[[Spots], Spots] = spot) -> NavigationEpoch:
-            return replace(epoch, spots=tuple(spot(s) for s in epoch.spots))
-
-        yield _Trial("points exchanged", f"points {a} and {b} are called by each other's names at the epochs navigated",
-                     "exchange them in point_id of image_points.csv", "point", (a, b), make,
-                     _rename_edits("point_id", other))  # fmt: skip
+        yield OfTrajectory(
+            "points exchanged", f"points {a} and {b} are called by each other's names at the epochs navigated",
+            "exchange them in point_id of image_points.csv", "point", (a, b), rows.renamed("point_id", other),
+        ), _beacons_renamed(other)  # fmt: skip
 
 
 def _forgotten(epoch: NavigationEpoch, pose: EpochPose) -> NavigationEpoch:
@@ -195,7 +193,7 @@ def _forgotten(epoch: NavigationEpoch, pose: EpochPose) -> NavigationEpoch:
     return replace(epoch, spots=tuple(spots(s, x) for s, x in zip(epoch.spots, pose.labels, strict=True)))
 
 
-def _tables(some: Sequence[NavigationEpoch]) -> Iterator[_Trial]:
+def _of_tables(some: Sequence[NavigationEpoch], rows: _Rows) -> Iterator[_Trial]:
     """Readings of the table with another sign, order or unit."""
     k = next((len(e.table_angles) for e in some if e.table_angles is not None), 0)
     ways = [(np.diag([-1.0 if i == axis else 1.0 for i in range(k)]), f"axis {axis + 1} counts the other way round")
@@ -204,20 +202,11 @@ def _tables(some: Sequence[NavigationEpoch]) -> Iterator[_Trial]:
     ways += [(factor * np.eye(k), f"its readings {said}") for said, factor in ANGLE_RATIOS.items()
              if said.endswith("read as degrees")] if k else []  # fmt: skip
     for A, said in ways:
-
-        def make(epoch: NavigationEpoch, A: FloatArray = A) -> NavigationEpoch:
-            angles = epoch.table_angles
-            return epoch if angles is None else replace(epoch, table_angles=A @ angles)
-
-        yield _Trial("table readings", f"table: at the epochs navigated {said}", "correct them in table_angles.csv, or "
-                     "navigate with --no-table", "table", (), make, _angle_edits(A))  # fmt: skip
+        yield OfTrajectory(
+            "table readings", f"table: at the epochs navigated {said}",
+            "correct them in table_angles.csv, or navigate with --no-table", "table", (), rows.angles(A),
+        ), _read_as(A)  # fmt: skip
 
 
-def _angle_edits(by: FloatArray) -> Callable[[Sequence[NavigationEpoch]], tuple[Edit, ...]]:
-    columns = tuple(f"axis{i + 1}_deg" for i in range(len(by)))
-
-    def edits(epochs: Sequence[NavigationEpoch]) -> tuple[Edit, ...]:
-        where = {"epoch_id": tuple(e.epoch_id for e in epochs)}
-        return (ChangeColumns("table_angles", columns, by, np.zeros(len(by)), where),)
-
-    return edits
+def _read_as(by: FloatArray) -> Change:
+    return lambda e: e if e.table_angles is None else replace(e, table_angles=by @ e.table_angles)

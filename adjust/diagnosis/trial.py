@@ -201,9 +201,7 @@ def _at_best_scale(squares: FloatArray) -> float:
 
 def n_other_components(survey: Survey, used_only: bool = True) -> int:
     """Observed components in use, or all, that are no image points."""
-    kinds = (survey.table_readings, survey.pairs, survey.distances, survey.coordinates, survey.readings, survey.levels,
-             survey.coordinate_differences, survey.alignments, survey.laser_spots, survey.on_surfaces)  # fmt: skip
-    return sum(_n_components([o for o in kind if o.used or not used_only]) for kind in kinds)
+    return sum(_n_components([o for o in kind if o.used or not used_only]) for kind in survey.others.values())
 
 
 def _left_out(survey: Survey) -> set[tuple[str, ...]]:

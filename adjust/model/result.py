@@ -1,10 +1,10 @@
 """What an adjustment gives back. Every estimated quantity is one ``Estimate`` under its ``ParameterName``."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
-from typing import Literal, Protocol
+from typing import Literal, Protocol, overload
 
 import numpy as np
 from gtsam import Pose3
@@ -83,6 +83,7 @@ class ReadingResiduals:
     sigma: a priori, with the target's centring. residual: adjusted minus observed.
     redundancy: diag(Q_vv P). test: w^2 with w = (P v)_i / sqrt((P Q_vv P)_ii), chi-square with one degree of freedom,
     the square of ``standardized`` but for readings with a joint covariance. weighted_square: shares of v'Pv.
+    influence: diag(A Q A'), whitened.
     """
 
     observed: FloatArray
@@ -94,6 +95,7 @@ class ReadingResiduals:
     test: FloatArray
     weighted_square: FloatArray
     used: BoolArray
+    influence: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +121,8 @@ class ObservationResidual:
     used: bool
 
 
+Named = tuple[str, str, tuple[str, ...], tuple[str, ...], tuple[str, ...]]
+"""Kind, group, ids, components and units of an observation."""
 _OF_COMPONENTS = ("observed", "adjusted", "residual", "sigma", "redundancy", "standardized")
 
 
@@ -153,18 +157,62 @@ class OtherArrays:
         return out
 
 
+class Residuals(Sequence[ObservationResidual]):
+    """Observations of which the ``arrays`` (M) are known; each is made when it is asked for."""
+
+    def __init__(self, arrays: OtherArrays, named: Callable[[int], Named]) -> None:
+        self.arrays, self._named = arrays, named
+        self._ptr = [0, *np.cumsum(arrays.n_components).tolist()]
+        self._made: list[ObservationResidual | None] = [None] * len(arrays.used)
+
+    def __len__(self) -> int:
+        return len(self.arrays.used)
+
+    @overload
+    def __getitem__(self, index: int) -> ObservationResidual: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[ObservationResidual]: ...
+
+    def __getitem__(self, index: int | slice) -> ObservationResidual | Sequence[ObservationResidual]:
+        if isinstance(index, slice):
+            mine = range(len(self))[index]
+            return self if len(mine) == len(self) and mine.step == 1 else tuple(map(self._one, mine))
+        return self._one(range(len(self))[index])
+
+    def __iter__(self) -> Iterator[ObservationResidual]:
+        return map(self._one, range(len(self)))
+
+    def _one(self, i: int) -> ObservationResidual:
+        found = self._made[i]
+        if found is None:
+            a, of = self.arrays, slice(self._ptr[i], self._ptr[i + 1])
+            found = self._made[i] = ObservationResidual(
+                *self._named(i), a.observed[of], a.adjusted[of], a.residual[of], a.sigma[of], a.redundancies[of],
+                a.standardized[of], a.test[i].item(), a.used[i].item(),
+            )  # fmt: skip
+        return found
+
+
+def arrays_of(residuals: Sequence[ObservationResidual]) -> OtherArrays:
+    """Observations as arrays; none of ``Residuals`` is made for that."""
+    if isinstance(residuals, Residuals):
+        return residuals.arrays
+    n = np.array([len(o.components) for o in residuals], dtype=np.int64)
+    columns = [np.concatenate([np.zeros(0), *(getattr(o, name) for o in residuals)]) for name in _OF_COMPONENTS]
+    redundancy = np.maximum.reduceat(columns[4], np.cumsum(n) - n) if len(n) else np.zeros(0)
+    used = np.array([o.used for o in residuals], dtype=np.bool_)
+    return OtherArrays(n, used, np.array([o.test for o in residuals]), redundancy, *columns)
+
+
 @lru_cache(2)  # those of an adjustment that is given another warning are the same
 def _other_arrays(residuals: Sequence[ObservationResidual], readings: ReadingResiduals | None) -> OtherArrays:
-    first = residuals[: len(residuals) - (0 if readings is None else len(readings.used))]
-    n = np.array([len(o.components) for o in first], dtype=np.int64)
-    columns = [np.concatenate([np.zeros(0), *(getattr(o, name) for o in first)]) for name in _OF_COMPONENTS]
-    redundancy = np.maximum.reduceat(columns[4], np.cumsum(n) - n) if len(n) else np.zeros(0)
-    parts = [(n, np.array([o.used for o in first], dtype=np.bool_), np.array([o.test for o in first]), redundancy,
-              *columns)]  # fmt: skip
-    if readings is not None:
-        one, r = np.ones(len(readings.used), dtype=np.int64), readings
-        parts.append((one, r.used, r.test, r.redundancy, *(getattr(r, name) for name in _OF_COMPONENTS)))
-    return OtherArrays(*(np.concatenate(x) for x in zip(*parts, strict=True)))
+    first = arrays_of(residuals[: len(residuals) - (0 if readings is None else len(readings.used))])
+    if readings is None:
+        return first
+    one, r = np.ones(len(readings.used), dtype=np.int64), readings
+    last = OtherArrays(one, r.used, r.test, r.redundancy, *(getattr(r, name) for name in _OF_COMPONENTS))
+    return OtherArrays(*(np.concatenate([getattr(x, f.name) for x in (first, last)]) for f in fields(first)))
 
 
 @dataclass(frozen=True)

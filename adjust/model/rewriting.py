@@ -1,4 +1,7 @@
-"""A survey with other parameters: the one walk over its lenses, poses, tables, warps and points by their names."""
+"""A survey with other parameters: the one walk over all of them, by their names.
+
+And with other rows of one of its lists.
+"""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -11,6 +14,7 @@ from adjust.model.survey import (
     PointParameter,
     PoseParameter,
     Station,
+    Surface,
     Survey,
     Table,
     Target,
@@ -26,7 +30,7 @@ class Rewriting:
     """What becomes of every parameter; a method that is not written anew leaves all of its kind as they are."""
 
     def vector(self, name: ParameterName, given: Vector) -> Vector:
-        """A lens, a table's geometry or a warp."""
+        """A lens, a table's geometry, a warp, what an instrument, a beam or a surface has, the tilt of the vertical."""
         return given
 
     def pose(self, name: ParameterName, given: PoseParameter) -> PoseParameter:
@@ -52,7 +56,18 @@ class Rewriting:
             tables=tuple(map(self._table, survey.tables)),
             targets=tuple(map(self._target, survey.targets)),
             points=tuple(replace(p, x_in_world=self.point(("point", p.point_id), p.x_in_world)) for p in survey.points),
+            instruments=tuple(
+                replace(x, parameters=self.vector(("instrument", x.instrument_id), x.parameters))
+                for x in survey.instruments
+            ),
+            beams=tuple(replace(x, parameters=self.vector(("beam", x.beam_id), x.parameters)) for x in survey.beams),
+            surfaces=tuple(map(self._surface, survey.surfaces)),
+            vertical=replace(survey.vertical, tilt=self.vector(("vertical",), survey.vertical.tilt)),
         )
+
+    def _surface(self, s: Surface) -> Surface:
+        name = ("surface", s.surface_id)
+        return s if s.parameters is None else replace(s, parameters=self.vector(name, s.parameters))
 
     def _camera(self, c: Camera) -> Camera:
         lens = self.vector(("lens", c.camera_id), c.lens)
@@ -75,3 +90,16 @@ class Rewriting:
         name = ("carrier_from_target", t.target_id)
         return replace(t, warp=warp, carrier_from_target=self.pose(name, t.carrier_from_target),
                        epochs=self.epochs(name, t.epochs, t.carrier_from_target))  # fmt: skip
+
+
+def with_rows(survey: Survey, field: str, new: Mapping[int, object]) -> Survey:
+    """The survey with others at these positions of one of its lists: "readings", "image_blocks", "targets" ..."""
+    fields: Fields = {field: tuple(new.get(i, row) for i, row in enumerate(getattr(survey, field)))}
+    return replace(survey, **fields)
+
+
+def with_changed(survey: Survey, field: str, owner: str, **changes: object) -> Survey:
+    """The survey with other values of one thing: of ``targets`` that whose ``target_id`` is ``owner``."""
+    key = f"{field.removesuffix('s')}_id"
+    rows = {i: replace(x, **changes) for i, x in enumerate(getattr(survey, field)) if getattr(x, key) == owner}
+    return with_rows(survey, field, rows)

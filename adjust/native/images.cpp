@@ -14,7 +14,7 @@ extern "C" __attribute__((visibility("default"))) const Entry *images() {
         entry<leaf_rows>("leaf_rows"), entry<tree_block>("tree_block"), entry<invert_cliques>("invert_cliques"), entry<inversion_room>("inversion_room"),
         entry<covariance_room>("covariance_room"), entry<covariance_rows>("covariance_rows"), entry<clique_covariance>("clique_covariance"),
         entry<joint_blocks>("joint_blocks"), entry<solution_room>("solution_room"),
-        entry<solve_cliques>("solve_cliques"),
+        entry<solve_cliques>("solve_cliques"), entry<sets_room>("sets_room"), entry<sets_among>("sets_among"),
         entry<refine_views>("refine_views"), entry<errors_of_views>("errors_of_views"),
         entry<offsets_of_views>("offsets_of_views"), entry<homographies>("homographies"),
         entry<plane_poses>("plane_poses"), entry<fit_lens>("fit_lens"), entry<turns_by>("turns_by"),

@@ -4,6 +4,8 @@
 // before children. Blocks of front x width numbers, row by row, begin at at[c]: in data first [R S], later
 // [R^-1, -R^-1 S]; in cov the rows of the covariance that belong to the frontal keys.
 #pragma once
+#include <algorithm>
+
 #include "dense.h"
 
 namespace {
@@ -245,6 +247,122 @@ inline void solve_cliques(Ints up, Ints down, Ints key_ptr, Ints keys, Ints dims
         place(c);
         const double *C = times(nf, n, false, [&](int64_t i, int64_t j) { return i <= j ? R[i * n + j] : 0.0; });
         for (int64_t i = 0; i < nf; ++i) std::memcpy(x.data + rows[i] * m, C + i * pm, line);
+    }
+}
+
+// The ways of some keys up a tree. parents: of cliques, which have lower numbers. of_key, of_clique: zero at first; of set s
+// 2 s + 2 for keys that were asked for and are left, and cliques that a way has reached; 2 s + 1 for what else was seen.
+struct Ways {
+    explicit Ways(Reader &r) : parents(r), n_front(r), of_key(r), of_clique(r), way(r), heap(r) {}
+    Ints parents, n_front;
+    Out<int64_t, 1> of_key, of_clique, way, heap;  // the last two have room for all cliques
+    int64_t seen = -1, wanted = 0, waiting = 0, length = 0;  // length: of the way
+
+    void begin() { seen += 2, wanted = waiting = length = 0; }
+    void push(int64_t clique) {
+        heap.data[waiting++] = clique;
+        std::push_heap(heap.data, heap.data + waiting);
+    }
+    // Whether it was not yet.
+    bool ask(int64_t key, int64_t home) {
+        if (of_key[key] > seen) return false;
+        of_key.data[key] = seen + 1;
+        ++wanted;
+        if (of_clique[home] < seen) {
+            of_clique.data[home] = seen;
+            push(home);
+        }
+        return true;
+    }
+    // The first clique, from the leaves up, with all keys that are left, or -1; the way below it, parents last. fresh(key): of
+    // each that is met there for the first time.
+    int64_t climb(const Tree &t, auto fresh) {
+        for (int64_t reached = 0; waiting;) {
+            std::pop_heap(heap.data, heap.data + waiting);
+            const int64_t c = heap[--waiting], begin = t.key_ptr[c], end = t.key_ptr[c + 1], p = parents[c];
+            reached -= of_clique[c] > seen;
+            int64_t inside = 0;
+            for (int64_t i = begin; i < end; ++i) inside += of_key[t.keys[i]] > seen;
+            if (!reached && inside == wanted) return c;
+            for (int64_t i = begin; i < end; ++i) {
+                const int64_t k = t.keys[i];
+                const bool left = of_key[k] > seen, own = i < begin + n_front[c];
+                if (of_key[k] < seen) fresh(k);
+                wanted -= own && left;
+                if (own || !left) of_key.data[k] = seen;
+            }
+            way.data[length++] = c;
+            if (p < 0) continue;
+            if (of_clique[p] < seen) push(p);
+            reached += of_clique[p] <= seen;
+            of_clique.data[p] = seen + 1;
+        }
+        return -1;
+    }
+};
+
+// Numbers of scratch that sets_among takes, of sets of m rows at most.
+inline int64_t sets_room(Ints width, int64_t m) {
+    int64_t most = 0;
+    for (int64_t c = 0; c < width.n[0]; ++c) most = larger(most, width[c] * (width[c] + 2 * padded_most(m)));
+    return larger(most, solution_room(width, m));
+}
+
+// G (m, m) += x' Q x of those rows x (., m) of the keys of a clique that the ways have met.
+inline void add_covariance(const Tree &t, int64_t clique, const Ways &ways, Ints first, const double *x, int64_t m, double *work, double *G) {
+    const int64_t begin = t.key_ptr[clique], end = t.key_ptr[clique + 1], pm = padded(m);
+    const auto met = [&](int64_t i) { return ways.of_key[t.keys[i]] >= ways.seen; };
+    int64_t n = 0, at = 0;
+    for (int64_t i = begin; i < end; ++i) n += met(i) * t.dims[t.keys[i]];
+    double *Q = work, *X = Q + n * n, *Y = X + n * pm;
+    for (int64_t i = begin; i < end; ++i) {
+        const int64_t a = t.keys[i], rows = t.dims[a];
+        if (!met(i)) continue;
+        for (int64_t r = 0; r < rows; ++r) {
+            std::memcpy(X + (at + r) * pm, x + (first[a] + r) * m, sizeof(double) * m);
+            std::memset(X + (at + r) * pm + m, 0, sizeof(double) * (pm - m));
+        }
+        for (int64_t j = begin, column = 0; j <= i; ++j) {
+            if (!met(j)) continue;
+            const int64_t columns = t.dims[t.keys[j]];
+            t.block(a, t.keys[j], Q + at * n + column, n);
+            for (int64_t r = 0; r < rows; ++r)
+                for (int64_t k = 0; k < columns; ++k) Q[(column + k) * n + at + r] = Q[(at + r) * n + column + k];
+            column += columns;
+        }
+        at += rows;
+    }
+    product(Q, n, X, pm, Y, pm, n, m, n);
+    for (int64_t r = 0; r < n; ++r)
+        for (int64_t i = 0; i < m; ++i) add_multiple(X[r * pm + i], Y + r * pm, G + i * m, m);
+}
+
+// A Q A' of sets of sparse rows A (row_ptr, columns, entries), set s from row set_ptr[s] on, one after the other in out: u'u
+// with R'u = A' on the ways to the first clique that holds all that is left, and this with its covariance. key_of: of every
+// column. x: for every column as many numbers as the largest set has rows.
+inline void sets_among(Ints set_ptr, Ints row_ptr, Ints columns, Vector entries, const Tree &t, Ways ways, Ints key_of, Ints first, Vector data,
+                       Out<double, 1> out, Out<double, 1> x, Out<int64_t, 1> rows, Out<double, 1> work) {
+    double *G = out.data;
+    for (int64_t s = 0; s + 1 < set_ptr.n[0]; ++s) {
+        const int64_t begin = set_ptr[s], m = set_ptr[s + 1] - begin;
+        const auto clear = [&](int64_t k) { std::memset(x.data + first[k] * m, 0, sizeof(double) * m * t.dims[k]); };
+        ways.begin();
+        for (int64_t e = row_ptr[begin]; e < row_ptr[begin + m]; ++e)
+            if (const int64_t k = key_of[columns[e]]; ways.ask(k, t.home[k])) clear(k);
+        const int64_t top = ways.climb(t, clear);
+        for (int64_t r = 0; r < m; ++r)
+            for (int64_t e = row_ptr[begin + r]; e < row_ptr[begin + r + 1]; ++e) x.data[columns[e] * m + r] += entries[e];
+        std::reverse(ways.way.data, ways.way.data + ways.length);
+        solve_cliques({ways.way.data, {ways.length}}, {ways.way.data, {0}}, t.key_ptr, t.keys, t.dims, first, t.front, t.width, t.at, data,
+                      {x.data, {key_of.n[0], m}}, rows, work);
+        std::memset(G, 0, sizeof(double) * m * m);
+        for (int64_t i = 0; i < ways.length; ++i) {
+            const double *u = x.data + first[t.keys[t.key_ptr[ways.way[i]]]] * m;
+            for (int64_t r = 0; r < t.front[ways.way[i]]; ++r, u += m)
+                for (int64_t k = 0; k < m; ++k) add_multiple(u[k], u, G + k * m, m);
+        }
+        if (top >= 0) add_covariance(t, top, ways, first, x.data, m, work.data, G);
+        G += m * m;
     }
 }
 

@@ -30,6 +30,12 @@ _solve_cliques = Function(
     "solve_cliques",
     "up[*] down[*] key_ptr[C+1] keys[*] dims[K] first[*] front[C] width[C] at[C] data[*] x[*,*] rows[*] work[*]",
 )
+_sets_room = Function("sets_room", "width[C] m")
+_sets_among = Function(
+    "sets_among",
+    f"set_ptr[*] row_ptr[*] columns[e] entries[e] {TREE} parents[C] n_front[C] of_key[K] of_clique[C] way[C] heap[C] "
+    "key_of[n] first[*] data[*] out[*] x[*] rows[*] work[*]",
+)
 
 
 class TreeArrays(NamedTuple):
@@ -129,3 +135,19 @@ def solve_cliques(
     work = np.empty(_solution_room(tree.width, x.shape[1]))
     _solve_cliques(up, down, tree.key_ptr, tree.keys, tree.dims, first, tree.front, tree.width, tree.at, data, x, rows,
                    work)  # fmt: skip
+
+
+def sets_among(
+    set_ptr: IntArray, row_ptr: IntArray, columns: IntArray, entries: FloatArray, tree: TreeArrays, parents: IntArray,
+    n_front: IntArray, key_of: IntArray, first: IntArray, data: FloatArray,
+) -> list[FloatArray]:  # fmt: skip
+    """A Q A' (m, m) of sets of sparse rows, set i from row ``set_ptr[i]`` on; key_of (n,): of every column."""
+    sizes, C = np.diff(set_ptr), len(parents)
+    m = int(sizes.max(initial=0))
+    marks = (np.zeros(n, dtype=np.int64) for n in (len(tree.dims), C, C, C))
+    out, x = np.empty(int(sizes @ sizes)), np.empty(len(key_of) * m)
+    rows, work = np.empty(int(tree.width.max(initial=0)), dtype=np.int64), np.empty(_sets_room(tree.width, m))
+    _sets_among(set_ptr, row_ptr, columns, entries, *tree, parents, n_front, *marks, key_of, first, data, out, x, rows,
+                work)  # fmt: skip
+    ends = np.cumsum(sizes**2).tolist()
+    return [out[end - n * n : end].reshape(n, n) for end, n in zip(ends, sizes.tolist(), strict=True)]

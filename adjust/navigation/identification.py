@@ -6,7 +6,6 @@ only the beacons that it predicts near a spot are tried. The candidates are adju
 by their evidence: what cannot be told apart is reported, all of it.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -15,50 +14,28 @@ import numpy as np
 from adjust.lenses.models import MODELS, focal_length_px
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.navigation import FoundArrays, SkyArrays, search
-from adjust.navigation.fit import PoseFit, Prior, fit_pose, fit_without_outliers, local, log_evidence
+from adjust.navigation.evidence import (
+    GATE,
+    KEPT,
+    MOST_NAMINGS,
+    Candidate,
+    allowed_namings,
+    gate_distances,
+    image_areas,
+    judged,
+    score_of,
+)
+from adjust.navigation.fit import Prior, fit_pose
 from adjust.navigation.model import NavigateOptions
-from adjust.navigation.precision import spot_noise
-from adjust.navigation.system import Sightings, System, evaluate, station_rays, visible
+from adjust.navigation.precision import own_covariance
+from adjust.navigation.system import Sightings, System, station_rays
 from adjust.spatial.rigid import rigid
-from adjust.testing.distributions import chi2
 
-_KEPT = 400
-_ADJUSTED = 60
 _COARSE = 25.0  # difference in the coarse score, about ln of the evidence, beyond which nobody looks
-_HOPELESS = 40.0  # difference in -2 ln evidence beyond which a candidate is of no interest
-_MARGIN = 0.05  # tangent of an angle; a beacon just outside may be the one of a spot at the border
-_GATE = float(chi2.isf(1e-4, 2))
-_MOST_NAMINGS = 24
 _DOUBTED = 6
 _BEYOND_DOUBT = 20.0  # 2 ln of a likelihood ratio
 _CROWDED = 3.0  # beacons near a spot beyond which naming in turn is hopeless
 _MOST_TRIPLES = 400
-_SAME = 1e-3  # rad and m; two roots of the minimal problem that one adjustment brings together
-
-
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """A pose that explains an epoch: its fit, what was rejected (spots), -2 ln evidence and posterior probability.
-
-    more: whether there were more explanations than were adjusted.
-    """
-
-    fit: PoseFit
-    rejected: tuple[int, ...]
-    score: float
-    probability: float = 1.0
-    more: bool = False
-
-
-def allowed_namings(system: System, seen: Sightings) -> BoolArray:
-    """(n, m): all beacons for a spot without a name, its own for one with a name."""
-    m = len(system.beacons.beacon_ids)
-    out = np.ones((len(seen.uv), m), dtype=np.bool_)
-    for row, label in zip(out, seen.label, strict=True):
-        if label >= 0:
-            row[:] = False
-            row[label] = True
-    return out
 
 
 def without_prior(system: System, seen: Sightings, options: NavigateOptions) -> tuple[Candidate, ...]:
@@ -66,7 +43,7 @@ def without_prior(system: System, seen: Sightings, options: NavigateOptions) -> 
     if len(seen.uv) < 3:
         return ()
     poses, matches = _hypotheses(system, seen, allowed_namings(system, seen), options)
-    return _judged(system, seen, list(zip(poses, matches, strict=True)), None, options)
+    return judged(system, seen, list(zip(poses, matches, strict=True)), None, options)
 
 
 def _hypotheses(
@@ -77,8 +54,8 @@ def _hypotheses(
     farthest = options.farthest_m
     if farthest is None:
         farthest = 10.0 * float(np.linalg.norm(np.ptp(x, axis=0)))
-    R, t = np.empty((_KEPT, 3, 3)), np.empty((_KEPT, 3))
-    score, match = np.full(_KEPT, -np.inf), np.empty((_KEPT, n), dtype=np.int64)
+    R, t = np.empty((KEPT, 3, 3)), np.empty((KEPT, 3))
+    score, match = np.full(KEPT, -np.inf), np.empty((KEPT, n), dtype=np.int64)
     missed = np.where(seen.present, -np.log(1.0 - options.detection), 0.0)
     named = np.log(_sky(system) / np.radians(options.gate_deg) ** 2)[seen.camera]
     origin, ray = station_rays(system, seen)
@@ -96,11 +73,8 @@ def _hypotheses(
 
 def _sky(system: System) -> FloatArray:
     """Solid angle (c,) of each camera's image, about."""
-    out = []
-    for camera in system.head.cameras:
-        focal = focal_length_px(MODELS[camera.model], camera.lens, camera.constants)
-        out.append(camera.image_size[0] * camera.image_size[1] / focal**2)
-    return np.array(out)
+    focal = [focal_length_px(MODELS[c.model], c.lens, c.constants) for c in system.head.cameras]
+    return np.asarray(image_areas(system) / np.array(focal) ** 2)
 
 
 def _triples(ray: FloatArray) -> IntArray:
@@ -119,20 +93,20 @@ def with_prior(system: System, seen: Sightings, prior: Prior, options: NavigateO
     if len(prior.rows) < 6:
         return _with_partial_prior(system, seen, prior, options)
     distance, support = gate_distances(system, seen, prior, options)
-    near = (distance < _GATE) & allowed_namings(system, seen) & (support > 0.0)
+    near = (distance < GATE) & allowed_namings(system, seen) & (support > 0.0)
     if len(seen.uv) >= 3 and near.sum() > _CROWDED * near.any(axis=1).sum():
         poses, matches = _hypotheses(system, seen, near, options)
         trials = _doubted(list(zip(poses, matches, strict=True)), support)
-        found = _judged(system, seen, trials, prior, options)
+        found = judged(system, seen, trials, prior, options)
         if found:
             return _agreed(system, seen, prior, found, options)
     trials = _doubted(_in_turn(system, seen, prior, near, distance, options), support)
-    return _agreed(system, seen, prior, _judged(system, seen, trials, prior, options), options)
+    return _agreed(system, seen, prior, judged(system, seen, trials, prior, options), options)
 
 
 def _doubted(trials: list[tuple[FloatArray, IntArray]], support: FloatArray) -> list[tuple[FloatArray, IntArray]]:
     """The likeliest trials, and each again without one of the spots that the prior alone does not tell from chance."""
-    out = trials[: _MOST_NAMINGS // 3]
+    out = trials[: MOST_NAMINGS // 3]
     known = {match.tobytes() for _, match in out}
     for pose, match in trials[:_DOUBTED]:
         for i in np.flatnonzero(match >= 0):
@@ -172,57 +146,10 @@ def _with_partial_prior(
 ) -> tuple[Candidate, ...]:
     if len(seen.uv) >= 3:
         poses, matches = _hypotheses(system, seen, allowed_namings(system, seen), options)
-        return _judged(system, seen, list(zip(poses, matches, strict=True)), prior, options)
+        return judged(system, seen, list(zip(poses, matches, strict=True)), prior, options)
     if np.any(seen.label < 0):
         return ()
-    return _judged(system, seen, [(prior.pose, seen.label)], prior, options)
-
-
-def gate_distances(
-    system: System, seen: Sightings, prior: Prior, options: NavigateOptions
-) -> tuple[FloatArray, FloatArray]:
-    """Squared distance (n, m) of every spot from where the prior expects every beacon, in sigmas.
-
-    Infinite for a beacon far outside the field of view, where the distortion may fold it back into the image.
-
-    The second (n, m): 2 ln of how much likelier an origin of the spot the beacon is than chance. A beacon of vague
-    position may be near everything and explains nothing. A spot that came with its name needs no such proof.
-    """
-    margin = _MARGIN + 4.0 * float(np.sqrt(np.diag(prior.total)[:3].max()))
-    ahead = visible(system, prior.pose, margin)
-    distance, log_det = _gates(system, seen, prior, ahead)
-    vague = distance + log_det - 2.0 * np.log(options.detection / (1.0 - options.detection))
-    by_chance = 2.0 * np.log(image_areas(system)[seen.camera] / options.false_spots)
-    return distance, np.where((seen.label >= 0)[:, None], np.inf, by_chance[:, None] - vague)
-
-
-def _gates(system: System, seen: Sightings, prior: Prior, ahead: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Squared distance (n, m) in sigmas of spots from beacons at a pose of error ``e + B eta``; ln det(2 pi S).
-
-    ahead (c, m): the others are infinitely far.
-    """
-    shape = len(seen.uv), ahead.shape[1]
-    distance, log_det = np.full(shape, np.inf), np.zeros(shape)
-    near_by = ahead & (np.bincount(seen.camera, minlength=len(ahead)) > 0)[:, None]
-    camera, beacon = map(np.ascontiguousarray, np.nonzero(near_by))
-    n = len(beacon)
-    predicted, H, M, _ = evaluate(system, prior.pose, camera, beacon, np.zeros((n, 2)))
-    common = H @ prior.B + M
-    common = common.reshape(n, 2, common.shape[-1])  # n may be 0: nothing is ahead
-    by_pose = (H @ prior.cov).reshape(n, 2, 6)
-    base = by_pose @ H.reshape(n, 2, 6).transpose(0, 2, 1) + common @ common.transpose(0, 2, 1)
-    spot, near = np.nonzero(seen.camera[:, None] == camera)
-    (xx, xy), (_, yy) = (base[near] + seen.cov[spot]).transpose(1, 2, 0)
-    x, y = (predicted.reshape(n, 2)[near] - seen.uv[spot]).T
-    det = xx * yy - xy * xy
-    distance[spot, beacon[near]] = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / det
-    log_det[spot, beacon[near]] = np.log(4.0 * np.pi**2 * det)
-    return distance, log_det
-
-
-def image_areas(system: System) -> FloatArray:
-    """(c,) px^2."""
-    return np.array([c.image_size[0] * c.image_size[1] for c in system.head.cameras], dtype=float)
+    return judged(system, seen, [(prior.pose, seen.label)], prior, options)
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,7 +172,7 @@ def _in_turn(
     start = _Partial(np.full(len(near), -1, dtype=np.int64), np.logical_not(near.any(axis=1)), prior)
     open_ones = [(start, near, distance)]
     done: list[tuple[FloatArray, IntArray]] = []
-    while open_ones and len(done) < _MOST_NAMINGS:
+    while open_ones and len(done) < MOST_NAMINGS:
         partial, near, distance = open_ones.pop()
         if partial.decided.all():
             done.append((partial.prior.pose, partial.match))
@@ -255,7 +182,7 @@ def _in_turn(
             if posterior is None:
                 continue
             new, support = gate_distances(system, seen, posterior, options)
-            free = (new < _GATE) & allowed & (support > 0.0) & ~decided[:, None]
+            free = (new < GATE) & allowed & (support > 0.0) & ~decided[:, None]
             for i in np.flatnonzero(match >= 0):
                 free[seen.camera == seen.camera[i], match[i]] = False
             decided = decided | ~free.any(axis=1)
@@ -294,92 +221,4 @@ def _posterior(system: System, seen: Sightings, match: IntArray, prior: Prior) -
     fit = fit_pose(system, seen, used, match[used], prior.pose, prior)
     if fit is None:
         return None
-    own = fit.G @ spot_noise(seen, fit.used) @ fit.G.T + fit.G_prior @ prior.cov @ fit.G_prior.T
-    return Prior(fit.pose, own, fit.B, np.arange(6))
-
-
-def _judged(
-    system: System, seen: Sightings, trials: Sequence[tuple[FloatArray, IntArray]], prior: Prior | None,
-    options: NavigateOptions,
-) -> tuple[Candidate, ...]:  # fmt: skip
-    """Adjust the trials, compare their evidence, and give each its probability."""
-    by_naming: dict[tuple[bytes, bytes], list[Candidate]] = {}
-    # three spots fit many namings exactly, and all of them are to be named
-    most = 2 * _MOST_NAMINGS if prior is not None else (_ADJUSTED if len(seen.uv) > 3 else _KEPT)
-    for pose, match in trials[:most]:
-        candidate = _adjusted(system, seen, pose, match, prior, options)
-        if candidate is not None:
-            alike = by_naming.setdefault((candidate.fit.used.tobytes(), candidate.fit.beacon.tobytes()), [])
-            if not any(np.linalg.norm(local(candidate.fit.pose, other.fit.pose)) < _SAME for other in alike):
-                alike.append(candidate)
-    found = sorted((c for alike in by_naming.values() for c in alike), key=lambda c: c.score)
-    if not found:
-        return ()
-    weights = np.exp(-0.5 * (np.array([c.score for c in found]) - found[0].score))
-    weights /= weights.sum()
-    kept = [
-        Candidate(c.fit, c.rejected, c.score, float(w), len(trials) > most or len(trials) == _KEPT)
-        for c, w in zip(found, weights, strict=True)
-        if c.score < found[0].score + _HOPELESS
-    ]
-    return tuple(kept)
-
-
-def _adjusted(
-    system: System, seen: Sightings, pose: FloatArray, match: IntArray, prior: Prior | None, options: NavigateOptions
-) -> Candidate | None:
-    used = np.flatnonzero(match >= 0)
-    if prior is None and len(used) < 3:
-        return None
-    fit, rejected = fit_without_outliers(system, seen, used, match[used], pose, prior, options.alpha)
-    if fit is None or not fit.in_front:
-        return None
-    if prior is None:
-        fit = _grown(system, seen, fit, rejected, options)
-    if fit.redundancy > 0 and fit.chi_square > chi2.isf(1e-6, fit.redundancy):
-        return None
-    return Candidate(fit, rejected, score_of(system, seen, fit, prior, options))
-
-
-def _grown(
-    system: System, seen: Sightings, fit: PoseFit, rejected: tuple[int, ...], options: NavigateOptions
-) -> PoseFit:
-    """Name the spots that the pose explains and the coarse consensus left out."""
-    for _ in range(len(seen.uv) - len(fit.used) - len(rejected)):
-        prior = Prior(fit.pose, fit.G @ spot_noise(seen, fit.used) @ fit.G.T, fit.B, np.arange(6))
-        distance, support = gate_distances(system, seen, prior, options)
-        distance[~(allowed_namings(system, seen) & (support > 0.0))] = np.inf
-        distance[fit.used] = np.inf
-        distance[list(rejected)] = np.inf
-        for i, b in zip(fit.used, fit.beacon, strict=True):
-            distance[seen.camera == seen.camera[i], b] = np.inf
-        i, b = np.unravel_index(int(np.argmin(distance)), distance.shape)
-        if distance[i, b] > _GATE:
-            return fit
-        order = np.argsort(np.append(fit.used, i), kind="stable")
-        more = fit_pose(system, seen, np.append(fit.used, i)[order], np.append(fit.beacon, b)[order], fit.pose)
-        if more is None:
-            return fit
-        fit = more
-    return fit
-
-
-def score_of(system: System, seen: Sightings, fit: PoseFit, prior: Prior | None, options: NavigateOptions) -> float:
-    """-2 ln of the evidence of an explanation: fit, spots it calls false, beacons it should have seen and did not.
-
-    A false spot may be anywhere in its image; what no prior knows of the pose is uniform over all rotations (8 pi^2)
-    and the room.
-    """
-    false = np.ones(len(seen.uv), dtype=np.bool_)
-    false[fit.used] = False
-    score = log_evidence(fit)
-    known = set() if prior is None else set(prior.rows.tolist())
-    score += 2.0 * np.log(8.0 * np.pi**2) * len({0, 1, 2} - known) / 3.0
-    score += 2.0 * np.log(options.room_m) * len({3, 4, 5} - known)
-    score -= 2.0 * float(np.log(options.false_spots / image_areas(system)[seen.camera[false]]).sum())
-    score -= 2.0 * len(fit.used) * np.log(options.detection)
-    # only cameras that took part: the others may not have been triggered
-    view = visible(system, fit.pose) & seen.present[:, None]
-    view[seen.camera[fit.used], fit.beacon] = False
-    missing = int(view.sum())
-    return float(score - 2.0 * missing * np.log(1.0 - options.detection))
+    return Prior(fit.pose, own_covariance(seen, fit, prior), fit.B, np.arange(6))

@@ -15,6 +15,7 @@ from adjust.model.survey import FloatArray
 from adjust.navigation.fit import PoseFit, Prior, local, local_derivative
 from adjust.navigation.model import Motion, NavigationEpoch, PosePrior
 from adjust.navigation.system import System
+from adjust.spatial.rigid import rigid
 
 
 def given_prior(prior: PosePrior, system: System) -> Prior:
@@ -36,7 +37,7 @@ def table_prior(system: System, epoch: NavigationEpoch) -> Prior | None:
         return None
     (R,), (t,), (D,) = table_motions(table.axes, table.geometry, np.array([epoch.table_angles], dtype=float))
     mount = table.mount_from_station
-    motion = Pose3(np.vstack([np.column_stack([R, t]), [0.0, 0.0, 0.0, 1.0]]))
+    motion = Pose3(rigid(R, t))
     pose = table.world_from_table * motion * mount
     by_base, by_motion = (motion * mount).inverse().AdjointMap(), mount.inverse().AdjointMap()
     at, k = system.table_at, len(table.axes)

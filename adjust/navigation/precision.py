@@ -6,12 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from gtsam import Pose3
 
-from adjust.lenses.models import MODELS, project
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native import navigation as native
 from adjust.navigation.fit import PoseFit, Prior, fit_pose
 from adjust.navigation.model import Beacons, Head, Shares
-from adjust.navigation.system import Sightings, System, evaluate, make_system, visible
+from adjust.navigation.system import Sightings, System, evaluate, in_view, make_system, sightings_of
 
 _OPEN = 1e-8  # of the largest eigenvalue of the scaled information
 
@@ -131,28 +130,14 @@ def expected_precision(
     system = make_system(head, beacons)
     out = []
     for pose in poses:
-        camera, beacon = (a.astype(np.int64) for a in np.nonzero(visible(system, pose.matrix())))
-        out.append(_expected(system, pose, camera, beacon, sigma_px))
+        out.append(_expected(system, pose, *in_view(system, pose.matrix()), sigma_px))
     return tuple(out)
-
-
-def _images(system: System, pose: FloatArray, camera: IntArray, beacon: IntArray) -> FloatArray:
-    """Image points (n, 2) px of beacons in view."""
-    uv = np.zeros((len(camera), 2))
-    q = (system.beacons.x_in_world[beacon] - pose[:3, 3]) @ pose[:3, :3]
-    for c, own in enumerate(system.head.cameras):
-        rows = camera == c
-        if rows.any():
-            p = (q[rows] - system.camera_t[c]) @ system.camera_R[c]
-            uv[rows] = project(MODELS[own.model], own.lens, own.constants, p)
-    return uv
 
 
 def _expected(system: System, pose: Pose3, camera: IntArray, beacon: IntArray, sigma_px: float) -> Expected:
     n, ids = len(camera), system.beacons.beacon_ids
-    zeros = np.zeros(n, dtype=np.int64)
-    uv, cov = _images(system, pose.matrix(), camera, beacon), np.tile(np.eye(2) * sigma_px**2, (n, 1, 1))
-    seen = Sightings(camera, uv, cov, beacon, zeros, zeros, np.ones(len(system.kinds), dtype=np.bool_))
+    predicted = evaluate(system, pose.matrix(), camera, beacon, np.zeros((n, 2)))[0]
+    seen = sightings_of(system, camera, beacon, predicted.reshape(n, 2), sigma_px)
     names = tuple(ids[b] for b in sorted(set(beacon.tolist())))
     fit = fit_pose(system, seen, np.arange(n), beacon, pose.matrix()) if n >= 3 else None
     if fit is None:

@@ -4,11 +4,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from gtsam import Pose3
 
 from adjust.model.survey import FloatArray, IntArray
+from adjust.navigation.evidence import Candidate
 from adjust.navigation.fit import PoseFit, Prior, fit_pose, local
-from adjust.navigation.identification import Candidate, with_prior, without_prior
+from adjust.navigation.identification import with_prior, without_prior
 from adjust.navigation.model import (
     Beacons,
     Bridge,
@@ -22,6 +22,7 @@ from adjust.navigation.model import (
 from adjust.navigation.motion import MotionState, given_prior, predicted, started, table_prior, updated
 from adjust.navigation.precision import open_directions, own_covariance, shares, some_pose, spot_noise
 from adjust.navigation.system import Sightings, System, make_sightings, make_system, station_rays, visible, with_rays
+from adjust.spatial.rigid import as_pose3
 from adjust.testing.distributions import chi2
 
 _AGREES = 1e-6
@@ -187,23 +188,19 @@ def _next_state(
 
 
 def _labels(
-    system: System, seen: Sightings, epoch: NavigationEpoch, fit: PoseFit
+    system: System, seen: Sightings, epoch: NavigationEpoch, used: IntArray, beacon: IntArray
 ) -> tuple[tuple[str | None, ...], ...]:
     out: list[list[str | None]] = [[None] * len(s.uv) for s in epoch.spots]
-    for i, b in zip(fit.used, fit.beacon, strict=True):
+    for i, b in zip(used, beacon, strict=True):
         out[seen.block[i]][seen.row[i]] = system.beacons.beacon_ids[b]
     return tuple(tuple(row) for row in out)
 
 
-def _pose3(pose: FloatArray) -> Pose3:
-    return Pose3(np.ascontiguousarray(pose))
-
-
 def _solution(system: System, seen: Sightings, epoch: NavigationEpoch, candidate: Candidate) -> Solution:
     fit = candidate.fit
+    labels = _labels(system, seen, epoch, fit.used, fit.beacon)
     return Solution(
-        _pose3(fit.pose), fit.cov, _labels(system, seen, epoch, fit), fit.chi_square, fit.redundancy, candidate.score,
-        candidate.probability,
+        as_pose3(fit.pose), fit.cov, labels, fit.chi_square, fit.redundancy, candidate.score, candidate.probability,
     )  # fmt: skip
 
 
@@ -214,8 +211,8 @@ def _result(
     system, seen, epoch = at.system, at.seen, at.epoch
     several = tuple(_solution(system, seen, epoch, c) for c in candidates[: at.options.max_alternatives])
     result = EpochPose(
-        epoch.epoch_id, "fixed", bridge if prior is not None else "", _pose3(fit.pose), fit.cov,
-        _labels(system, seen, epoch, fit),
+        epoch.epoch_id, "fixed", bridge if prior is not None else "", as_pose3(fit.pose), fit.cov,
+        _labels(system, seen, epoch, fit.used, fit.beacon),
         tuple((epoch.spots[seen.block[i]].camera_id, int(seen.row[i])) for i in best.rejected),
         fit.chi_square, fit.redundancy, best.probability, shares(system, seen, fit, prior),
     )  # fmt: skip
@@ -237,7 +234,7 @@ def _from_little(
     if prior is not None and len(prior.rows) == 6:
         fit = fit_pose(system, seen, none.astype(np.int64), none.astype(np.int64), prior.pose, prior)
         if fit is not None:
-            return EpochPose(epoch.epoch_id, "bridged", bridge, _pose3(fit.pose), fit.cov, unnamed,
+            return EpochPose(epoch.epoch_id, "bridged", bridge, as_pose3(fit.pose), fit.cov, unnamed,
                              chi_square=0.0, shares=shares(system, seen, fit, prior))  # fmt: skip
     used = np.flatnonzero(seen.label >= 0)
     if not len(used):
@@ -255,11 +252,8 @@ def _undetermined(system: System, seen: Sightings, epoch: NavigationEpoch, prior
     start = _facing(system, seen, used) if prior is None else prior.pose
     pose = some_pose(system, seen, used, beacon, start)
     cov, names = open_directions(system, seen, used, beacon, pose, prior)
-    labels: list[list[str | None]] = [[None] * len(s.uv) for s in epoch.spots]
-    for i in used:
-        labels[seen.block[i]][seen.row[i]] = system.beacons.beacon_ids[seen.label[i]]
-    return EpochPose(epoch.epoch_id, "undetermined", "", _pose3(pose), cov, tuple(map(tuple, labels)),
-                     undetermined=names)  # fmt: skip
+    labels = _labels(system, seen, epoch, used, beacon)
+    return EpochPose(epoch.epoch_id, "undetermined", "", as_pose3(pose), cov, labels, undetermined=names)
 
 
 def _facing(system: System, seen: Sightings, used: IntArray) -> FloatArray:

@@ -173,6 +173,13 @@ def make_sightings(system: System, epoch: NavigationEpoch) -> Sightings:
     return Sightings(camera_, uv, cov, label_, block_, row_, present)
 
 
+def sightings_of(system: System, camera: IntArray, beacon: IntArray, uv: FloatArray, sigma_px: float) -> Sightings:
+    """Spots (n, 2) px of known beacons (n,) that every camera of the head might have seen."""
+    n, zeros = len(camera), np.zeros(len(camera), dtype=np.int64)
+    cov = np.tile(np.eye(2) * sigma_px**2, (n, 1, 1))
+    return Sightings(camera, uv, cov, beacon, zeros, zeros, np.ones(len(system.kinds), dtype=np.bool_))
+
+
 def station_rays(system: System, seen: Sightings) -> tuple[FloatArray, FloatArray]:
     """Origins and unit rays (n, 3) of the spots in the station. Raises SurveyError for pixels that have no ray."""
     if seen.ray is not None:
@@ -220,6 +227,12 @@ def evaluate(
     spots = SpotArrays(camera, beacon, np.ascontiguousarray(uv))
     in_front = spot_rows(system.arrays, np.ascontiguousarray(pose), spots, residual, H, M)
     return residual, H, M, in_front
+
+
+def in_view(system: System, pose: FloatArray) -> tuple[IntArray, IntArray]:
+    """Camera and beacon (n,) of every image of a beacon in a field of view at a pose (4, 4)."""
+    camera, beacon = np.nonzero(visible(system, pose))
+    return camera.astype(np.int64), beacon.astype(np.int64)
 
 
 def visible(system: System, pose: FloatArray, margin: float = 0.0) -> BoolArray:

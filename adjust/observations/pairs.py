@@ -9,7 +9,7 @@ chi-square with the rank of Q_vv degrees of freedom (Baarda 1968; Koch 1999, sec
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 
 import gtsam
 import numpy as np
@@ -19,7 +19,7 @@ from adjust.frames.state import State
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, FrameTree, Unknowns
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Pair, frame_text
-from adjust.model.result import ObservationResidual
+from adjust.model.result import Named, OtherArrays, Residuals
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.pairs import pair_jacobians, pair_rows, sure_forms
 from adjust.native.trees import KeyCovariances
@@ -373,16 +373,11 @@ class PairBatch:
         redundancy = np.where(used[:, None], np.diagonal(Qvv, axis1=1, axis2=2), 0.0)
         return PairStatistics(residual, white, redundancy, test, freedom, p, own, arrays.cov + sign * scatter)
 
-    def squares(self, found: Sequence[ObservationResidual]) -> dict[int, float]:
-        """Weighted squares of the residuals of these pairs, by their row in ``Survey.pairs``; ``found`` are of all."""
-        v, rows = np.zeros((len(self), 6)), self.rows.tolist()
-        for k, alike in ((6, self.arrays.is_pose), (3, ~self.arrays.is_pose)):
-            of = self.rows[alike].tolist()
-            v[alike, :k] = np.array([found[row].residual for row in of]).reshape(-1, k)
-        white = np.einsum("nij,nj->ni", self.arrays.whitening, v)
-        return dict(zip(rows, np.einsum("ni,ni->n", white, white).tolist(), strict=True))
+    def squares(self, stats: PairStatistics) -> FloatArray:
+        """Weighted squares (E,) of the residuals."""
+        return np.asarray(np.einsum("ni,ni->n", stats.whitened, stats.whitened))
 
-    def residuals(self, stats: PairStatistics, pairs: Sequence[Pair]) -> list[ObservationResidual]:
+    def residuals(self, stats: PairStatistics, pairs: Sequence[Pair]) -> Residuals:
         """As reports take them; ``pairs`` are those of the survey."""
         v, cov = stats.residual, self.arrays.cov
         adjusted = (self.arrays.motions @ exp(v)).log()
@@ -393,12 +388,16 @@ class PairBatch:
             standardized = np.where(seen, v / np.sqrt(np.where(seen, spread, 1.0)), np.nan)
         turned = Motions(self.arrays.rotations @ exp(v[:, :3]).rotation).log()
         adjusted[~self.arrays.is_pose, :3] = turned[~self.arrays.is_pose]
-        said = {k: (POSE_COMPONENTS[:k], POSE_UNITS[:k]) for k in (3, 6)}
+        sizes = np.where(self.arrays.is_pose, 6, 3)
+        measured = np.arange(6) < sizes[:, None]
         columns = self.arrays.logs, adjusted, v, sigma, stats.redundancy, standardized
-        rows = zip((pairs[row] for row in self.rows.tolist()), np.where(self.arrays.is_pose, 6, 3).tolist(), *columns,
-                   stats.test.tolist(), strict=True)  # fmt: skip
-        return [ObservationResidual("pair", p.group, _ids(p), *said[k], o[:k], a[:k], r[:k], s[:k], n[:k], w[:k], test,
-                                    p.used) for p, k, o, a, r, s, n, w, test in rows]  # fmt: skip
+        most = np.where(measured, stats.redundancy, -np.inf).max(axis=1)
+        arrays = OtherArrays(sizes, self.arrays.used, stats.test, most, *(x[measured] for x in columns))
+        return Residuals(arrays, partial(_named, [pairs[row] for row in self.rows.tolist()], sizes.tolist()))
+
+
+def _named(pairs: Sequence[Pair], sizes: Sequence[int], e: int) -> Named:
+    return "pair", pairs[e].group, _ids(pairs[e]), POSE_COMPONENTS[: sizes[e]], POSE_UNITS[: sizes[e]]
 
 
 def _quadratic(Q: FloatArray, v: FloatArray) -> tuple[FloatArray, IntArray]:

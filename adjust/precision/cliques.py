@@ -1,6 +1,5 @@
 """A Bayes tree as arrays: its cliques one after the other, parents first, and the ways through them."""
 
-from bisect import bisect_left
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -104,47 +103,21 @@ class Cliques:
         out[key] = self.at[clique] + column * (self.width[clique] + 1)
         return out
 
-    def ancestors(self, cliques: set[int], top: int = -1) -> IntArray:
-        """These and all above them, but for those from ``top`` on, which is on the way of all."""
+    def ancestors(self, cliques: set[int]) -> IntArray:
+        """These and all above them."""
         found: set[int] = set()
         for start in cliques:
             c = start
-            while c > top and c not in found:
+            while c >= 0 and c not in found:
                 found.add(c)
                 c = int(self.parents[c])
         return np.array(sorted(found), dtype=np.int64)
 
-    def gathered(self, cliques: IntArray, top: int = -1) -> tuple[IntArray, int]:
-        """Row (K,) at which a key begins where only the own ones of these cliques are kept, and how many these are.
-
-        Those of ``top`` come after.
-        """
+    def gathered(self, cliques: IntArray) -> tuple[IntArray, int]:
+        """Row (K,) at which a key begins where only the own ones of these cliques are kept, and how many these are."""
         shift, front = np.zeros(len(self), dtype=np.int64), self.front[cliques]
         shift[cliques] = np.cumsum(front) - front - self.first[self.keys[self.key_ptr[cliques]]]
-        first, n = self.first[:-1] + shift[self.home], int(front.sum())
-        if top >= 0:
-            keys = self.keys_in(top)
-            first[keys] = n + np.cumsum(self.dims[keys]) - self.dims[keys]
-        return first, n
-
-    def common(self, keys: IntArray) -> int:
-        """The first clique, from the leaves up, that has all these keys, or those left of the cliques below; or -1."""
-        left: list[int] = sorted(set(self.home[keys].tolist()))
-        met, wanted = set[int](), set(keys.tolist())
-        while left:
-            c = left.pop()  # parents have lower numbers
-            inside = self.keys_in(c).tolist()
-            if met.isdisjoint(left) and wanted.issubset(inside):
-                return c
-            wanted.difference_update(inside[: self.n_front[c]])
-            parent = int(self.parents[c])
-            if parent < 0:
-                return -1
-            met.add(parent)
-            at = bisect_left(left, parent)
-            if at == len(left) or left[at] != parent:
-                left.insert(at, parent)
-        return -1
+        return self.first[:-1] + shift[self.home], int(front.sum())
 
     def columns_for(self, eliminations: float) -> float:
         """How many columns go up the deepest way at the price of so many eliminations of the whole."""

@@ -27,6 +27,7 @@ from adjust.model.result import (
     ObservationResidual,
     ParameterName,
     ReadingResiduals,
+    arrays_of,
 )
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.point_tests import AdjustedPoints, residual_tests
@@ -41,7 +42,7 @@ from adjust.testing.distributions import chi2
 if TYPE_CHECKING:
     from adjust.observations.pairs import PairStatistics
 
-_PAIRS = 24
+_PAIRS = 200
 """Pairs of unknowns that are brought together in one go."""
 
 
@@ -134,7 +135,7 @@ class Precision(Covariances):
             self.transformation = s_transformation(
                 solved.datum.rows, motions, lambda rows: self.stacked.by_key(rows, self.stacked.times)
             )
-            self.stacked.move_to(self.transformation)
+            self.stacked.move_to(self.transformation, solved.datum.rows)
 
     def datum_products(self, rows: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
         """Covariance times the transpose of ``rows`` (k, dim per key): (dim, k) for every unknown."""
@@ -167,9 +168,7 @@ class Precision(Covariances):
         elif tuple(keys) in self._together:
             Q = self._together[keys[0], keys[1]]
         else:
-            rows = np.concatenate([self.stacked.rows(k) for k in keys])
-            half = self.stacked.columns(rows)[rows]
-            Q = 0.5 * (half + half.T)
+            Q = self.stacked.joint(keys)
         return _in_datum(self.transformation, keys, Q)
 
     def bring_together(self, pairs: Iterable[tuple[ParameterName, ParameterName]]) -> None:
@@ -179,12 +178,13 @@ class Precision(Covariances):
         self.tree.bring_together((a, b) for a, b in keys if a not in self.hidden and b not in self.hidden)
         below = [(a, b) for a, b in keys if a in self.hidden or b in self.hidden]
         for k in range(0, len(below), _PAIRS):
-            columns = np.concatenate([self.stacked.rows(a) for a in dict.fromkeys(a for a, _ in below[k : k + _PAIRS])])
-            found = self.stacked.columns(columns)
+            some = list(dict.fromkeys(key for pair in below[k : k + _PAIRS] for key in pair))
+            ends = np.cumsum([0, *(self.unknowns.by_key[key].dim for key in some)])
+            at = {key: np.arange(*ends[i : i + 2]) for i, key in enumerate(some)}
+            Q = self.stacked.joint(some)
             for a, b in below[k : k + _PAIRS]:
-                across = found[self.stacked.rows(b)][:, np.isin(columns, self.stacked.rows(a))].T
-                Qa, Qb = (self.hidden[x] if x in self.hidden else self.tree.marginal(x) for x in (a, b))
-                self._together[a, b] = np.block([[Qa, across], [across.T, Qb]])
+                rows = np.concatenate([at[a], at[b]])
+                self._together[a, b] = Q[np.ix_(rows, rows)]
 
     def rows(self, item: ObservationFactor) -> ObservationRows:
         """An observation that is neither image point nor reading, linearised at the solution: built once, and kept."""
@@ -294,12 +294,14 @@ def image_residuals(precision: Precision) -> ImageResiduals:
     return ImageResiduals(ptr, points.v, *residual_tests(points), points.used)
 
 
-def other_residuals(precision: Precision) -> tuple[ObservationResidual, ...]:
+def other_residuals(precision: Precision) -> Sequence[ObservationResidual]:
     """The same for every observation that is neither an image point nor a reading."""
     graph, out = precision.graph, dict[int, ObservationResidual]()
     if graph.pairs is not None:
-        places = (graph.first_pair + graph.pairs.rows).tolist()
-        out |= dict(zip(places, graph.pairs.residuals(precision.pairs, graph.survey.pairs), strict=True))
+        of_pairs = graph.pairs.residuals(precision.pairs, graph.survey.pairs)
+        if not graph.singles:
+            return of_pairs
+        out |= dict(zip((graph.first_pair + graph.pairs.rows).tolist(), of_pairs, strict=True))
     for i, item in zip(graph.single, graph.singles, strict=True):
         x = precision.rows(item)
         e, M, root = x.e, x.influence, x.root
@@ -327,13 +329,13 @@ def adjusted_motion(observed: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def group_summaries(
-    graph: AdjustmentGraph,
+    precision: Precision,
     images: ImageResiduals,
     others: Sequence[ObservationResidual],
     readings: ReadingResiduals | None = None,
 ) -> tuple[GroupSummary, ...]:
     """Observations, redundancy and weighted square sum of every group, in order of appearance."""
-    sums: dict[str, list[float]] = {}
+    graph, sums = precision.graph, dict[str, list[float]]()
 
     def add(group: str, n: int, r: float, omega: float) -> None:
         total = sums.setdefault(group, [0.0, 0.0, 0.0])
@@ -342,24 +344,26 @@ def group_summaries(
     names = list(dict.fromkeys(block.group for block in graph.survey.image_blocks))
     for group, *sums_of_group in zip(names, *_image_sums(graph, images, names), strict=True):
         add(group, *sums_of_group)
-    of_pairs = {} if graph.pairs is None else graph.pairs.squares(others[graph.first_pair :])
-    alone = iter(graph.singles)
-    for i, item in enumerate(others):
-        square = of_pairs.get(i - graph.first_pair)
-        factor = next(alone) if square is None else None
-        if item.used:
-            if factor is not None:
-                e = noise_of(factor).whiten(item.residual)
-                square = float(e @ e)
-            add(item.group, len(item.residual), sum(item.redundancy.tolist()), square or 0.0)
+    arrays, squares = arrays_of(others), np.zeros(len(others))
+    for i, item in zip(graph.single, graph.singles, strict=True):
+        e = precision.rows(item).e
+        squares[i] = e @ e
+    if graph.pairs is not None:
+        squares[graph.first_pair + graph.pairs.rows] = graph.pairs.squares(precision.pairs)
+    shares = np.bincount(arrays.observation, arrays.redundancies, len(others)).tolist()
+    every = zip(graph.of_others(lambda o: o.group, lambda p: p.group), arrays.n_components.tolist(), shares,
+                squares.tolist(), arrays.used.tolist(), strict=True)  # fmt: skip
+    for group, n, share, square, used in every:
+        if used:
+            add(group, n, share, square)
     if readings is not None:
         of_group: dict[str, list[int]] = {}
         for i, reading in enumerate(graph.survey.readings):
             of_group.setdefault(reading.group, []).append(i)
         for group, mine in of_group.items():
             taken = np.array(mine)[readings.used[mine]]
-            squares = float(readings.weighted_square[taken].sum())
-            add(group, len(taken), float(readings.redundancy[taken].sum()), squares)
+            square = float(readings.weighted_square[taken].sum())
+            add(group, len(taken), float(readings.redundancy[taken].sum()), square)
     return tuple(GroupSummary(g, int(n), r, omega) for g, (n, r, omega) in sums.items())
 
 

@@ -20,6 +20,7 @@ from adjust.native.trees import (
     fill_block,
     invert_cliques,
     joint_blocks,
+    sets_among,
     solve_cliques,
 )  # fmt: skip
 from adjust.observations.images.reduction import Leaves
@@ -57,28 +58,15 @@ class TreeCovariance:
         return self._across.get((a, b))
 
     def bring_together(self, pairs: Iterable[tuple[int, int]]) -> None:
-        """Find what :meth:`joint` of these pairs of keys takes, of those in different cliques, many columns at once."""
-        home, dims = self.cliques.home, self.cliques.dims
-        apart: dict[int, list[int]] = {}
-        for a, b in ((self.number[i], self.number[j]) for i, j in pairs):
-            if self._block(a, b) is None:
-                apart.setdefault(a, []).append(b)
-        left = sorted(apart, key=lambda a: int(home[a]))  # neighbours in the tree side by side
-        while left:
-            n = max(1, int(np.searchsorted(np.cumsum(dims[left]), _COLUMNS, side="right")))
-            some, left = left[:n], left[n:]
-            others = [b for a in some for b in apart[a]]
-            up, down = (self.cliques.ancestors(set(home[of].tolist())) for of in (some, some + others))
-            first, rows = self.cliques.gathered(down)
-            columns = self.cliques.rows_of(np.array(some, dtype=np.int64), first)
-            x = np.zeros((rows, len(columns)))
-            x[columns, np.arange(len(columns))] = 1.0
-            solve_cliques(self.arrays, up, down, first, self.cliques.data, x)
-            at = 0
-            for a in some:
-                own = slice(at, at := at + int(dims[a]))
-                for b in apart[a]:
-                    self._across[a, b] = x[first[b] : first[b] + dims[b], own].T.copy()
+        """Find what :meth:`joint` of these pairs of keys takes, of those in different cliques, all at once."""
+        numbers = ((self.number[i], self.number[j]) for i, j in pairs)
+        apart = [(a, b) for a, b in numbers if self._block(a, b) is None]
+        both = np.array(apart, dtype=np.int64).reshape(-1, 2)
+        columns, ptr = self.cliques.rows_of(both.ravel()), np.append(0, np.cumsum(self.cliques.dims[both].sum(axis=1)))
+        units = sparse.csr_array((np.ones(len(columns)), columns, np.arange(len(columns) + 1)), (len(columns), self.n))
+        for (a, b), Q in zip(apart, self.each_among(units, ptr), strict=True):
+            n = int(self.cliques.dims[a])
+            self._across[a, b] = Q[:n, n:]
 
     def marginal(self, key: int) -> FloatArray:
         """Covariance (dim, dim) of one unknown."""
@@ -100,7 +88,9 @@ class TreeCovariance:
             return self._apart(numbers)
         at = np.concatenate([[0], np.cumsum(c.dims[numbers])])
         if together and len(numbers) > _MANY and 2 * at[-1] >= c.width[deepest]:  # all of the clique at once
-            rows = c.rows_of(numbers, c.gathered(np.zeros(0, dtype=np.int64), deepest)[0])
+            inside, first = c.keys_in(deepest), np.zeros(len(c.dims), dtype=np.int64)
+            first[inside] = np.cumsum(c.dims[inside]) - c.dims[inside]
+            rows = c.rows_of(numbers, first)
             return np.asarray(clique_covariance(self.arrays, c.n_front, deepest)[np.ix_(rows, rows)])
         out = np.empty((at[-1], at[-1]))
         for i, a in enumerate(numbers.tolist()):
@@ -148,44 +138,58 @@ class TreeCovariance:
     def times(self, columns: FloatArray) -> FloatArray:
         """The whole covariance matrix times columns (n, m), without forming it."""
         x = np.array(columns, dtype=float, order="C")
-        every = np.arange(len(self.cliques), dtype=np.int64)
-        solve_cliques(self.arrays, every, every, self.cliques.first, self.cliques.data, x)
+        c, every = self.cliques, np.arange(len(self.cliques), dtype=np.int64)
+        begun = set(c.home[c.key_of[x.any(axis=1)]].tolist())
+        up = every if 2 * len(begun) > len(c) else c.ancestors(begun)
+        solve_cliques(self.arrays, up, every, c.first, c.data, x)
         return x
 
-    def among(self, A: sparse.csr_array) -> FloatArray:
-        """A Q A' (m, m) of the rows of A (m, n), without forming Q.
+    def drawn(self, w: FloatArray) -> FloatArray:
+        """R^-1 w (n, m): errors with the whole covariance matrix, where w are independent with unit variance."""
+        x, c = np.array(w), self.cliques
+        none, every = np.zeros(0, dtype=np.int64), np.arange(len(c), dtype=np.int64)
+        solve_cliques(self.arrays, none, every, c.first, c.data, x)
+        return x
+
+    def each_among(self, A: sparse.csr_array, ptr: IntArray) -> list[FloatArray]:
+        """A Q A' (m, m) of sets of the rows of A, set i from ``ptr[i]`` on, without forming Q.
 
         U'U with R'U = A', on the ways to the first clique that holds all that is left of A', and this with the joint
         covariance of its keys; to the roots where there is none.
         """
-        c = self.cliques
-        home, m = c.home[c.key_of], A.shape[0]
-        top = c.common(np.unique(c.key_of[A.indices]))
-        of_row = np.maximum.reduceat(np.append(home[A.indices], 0), A.indptr[:-1]) if m else np.zeros(0)
+        c, i8 = self.cliques, np.int64
+        rows = ptr.astype(i8), A.indptr.astype(i8), A.indices.astype(i8), np.asarray(A.data, dtype=float)
+        return sets_among(*rows, self.arrays, c.parents, c.n_front, c.key_of, c.first, c.data)
+
+    def among(self, A: sparse.csr_array) -> FloatArray:
+        """The same of all rows of A (m, n): of many some at once, on their ways to the roots."""
+        c, m = self.cliques, A.shape[0]
+        if m <= _COLUMNS:
+            return self.each_among(A, np.array([0, m]))[0]
+        home = c.home[c.key_of]
+        of_row = np.maximum.reduceat(np.append(home[A.indices], 0), A.indptr[:-1])
         order = np.argsort(of_row, kind="stable")  # neighbours in the tree side by side
         A, out = A[order], np.zeros((m, m))
-        Q = np.zeros((0, 0)) if top < 0 else clique_covariance(self.arrays, c.n_front, top)
-        none, done = np.zeros(0, dtype=np.int64), list[tuple[IntArray, FloatArray, FloatArray]]()
+        none, done = np.zeros(0, dtype=np.int64), list[tuple[IntArray, FloatArray]]()
         for i in range(0, m, _COLUMNS):
             mine = A[i : i + _COLUMNS]
-            up = c.ancestors(set(home[mine.indices].tolist()), top)
-            first, n = c.gathered(up, top)
+            up = c.ancestors(set(home[mine.indices].tolist()))
+            first, n = c.gathered(up)
             entries = mine.data, (first - c.first[:-1])[c.key_of[mine.indices]] + mine.indices, mine.indptr
-            x = np.ascontiguousarray(sparse.csr_array(entries, (mine.shape[0], n + len(Q))).toarray().T)
-            solve_cliques(self.arrays, up, none, first, c.data, x)
-            U, left = x[:n], x[n:]
-            out[i : i + _COLUMNS, i : i + _COLUMNS] = U.T @ U + left.T @ (Q @ left)
-            if m <= _COLUMNS:
-                break
+            U = np.ascontiguousarray(sparse.csr_array(entries, (mine.shape[0], n)).toarray().T)
+            solve_cliques(self.arrays, up, none, first, c.data, U)
             way = np.zeros(len(c), dtype=np.bool_)
             way[up] = True
             rows = np.flatnonzero(way[home])
-            for k, (before, V, held) in enumerate(done):
+            for k, (before, V) in enumerate(done):
                 _, here, there = np.intersect1d(rows, before, assume_unique=True, return_indices=True)
-                out[i : i + _COLUMNS, k * _COLUMNS : (k + 1) * _COLUMNS] = U[here].T @ V[there] + left.T @ held
-            done.append((rows, U, Q @ left))
+                across = U[here].T @ V[there]
+                out[i : i + _COLUMNS, k * _COLUMNS : (k + 1) * _COLUMNS] = across
+                out[k * _COLUMNS : (k + 1) * _COLUMNS, i : i + _COLUMNS] = across.T
+            done.append((rows, U))
+            out[i : i + _COLUMNS, i : i + _COLUMNS] = U.T @ U
         back = np.argsort(order)
-        return np.asarray((np.tril(out) + np.tril(out, -1).T)[np.ix_(back, back)])
+        return np.asarray(out[np.ix_(back, back)])
 
     def full(self) -> FloatArray:
         """The whole covariance matrix (n, n) of all unknowns, rows as :meth:`places` says, parents before children.
@@ -209,21 +213,6 @@ class TreeCovariance:
                 Q[:done, own] = across.T
                 Q[own, own] += across[:, rows[nf:]] @ T.T
         return Q
-
-    def given_separators(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What does not follow from the separator of its clique, as all between it and the cliques that are not below.
-
-        Of columns (n, k) that part, and of every unknown the variance (n,) that is left: inf where a clique has others
-        of its own, with which it may share anything.
-        """
-        left, own, cliques = np.array(columns), np.full(self.n, np.inf), self.cliques
-        for c in range(len(cliques)):
-            nf, n, at = int(cliques.front[c]), int(cliques.width[c]), int(cliques.at[c])
-            A, rows = cliques.data[at : at + nf * n].reshape(nf, n), cliques.rows_of(cliques.keys_in(c))
-            left[rows[:nf]] -= A[:, nf:] @ columns[rows[nf:]]
-            if cliques.n_front[c] == 1:
-                own[rows[:nf]] = (np.triu(A[:, :nf]) ** 2).sum(axis=1)
-        return left, own
 
     def pairs(self, first: IntArray, second: IntArray, dim: int) -> FloatArray:
         """Joint covariances (p, 2 dim, 2 dim) of pairs of keys that share a factor; -1 stands for a constant.

@@ -6,8 +6,7 @@ same observations reaches the Cramer-Rao bound; this shows what the steps leave.
 """
 
 from adjust.published.head import ComparedPose, HeadComparison, compare_head
-from adjust.published.method import Calibration, CpcInput, calibrate, propagate
-from adjust.published.quantities import PaperRotation, PaperVector
+from adjust.published.method import Calibration, CpcInput, PaperRotation, PaperVector, calibrate, propagate
 from adjust.published.steps import Fit, TableImages
 from adjust.published.surveys import body_on_main_axis, single_camera_survey, table_images
 

@@ -8,7 +8,6 @@ from gtsam import Pose3, Rot3
 
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
-from adjust.published.quantities import PaperRotation, PaperVector
 from adjust.published.steps import (
     TableImages,
     body_origin,
@@ -19,9 +18,40 @@ from adjust.published.steps import (
     table_origin,
 )
 from adjust.spatial.rigid import rigid, rotation_exp, rotation_log
-from adjust.spatial.rotation_forms import matrix_from_euler
+from adjust.spatial.rotation_forms import euler_from_matrix, matrix_from_euler
 
 _STEP = 1e-6  # rad, m: of the numerical derivatives; second differences stay below a billionth
+
+
+@dataclass(frozen=True, eq=False)
+class PaperRotation:
+    """``C_a^b``: the matrix that takes coordinates in a to coordinates in b (``b_from_a``).
+
+    sigma_deg: (3,) about the axes x, y, z of the frame a. For a small rotation these are the sigmas of its Euler
+    angles.
+    """
+
+    name: str
+    matrix: FloatArray
+    sigma_deg: FloatArray
+
+    @property
+    def angles_deg(self) -> FloatArray:
+        """Euler angles (phi, theta, psi) of equation 9, phi within a quarter turn.
+
+        A camera that looks along the body's y axis stands at phi = 90 deg, where theta and psi turn about one axis: its
+        sigmas have no counterpart in Euler angles. Raises SurveyError where they are not defined at all.
+        """
+        return np.degrees(euler_from_matrix(self.matrix, "213"))
+
+
+@dataclass(frozen=True, eq=False)
+class PaperVector:
+    """``r_ij^k``: from the origin of i to that of j, in the axes of k; (3,) mm. nan: a component by definition."""
+
+    name: str
+    value_mm: FloatArray
+    sigma_mm: FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,6 +18,11 @@ def pose_distance(a: FloatArray, b: FloatArray, lever: float) -> FloatArray:
     return np.asarray(np.hypot(np.sqrt(squares[..., 3].sum(axis=-1)), lever * turn))
 
 
+def typical_distance(poses: FloatArray) -> float:
+    """The median length, m, of the shifts of rigid motions (n, 4, 4): at which turns weigh as much as shifts."""
+    return float(np.median(np.linalg.norm(poses[:, :3, 3], axis=1)))
+
+
 def mean_pose(poses: FloatArray, lever: float, members: IntArray | None = None) -> tuple[FloatArray, FloatArray]:
     """One mean (4, 4) as :func:`mean_poses` has it, and the distance (n,) m of each motion from it."""
     order = np.arange(len(poses)) if members is None else np.argsort(members, kind="stable")

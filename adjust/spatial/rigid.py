@@ -1,6 +1,7 @@
 """Rotations and rigid motions as plain arrays: (..., 3, 3) and (..., 4, 4), all vectorised over the leading axes."""
 
 import numpy as np
+from gtsam import Pose3
 
 from adjust.model.survey import FloatArray
 from adjust.native.views import turns_by, turns_of
@@ -51,6 +52,11 @@ def inverse(m: FloatArray) -> FloatArray:
     """Inverse rigid motions (..., 4, 4)."""
     rt = np.swapaxes(m[..., :3, :3], -1, -2)
     return rigid(rt, -(rt @ m[..., :3, 3, None])[..., 0])
+
+
+def as_pose3(m: FloatArray) -> Pose3:
+    """GTSAM's pose of a motion (4, 4)."""
+    return Pose3(np.ascontiguousarray(m))
 
 
 def transform(m: FloatArray, x: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ from adjust.graph.datum import in_world
 from adjust.model.result import ParameterName
 from adjust.model.rewriting import Rewriting
 from adjust.model.survey import FloatArray, PointParameter, PoseParameter, Survey
-from adjust.spatial.rigid import align
+from adjust.spatial.rigid import align, as_pose3
 from adjust.start.search import Start
 
 
@@ -84,6 +84,6 @@ def moved_onto(start: Start, given: GivenStarts, survey: Survey) -> Start:
     there, here = (np.array([pair[i] for pair in pairs], dtype=float) for i in (0, 1))
     if min(np.linalg.matrix_rank(x - x.mean(axis=0), tol=1e-6) for x in (there, here)) < 2:
         return start
-    move = Pose3(np.ascontiguousarray(align(there, here)))
+    move = as_pose3(align(there, here))
     poses = {n: move * p if n in placed else p for n, p in start.poses.items()}
     return replace(start, poses=poses, points={n: np.asarray(move.transformFrom(x)) for n, x in start.points.items()})

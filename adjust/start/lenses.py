@@ -24,12 +24,11 @@ from adjust.native.lenses import Lens, fit_lens
 from adjust.native.views import homographies
 from adjust.start.closed_forms.absolute_pose import best_poses
 from adjust.start.closed_forms.zhang import pinhole_from_homographies
-from adjust.start.views import ENOUGH, ends_of, few_of, rays_of_images
+from adjust.start.lens_images import MOST_IMAGES, Sighting, every_nth, plane_coordinates, spread_out, thinned
+from adjust.start.views import ends_of, rays_of_images
 
-_MOST_IMAGES = 30
 _SCAN_IMAGES = 8
 _MOST_SCREENED = 60
-_MOST_POINTS = 1080  # of all images together
 _REFINEMENTS = 2  # of the poses with a lens that is refined itself afterwards
 _GOOD_START = 0.01  # of the image width: with less error a closed form needs no scan beside it
 _SEVERAL, _OTHER_STARTS = 3, 4  # images, and starts that are tried beside the first where that leads nowhere
@@ -38,15 +37,6 @@ _SIMPLE_PX = 2.0
 _FOCAL = {"fx", "fy", "c", "ck"}
 _CENTRE = {"u0", "v0", "xp", "yp", "px", "py", "xh", "yh"}
 _RADIAL = {"k1": 1, "k2": 2, "K1": 1, "K2": 2, "A1": 1, "A2": 2}
-
-
-@dataclass(frozen=True, eq=False)
-class Sighting:
-    """Known points (n, 3) m of one rigid body and their image points (n, 2) px in one image."""
-
-    block_idx: int
-    x: FloatArray
-    uv: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +165,7 @@ class _LensSearch:
                 )
 
     def run(self, sightings: Sequence[Sighting], near: FloatArray | None) -> LensStart:
-        usable = _thinned([s for s in sightings if len(s.x) >= 4])
+        usable = thinned([s for s in sightings if len(s.x) >= 4])
         if any(name in self.prior for name in _FOCAL):
             focal = self.prior.get("fx", self.prior.get("c", self.prior.get("ck", 0.0)))
             return LensStart(self._values(focal / (self.constants[0] if self.model.in_mm else 1.0)), "lens prior", {})
@@ -185,10 +175,10 @@ class _LensSearch:
                 " show it a target, or give lens values"
             )
         # the other images of a long series are screened by their poses
-        flat = _every([s for s in usable if self._on_plane(s) is not None], _MOST_SCREENED)
+        flat = every_nth([s for s in usable if self._on_plane(s) is not None], _MOST_SCREENED)
         maps, excluded = self._screen(flat) if flat else ({}, {})
         chosen = spread_out([s for s in flat if s.block_idx in maps])
-        chosen = chosen or [s for s in usable if s.block_idx not in excluded][:_MOST_IMAGES]
+        chosen = chosen or [s for s in usable if s.block_idx not in excluded][:MOST_IMAGES]
         if not chosen:
             raise SurveyError(
                 f"camera {self.camera.camera_id!r}: none of its {len(flat)} images fits a plane; the first: "
@@ -208,7 +198,7 @@ class _LensSearch:
         """Coordinates in the points' plane, asked for once for all images that show the same array of points."""
         key = id(sighting.x)
         if key not in self._plane:
-            self._plane[key] = _plane_coordinates(sighting.x)
+            self._plane[key] = plane_coordinates(sighting.x)
         return self._plane[key]
 
     def _screen(self, flat: Sequence[Sighting]) -> tuple[dict[int, FloatArray | None], dict[int, str]]:
@@ -252,7 +242,7 @@ class _LensSearch:
             yield self._tried(values, "known before", chosen)
             return
         low, high = (0.15, 2.0) if self.model.name == "fisheye" else (0.35, 8.0)
-        some = _every(chosen, _SCAN_IMAGES)
+        some = every_nth(chosen, _SCAN_IMAGES)
         for factor in np.geomspace(low, high, 16):
             trials.append(self._tried(self._values(factor * max(self.size)), "scan of focal lengths", some))
         in_order = sorted((t for t in trials if np.isfinite(t.error_px)), key=lambda trial: trial.error_px)
@@ -367,61 +357,3 @@ class _LensSearch:
         except SurveyError:
             return False
         return bool(known and inside and 0.05 * width < focal < 50 * width)
-
-
-def _plane_coordinates(x: FloatArray) -> FloatArray | None:
-    """Coordinates (n, 2) of points in their plane, of unit size; None where they are no plane, or on a line."""
-    centred = x - x.mean(axis=0)
-    squares, vectors = np.linalg.eigh(centred.T @ centred)
-    thin, middle, long = np.sqrt(np.maximum(squares, 0.0))
-    if not (middle > 1e-3 * long and thin < 1e-2 * middle):
-        return None
-    xy = centred @ vectors[:, :0:-1]
-    return np.asarray(xy / np.sqrt((xy**2).sum(axis=1).max()))
-
-
-def _thinned(images: Sequence[Sighting]) -> list[Sighting]:
-    """The images with no more points each than tell the lens and all poses, one array for all that show the same."""
-    most, parts = max(ENOUGH, _MOST_POINTS // max(1, min(len(images), _MOST_IMAGES))), dict[int, FloatArray]()
-    out = []
-    for s in images:
-        if len(s.x) > most:
-            few = few_of(len(s.x), most)
-            if id(s.x) not in parts:
-                parts[id(s.x)] = s.x[few]
-            s = Sighting(s.block_idx, parts[id(s.x)], s.uv[few])
-        out.append(s)
-    return out
-
-
-def _every(images: Sequence[Sighting], n: int) -> list[Sighting]:
-    if len(images) <= n:
-        return list(images)
-    return [images[int(i)] for i in np.unique(np.linspace(0, len(images) - 1, n).round())]
-
-
-def spread_out(images: Sequence[Sighting], n: int = _MOST_IMAGES) -> list[Sighting]:
-    """At most n images that differ most in place, size and tilt of the target (farthest-point sampling)."""
-    if len(images) <= n:
-        return list(images)
-    features = _features(images)
-    features = (features - features.mean(axis=0)) / np.maximum(features.std(axis=0), 1e-9)
-    squares = ((features[:, None] - features) ** 2).sum(axis=2)  # of at most _MOST_SCREENED images
-    sizes = [len(s.x) for s in images]
-    chosen = [sizes.index(max(sizes))]
-    nearest = squares[chosen[0]]
-    while len(chosen) < n:
-        chosen.append(int(nearest.argmax()))
-        nearest = np.minimum(nearest, squares[chosen[-1]])
-    return [images[i] for i in sorted(chosen)]
-
-
-def _features(images: Sequence[Sighting]) -> FloatArray:
-    """Of every image centroid, logarithm of the size, and shape of the covariance of the image points, (B, 5)."""
-    counts = np.array([len(s.uv) for s in images])
-    first, uv = np.cumsum([0, *counts[:-1]]), np.concatenate([s.uv for s in images])
-    mean = np.add.reduceat(uv, first) / counts[:, None]
-    u, v = (uv - np.repeat(mean, counts, axis=0)).T
-    uu, uv_, vv = (np.add.reduceat(p, first) / (counts - 1) for p in (u * u, u * v, v * v))
-    size = np.sqrt(uu + vv)
-    return np.column_stack([mean / size[:, None], np.log(size), (uu - vv) / size**2, uv_ / size**2])

@@ -74,17 +74,23 @@ def _shared(network: FrameNetwork, groups: list[_Group], minimum_norm: bool) -> 
         if len(group.motions) >= 2:
             by_second.setdefault(group.second, []).append(group)
     for link, sharing in sorted(by_second.items(), key=lambda item: item[0]):
-        a, b = (
-            np.concatenate(m) for m in zip(*[relative_motions(g.motions, g.products) for g in sharing], strict=True)
-        )
-        try:
-            x, _ = solve_ax_xb(a, b, minimum_norm)
-        except SurveyError:
-            continue
-        network.set(link[0], x, link[1])
-        how = "turns about one axis only: smallest consistent solution" if minimum_norm else f"{len(a)} motions"
-        return f"{_text(network, link)} from {how}"
+        found = _hand_eye([relative_motions(g.motions, g.products) for g in sharing], minimum_norm)
+        if found is not None:
+            network.set(link[0], found[0], link[1])
+            how = "turns about one axis only: smallest consistent solution" if minimum_norm else f"{found[1]} motions"
+            return f"{_text(network, link)} from {how}"
     return None
+
+
+def _hand_eye(
+    motions: list[tuple[FloatArray, FloatArray]], minimum_norm: bool = False
+) -> tuple[FloatArray, int] | None:
+    """``x`` (4, 4) with a x = x b for all these motions, and how many there are; None where they do not tell it."""
+    a, b = (np.concatenate(m) for m in zip(*motions, strict=True))
+    try:
+        return solve_ax_xb(a, b, minimum_norm)[0], len(a)
+    except SurveyError:
+        return None
 
 
 def _side_by_side(network: FrameNetwork) -> str | None:
@@ -109,14 +115,10 @@ def _side_by_side(network: FrameNetwork) -> str | None:
         several = [np.array(both) for both in by_things.values() if len(both) >= 2]
         if not several:
             continue
-        motions = [relative_motions(inverse(both[:, 0]), inverse(both[:, 1])) for both in several]
-        a, b = (np.concatenate(m) for m in zip(*motions, strict=True))
-        try:
-            x, _ = solve_ax_xb(a, b)
-        except SurveyError:
-            continue
-        network.set_link(other[0], inverse(x) @ network.product(before))
-        return f"{_text(network, (other[0].slot, other[0].inverse))} from {len(a)} motions of two on one body"
+        found = _hand_eye([relative_motions(inverse(both[:, 0]), inverse(both[:, 1])) for both in several])
+        if found is not None:
+            network.set_link(other[0], inverse(found[0]) @ network.product(before))
+            return f"{_text(network, (other[0].slot, other[0].inverse))} from {found[1]} motions of two on one body"
     return None
 
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from gtsam import Pose3
 
 from adjust.frames.tables import table_motions
 from adjust.frames.unknowns import Chain, FrameTree, Link
@@ -273,8 +272,3 @@ def table_from_mount(table: Table, angles: FloatArray) -> FloatArray:
         raise SurveyError(f"table {table.table_id!r} has {len(table.axes)} axes, a reading has {len(angles)} angles")
     (R,), (t,), _ = table_motions(table.axes, table.geometry.by_name, np.asarray(angles, dtype=float)[None])
     return rigid(R, t)
-
-
-def as_pose3(matrix: FloatArray) -> Pose3:
-    """GTSAM's pose of a matrix (4, 4)."""
-    return Pose3(np.ascontiguousarray(matrix))

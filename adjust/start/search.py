@@ -4,7 +4,7 @@ One search: of the steps that are possible with what is known by now the safest 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 from types import MappingProxyType
 
@@ -14,6 +14,7 @@ from gtsam import Pose3, Rot3
 from adjust.frames.lens_states import lenders
 from adjust.frames.lens_times import whole_images
 from adjust.frames.unknowns import FrameTree, Unknowns
+from adjust.graph.assembly import StartValues
 from adjust.lenses.models import MODELS
 from adjust.model.boards import deformed
 from adjust.model.errors import IndeterminateError, SurveyError
@@ -21,12 +22,13 @@ from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.observations.geometry.building import frame_refs, position_refs
 from adjust.observations.terrestrial.building import reading_refs
-from adjust.spatial.averaging import pose_distance
-from adjust.spatial.rigid import rigid
+from adjust.spatial.averaging import pose_distance, typical_distance
+from adjust.spatial.rigid import as_pose3, rigid
 from adjust.start.gauge import fix_one_gauge
-from adjust.start.lenses import Sighting, start_lens
+from adjust.start.lens_images import Sighting
+from adjust.start.lenses import start_lens
 from adjust.start.motion import solve_motion
-from adjust.start.network import ChainObservation, FrameNetwork, as_pose3, partial_pose
+from adjust.start.network import ChainObservation, FrameNetwork, partial_pose
 from adjust.start.points import PARALLAX, improve, intersect_points, orient_second, resect
 from adjust.start.polish import polish
 from adjust.start.positions import PointField, Positions, Sight, point_field, undetermined
@@ -48,18 +50,13 @@ _POLISH_PX = 2.0  # below this the robust means are a good start already
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
-    """Start values for every parameter that the survey needs.
+class Start(StartValues):
+    """Start values for every parameter that the survey needs: of tables their angles and geometry, of boards the warp.
 
-    lenses: full vectors (n,) by camera. poses: by parameter name. points: (3,) m by point id. vectors: table_angles,
-    table_geometry and warp by parameter name. excluded_blocks: positions in ``Survey.image_blocks`` of what is not
-    trusted, each with its reason. block_rms_px: misfit of every block at the start, px (nan where it has no rays).
+    excluded_blocks: positions in ``Survey.image_blocks`` of what is not trusted, each with its reason. block_rms_px:
+    misfit of every block at the start, px (nan where it has no rays).
     """
 
-    lenses: Mapping[str, FloatArray]
-    poses: Mapping[ParameterName, Pose3]
-    points: Mapping[str, FloatArray]
-    vectors: Mapping[ParameterName, FloatArray] = field(default_factory=dict)
     excluded_blocks: tuple[int, ...] = ()
     reasons: tuple[str, ...] = ()
     block_rms_px: tuple[float, ...] = ()
@@ -162,9 +159,7 @@ class _Search:
         return out
 
     def _register_positions(self, frames: FrameTree) -> None:
-        refs = [ref for d in self.survey.distances for ref in (d.a, d.b)]
-        refs += [ref for c in self.survey.coordinates for ref in c.positions]
-        refs += position_refs(self.survey) + reading_refs(self.survey)
+        refs = position_refs(self.survey) + reading_refs(self.survey)
         for frame in [*frame_refs(self.survey), *(ref.frame for ref in refs if ref.frame is not None)]:
             frames.world_from(frame)
 
@@ -246,8 +241,7 @@ class _Search:
             observation = ChainObservation(self.chains[i], self.alternatives(i, self.views.poses[a:b]), i)
             (self.doubtful if i in self.reasons else self.network.observations).append(observation)
         if len(self.views):
-            nearest = self.views.poses[self.views.first[:-1], :3, 3]
-            self.network.lever = float(np.median(np.linalg.norm(nearest, axis=1)))
+            self.network.lever = typical_distance(self.views.poses[self.views.first[:-1]])
 
     def alternatives(self, i: int, poses: FloatArray) -> FloatArray:
         """Poses (k, 4, 4) of a block as named, then after every motion that its target cannot be told from."""

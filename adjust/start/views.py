@@ -103,17 +103,9 @@ def block_text(block: ImageBlock) -> str:
     return f"camera {block.camera_id!r}, epoch {block.epoch_id!r}, {seen}"
 
 
-def rays_of(camera: Camera, values: FloatArray, uv: FloatArray) -> FloatArray:
-    """Unit rays (n, 3) of pixels (n, 2); raises SurveyError for pixels the lens cannot have imaged."""
-    model = lens_model(camera.lens.model)
-    constants = camera_constants(camera)
-    return unit_rays(model, values, constants, np.asarray(uv, dtype=float))
-
-
 def focal_px(camera: Camera, values: FloatArray) -> float:
     """Principal distance in px."""
-    model = lens_model(camera.lens.model)
-    return focal_length_px(model, values, camera_constants(camera))
+    return focal_length_px(lens_model(camera.lens.model), values, camera_constants(camera))
 
 
 def rays_by_block(
@@ -145,8 +137,9 @@ def rays_of_images(
     """Unit rays (n, 3) of every image (n, 2) px, or why it has none."""
     if not images:
         return []
+    uv = np.concatenate(images, dtype=float)
     try:
-        rays = rays_of(camera, values, np.concatenate(images))
+        rays = unit_rays(lens_model(camera.lens.model), values, camera_constants(camera), uv)
         return [rays[a:b] for a, b in pairwise(ends_of([len(uv) for uv in images]).tolist())]
     except SurveyError as error:  # some pixel of some image: find out which
         return [error] if len(images) == 1 else [rays_of_images(camera, values, [uv])[0] for uv in images]

@@ -30,6 +30,7 @@ from adjust.testing.quadratic_forms import pseudo_squares
 _SEEN = 1e-4
 """Share of a column that no unknown takes over, below which it is not told from rounding."""
 _MOST_RUNS = 256
+"""Of a system without structure, where every run is compared with every other."""
 _ROOM = 2e7
 """Numbers that all possible changes may need."""
 _MOST, _MOST_OF_ONE = 20, 2
@@ -59,7 +60,7 @@ class Unit:
 class _Candidates:
     """A unit's possible changes (J, ...), scaled so that B'B has a unit diagonal: M (J, q, q), g (J, q), scale (J, q).
 
-    X: (n, j q) A'B of the j runs by themselves, one after the other; a change has the sum of those from its run on.
+    X: (j q, n) B'A of the j runs by themselves, one after the other; a change has the sum of those from its run on.
     """
 
     unit: Unit
@@ -95,8 +96,10 @@ class ChangeSearch:
         self.A, self.e = s.A, s.e - s.A @ step
         self.epoch, self.epochs = _coded([b.epoch_id for b in adjustment.survey.image_blocks])
         self.owners = list(self._owners())
-        units, self.runs = list(self._units(_MOST_RUNS)), _MOST_RUNS
         shared = None if s.structured is None else len(s.structured.U)
+        read = {r.epoch_id for r in adjustment.survey.table_readings}
+        self.runs = _MOST_RUNS if shared is None else max(2, len(self.epochs), len(read))
+        units = list(self._units(self.runs))
 
         def numbers(runs: Sequence[int]) -> float:
             """That M of every unit needs, or what it is made of."""
@@ -105,7 +108,7 @@ class ChangeSearch:
 
         if numbers([len(u.epochs) for u in units]) > _ROOM:
             share = _ROOM / numbers([1] * len(units))
-            self.runs = int(np.clip(share if shared is not None else np.sqrt(share), 2, _MOST_RUNS))
+            self.runs = int(np.clip(share if shared is not None else np.sqrt(share), 2, self.runs))
             units = list(self._units(self.runs))
         self.candidates = side_by_side(lambda u: self._candidates(_by_runs(u)), units)
         self.n_tests = sum(len(c.g) for c in self.candidates)
@@ -210,15 +213,16 @@ class ChangeSearch:
     def _candidates(self, u: Unit) -> _Candidates:
         """Of the runs from j on, j = 1, 2, ..., or of the only one."""
         J, q = len(u.epochs), u.B.shape[1]
-        columns = u.run[:, None] * q + np.arange(q)
-        order, length = np.argsort(u.rows, kind="stable"), np.zeros(len(self.e), dtype=np.int64)
-        length[u.rows] = q
-        ptr = np.concatenate([[0], np.cumsum(length)])
-        wide = sparse.csr_matrix((u.B[order].ravel(), columns[order].ravel(), ptr), (len(length), J * q))
-        wide.eliminate_zeros()
-        X = (self.A.T @ wide).tocsr()
-        P = _from_runs_on(_by_run(u, u.B))
-        g = _from_runs_on(_by_run(u, self.e[u.rows, None]))[:, :, 0]
+        of_run = np.bincount(u.run, minlength=J)
+        ptr, before = np.cumsum([0, *np.repeat(of_run, q)]), np.cumsum(of_run) - of_run
+        place = (ptr[u.run * q] + np.arange(len(u.run)) - before[u.run])[:, None] + of_run[u.run, None] * np.arange(q)
+        values, rows = np.empty(u.B.size), np.empty(u.B.size, dtype=np.int64)
+        values[place], rows[place] = u.B, u.rows[:, None]
+        by_run = sparse.csr_matrix((values, rows, ptr), (J * q, len(self.e)))
+        by_run.eliminate_zeros()
+        X = (by_run @ self.A).tocsr()
+        both = _from_runs_on(_by_run(u, np.column_stack([u.B, self.e[u.rows]])))
+        P, g = both[:, :, :q], both[:, :, q]
         taken = _taken(self.system, X, J)[1 if J > 1 else 0 :]
         size = np.sqrt(np.einsum("jqq->jq", P))
         scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
@@ -242,18 +246,18 @@ class ChangeSearch:
 
 
 def _taken(system: LinearSystem, X: sparse.csr_matrix, J: int) -> FloatArray:
-    """X'QX of the runs from j on together (J, q, q); X (n, J q) of the runs by themselves."""
-    q, sums = X.shape[1] // J, system.structured
+    """XQX' of the runs from j on together (J, q, q); X (J q, n) of the runs by themselves."""
+    q, sums = X.shape[0] // J, system.structured
     if sums is None:
-        M, out = system.among(X.T.tocsr()).reshape(J, q, J, q), np.empty((J, q, q))
+        M, out = system.among(X).reshape(J, q, J, q), np.empty((J, q, q))
         for j in range(J):
             later = M[j, :, j + 1 :].sum(axis=1)
             out[j] = M[j, :, j] + later + later.T
         return np.cumsum(out[::-1], axis=0)[::-1]
-    own = (X.T @ (sums.own @ X)).tocoo()
+    own = (X @ (sums.own @ X.T)).tocoo()
     (a, i), (b, k) = np.divmod(own.row, q), np.divmod(own.col, q)
     of_run = np.bincount((np.minimum(a, b) * q + i) * q + k, own.data, J * q * q).reshape(J, q, q)
-    shared = np.asarray(X.T @ sums.U.T).reshape(J, q, -1)
+    shared = np.asarray(X @ sums.U.T).reshape(J, q, -1)
     own_on, shared_on = (np.cumsum(x[::-1], axis=0)[::-1] for x in (of_run, shared))
     return np.asarray(own_on + shared_on @ shared_on.transpose(0, 2, 1))
 
@@ -295,7 +299,7 @@ def _from_runs_on(of_runs: FloatArray) -> FloatArray:
 def _given(c: _Candidates, known: _Chosen) -> _Candidates:
     """Candidates with M and g where one more change is part of the model."""
     u = c.unit
-    across = _by_run(u, known.B[u.rows]) - np.asarray(c.X.T @ known.Y).reshape(len(u.epochs), u.B.shape[1], -1)
+    across = _by_run(u, known.B[u.rows]) - np.asarray(c.X @ known.Y).reshape(len(u.epochs), u.B.shape[1], -1)
     K = _from_runs_on(across) * c.scale[:, :, None]
     M = c.M - K @ known.inverse @ K.transpose(0, 2, 1)
     return replace(c, M=0.5 * (M + M.transpose(0, 2, 1)), g=c.g - K @ known.amounts)

@@ -7,6 +7,7 @@ v'Pv falls by ``g' inv(M) g``, and the change is ``-inv(M) g`` (score test, Rao 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from scipy import sparse
@@ -23,6 +24,7 @@ from adjust.testing.significance import LEVEL, Significance
 _SEEN = 1e-7
 """Share of a change's column that no unknown takes over, below which it does not show."""
 _CUTS = 40
+_ONE_SET: IntArray = np.array([0, -1])
 _SMALL = 1_000_000  # numbers of a matrix that is written out
 
 
@@ -104,6 +106,15 @@ class LinearScores:
         ptr, rows = self._by_column.indptr, self._by_column.indices
         return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(rows[ptr[c] : ptr[c + 1]] for c in columns)]))
 
+    def mean_squares(self, columns: Sequence[IntArray]) -> FloatArray:
+        """(u,) of the residuals of the rows that each of these unknowns has a part in."""
+        ends = np.cumsum([0, *map(len, columns)])
+        of = np.concatenate([np.zeros(0, dtype=np.int64), *columns])
+        seen = abs(self.A) @ sparse.csc_matrix((np.ones(len(of)), of, ends), (self.A.shape[1], len(columns)))
+        seen.data[:] = 1.0
+        squares, n = np.asarray(seen.T @ self.e**2), np.asarray(seen.sum(axis=0)).ravel()
+        return np.asarray(squares / np.maximum(n, 1.0))
+
     def parts(self, columns: IntArray, rows: Sequence[IntArray]) -> list[Part]:
         """Rows with their derivatives by unknowns."""
         if not rows:
@@ -140,19 +151,27 @@ class LinearScores:
     def apart(self, parts: Sequence[Part]) -> tuple[FloatArray, FloatArray]:
         """Of p changes by one number each: B'e (p,) and M (p, p), what the unknowns leave of B'B."""
         g, BB, taken = self._normals(parts, np.arange(len(parts)))
-        return g[:, 0], np.diag(BB[:, 0, 0]) - taken[:, 0, :, 0]
+        return g[:, 0], np.diag(BB[:, 0, 0]) - taken[0][:, 0, :, 0]
 
-    def steps(self, parts: Sequence[Part]) -> dict[int, Score]:
-        """A change from part t on: the scores of t, at most ``_CUTS`` of them. parts: in the order of time."""
-        cuts = list(range(2, len(parts) - 1))[:: max(1, (len(parts) - 3) // _CUTS)]
-        if not cuts:
-            return {}
-        lengths = np.diff([*cuts, len(parts)])
-        g, BB, taken = self._normals(parts[cuts[0] :], np.repeat(np.arange(len(cuts)), lengths))
-        g, BB = (np.cumsum(x[::-1], axis=0)[::-1] for x in (g, BB))
-        taken = np.cumsum(np.cumsum(taken[::-1, :, ::-1], axis=0), axis=2)[::-1, :, ::-1]
-        every = np.arange(len(cuts))
-        return dict(zip(cuts, scores(g, BB, taken[every, :, every]), strict=True))
+    def steps(self, courses: Sequence[Sequence[Part]]) -> list[dict[int, Score]]:
+        """Of each course a change from part t on: the scores of t, at most ``_CUTS`` of them.
+
+        courses: their parts in the order of time, all with derivatives by as many numbers.
+        """
+        cuts = [list(range(2, n - 1))[:: max(1, (n - 3) // _CUTS)] for n in map(len, courses)]
+        every = [(parts[at[0] :], np.diff([*at, len(parts)])) for parts, at in zip(courses, cuts, strict=True) if at]
+        if not every:
+            return [{} for _ in courses]
+        ptr, lengths = np.cumsum([0, *map(len, cuts)]), np.concatenate([n for _, n in every])
+        group = np.repeat(np.arange(len(lengths)), lengths)
+        g, BB, taken = self._normals([p for parts, _ in every for p in parts], group, ptr)
+        over = np.empty_like(BB)
+        for (i, j), mine in zip(pairwise(ptr.tolist()), taken, strict=True):
+            g[i:j], BB[i:j] = (np.cumsum(x[i:j][::-1], axis=0)[::-1] for x in (g, BB))
+            later = np.cumsum(np.cumsum(mine[::-1, :, ::-1], axis=0), axis=2)[::-1, :, ::-1]
+            over[i:j] = np.einsum("ikil->ikl", later)
+        found = iter(scores(g, BB, over))
+        return [{t: next(found) for t in at} for at in cuts]
 
     def _summed(self, parts: Sequence[Part], weights: FloatArray) -> Score:
         """Of changes of all of them in these proportions."""
@@ -160,33 +179,42 @@ class LinearScores:
             return Score(np.zeros(0), np.zeros((0, 0)), 0.0, 0)
         weighted = [(rows, w * self._used[rows, None] * B) for w, (rows, B) in zip(weights, parts, strict=True)]
         g, BB, taken = self._normals(weighted, np.zeros(len(parts), dtype=np.int64))
-        return scores(g, BB, taken[:, :, 0])[0]
+        return scores(g, BB, taken[0][:, :, 0])[0]
 
-    def _normals(self, parts: Sequence[Part], group: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Of s groups of parts, each a change of its own: B'e (s, k), B'B (s, k, k), B'A Q A'B (s, k, s, k).
+    def _normals(
+        self, parts: Sequence[Part], group: IntArray, ptr: IntArray = _ONE_SET
+    ) -> tuple[FloatArray, FloatArray, list[FloatArray]]:
+        """Of groups of parts, each a change of its own: B'e (S, k), B'B (S, k, k); of sets B'A Q A'B (s, k, s, k).
 
-        group: (p,) of every part, 0, 1, ... in this order. No two parts have a row in common.
+        group: (p,) of every part, 0, 1, ... in this order. ptr: groups at which sets begin, and S, or -1 for it. No two
+        parts of a group have a row in common.
         """
         rows, B = (np.concatenate(x) for x in zip(*parts, strict=True))
-        of_row, k, s = np.repeat(group, [len(r) for r, _ in parts]), B.shape[1], int(group[-1]) + 1
-        by_group = np.split(np.arange(len(rows)), np.searchsorted(of_row, np.arange(1, s)))
+        of_row, k, n = np.repeat(group, [len(r) for r, _ in parts]), B.shape[1], int(group[-1]) + 1
+        by_group = np.split(np.arange(len(rows)), np.searchsorted(of_row, np.arange(1, n)))
         g = np.array([B[mine].T @ self.e[rows[mine]] for mine in by_group])
         BB = np.array([B[mine].T @ B[mine] for mine in by_group])
+        ends = k * np.where(ptr < 0, n, ptr)
         if self._dense is not None:
             dense = self._dense
             BA = np.concatenate([B[mine].T @ dense[rows[mine]] for mine in by_group])
-            return g, BB, (BA @ self.system.covariance @ BA.T).reshape(s, k, s, k)
-        at = (k * of_row[:, None] + np.arange(k)).ravel(), np.repeat(rows, k)
-        turned = sparse.csr_matrix((B.ravel(), at), (s * k, len(self.e)))
-        return g, BB, self._taken(turned @ self.A).reshape(s, k, s, k)
+            sets = (BA[i:j] for i, j in pairwise(ends.tolist()))
+            taken = [some @ self.system.covariance @ some.T for some in sets]
+        else:
+            at = (k * of_row[:, None] + np.arange(k)).ravel(), np.repeat(rows, k)
+            taken = self._taken(sparse.csr_matrix((B.ravel(), at), (n * k, len(self.e))) @ self.A, ends)
+        return g, BB, [x.reshape(len(x) // k, k, len(x) // k, k) for x in taken]
 
-    def _taken(self, BA: sparse.csr_matrix) -> FloatArray:
-        """``B'A Q A'B`` (c, c) of sparse rows B'A (c, n)."""
-        if len(self.system.columns) <= DENSE:
-            near = np.unique(BA.indices)
-            few = BA[:, near].toarray()
-            return np.asarray(few @ self.system.covariance[np.ix_(near, near)] @ few.T)
-        return self.system.among(BA)
+    def _taken(self, BA: sparse.csr_matrix, ptr: IntArray) -> list[FloatArray]:
+        """``B'A Q A'B`` (c, c) of sets of sparse rows B'A (c, n)."""
+        if len(self.system.columns) > DENSE:
+            return self.system.among_each(BA, ptr)
+        out = []
+        for some in (BA[i:j] for i, j in pairwise(ptr.tolist())):
+            near = np.unique(some.indices)
+            few = some[:, near].toarray()
+            out.append(np.asarray(few @ self.system.covariance[np.ix_(near, near)] @ few.T))
+        return out
 
 
 def ratio(omega: float, n: float, drop: float) -> float:

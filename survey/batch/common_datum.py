@@ -27,7 +27,7 @@ from adjust.spatial.rotation_forms import quaternion_wxyz
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
 from survey.solution.covariances import read_covariances
-from survey.solution.quantities import ARCSEC_PER_RAD
+from survey.solution.quantities import ARCSEC_PER_RAD, sigmas_in
 
 _Kind = tuple[tuple[bool, ...], frozenset[str]]
 """The motions that a free datum leaves open, and what carries it."""
@@ -231,15 +231,15 @@ class _Epoch:
             own = own @ np.linalg.inv(G.T @ G)
         for m in out:
             B = own @ self._motions(target, [m]).T
-            total += np.sqrt(np.clip(np.diag(B @ self.cov(m) @ B.T), 0.0, None))
+            total += sigmas_in(B @ self.cov(m) @ B.T)
         return total
 
     def _place(self, name: str, gained: FloatArray) -> Moved:
         value, cov = self.values[name], self.cov(name)
         axes = value.rotation().matrix() if isinstance(value, Pose3) else np.eye(3)
-        own = np.sqrt(np.clip(np.diag(axes @ cov[-3:, -3:] @ axes.T), 0.0, None)) + np.abs(axes) @ gained[-3:]
+        own = sigmas_in(axes @ cov[-3:, -3:] @ axes.T) + np.abs(axes) @ gained[-3:]
         x, sigmas = tuple((1e3 * origin(value)).tolist()), tuple((1e3 * own).tolist())
         if not isinstance(value, Pose3):
             return Moved(x, sigmas, None, None)
-        turned = ARCSEC_PER_RAD * (np.sqrt(np.clip(np.diag(cov)[:3], 0.0, None)) + gained[:3])
+        turned = ARCSEC_PER_RAD * (sigmas_in(cov)[:3] + gained[:3])
         return Moved(x, sigmas, quaternion_wxyz(value.rotation()), tuple(turned.tolist()))

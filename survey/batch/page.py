@@ -8,32 +8,16 @@ from urllib.parse import quote
 import numpy as np
 from markupsafe import Markup
 
-from survey.batch.causes import CAUSES
 from survey.batch.charts import control_chart
 from survey.batch.control import ONE_SIDE, TREND, Chart
-from survey.batch.record import FAILED, TEST_FAILED, Record
+from survey.batch.record import CAUSES, FAILED, TEST_FAILED, Record
 from survey.batch.run import counts
 from survey.batch.tables import folders_csv, overview_json, short_names, trends_csv
 from survey.batch.trends import LEVEL, Trends
 from survey.folder.replacing import write_set
 from survey.folder.text import time_text
+from survey.report import markup as m
 from survey.report.language import group_name, known, message, speaking, t
-from survey.report.markup import (
-    MISSING,
-    count,
-    document,
-    element,
-    figures,
-    fixed,
-    general,
-    joined,
-    part,
-    pill,
-    section,
-    sigma_text,
-    table,
-    value_text,
-)
 
 _MOST_CHARTS, _LEAST_CHARTS = 24, 6
 _MOST_MORE = 120
@@ -52,16 +36,16 @@ def overview_html(
             ("numbers", "All numbers", _numbers(trends, records)),
             ("folders", "Folders", _folders(records, place)),
         )
-        nav = part("nav", [(anchor, t(name)) for anchor, name, body in made if body])
-        shown = _header(records, trends, date) + nav + joined((body for _, _, body in made), "\n")
-        return document(t("Overview of {n} surveys", n=count(len(records))), shown)
+        nav = m.part("nav", [(anchor, t(name)) for anchor, name, body in made if body])
+        shown = _header(records, trends, date) + nav + m.joined((body for _, _, body in made), "\n")
+        return m.document(t("Overview of {n} surveys", n=m.count(len(records))), shown)
 
 
 def _header(records: Sequence[Record], trends: Trends, date: str) -> Markup:
     n = counts(records)
     alarming = [c for c in trends.charts if trends.is_alarming(c)]
     if n["failed"]:
-        kind, word = "failed", t("{n} failed", n=count(n["failed"]))
+        kind, word = "failed", t("{n} failed", n=m.count(n["failed"]))
     elif n["test_failed"] or alarming:
         kind, word = "check", t("Needs a look")
     else:
@@ -69,41 +53,41 @@ def _header(records: Sequence[Record], trends: Trends, date: str) -> Markup:
     said = t(
         "{failed} of {n} surveys could not be adjusted, {tested} fail their global test; {k} of {m} numbers are not in "
         "control over the epochs.",
-        failed=count(n["failed"]), n=count(n["folders"]), tested=count(n["test_failed"]), k=count(len(alarming)),
-        m=count(len(trends.charts)),
+        failed=m.count(n["failed"]), n=m.count(n["folders"]), tested=m.count(n["test_failed"]),
+        k=m.count(len(alarming)), m=m.count(len(trends.charts)),
     )  # fmt: skip
     seconds = sum(r.seconds for r in records if r.origin == "adjusted")
     cards = (
-        (count(n["folders"]), t("surveys")), (count(n["done"]), t("passed")),
-        (count(n["test_failed"]), t("does not fit")), (count(n["failed"]), t("not adjusted")),
-        (count(n["not_adjusted_again"]), t("unchanged, not adjusted again")),
-        (t("{n} s", n=fixed(seconds, 1)), t("time of all adjustments")),
+        (m.count(n["folders"]), t("surveys")), (m.count(n["done"]), t("passed")),
+        (m.count(n["test_failed"]), t("does not fit")), (m.count(n["failed"]), t("not adjusted")),
+        (m.count(n["not_adjusted_again"]), t("unchanged, not adjusted again")),
+        (t("{n} s", n=m.fixed(seconds, 1)), t("time of all adjustments")),
     )  # fmt: skip
-    title = t("Overview of {n} surveys", n=count(len(records)))
-    head = part("header", t("Overview of a batch"), title, date)
-    return joined((head, part("verdict", kind, word, said), part("cards", cards)))
+    title = t("Overview of {n} surveys", n=m.count(len(records)))
+    head = m.part("header", t("Overview of a batch"), title, date)
+    return m.joined((head, m.part("verdict", kind, word, said), m.part("cards", cards)))
 
 
 def _link(record: Record, name: str, place: Path) -> Markup:
     report = record.written.get("report.html")
     if not report:
-        return element("b", name)
-    return part("link", quote(os.fsencode(Path(os.path.relpath(report, place)).as_posix())), name)
+        return m.element("b", name)
+    return m.part("link", quote(os.fsencode(Path(os.path.relpath(report, place)).as_posix())), name)
 
 
 def _failures(records: Sequence[Record], place: Path) -> Markup:
     rows = [
-        (_link(r, name, place), pill("bad", t(CAUSES[r.cause])), _wrapped(message(r.error).split("\n")), str(r.tries))
+        (_link(r, name, place), m.pill("bad", t(CAUSES[r.cause])), _wrapped(message(r.error).split("\n")), str(r.tries))
         for r, name in zip(records, short_names(records), strict=True)
         if r.state == FAILED
     ]
     note = t("What could not be adjusted, where the error is and what to do. Everything else was adjusted as usual.")
     columns = ("<Survey", "<Why", "<Message", "Tries")
-    return section("failures", "Failures", table(columns, rows) if rows else "", note)
+    return m.section("failures", "Failures", m.table(columns, rows) if rows else "", note)
 
 
 def _wrapped(lines: Sequence[str]) -> Markup:
-    return element("div", part("lines", lines), "words")
+    return m.element("div", m.part("lines", lines), "words")
 
 
 def _tests(records: Sequence[Record], place: Path) -> Markup:
@@ -111,23 +95,23 @@ def _tests(records: Sequence[Record], place: Path) -> Markup:
     for r, name in zip(records, short_names(records), strict=True):
         if r.state == TEST_FAILED:
             test = r.summary["global_test"]
-            interval = f"{fixed(test['lower'], 0)} – {fixed(test['upper'], 0)}"
-            rows.append((_link(r, name, place), fixed(r.summary["sigma0"], 3), fixed(test["omega"], 1), interval,
+            interval = f"{m.fixed(test['lower'], 0)} – {m.fixed(test['upper'], 0)}"
+            rows.append((_link(r, name, place), m.fixed(r.summary["sigma0"], 3), m.fixed(test["omega"], 1), interval,
                          _worst_group(r), _wrapped(_why(r))))  # fmt: skip
     columns = ("<Survey", "sigma0", "v'Pv", "expected", "<Worst group", "<Why")
     note = t(
         "Solved, but the residuals are larger than the sigmas say. Worst group: the one whose weighted square sum is "
         "furthest above its expectation, with the factor that its sigmas would need."
     )
-    return section("tests", "Global tests", table(columns, rows) if rows else "", note)
+    return m.section("tests", "Global tests", m.table(columns, rows) if rows else "", note)
 
 
 def _worst_group(record: Record) -> str:
     found = [(g.get("deviation") or 0.0, name, g.get("sigma_scale")) for name, g in record.groups.items()]
     if not found:
-        return MISSING
+        return m.MISSING
     _, name, scale = max(found)
-    return f"{group_name(name)} × {fixed(scale, 2)}"
+    return f"{group_name(name)} × {m.fixed(scale, 2)}"
 
 
 def _why(record: Record) -> list[str]:
@@ -135,7 +119,7 @@ def _why(record: Record) -> list[str]:
     said = [record.summary.get("reason", ""), *warnings[:_MOST_WARNINGS]]
     more = len(warnings) - _MOST_WARNINGS
     lines = [line for s in said if s for line in message(s).split("\n")]
-    return lines + ([t("{n} more warnings in solution.json.", n=count(more))] if more > 0 else [])
+    return lines + ([t("{n} more warnings in solution.json.", n=m.count(more))] if more > 0 else [])
 
 
 def _control(records: Sequence[Record], trends: Trends) -> Markup:
@@ -152,20 +136,20 @@ def _control(records: Sequence[Record], trends: Trends) -> Markup:
         "epoch claims them; dashed: three sigmas from the scatter (median moving range). Red: outside of its own "
         "sigmas, orange: outside of the scatter alone; orange line: {side} in a row on one side, or {trend} steadily "
         "up or down. A cross is an epoch without result. Chance alone puts {expected} of all {n} points outside.",
-        side=ONE_SIDE, trend=TREND, expected=general(trends.expected, 2), n=count(trends.n_points),
+        side=ONE_SIDE, trend=TREND, expected=m.general(trends.expected, 2), n=m.count(trends.n_points),
     )  # fmt: skip
     body = _figures(shown, records)
     if calm:
-        rest = t("{n} more charts", n=count(len(calm[:_MOST_MORE])))
-        body += part("details", rest, _figures(calm[:_MOST_MORE], records), False)
-    said = joined(element("p", message(n)) for n in trends.notes)
-    return section("control", "Control charts", said + body, note)
+        rest = t("{n} more charts", n=m.count(len(calm[:_MOST_MORE])))
+        body += m.part("details", rest, _figures(calm[:_MOST_MORE], records), False)
+    said = m.joined(m.element("p", message(n)) for n in trends.notes)
+    return m.section("control", "Control charts", said + body, note)
 
 
 def _figures(charts: Sequence[Chart], records: Sequence[Record]) -> Markup:
     names = short_names(records)
     failed = [i for i, r in enumerate(records) if r.state == FAILED]
-    return figures(control_chart(c, names, failed, _title(c)) for c in charts)
+    return m.figures(control_chart(c, names, failed, _title(c)) for c in charts)
 
 
 def _title(c: Chart) -> str:
@@ -181,30 +165,30 @@ def _numbers(trends: Trends, records: Sequence[Record]) -> Markup:
         classes.append("suspect" if alarming else "")
         spread = c.by_scatter / 3.0
         rows.append((
-            element("b", _title(c)), c.series.unit, str(len(c.series.value)), value_text(c.mean, c.mean_sigma),
-            sigma_text(c.mean_sigma), sigma_text(float(np.median(c.series.sigma))), sigma_text(spread),
-            fixed(c.ratio, 2), general(c.p, 2), _slope(c), general(c.p_slope, 2), _alarm(trends, c, names),
+            m.element("b", _title(c)), c.series.unit, str(len(c.series.value)), m.value_text(c.mean, c.mean_sigma),
+            m.sigma_text(c.mean_sigma), m.sigma_text(float(np.median(c.series.sigma))), m.sigma_text(spread),
+            m.fixed(c.ratio, 2), m.general(c.p, 2), _slope(c), m.general(c.p_slope, 2), _alarm(trends, c, names),
         ))  # fmt: skip
     columns = ("<Number", "<Unit", "n", "Mean", "σ", "σ of one", "Scatter", "Ratio", "p", "Per epoch", "p", "<Finding")
     note = t(
         "σ of one: median of what the epochs claim. Scatter: sigma from the moving range. Ratio: deviations over their "
         "sigmas, 1 where sigmas can be believed; p: that chance makes it so large. Per epoch: slope, and p of none. "
         "Marked where a test fails at {level} % for all numbers together, or a run is too long for chance.",
-        level=general(100 * LEVEL),
+        level=m.general(100 * LEVEL),
     )  # fmt: skip
-    return section("numbers", "All numbers", table(columns, rows, "", classes) if rows else "", note)
+    return m.section("numbers", "All numbers", m.table(columns, rows, "", classes) if rows else "", note)
 
 
 def _slope(c: Chart) -> Markup:
-    return part("below", value_text(c.slope, c.slope_sigma), f"± {sigma_text(c.slope_sigma)}")
+    return m.part("below", m.value_text(c.slope, c.slope_sigma), f"± {m.sigma_text(c.slope_sigma)}")
 
 
 def _alarm(trends: Trends, c: Chart, names: Sequence[str]) -> Markup:
     out: list[str] = []
     if trends.disagrees(c):
-        out.append(pill("bad", t("epochs disagree")))
+        out.append(m.pill("bad", t("epochs disagree")))
     if trends.drifts(c):
-        out.append(pill("warn", t("drift")))
+        out.append(m.pill("warn", t("drift")))
     outside = [names[int(c.series.epoch[i])] for i in np.flatnonzero(c.outside)]
     if outside:
         listed = ", ".join(outside[:4]) + (" …" if len(outside) > 4 else "")
@@ -212,8 +196,8 @@ def _alarm(trends: Trends, c: Chart, names: Sequence[str]) -> Markup:
     for run in c.runs:
         first, last = (names[int(c.series.epoch[i])] for i in (run.first, run.last))
         word = {"one_side": t("on one side"), "rising": t("rising"), "falling": t("falling")}[run.kind]
-        out.append(joined((pill("soft", word), f"{first} – {last}"), " "))
-    return _wrapped([joined(out, " ")]) if out else Markup()
+        out.append(m.joined((m.pill("soft", word), f"{first} – {last}"), " "))
+    return _wrapped([m.joined(out, " ")]) if out else Markup()
 
 
 def _folders(records: Sequence[Record], place: Path) -> Markup:
@@ -224,17 +208,17 @@ def _folders(records: Sequence[Record], place: Path) -> Markup:
         word = {"passed": t("Passed"), "check": t("Needs a look"), "failed": t("Failed")}[verdict]
         kind = {"passed": "good", "check": "warn", "failed": "bad"}[verdict]
         origin = {"adjusted": t("adjusted"), "unchanged": t("unchanged"), "resumed": t("as before")}[r.origin]
-        numbers = [count(s[k]) if k in s else MISSING for k in ("n_observations", "n_unknowns", "redundancy")]
+        numbers = [m.count(s[k]) if k in s else m.MISSING for k in ("n_observations", "n_unknowns", "redundancy")]
         not_used = s.get("suspects", {}).get("n_not_used")
-        seconds = fixed(r.seconds, 2) if r.origin == "adjusted" else MISSING
+        seconds = m.fixed(r.seconds, 2) if r.origin == "adjusted" else m.MISSING
         said = message(r.error or s.get("reason", "")).splitlines()[0] if (r.error or s.get("reason")) else ""
         classes.append("suspect" if r.state == FAILED else "")
-        title = element("span", s["title"], "s") if s.get("title") else Markup()
-        rows.append((_link(r, name, place) + title, pill(kind, word), _wrapped([said]), fixed(s.get("sigma0"), 3),
-                     *numbers, MISSING if not_used is None else count(not_used), origin, seconds))  # fmt: skip
+        title = m.element("span", s["title"], "s") if s.get("title") else Markup()
+        rows.append((_link(r, name, place) + title, m.pill(kind, word), _wrapped([said]), m.fixed(s.get("sigma0"), 3),
+                     *numbers, m.MISSING if not_used is None else m.count(not_used), origin, seconds))  # fmt: skip
     columns = ("<Survey", "<", "<Reason", "sigma0", "n", "u", "Redundancy", "Not used", "<", "s")
     note = t("n observations, u unknowns. A name leads to the survey's own report.")
-    return section("folders", "Folders", table(columns, rows, "", classes), note)
+    return m.section("folders", "Folders", m.table(columns, rows, "", classes), note)
 
 
 def write_overview(place: Path, records: Sequence[Record], trends: Trends, language: str = "en") -> dict[str, Path]:

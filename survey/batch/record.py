@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 from adjust.frames.unknowns import POSE_COMPONENTS
-from survey.batch.causes import CAUSES
+from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
 from survey.batch.common_datum import FreeDatum, Place, free_datum
+from survey.folder.locking import BusyError
 from survey.folder.shapes import NUMBER, POSITIVE, REAL, WHOLE, Each, Either, misfit
 from survey.solution.quantities import Status
 from survey.solution.verdict import misfits
@@ -16,6 +17,25 @@ from survey.solution.verdict import misfits
 DONE, TEST_FAILED, FAILED = "done", "test_failed", "failed"
 ORIGINS, VERDICTS = ("adjusted", "unchanged", "resumed"), ("passed", "check", "failed")
 EXIT_CODES = {DONE: 0, FAILED: 1, TEST_FAILED: 3}
+CAUSES = {
+    "project": "no project",
+    "files": "error in the project's files",
+    "undetermined": "not determined",
+    "convergence": "did not converge",
+    "survey": "cannot be adjusted",
+    "access": "file or folder not accessible",
+    "busy": "another command works on it",
+    "memory": "out of memory",
+    "process": "its process ended abruptly",
+    "cluster": "lost on the cluster",
+    "internal": "internal error",
+}
+"""Kind of failure and how it is called."""
+
+MAY_PASS = frozenset({"access", "busy", "memory", "process"})
+"""What a second try may mend: everything else would end the same way again."""
+
+_LINE_OF_FILE = re.compile(r"\.(toml|csv|parquet)(:|\b)")
 _SINGLE_POSES = (
     ("cameras", "station_from_camera"), ("stations", "mount_from_station"), ("stations", "world_from_station"),
     ("tables", "world_from_table"), ("targets", "world_from_target"), ("targets", "station_from_target"),
@@ -84,7 +104,7 @@ class Record:
 
     folder: as it was named. state: ``done``, ``test_failed`` (residuals larger than the sigmas say) or ``failed``.
     origin: ``adjusted`` now, ``unchanged`` (its results were there), ``resumed`` (failed in the run that is resumed).
-    cause: kind of a failure, a key of ``survey.batch.causes.CAUSES``. error: its message. summary, warnings, groups:
+    cause: kind of a failure, a key of ``CAUSES``. error: its message. summary, warnings, groups:
     of the solution. free_datum: what its world takes to a common datum, None where its datum is given. tries: how often
     it was adjusted in this run. seconds: of the last try.
     """
@@ -139,6 +159,24 @@ def _free_from(plain: Mapping[str, Any] | None) -> FreeDatum | None:
         for p in plain["places"]
     )
     return FreeDatum(tuple(tuple(row) for row in plain["open_motions"]), tuple(plain["carried_by"]), places)
+
+
+def cause_of(error: BaseException) -> str:
+    """The kind of a failure."""
+    if isinstance(error, IndeterminateError):
+        return "undetermined"
+    if isinstance(error, NotConvergedError):
+        return "convergence"
+    if isinstance(error, BusyError):
+        return "busy"
+    if isinstance(error, SurveyError):
+        text = str(error)
+        if "no such folder" in text or "there is no survey.toml" in text:
+            return "project"
+        return "files" if _LINE_OF_FILE.search(text.split("; ")[0]) else "survey"
+    if isinstance(error, OSError):
+        return "access"
+    return "memory" if isinstance(error, MemoryError) else "internal"
 
 
 def solved_record(

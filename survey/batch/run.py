@@ -14,10 +14,9 @@ from tqdm import tqdm
 from adjust.model.errors import SurveyError
 from adjust.native.parallel import cores
 from survey.batch.cache import fingerprint, unchanged_solution
-from survey.batch.causes import MAY_PASS
 from survey.batch.cluster import on_cluster
 from survey.batch.journal import Journal, entry_of, read_journal
-from survey.batch.record import DONE, FAILED, TEST_FAILED, Record, record_from, solved_record
+from survey.batch.record import DONE, FAILED, MAY_PASS, TEST_FAILED, Record, record_from, solved_record
 from survey.batch.worker import Worker, attempts
 from survey.folder.text import NOT_OURS
 

@@ -6,9 +6,8 @@ import numpy as np
 
 from adjust.model.errors import listed
 from adjust.model.survey import BoolArray
-from survey.batch.causes import CAUSES
 from survey.batch.control import Chart
-from survey.batch.record import DONE, FAILED, TEST_FAILED, Record
+from survey.batch.record import CAUSES, DONE, FAILED, TEST_FAILED, Record
 from survey.batch.run import counts, exit_code
 from survey.batch.trends import LEVEL, Trends
 from survey.folder.plain import plain

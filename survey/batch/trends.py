@@ -12,10 +12,10 @@ from adjust.testing.distributions import norm
 from survey.batch.common_datum import Moved, in_common_datum, incomparable, scale_is_open
 from survey.batch.control import WIDTH, Chart, Run, Series, chart
 from survey.batch.record import FAILED, Number, Record, Turn
+from survey.solution.quantities import ARCSEC_PER_RAD
 
 LEVEL = 0.05
 """Error probability of all charts together, for the tests of agreement and of slopes."""
-_ARCSEC = 180.0 * 3600.0 / np.pi
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +193,7 @@ def _turns(records: Sequence[Record]) -> Iterator[tuple[str, str, int, float, fl
         for turn in record.turns:
             w, x, y, z = turn.wxyz
             now = Rotation.from_quat([x, y, z, w])
-            vector = _ARCSEC * (first.setdefault(turn.name, now).inv() * now).as_rotvec()
+            vector = ARCSEC_PER_RAD * (first.setdefault(turn.name, now).inv() * now).as_rotvec()
             for axis, value, sigma in zip(("rx", "ry", "rz"), vector, turn.sigmas_arcsec, strict=True):
                 if np.isfinite(sigma) and sigma > 0.0:
                     yield f"{turn.name}/{axis}", "arcsec", epoch, float(value), sigma

@@ -13,13 +13,18 @@ import signal
 import subprocess
 import sys
 import threading
+import time
+import traceback
 import weakref
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
-from survey.batch.causes import MAY_PASS
-from survey.batch.record import FAILED, Record, record_from
+from adjust.model.errors import SurveyError
+from survey.batch.record import FAILED, MAY_PASS, Record, cause_of, record_from, solved_record
+from survey.folder.kept import require_project
+from survey.folder.messages import message
 
 _START = "import sys; sys.path[:] = sys.argv[1:]; from survey.batch.worker import main; main()"
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS")
@@ -136,12 +141,39 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the owner says when to stop
     tasks: queue.Queue[dict[str, object]] = queue.Queue()
     threading.Thread(target=_listen, args=(tasks,), daemon=True).start()
-    from survey.batch.task import adjust_task
-
     while True:
         record = adjust_task(tasks.get())
         answers.write(json.dumps(record.plain()).encode() + b"\n")
         answers.flush()
+
+
+def adjust_task(task: Mapping[str, Any]) -> Record:
+    """Adjust ``task["path"]`` and write its results; whatever goes wrong is in the record.
+
+    ``folder``: as the user named it. ``redetect``: look for targets again.
+    """
+    begin, folder = time.perf_counter(), Path(task["path"])
+    try:
+        require_project(folder)
+        from survey.jobs.adjusting.job import adjust_job
+
+        outcome = adjust_job(folder, progress=False, redetect=task["redetect"])
+        written = {name: str(path) for name, path in outcome.paths.items()}
+        return solved_record(task["folder"], outcome.solution, written, time.perf_counter() - begin)
+    except (SurveyError, OSError) as error:
+        known = isinstance(error, SurveyError) or error.filename is not None
+        text = message(error) if known else f"{folder}: {error}"
+        return Record(
+            task["folder"], FAILED, cause=cause_of(error), error=text, seconds=time.perf_counter() - begin
+        )
+    except Exception as error:  # a bug in one project must not cost the night's other results
+        text = f"{folder}: internal error, {type(error).__name__}: {error}"
+        if isinstance(error, MemoryError):
+            text = f"{folder}: not enough memory; run with fewer jobs"
+        return Record(
+            task["folder"], FAILED, cause=cause_of(error), error=text, traceback=traceback.format_exc(),
+            seconds=time.perf_counter() - begin,
+        )  # fmt: skip
 
 
 def _listen(tasks: "queue.Queue[dict[str, object]]") -> None:

@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 
 from survey.commands.common import DONE, begin_adjusting, is_set, print_json, require_project, say, show, tested
-from survey.commands.excluding import NAMES
+from survey.commands.excluding import NAMES, add_names
 from survey.commands.parser import Commands, project_folder
 
 _PAUSE_S = 0.3
@@ -42,10 +42,7 @@ def declare_remove(commands: Commands) -> None:
         "what the rest cannot do without; on any error FOLDER stays as it was.\n\n" + NAMES,
         epilog="Next: open FOLDER/results/report.html; labsurvey include FOLDER NAME takes back",
     )
-    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder, adjusted or not")
-    parser.add_argument("names", nargs="+", metavar="NAME", help="what is to be left out")
-    parser.add_argument("--reason", default="", metavar="TEXT", help="why; stands in the report")
-    parser.add_argument("--author", default="", metavar="TEXT", help="who; default: $LABSURVEY_AUTHOR, or the user")
+    add_names(parser, "project folder, adjusted or not", "what is to be left out", "why; stands in the report")
     parser.add_argument("--out", type=Path, metavar="DIR", help="leave FOLDER alone, write the new project to DIR")
 
 

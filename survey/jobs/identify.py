@@ -90,7 +90,7 @@ def predict(
     epoch_id: str | None = None,
 ) -> dict[str, FloatArray]:
     """Image points (2,) px of the world points that are in front of a camera and inside its image of an epoch."""
-    camera = next(c for c in survey.cameras if c.camera_id == camera_id)
+    camera = survey.cameras_by_id[camera_id]
     if not positions:
         return {}
     model, times = MODELS[camera.lens.model], LensTimes(survey)

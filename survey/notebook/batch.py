@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from adjust.model.errors import SurveyError
-from survey.batch.causes import CAUSES
 from survey.batch.charts import control_chart
 from survey.batch.page import write_overview
-from survey.batch.record import FAILED, Record
+from survey.batch.record import CAUSES, FAILED, Record
 from survey.batch.run import BatchOptions, counts, run_batch
 from survey.batch.tables import STATES, count_line, findings, short_names, summary_table
 from survey.batch.trends import Trends, trends_of

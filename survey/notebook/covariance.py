@@ -8,6 +8,7 @@ import numpy as np
 from adjust.model.survey import FloatArray
 from survey.notebook.frames import pandas
 from survey.notebook.names import Cell, Component, heading, html_table
+from survey.solution.quantities import correlations_in, sigmas_in
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,14 +40,12 @@ class Covariance:
     @property
     def sigmas(self) -> FloatArray:
         """Standard deviations (n,)."""
-        return np.asarray(np.sqrt(np.clip(np.diag(self.matrix), 0.0, None)))
+        return sigmas_in(self.matrix)
 
     @property
     def correlation(self) -> FloatArray:
         """Correlation matrix (n, n); 0 where a sigma is 0."""
-        s = self.sigmas
-        safe = np.where(s > 0.0, s, np.inf)
-        return np.asarray(self.matrix / np.outer(safe, safe))
+        return correlations_in(self.matrix)
 
     @property
     def frame(self) -> Any:

@@ -6,13 +6,13 @@ And small pieces of HTML that look well in a notebook, on light and on dark grou
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
-from gtsam import Pose3
 from markupsafe import Markup
 
 from adjust.model.errors import SurveyError
 from adjust.model.result import Estimate, ParameterName
 from survey.folder.text import suggestion
 from survey.report.markup import part
+from survey.solution.quantities import estimated, in_joint
 
 Component = tuple[ParameterName, str]
 Estimates = Mapping[ParameterName, Estimate]
@@ -63,15 +63,6 @@ def _known(estimates: Estimates) -> list[str]:
     return [*dict.fromkeys(n[1] for n in estimates if len(n) > 1), *("/".join(n) for n in estimates)]
 
 
-def estimated(estimate: Estimate) -> tuple[str, ...]:
-    """The components of an estimate that are not held or tied to others."""
-    return tuple(c for c, s in zip(estimate.components, estimate.status, strict=True) if s in ("free", "prior"))
-
-
-def in_joint(estimate: Estimate) -> tuple[str, ...]:
-    """The components that stand in a joint covariance: all of a pose or point, the estimated ones of a vector."""
-    whole = isinstance(estimate.value, Pose3) or estimate.name[0] == "point"
-    return estimate.components if whole else estimated(estimate)
 
 
 def rows_in_joint(estimates: Estimates, wanted: Sequence[Component]) -> tuple[list[ParameterName], list[int]]:

@@ -24,9 +24,6 @@ from survey.solution.quantities import Scale, scale_of
 from survey.solution.statistics import Statistics, statistics_of
 from survey.solution.verdict import MISFIT, UNTESTED, fit_of
 
-_VECTOR_KINDS = {"lenses": ("lens",), "tables": ("table_geometry",), "warps": ("warp",),
-                 "instruments": ("instrument",), "surfaces": ("surface",)}  # fmt: skip
-
 
 @dataclass(frozen=True, eq=False)
 class Solution:
@@ -83,73 +80,19 @@ class Solution:
         """
         return published_dict(self.adjustment, self.scale)
 
-    @property
-    def points(self) -> Any:
-        """Data frame: coordinates, sigmas, 95 % ellipsoids of points (mm)."""
-        return frames.points(self.adjustment, self.scale)
-
-    @property
-    def stations(self) -> Any:
-        """Data frame: poses of stations in the world or on their mount, by epoch where they move."""
-        return frames.poses(self.adjustment, self.scale, ("world_from_station", "mount_from_station"))
-
-    @property
-    def poses(self) -> Any:
-        """Data frame: all poses."""
-        return frames.poses(self.adjustment, self.scale)
-
-    @property
-    def cameras(self) -> Any:
-        """Data frame: images, points, RMS residual (px) and pose of each camera."""
-        return frames.cameras(self.adjustment, self.scale)
-
-    @property
-    def lenses(self) -> Any:
-        """Data frame: parameters of lenses by (camera, parameter)."""
-        return self._vectors("lenses")
-
-    @property
-    def tables(self) -> Any:
-        """Data frame: geometry of turntables by (table, parameter)."""
-        return self._vectors("tables")
-
-    @property
-    def unknowns(self) -> Any:
-        """Data frame: every component of every estimate in SI units."""
-        return frames.unknowns(self.adjustment, self.scale)
-
-    @property
-    def image_residuals(self) -> Any:
-        """Data frame: one row per image point."""
-        return frames.image_residuals(self.adjustment)
-
-    @property
-    def readings(self) -> Any:
-        """Data frame: one row per component of every observation that is no image point."""
-        return frames.readings(self.adjustment)
-
-    @property
-    def groups(self) -> Any:
-        """Data frame: redundancy and variance factor of the groups of observations."""
-        return frames.groups(self.adjustment)
-
-    @property
-    def reliability(self) -> Any:
-        """Data frame: tests, redundancy, least detectable bias of every observation."""
-        return frames.reliability(self.adjustment, self.precision)
-
-    @property
-    def relative_precision(self) -> Any:
-        """Data frame: of neighbouring points and stations (mm)."""
-        return frames.relative(self.precision)
-
-    @property
-    def budget(self) -> Any:
-        """Data frame: uncertainty budget of the results."""
-        return frames.budget(self.precision)
-
-    def _vectors(self, what: str) -> Any:
-        return frames.vectors(self.adjustment, self.scale, _VECTOR_KINDS[what])
+    points = property(frames.points)
+    stations = property(frames.stations)
+    poses = property(frames.poses)
+    cameras = property(frames.cameras)
+    lenses = property(frames.lenses)
+    tables = property(frames.tables)
+    unknowns = property(frames.unknowns)
+    image_residuals = property(frames.image_residuals)
+    readings = property(frames.readings)
+    groups = property(frames.groups)
+    reliability = property(frames.reliability)
+    relative_precision = property(frames.relative_precision)
+    budget = property(frames.budget)
 
     def covariance(
         self, *names: str | tuple[str, ...], sigmas: Literal["a_priori", "a_posteriori"] | None = None

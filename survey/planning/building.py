@@ -152,8 +152,8 @@ def _moments(series: Sequence[Moments], survey: Survey, values: _Values) -> list
 def _hand_poses(hand: ByHand, survey: Survey, values: _Values) -> list[Pose3]:
     """camera_from_target: the middle of the target in nine cells of the image in turn, tilted, at any distance."""
     rng = np.random.default_rng(hand.seed)
-    camera = next(c for c in survey.cameras if c.camera_id == hand.camera_id)
-    target = next(t for t in survey.targets if t.target_id == hand.target_id)
+    camera = survey.cameras_by_id[hand.camera_id]
+    target = survey.targets_by_id[hand.target_id]
     middle = 0.5 * (target.x_in_target.min(axis=0) + target.x_in_target.max(axis=0))
     out = []
     for i in range(hand.count):
@@ -175,9 +175,9 @@ def _ray(camera: Camera, lens: FloatArray, pixel: FloatArray) -> FloatArray:
 
 def _held_by_hand(m: Moment, hand: ByHand, survey: Survey, values: _Values, camera_from_target: Pose3) -> Moment:
     """Who moves: the target where it moves between epochs, else the station with its camera."""
-    camera = next(c for c in survey.cameras if c.camera_id == hand.camera_id)
-    target = next(t for t in survey.targets if t.target_id == hand.target_id)
-    station = next(s for s in survey.stations if s.station_id == camera.station_id)
+    camera = survey.cameras_by_id[hand.camera_id]
+    target = survey.targets_by_id[hand.target_id]
+    station = survey.stations_by_id[camera.station_id]
     mount = _value(values, ("station_from_camera", camera.camera_id), camera.station_from_camera)
     if target.motion == "epoch":
         if station.motion != "fixed":
@@ -203,11 +203,10 @@ def _value(values: _Values, name: ParameterName, parameter: PoseParameter) -> Po
 
 def _check_moving(survey: Survey, moments: Sequence[Moment]) -> None:
     """Raise where a fixed station or target is given poses."""
-    stations, targets = {s.station_id: s for s in survey.stations}, {t.target_id: t for t in survey.targets}
     for m in moments:
-        if m.station_id is not None and stations[m.station_id].motion == "fixed":
+        if m.station_id is not None and survey.stations_by_id[m.station_id].motion == "fixed":
             raise SurveyError(f'station {m.station_id} is given poses but is fixed; write motion = "epoch" or "table"')
-        if m.target_id is not None and targets[m.target_id].motion == "fixed":
+        if m.target_id is not None and survey.targets_by_id[m.target_id].motion == "fixed":
             raise SurveyError(f'target {m.target_id} is given poses but is fixed; write motion = "epoch"')
 
 
@@ -241,17 +240,15 @@ def _sigma_px(plan: Plan, project: Project) -> float:
 def _wanted(survey: Survey, m: Moment, sigma: float, points: Sequence[int]) -> list[ImageBlock]:
     """Every block that the images of an epoch may show: all points, seen or not."""
     out = []
-    sizes = {t.target_id: len(t.point_ids) for t in survey.targets}
     posed = {s.station_id for s in survey.stations if _is_posed(s, m)}
-    on = {c.camera_id: c.station_id for c in survey.cameras}
     hung = {
         t.target_id
         for t in survey.targets
         if (t.motion == "fixed" or m.target_id == t.target_id) and (t.station_id is None or t.station_id in posed)
     }
-    for camera in (c for c in m.cameras if on[c] in posed):
+    for camera in (c for c in m.cameras if survey.cameras_by_id[c].station_id in posed):
         for target in (t for t in m.targets if t in hung):
-            idx = np.arange(sizes[target], dtype=np.int64)
+            idx = np.arange(len(survey.targets_by_id[target].point_ids), dtype=np.int64)
             out.append(_block(camera, m.epoch_id, target, idx, sigma))
         if m.points and len(points):
             out.append(_block(camera, m.epoch_id, None, np.array(points, dtype=np.int64), sigma))

@@ -8,25 +8,9 @@ from adjust.design import group_redundancy
 from survey.planning.navigation import NavigationOutcome
 from survey.planning.summary import PlanningOutcome, expected_sigmas, meets, pose_sigmas, tolerance_values
 from survey.report import drawing as d
+from survey.report import markup as m
 from survey.report.charts import Series, bars, chart, seen_map
 from survey.report.language import esc, speaking
-from survey.report.markup import (
-    count,
-    definition,
-    document,
-    element,
-    figures,
-    fixed,
-    general,
-    joined,
-    listed,
-    note,
-    part,
-    pill,
-    section,
-    sigma_text,
-    table,
-)
 from survey.report.picture import draw, perspective, pictures
 from survey.report.scene import Scene, Spot, scene_of
 from survey.solution.quantities import scale_of, sigma_unit_for_people
@@ -37,8 +21,8 @@ _COLOURS = {"epoch": d.BLUE, "beacon": d.RED, "distance": d.GREEN, "pair": d.ORA
 
 def html_page(title: str, heading: str, sections: list[Markup]) -> str:
     """A page in the style of the reports."""
-    head = element("p", heading, "meta") + element("h1", title)
-    return document(title, head + joined(sections, "\n"))
+    head = m.element("p", heading, "meta") + m.element("h1", title)
+    return m.document(title, head + m.joined(sections, "\n"))
 
 
 def plan_page(o: PlanningOutcome) -> str:
@@ -54,12 +38,12 @@ def plan_page(o: PlanningOutcome) -> str:
 
 def _summary(o: PlanningOutcome) -> Markup:
     e = o.expected
-    cards = [(count(e.n_observations), "observations"), (count(e.n_unknowns), "unknowns"),
-             (count(e.redundancy), "redundancy"), (count(o.planned.n_planned_epochs), "planned epochs"),
-             (count(o.planned.n_existing_blocks), "images measured already")]  # fmt: skip
-    body = listed([*o.planned.notes, *e.warnings]) + part("cards", cards)
+    cards = [(m.count(e.n_observations), "observations"), (m.count(e.n_unknowns), "unknowns"),
+             (m.count(e.redundancy), "redundancy"), (m.count(o.planned.n_planned_epochs), "planned epochs"),
+             (m.count(o.planned.n_existing_blocks), "images measured already")]  # fmt: skip
+    body = m.listed([*o.planned.notes, *e.warnings]) + m.part("cards", cards)
     rows = [
-        (g, count(n), fixed(r, 1), fixed(q[0], 3), fixed(q[1], 3), fixed(q[2], 3))
+        (g, m.count(n), m.fixed(r, 1), m.fixed(q[0], 3), m.fixed(q[1], 3), m.fixed(q[2], 3))
         for g, (n, r, q) in group_redundancy(e).items()
     ]
     columns = ("<Group", "Observations", "Redundancy", "Smallest", "Median", "Largest number")
@@ -68,17 +52,17 @@ def _summary(o: PlanningOutcome) -> Markup:
         "observations and the geometry alone. A redundancy number tells how well an observation is checked by the "
         "others: an error in one near 0 would not be noticed."
     )
-    return section("summary", "Summary", body + table(columns, rows), said)
+    return m.section("summary", "Summary", body + m.table(columns, rows), said)
 
 
 def _picture(o: PlanningOutcome) -> Markup:
     scale = scale_of(o.expected, "a_priori")
     drawn, enlarged = pictures(scene_of(o.expected, scale), scale.ellipsoid)
     said = (
-        f"95 % confidence ellipsoids of points (red) and stations (green), enlarged {general(enlarged, 3)} times. "
+        f"95 % confidence ellipsoids of points (red) and stations (green), enlarged {m.general(enlarged, 3)} times. "
         "Cameras are drawn at the first epoch; thin lines are their axes at others."
     )
-    return section("picture", "The survey", figures(drawn), said)
+    return m.section("picture", "The survey", m.figures(drawn), said)
 
 
 def _seen(o: PlanningOutcome) -> Markup:
@@ -93,27 +77,27 @@ def _seen(o: PlanningOutcome) -> Markup:
         counts[rows.index((b.camera_id, b.target_id or "points")), epochs.index(b.epoch_id)] += len(b.point_idx)
     title = "Points seen, by camera and target over epochs (darker: more)"
     drawn = seen_map([f"{c}: {t}" for c, t in rows], epochs, counts, title)
-    return section("seen", "What will be seen", element("figure", drawn))
+    return m.section("seen", "What will be seen", m.element("figure", drawn))
 
 
 def _sigmas(o: PlanningOutcome) -> Markup:
     rows = [
-        (".".join(name), " \u00a0 ".join(f"{c} {sigma_text(sigma)} {unit}".strip() for c, sigma, unit in sigmas))
+        (".".join(name), " \u00a0 ".join(f"{c} {m.sigma_text(sigma)} {unit}".strip() for c, sigma, unit in sigmas))
         for name, sigmas in expected_sigmas(o) if len(name) < 3
     ]  # fmt: skip
     said = "One standard deviation, all others unknown too; poses in the tangent, in the frame on the right."
-    return section("sigmas", "Expected sigmas", table(("<Unknown", "<Sigmas"), rows), said)
+    return m.section("sigmas", "Expected sigmas", m.table(("<Unknown", "<Sigmas"), rows), said)
 
 
 def _weak(o: PlanningOutcome) -> Markup:
     rows = [
-        (fixed(w.factor, 0), part("lines", [f"{s:+.2f}  {a}: {c}" for a, c, s in w.parts])) for w in o.weak
+        (m.fixed(w.factor, 0), m.part("lines", [f"{s:+.2f}  {a}: {c}" for a, c, s in w.parts])) for w in o.weak
     ]  # fmt: skip
     said = (
         "Combinations of unknowns that the observations hardly tell apart. Factor: how many times less precise the "
         "combination is than its parts would be if the rest were known; shares in sigmas of each."
     )
-    return section("weak", "Weak directions", table(("Factor", "<What moves together"), rows) if rows else "", said)
+    return m.section("weak", "Weak directions", m.table(("Factor", "<What moves together"), rows) if rows else "", said)
 
 
 def _selection(o: PlanningOutcome) -> Markup:
@@ -126,25 +110,25 @@ def _selection(o: PlanningOutcome) -> Markup:
     drawn = bars(names, np.array([g.value(s.criterion) for g in shown]), f"Every candidate alone: {label}",
                  [_COLOURS.get(g.kind, d.GREY) for g in shown])  # fmt: skip
     steps = [
-        (str(i + 1), g.kind, g.name, fixed(g.ln_det, 3), fixed(g.ln_det_all, 3),
-         fixed(100 * g.mean_variance, 2) + " %")
+        (str(i + 1), g.kind, g.name, m.fixed(g.ln_det, 3), m.fixed(g.ln_det_all, 3),
+         m.fixed(100 * g.mean_variance, 2) + " %")
         for i, g in enumerate(s.steps)
     ]  # fmt: skip
     columns = ("", "<Kind", "<Measure next", "Gain ln det", "Of all unknowns", "Mean variance falls by")
-    body = figures([drawn]) + table(columns, steps)
+    body = m.figures([drawn]) + m.table(columns, steps)
     rows = []
     for c, a, b in zip(s.wanted, s.sigmas.tolist(), s.after.tolist(), strict=True):
         unit, factor = sigma_unit_for_people(c.unit)
-        drop = fixed(100 * (1 - b / a), 1) + " %" if a > 0 else ""
-        rows.append((c.text, sigma_text(factor * a), sigma_text(factor * b), unit, drop))
-    wanted = table(("<Component", "Before", "After all", "<Unit", "Smaller by"), rows)
-    body += part("details", "Sigmas of everything wanted, before and after", wanted, False)
+        drop = m.fixed(100 * (1 - b / a), 1) + " %" if a > 0 else ""
+        rows.append((c.text, m.sigma_text(factor * a), m.sigma_text(factor * b), unit, drop))
+    wanted = m.table(("<Component", "Before", "After all", "<Unit", "Smaller by"), rows)
+    body += m.part("details", "Sigmas of everything wanted, before and after", wanted, False)
     said = (
         f"{len(s.first)} candidates; {s.criterion}-optimal choice of {len(s.steps)}, one after the other, each beside "
         "those taken. ln det: of the covariance of what is wanted; the mean variance counts every component in units "
         "of its variance now."
     )
-    return section("next", "What to add next", body, said)
+    return m.section("next", "What to add next", body, said)
 
 
 def _tolerances(o: PlanningOutcome) -> Markup:
@@ -152,35 +136,37 @@ def _tolerances(o: PlanningOutcome) -> Markup:
         return Markup()
     rows, share = [], o.budget.variances / o.budget.variances.sum(axis=0)
     for x, shares in zip(o.requirements, share.T, strict=True):
-        word = pill("good", "met") if x.met else pill("bad", "not met")
-        sigmas = sigma_text(x.factor * x.required), sigma_text(x.factor * x.planned)
-        rows.append((x.component.text, *sigmas, x.unit, word, *(fixed(100 * v, 0) + " %" for v in shares)))
-    body = table(("<Component", "Required", "Planned", "<Unit", "<", *map(esc, o.budget.groups)), rows)
+        word = m.pill("good", "met") if x.met else m.pill("bad", "not met")
+        sigmas = m.sigma_text(x.factor * x.required), m.sigma_text(x.factor * x.planned)
+        rows.append((x.component.text, *sigmas, x.unit, word, *(m.fixed(100 * v, 0) + " %" for v in shares)))
+    body = m.table(("<Component", "Required", "Planned", "<Unit", "<", *map(esc, o.budget.groups)), rows)
     lines = [(t.group, _factor(t.alone), _factor(t.together), t.limiting) for t in o.tolerances]
-    body += table(("<Group", "Alone", "Together", "<Limited by"), lines, "Sigmas may be so many times the planned ones")
+    body += m.table(
+        ("<Group", "Alone", "Together", "<Limited by"), lines, "Sigmas may be so many times the planned ones"
+    )
     said = (
         "The variance of each component by group of observations, weights as planned. Alone: this group is changed, "
         "the others stay; together: every group takes an equal share of what is allowed."
     )
-    return section("tolerances", "Required precision and tolerances", body, said)
+    return m.section("tolerances", "Required precision and tolerances", body, said)
 
 
 def _factor(value: float) -> str:
     if np.isnan(value):
         return "never"
-    return "any" if value > 1e6 else general(value, 3)
+    return "any" if value > 1e6 else m.general(value, 3)
 
 
 def _trials(o: PlanningOutcome) -> Markup:
     t = o.trials
     if t is None:
         return Markup()
-    word = pill("good", "agrees") if t.passed else pill("bad", "does not agree")
-    facts = definition([
-        ("Surveys simulated and adjusted", f"{count(len(t.errors))}, {len(t.failed)} failed"),
+    word = m.pill("good", "agrees") if t.passed else m.pill("bad", "does not agree")
+    facts = m.definition([
+        ("Surveys simulated and adjusted", f"{m.count(len(t.errors))}, {len(t.failed)} failed"),
         ("Scatter and predicted covariance", word),
-        ("Mean of d' inv(C) d", f"{fixed(t.mean_square, 2)}, expected {t.dof} "
-                                f"({fixed(t.band[0], 2)} to {fixed(t.band[1], 2)} at 99 %)"),
+        ("Mean of d' inv(C) d", f"{m.fixed(t.mean_square, 2)}, expected {t.dof} "
+                                f"({m.fixed(t.band[0], 2)} to {m.fixed(t.band[1], 2)} at 99 %)"),
     ])  # fmt: skip
     k = len(t.ratios)
     x = np.arange(1.0, k + 1)
@@ -190,7 +176,7 @@ def _trials(o: PlanningOutcome) -> Markup:
              Series("± 2 standard errors", np.array([0.0, k]), np.ones(2) + 2 * se, d.GREY, line=True, dashed=True),
              Series("", np.array([0.0, k]), np.ones(2) - 2 * se, d.GREY, line=True, dashed=True)]  # fmt: skip
     drawn = chart(lines, "Scatter over prediction", "component", "ratio", 620, 260, None)
-    return section("trials", "Monte Carlo", facts + element("figure", drawn))
+    return m.section("trials", "Monte Carlo", facts + m.element("figure", drawn))
 
 
 def _navigation(n: NavigationOutcome) -> Markup:
@@ -206,23 +192,23 @@ def _navigation(n: NavigationOutcome) -> Markup:
                  Series(f"largest sigma of {what}", x[good], values[good], d.BLUE)]  # fmt: skip
         drawn.append(chart(lines, f"Expected {what} of every pose", "pose", unit))
     drawn += [_room(n)] if n.placement is None else []
-    body = part("figures", drawn, "figures")
+    body = m.part("figures", drawn, "figures")
     good = meets(n)
     open_poses = [i + 1 for i, e in enumerate(n.precision) if e.undetermined]
     facts = [("Poses as precise as required", f"{int(good.sum())} of {len(good)}")]
     if open_poses:
         facts.append(("Not determined", ", ".join(map(str, open_poses[:20]))))
-    body = definition(facts) + body
+    body = m.definition(facts) + body
     if n.placement is not None:
         body += _placement(n)
     if n.tolerances:
         rows = []
         for t in n.tolerances:
             unit, *sigmas = tolerance_values(t)
-            rows.append((t.source, *("never" if np.isnan(v) else general(v, 3) for v in sigmas), unit))
+            rows.append((t.source, *("never" if np.isnan(v) else m.general(v, 3) for v in sigmas), unit))
         caption = "Sigma per component that each source may have for every determined pose to be as required"
-        body += table(("<Source", "Alone", "Beside the planned", "Equal shares", "<Unit"), rows, caption)
-        body += note(
+        body += m.table(("<Source", "Alone", "Beside the planned", "Equal shares", "<Unit"), rows, caption)
+        body += m.note(
             f"With equal shares simulated and solved anew: RMS errors are {n.simulated.min():.3f} to "
             f"{n.simulated.max():.3f} of their predictions."
         )
@@ -230,7 +216,7 @@ def _navigation(n: NavigationOutcome) -> Markup:
         f"Station {n.station_id} with its calibration as planned, {len(n.beacons.beacon_ids)} beacons; required: "
         f"{limits[0]:.3g} deg and {limits[1]:.3g} mm per component."
     )
-    return section("navigation", "Navigation", body, said)
+    return m.section("navigation", "Navigation", body, said)
 
 
 def _room(n: NavigationOutcome) -> Markup:
@@ -261,13 +247,13 @@ def _placement(n: NavigationOutcome) -> Markup:
     title = f"{what.capitalize()} over beacons placed"
     drawn = chart(lines, title, "beacons", "sigma / required") if lines else Markup()
     rows = [
-        (f"N{i + 1}", *(fixed(1e3 * v, 0) for v in place), str(sum(f"N{i + 1}" in e.beacon_ids for e in n.precision)))
+        (f"N{i + 1}", *(m.fixed(1e3 * v, 0) for v in place), str(sum(f"N{i + 1}" in e.beacon_ids for e in n.precision)))
         for i, place in enumerate(n.places)
     ]
-    body = element("h3", "Where to put beacons") + figures((_room(n), drawn))
+    body = m.element("h3", "Where to put beacons") + m.figures((_room(n), drawn))
     said = (
         f"{len(n.places)} of {len(n.plan.places)} places on the walls (small dots), chosen one by one "
         f"for the {what}, {p.exchanged} then exchanged; red: beacons, green: where the head will be. Every pose sees "
         f"at least {min(p.seen)} beacons."
     )
-    return body + note(said) + table(("<Beacon", "x mm", "y mm", "z mm", "Poses that see it"), rows)
+    return body + m.note(said) + m.table(("<Beacon", "x mm", "y mm", "z mm", "Poses that see it"), rows)

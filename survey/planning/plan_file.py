@@ -60,9 +60,8 @@ class ByHand:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """A series of epochs under one name; ``by_hand`` where their poses are still to be drawn."""
+    """A series of epochs; ``by_hand`` where their poses are still to be drawn."""
 
-    prefix: str
     moments: tuple[Moment, ...]
     by_hand: ByHand | None = None
 
@@ -187,7 +186,7 @@ def _moments(node: Node, survey: Survey, number: int) -> Moments:
         for group in each:
             own = f"{prefix}{i + 1:0{width}d}" + (f"-{group[0]}" if len(each) > 1 else "")
             moments.append(Moment(own, group, targets, points, **place))
-    return Moments(prefix, tuple(moments), hand)
+    return Moments(tuple(moments), hand)
 
 
 def _places(node: Node, survey: Survey, kind: str) -> tuple[list[dict[str, Any]], ByHand | None]:
@@ -199,7 +198,7 @@ def _places(node: Node, survey: Survey, kind: str) -> tuple[list[dict[str, Any]]
         return [{}] * hand.count, hand
     if kind == "table":
         table = node.reference("table", (t.table_id for t in survey.tables), "table")
-        axes = next(len(t.axes) for t in survey.tables if t.table_id == table)
+        axes = len(survey.tables_by_id[table].axes)
         return [{"table_id": table, "angles": a} for a in _angles(node, axes)], None
     if node.has("station") == node.has("target"):
         raise node.error("poses are of one thing; name a station or a target", "poses")

@@ -42,7 +42,7 @@ def matches(component: Component, pattern: str, survey: Survey) -> bool:
     texts = [component.text, owner, ".".join(component.name[1:])]
     if component.name[0] == "station_from_camera":
         camera = component.name[1]
-        station = next(c.station_id for c in survey.cameras if c.camera_id == camera)
+        station = survey.cameras_by_id[camera].station_id
         texts += [f"{station}.camera_{camera}", f"{station}.{camera}"]
         texts.append(f"{station}.camera_{camera}.{component.component}")
     return any(fnmatchcase(text, pattern) for text in texts)

@@ -51,6 +51,8 @@ class ReportOptions:
 
 
 ENGLISH_PAGE = ReportOptions()
+
+
 class MissingTranslationError(KeyError):
     """A text of the report that a language does not know: a bug, found by the tests."""
 

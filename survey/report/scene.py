@@ -128,7 +128,7 @@ def _add_cameras(scene: Scene, adjustment: Adjustment, frames: AdjustedFrames, e
 
 def _half_angles(adjustment: Adjustment, camera_id: str) -> tuple[float, float]:
     """Half the field of view from an fx in pixels, a drawing's 25 degrees where the lens names none."""
-    camera = next(c for c in adjustment.survey.cameras if c.camera_id == camera_id)
+    camera = adjustment.survey.cameras_by_id[camera_id]
     estimate = adjustment.estimates.get(("lens", camera_id))
     width, height = camera.image_size
     if estimate is None or isinstance(estimate.value, Pose3) or "fx" not in estimate.components:

@@ -216,16 +216,18 @@ def _published(solution: dict[str, Any]) -> Iterator[str]:
     yield ""
     yield "  published methods, step by step, beside this adjustment"
     if "head" in found:
-        yield f"  {'':<30}{'published':>12}{'claimed σ':>11}{'σ':>11}{'joint':>12}{'σ':>11}{'ratio':>7}"
+        heads = f"{'published':>11}{'claimed σ':>10}{'σ':>9}{'joint':>11}{'σ':>9}{'difference':>11}{'ratio':>7}"
+        yield f"  {'':<30}{heads}"
         for pose, name, unit, e in head_rows(found["head"]):
-            small = "arcsec" if unit == "deg" else "mm"
+            small, digits, fine = ("arcsec", 4, 1) if unit == "deg" else ("mm", 3, 3)
+            values = (_number(e[f"{which}_{unit}"], 11, digits) for which in ("published", "joint"))
             sigmas = (e[f"{which}_sigma_{small}"] for which in ("claimed", "published", "joint"))
-            claimed, own, joint = (_number(x, 11, 1 if unit == "deg" else 3) for x in sigmas)
-            values = (_number(e[f"{which}_{unit}"], 12, 4 if unit == "deg" else 3) for which in ("published", "joint"))
-            value, other = values
+            (value, other), (claimed, own, joint) = values, map(_number, sigmas, (10, 9, 9), [fine] * 3)
+            apart = _number(e[f"difference_{small}"], 11, fine)
             place = f"{_cut(pose, 22)} {name} {unit}"
-            yield f"  {place:<30}{value}{claimed}{own}{other}{joint}{_number(e['sigma_ratio'], 7, 1)}"
-        yield "  σ of angles in arcsec; claimed: as each step states it, σ: through all steps"
+            yield f"  {place:<30}{value}{claimed}{own}{other}{joint}{apart}{_number(e['sigma_ratio'], 7, 1)}"
+        yield "  claimed: as each step states it, σ: through all steps; difference: published minus joint; σ and"
+        yield "  differences of angles in arcsec, of turns about the axes: near ry = ±90° rx and rz differ by more"
     if "pairs" in found:
         pairs, steps = found["pairs"], found["pairs"]["steps"]["weighted"]
         said = f"{pairs['n_loops']} loops closed in {steps['iterations']} iterations"

@@ -8,21 +8,9 @@ from gtsam import Pose3
 from adjust.model.observations import Coordinates, Distance, PositionRef
 from adjust.model.survey import Station, Survey
 from survey.project.targets import Checkerboard, MarkerGrid
+from survey.simulate import parts as parts
 from survey.simulate.draft import ARCSEC, HELD, Draft, Shot, image_blocks, outline, rotation_vector, table_readings
 from survey.simulate.noise import resample
-from survey.simulate.parts import (
-    CHARUCO,
-    add_beacons,
-    add_head,
-    add_relay,
-    add_table,
-    add_wall_grids,
-    shoot_board_by_hand,
-    shoot_board_from_table,
-    shoot_target_by_hand,
-    turn_to_walls,
-    wide_lens,
-)
 from survey.simulate.scene import Truth, rotation_about, shift_along
 
 CORNER_SIGMA_PX = 0.115
@@ -79,10 +67,10 @@ def single_camera_draft(seed: int, n_images: int) -> Draft:
     draft = Draft(np.random.default_rng(seed))
     draft.stations.append(Station("tripod", world_from_station=HELD))
     draft.truth["world_from_station", "tripod"] = Pose3()
-    draft.add_camera("C1", "tripod", wide_lens(draft.rng, 1400.0), np.eye(4), held=True)
+    draft.add_camera("C1", "tripod", parts.wide_lens(draft.rng, 1400.0), np.eye(4), held=True)
     draft.add_target("board", SMALL_BOARD, None)
     epochs = [f"e{number + 1:02d}" for number in range(n_images)]
-    shoot_target_by_hand(draft, "C1", "board", epochs, (0.45, 0.95), 0.04)
+    parts.shoot_target_by_hand(draft, "C1", "board", epochs, (0.45, 0.95), 0.04)
     return draft
 
 
@@ -97,15 +85,15 @@ def stereo_draft(seed: int, n_pairs: int, baseline_m: float = 0.2) -> Draft:
     draft = Draft(np.random.default_rng(seed))
     draft.stations.append(Station("bar", world_from_station=HELD))
     draft.truth["world_from_station", "bar"] = Pose3()
-    draft.add_camera("left", "bar", wide_lens(draft.rng, 1400.0), np.eye(4), held=True)
+    draft.add_camera("left", "bar", parts.wide_lens(draft.rng, 1400.0), np.eye(4), held=True)
     turned = rotation_about("y", np.radians(-12.0))
     turned[:3, :3] = turned[:3, :3] @ rotation_vector(draft.rng.normal(0.0, 0.7, 3))
-    draft.add_camera("right", "bar", wide_lens(draft.rng, 1400.0), shift_along("x", baseline_m) @ turned)
+    draft.add_camera("right", "bar", parts.wide_lens(draft.rng, 1400.0), shift_along("x", baseline_m) @ turned)
     draft.add_target("board", SMALL_BOARD, None)
     number = 0
     while sum(shot.camera_id == "right" for shot in draft.shots) < n_pairs:
         epoch_id = f"e{len(draft.shots) // 2 + 1:02d}"
-        shoot_target_by_hand(draft, "left", "board", [epoch_id], (0.55, 1.0), 0.04)
+        parts.shoot_target_by_hand(draft, "left", "board", [epoch_id], (0.55, 1.0), 0.04)
         shot = Shot("right", epoch_id, ("board",))
         number += 1
         if draft.outline_visible(shot, "board", outline(SMALL_BOARD, 0.04), 8.0):
@@ -127,12 +115,12 @@ def _head_draft(
     seed: int, n_cameras: int, n_table_epochs: int, n_free_epochs: int, skewness_arcsec: float, offset_mm: float
 ) -> Draft:
     draft = Draft(np.random.default_rng(seed))
-    names = add_head(draft, n_cameras)
-    add_table(draft, skewness_arcsec, offset_mm)
+    names = parts.add_head(draft, n_cameras)
+    parts.add_table(draft, skewness_arcsec, offset_mm)
     for name in names:
-        shoot_board_from_table(draft, name, n_table_epochs)
+        parts.shoot_board_from_table(draft, name, n_table_epochs)
     for name in names:
-        shoot_board_by_hand(draft, name, n_free_epochs)
+        parts.shoot_board_by_hand(draft, name, n_free_epochs)
     return draft
 
 
@@ -163,7 +151,7 @@ def beacons(
 ) -> tuple[Survey, Truth]:
     """``head_on_table`` and ten beacons on walls and ceiling, most with surveyed coordinates, and five distances."""
     draft = _head_draft(seed, 3, n_table_epochs, n_free_epochs, 60.0, 0.35)
-    add_beacons(draft)
+    parts.add_beacons(draft)
     _shoot_night(draft, n_night_epochs, ("X", "Y", "Z"))
     return observed(draft, seed, sigma_px, table_sigma_arcsec), draft.truth
 
@@ -171,7 +159,7 @@ def beacons(
 def _shoot_night(draft: Draft, n_epochs: int, camera_ids: tuple[str, ...]) -> None:
     """Beacons alone; images without any are not kept."""
     scene = draft.scene()
-    for epoch_id in turn_to_walls(draft, "n", n_epochs):
+    for epoch_id in parts.turn_to_walls(draft, "n", n_epochs):
         for camera_id in camera_ids:
             uv = scene.project(camera_id, epoch_id, scene.world_points())
             if scene.inside(camera_id, uv, 12.0).any():
@@ -181,8 +169,8 @@ def _shoot_night(draft: Draft, n_epochs: int, camera_ids: tuple[str, ...]) -> No
 def relay(seed: int, *, n_epochs: int = 12, sigma_px: float = CORNER_SIGMA_PX) -> tuple[Survey, Truth]:
     """A relay station of four cameras, turned from wall to wall before four plates of markers; plate G1 is held."""
     draft = Draft(np.random.default_rng(seed))
-    add_wall_grids(draft, held=("G1",))
-    room_from_station = add_relay(draft, "epoch", (0.0, 0.0, 0.0))
+    parts.add_wall_grids(draft, held=("G1",))
+    room_from_station = parts.add_relay(draft, "epoch", (0.0, 0.0, 0.0))
     for number in range(n_epochs):
         epoch_id = f"e{number + 1:02d}"
         turned = rotation_about("z", number % 4 * np.pi / 2)
@@ -210,20 +198,20 @@ def full_lab_draft(seed: int, size: LabSize = LabSize()) -> Draft:
     each relay camera also sees a ChArUco board held by hand.
     """
     draft = _head_draft(seed, 3, size.n_table_epochs, size.n_free_epochs, 60.0, 0.35)
-    add_wall_grids(draft)
-    add_beacons(draft)
-    add_relay(draft, "fixed", (0.7, -0.5, 0.15))
+    parts.add_wall_grids(draft)
+    parts.add_beacons(draft)
+    parts.add_relay(draft, "fixed", (0.7, -0.5, 0.15))
     relay_cameras = tuple(c.camera_id for c in draft.cameras if c.station_id == "relay")
-    for epoch_id in turn_to_walls(draft, "w", size.n_wall_epochs):
+    for epoch_id in parts.turn_to_walls(draft, "w", size.n_wall_epochs):
         for camera_id in ("X", "Y"):
             _shoot_grids(draft, camera_id, epoch_id)
     _shoot_night(draft, size.n_night_epochs, ("X", "Y", "Z"))
-    draft.add_target("charuco", CHARUCO, None)
+    draft.add_target("charuco", parts.CHARUCO, None)
     for camera_id in relay_cameras:
         _shoot_grids(draft, camera_id, "r01")
         draft.shots.append(Shot(camera_id, "q01", beacons=True))
         epochs = [f"c{camera_id}{number + 1:02d}" for number in range(size.n_charuco_epochs)]
-        shoot_target_by_hand(draft, camera_id, "charuco", epochs, (0.45, 1.0), 0.034)
+        parts.shoot_target_by_hand(draft, camera_id, "charuco", epochs, (0.45, 1.0), 0.034)
     return draft
 
 

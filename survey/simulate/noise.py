@@ -6,8 +6,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.design.noise import moved, with_drawn_priors
-from adjust.design.readings import draw
+from adjust.design.noise import draw, moved, with_drawn_priors
 from adjust.model.observations import Pair, TableReading
 from adjust.model.survey import FloatArray, Survey
 from survey.simulate.readings import fresh_readings
@@ -91,7 +90,7 @@ def _ideal(scene: Scene) -> _Ideal:
 
 def _true_angles(scene: Scene, reading: TableReading) -> FloatArray:
     """Of a table when it was read."""
-    table = next(t for t in scene.survey.tables if t.table_id == reading.table_id)
+    table = scene.survey.tables_by_id[reading.table_id]
     late = scene.courses.late(("table_clock", table.table_id), table.clock, reading.epoch_id)
     return scene.angles(table.table_id, reading.epoch_id, late)
 

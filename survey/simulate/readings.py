@@ -9,12 +9,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from gtsam import Pose3
 from scipy.spatial.transform import Rotation
 
-from adjust.design.readings import draw
+from adjust.design.noise import draw
 from adjust.model.observations import Alignment, FrameRef, LaserSpot, Level, OnSurface, PositionRef, Reading
-from adjust.model.survey import FloatArray, Survey, VectorParameter, tilt_axes
+from adjust.model.survey import FloatArray, Survey, tilt_axes
 from survey.simulate.scene import Scene
 
 
@@ -111,7 +110,7 @@ class Instruments:
 
 
 def fresh_readings(scene: Scene, rng: np.random.Generator) -> dict[str, Any]:
-    """The survey's terrestrial and geometric observations with new noise, and new means of their priors."""
+    """The survey's terrestrial and geometric observations with new noise."""
     survey = scene.survey
     if not any((survey.readings, survey.levels, survey.alignments, survey.laser_spots, survey.on_surfaces,
                 survey.coordinate_differences)):  # fmt: skip
@@ -126,11 +125,6 @@ def fresh_readings(scene: Scene, rng: np.random.Generator) -> dict[str, Any]:
         "coordinate_differences": tuple(
             replace(d, values=np.array([scene.position(b) - scene.position(a) for a, b in zip(d.at, d.to, strict=True)])
                     + draw(d.cov, rng).reshape(-1, 3)) for d in survey.coordinate_differences),
-        "instruments": tuple(replace(i, parameters=_prior(i.parameters, scene, ("instrument", i.instrument_id), rng))
-                             for i in survey.instruments),
-        "beams": tuple(replace(b, parameters=_prior(b.parameters, scene, ("beam", b.beam_id), rng))
-                       for b in survey.beams),
-        "vertical": replace(survey.vertical, tilt=_prior(survey.vertical.tilt, scene, ("vertical",), rng)),
     }  # fmt: skip
 
 
@@ -156,11 +150,3 @@ def _on_surface(ideal: Instruments, o: OnSurface, rng: np.random.Generator) -> O
     if ideal.surfaces[o.surface_id].kind == "line" and o.offset == 0.0:
         return o
     return replace(o, offset=ideal.offset(o) + o.sigma * float(rng.standard_normal()))
-
-
-def _prior(vector: VectorParameter, scene: Scene, name: tuple[str, ...], rng: np.random.Generator) -> VectorParameter:
-    true = scene.truth.get(name)
-    if vector.prior is None or true is None or isinstance(true, Pose3):
-        return vector
-    mean = np.array([true[vector.names.index(n)] for n in vector.prior.names]) + draw(vector.prior.cov, rng)
-    return replace(vector, prior=replace(vector.prior, mean=mean))

@@ -132,7 +132,7 @@ def scene_camera(scene: Scene, camera_id: str) -> BrownCamera:
     """A camera as it truly is."""
     lens = dict(zip(BROWN, scene.vector("lens", camera_id), strict=True))
     distortion = tuple(float(lens[name]) for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"))
-    size = next(c.image_size for c in scene.survey.cameras if c.camera_id == camera_id)
+    size = scene.survey.cameras_by_id[camera_id].image_size
     return BrownCamera(size, lens["fx"], lens["fy"], lens["u0"], lens["v0"], distortion)
 
 

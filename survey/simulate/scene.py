@@ -6,8 +6,8 @@ there cannot hide by being made twice.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import reduce
+from dataclasses import dataclass
+from functools import cached_property, reduce
 
 import cv2
 import numpy as np
@@ -17,7 +17,7 @@ from adjust.frames.lens_times import block_starts, crop_starts
 from adjust.model.boards import BOARD
 from adjust.model.observations import FrameRef, ImageBlock, PositionRef
 from adjust.model.result import ParameterName
-from adjust.model.survey import BoolArray, Camera, FloatArray, IntArray, Station, Survey, Table, Target
+from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey, Target
 from survey.simulate.courses import Courses, Late, rolls
 
 Truth = dict[ParameterName, Pose3 | FloatArray]
@@ -101,19 +101,11 @@ class Scene:
 
     survey: Survey
     truth: Truth
-    _cameras: Mapping[str, Camera] = field(init=False, repr=False)
-    _stations: Mapping[str, Station] = field(init=False, repr=False)
-    _tables: Mapping[str, Table] = field(init=False, repr=False)
-    _targets: Mapping[str, Target] = field(init=False, repr=False)
-    courses: Courses = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        survey = self.survey
-        object.__setattr__(self, "_cameras", {c.camera_id: c for c in survey.cameras})
-        object.__setattr__(self, "_stations", {s.station_id: s for s in survey.stations})
-        object.__setattr__(self, "_tables", {t.table_id: t for t in survey.tables})
-        object.__setattr__(self, "_targets", {t.target_id: t for t in survey.targets})
-        object.__setattr__(self, "courses", Courses(survey, self.truth))
+    @cached_property
+    def courses(self) -> Courses:
+        """Where things are between the epochs."""
+        return Courses(self.survey, self.truth)
 
     def _pose(self, *name: str, late: Late = 0.0) -> FloatArray:
         if len(name) == 3 and np.any(late):
@@ -135,7 +127,7 @@ class Scene:
         """(4, 4): outer axis, common perpendicular, inner axis, as ``adjust.model.survey.Table`` writes the chain."""
         if angles.ndim == 2:
             return np.array([self.table_from_mount(table_id, a) for a in angles])
-        table = self._tables[table_id]
+        table = self.survey.tables_by_id[table_id]
         g = dict(zip(table.geometry.names, self.vector("table_geometry", table_id).tolist(), strict=True))
         if len(table.axes) == 1:
             return _moving(table.axes[0], 1, g, angles[0]) @ rotation_about(table.axes[0], angles[0] + g["zero_1"])
@@ -151,7 +143,7 @@ class Scene:
 
     def world_from_station(self, station_id: str, epoch_id: str | None = None, late: Late = 0.0) -> FloatArray:
         """(4, 4) at an epoch, or a time after it: by the table where it was read then, else the station's own pose."""
-        station = self._stations[station_id]
+        station = self.survey.stations_by_id[station_id]
         if station.motion == "fixed":
             return self._pose("world_from_station", station_id)
         if epoch_id is None:
@@ -172,12 +164,12 @@ class Scene:
 
     def world_from_camera(self, camera_id: str, epoch_id: str | None = None, late: Late = 0.0) -> FloatArray:
         """(4, 4) of a camera at an epoch, or a time after it."""
-        station_id = self._cameras[camera_id].station_id
+        station_id = self.survey.cameras_by_id[camera_id].station_id
         return self.world_from_station(station_id, epoch_id, late) @ self._pose("station_from_camera", camera_id)
 
     def world_from_target(self, target_id: str, epoch_id: str | None = None, late: Late = 0.0) -> FloatArray:
         """(4, 4) of a target at an epoch, or a time after it."""
-        target = self._targets[target_id]
+        target = self.survey.targets_by_id[target_id]
         name: tuple[str, ...] = ("carrier_from_target", target_id)
         if target.motion == "epoch":
             name = (*name, str(epoch_id))
@@ -189,7 +181,7 @@ class Scene:
         self, target_id: str, epoch_id: str | None = None, late: Late = 0.0, points: IntArray | slice = slice(None)
     ) -> FloatArray:
         """The target's points in the world, (n, 3) m, or some of them."""
-        target = self._targets[target_id]
+        target = self.survey.targets_by_id[target_id]
         warp, warmth = ("warp", target_id), self.survey.temperatures.get(str(epoch_id), target.reference_temperature)
         x = _warped(target, self.vector(*warp), warmth) if warp in self.truth else target.x_in_target
         return transform(self.world_from_target(target_id, epoch_id, late), x[points])
@@ -201,7 +193,7 @@ class Scene:
     def _lens(self, camera_id: str, epoch_id: str) -> dict[str, float]:
         """The parameters of a lens as it was at an epoch."""
         lens = dict(zip(BROWN, self.vector("lens", camera_id).tolist(), strict=True))
-        drift = self._cameras[camera_id].lens.drift
+        drift = self.survey.cameras_by_id[camera_id].lens.drift
         if drift is None:
             return lens
         name: ParameterName = ("lens_drift", camera_id)
@@ -209,7 +201,7 @@ class Scene:
         if reference is not None:
             factor = self.survey.temperatures[epoch_id] - reference
         else:
-            name = (*name, block_starts(self.survey, self._cameras[camera_id])[epoch_id] or "")
+            name = (*name, block_starts(self.survey, self.survey.cameras_by_id[camera_id])[epoch_id] or "")
         if name in self.truth:
             for parameter, value in zip(drift.parameters, self.vector(*name).tolist(), strict=True):
                 lens[parameter] += factor * value
@@ -217,7 +209,8 @@ class Scene:
 
     def image(self, block: ImageBlock) -> FloatArray:
         """Image coordinates (n, 2) px of what a block shows when its camera truly exposes, row by row."""
-        camera, name, epoch = self._cameras[block.camera_id], ("camera_clock", block.camera_id), block.epoch_id
+        camera, epoch = self.survey.cameras_by_id[block.camera_id], block.epoch_id
+        name = ("camera_clock", block.camera_id)
         uv = self._seen(block, self.courses.late(name, camera.clock, epoch))
         if not rolls(camera):
             return uv
@@ -249,7 +242,7 @@ class Scene:
 
     def _cropped(self, camera_id: str, epoch_id: str, uv: FloatArray) -> FloatArray:
         """Pixels of the image as it was cropped by then, from those of the whole."""
-        camera = self._cameras[camera_id]
+        camera = self.survey.cameras_by_id[camera_id]
         start = crop_starts(self.survey, camera).get(epoch_id) if camera.lens.crops else None
         if start is None:
             return uv
@@ -260,7 +253,7 @@ class Scene:
 
     def inside(self, camera_id: str, uv: FloatArray, margin_px: float) -> BoolArray:
         """Which of the image points (n, 2) lie in the image, at least ``margin_px`` from its border."""
-        size = np.array(self._cameras[camera_id].image_size, dtype=float)
+        size = np.array(self.survey.cameras_by_id[camera_id].image_size, dtype=float)
         with np.errstate(invalid="ignore"):
             within: BoolArray = np.all((uv >= margin_px) & (uv <= size - 1.0 - margin_px), axis=1)
         return within
@@ -287,6 +280,6 @@ class Scene:
         if ref.point_id is None:
             origin: FloatArray = self.world_from_frame(ref.frame)[:3, 3]
             return origin
-        target = self._targets[ref.frame.frame_id]
+        target = self.survey.targets_by_id[ref.frame.frame_id]
         x: FloatArray = self.target_points(target.target_id, ref.frame.epoch_id)[target.point_ids.index(ref.point_id)]
         return x

@@ -17,9 +17,9 @@ from adjust.testing.significance import Significance, significance_of_changes, s
 from survey.folder.plain import attributes, plain
 from survey.project.detected import DetectedImage
 from survey.project.project import LeftOut
+from survey.solution import quantities as q
 from survey.solution.instruments import instrument_entries
 from survey.solution.left_out import left_out_dict
-from survey.solution.quantities import PoseColumns, Scale, SigmaKind, point_entry, pose_columns, scale_of, vector_entry
 from survey.solution.records import Form, Records
 from survey.solution.statistics import Statistics
 from survey.solution.statistics_dict import statistics_dict
@@ -55,7 +55,7 @@ class RunInfo:
     versions: Mapping[str, str] = field(default_factory=dict)
     date: str = ""
     seconds: Mapping[str, float] = field(default_factory=dict)
-    sigmas: SigmaKind = "a_posteriori"
+    sigmas: q.SigmaKind = "a_posteriori"
     identification: tuple[tuple[str, str], ...] = ()
     command: str = ""
     images: Mapping[str, DetectedImage] = field(default_factory=dict)
@@ -68,8 +68,8 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
     """The whole solution as plain values, floats in full, None where there is no number; ``found``: its statistics."""
     if found is not None:
         return with_statistics(solution_dict(adjustment, run), adjustment, run, found)
-    scale = scale_of(adjustment, run.sigmas)
-    columns = pose_columns(adjustment.estimates.values(), scale)
+    scale = q.scale_of(adjustment, run.sigmas)
+    columns = q.pose_columns(adjustment.estimates.values(), scale)
     poses = _poses(columns)
     solution: dict[str, Any] = plain(
         {
@@ -115,7 +115,7 @@ def with_statistics(
 
     Its warnings: causes that were tried first, then what tests of parts found, then the rest.
     """
-    scale, warnings = scale_of(adjustment, run.sigmas), adjustment.warnings
+    scale, warnings = q.scale_of(adjustment, run.sigmas), adjustment.warnings
     tried = len(adjustment.diagnosis.lines) if adjustment.diagnosis is not None else 0
     told: dict[str, Any] = plain({
         "summary": _summary(adjustment, run, scale, found),
@@ -135,7 +135,7 @@ def _free_datum(adjustment: Adjustment) -> dict[str, Any]:
     return {"free_datum": {"open_motions": directions.T.tolist(), "carried_by": carriers}}
 
 
-def _summary(adjustment: Adjustment, run: RunInfo, scale: Scale, statistics: Statistics | None) -> dict[str, Any]:
+def _summary(adjustment: Adjustment, run: RunInfo, scale: q.Scale, statistics: Statistics | None) -> dict[str, Any]:
     found, test = suspects(adjustment), adjustment.global_test
     n_unmet = sum(not v.met for v in statistics.verdicts) if statistics is not None else 0
     tested = statistics.consistency if statistics is not None else None
@@ -180,12 +180,10 @@ def _group(group: GroupSummary) -> dict[str, Any]:
 
 def correlated(estimate: Estimate) -> list[dict[str, Any]]:
     """Pairs of components of one parameter with |correlation| above 95 %, strongest first."""
-    sigmas = np.sqrt(np.clip(np.diag(estimate.cov), 0.0, None))
-    safe = np.where(sigmas > 0.0, sigmas, np.inf)
-    rho = estimate.cov / np.outer(safe, safe)
+    rho = q.correlations_in(estimate.cov)
     pairs = [
         (float(rho[i, j]), i, j)
-        for i in range(len(sigmas))
+        for i in range(len(rho))
         for j in range(i)
         if abs(rho[i, j]) > CORRELATION_LIMIT and "tied" not in (estimate.status[i], estimate.status[j])
     ]
@@ -195,9 +193,9 @@ def correlated(estimate: Estimate) -> list[dict[str, Any]]:
     ]
 
 
-def _lens(estimate: Estimate, model: str, scale: Scale) -> dict[str, Any]:
-    entry = {"model": model} | vector_entry(estimate, scale)
-    sigmas = scale.factor * np.sqrt(np.clip(np.diag(estimate.cov), 0.0, None))
+def _lens(estimate: Estimate, model: str, scale: q.Scale) -> dict[str, Any]:
+    entry = {"model": model} | q.vector_entry(estimate, scale)
+    sigmas = q.sigmas_of(estimate, scale)
     values = np.asarray(estimate.value, dtype=float)
     ratios = {
         name: float(abs(value) / sigma)
@@ -211,7 +209,7 @@ def _lens(estimate: Estimate, model: str, scale: Scale) -> dict[str, Any]:
     return entry
 
 
-def _cameras(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, Any]:
+def _cameras(adjustment: Adjustment, pose: PoseOf, scale: q.Scale) -> dict[str, Any]:
     sums = _sums_of_blocks(adjustment.image_residuals)
     out: dict[str, Any] = {}
     shared = {s.camera: s for s in shared_lenses(adjustment, scale.sigmas == "a_posteriori")}
@@ -264,7 +262,7 @@ def _rms(n: float, squares: float) -> float:
     return math.sqrt(squares / (2 * n)) if n else math.nan
 
 
-def _poses(of: PoseColumns) -> PoseOf:
+def _poses(of: q.PoseColumns) -> PoseOf:
     """What is said of a pose: under ``key`` and, where it moves, under ``epochs``; nothing where it is no unknown."""
     moving: dict[tuple[str, ...], list[tuple[str, ...]]] = {}
     for name in of.rows:
@@ -279,7 +277,7 @@ def _poses(of: PoseColumns) -> PoseOf:
     return pose
 
 
-def _stations(adjustment: Adjustment, pose: PoseOf, of: PoseColumns, scale: Scale) -> Records:
+def _stations(adjustment: Adjustment, pose: PoseOf, of: q.PoseColumns, scale: q.Scale) -> Records:
     """Fixed ones with nothing but a pose, of which there may be very many, by columns."""
     stations, apart = adjustment.survey.stations, dict[str, dict[str, Any]]()
     names: list[tuple[str, ...]] = [("world_from_station", s.station_id) for s in stations]
@@ -298,11 +296,11 @@ def _stations(adjustment: Adjustment, pose: PoseOf, of: PoseColumns, scale: Scal
     return Records([s.station_id for s in stations], forms, apart)
 
 
-def _points(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
-    return {n[1]: point_entry(e, scale) for n, e in adjustment.estimates.items() if n[0] == "point"}
+def _points(adjustment: Adjustment, scale: q.Scale) -> dict[str, Any]:
+    return {n[1]: q.point_entry(e, scale) for n, e in adjustment.estimates.items() if n[0] == "point"}
 
 
-def _tables(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, Any]:
+def _tables(adjustment: Adjustment, pose: PoseOf, scale: q.Scale) -> dict[str, Any]:
     out = {}
     for table in adjustment.survey.tables:
         name = table.table_id
@@ -313,33 +311,33 @@ def _tables(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, Any
             entry["geometry"] = _terms(adjustment, geometry, scale)
         entry |= _clock(adjustment, ("table_clock", name), scale)
         angles = {n[2]: e for n, e in adjustment.estimates.items() if n[:2] == ("table_angles", name)}
-        out[name] = entry | {"epochs": {epoch: vector_entry(e, scale) for epoch, e in angles.items()}}
+        out[name] = entry | {"epochs": {epoch: q.vector_entry(e, scale) for epoch, e in angles.items()}}
     return out
 
 
-def _changes(adjustment: Adjustment, camera_id: str, kind: str, key: str, scale: Scale) -> dict[str, Any]:
+def _changes(adjustment: Adjustment, camera_id: str, kind: str, key: str, scale: q.Scale) -> dict[str, Any]:
     """How a lens changes or images are cropped: by the epoch from which on, or per kelvin; and whether it is clear."""
     found = {n: e for n, e in adjustment.estimates.items() if n[:2] == (kind, camera_id)}
     test = significance_of_changes(adjustment, (kind, camera_id), kind, scale.sigmas == "a_posteriori")
-    parts = {n[2] if len(n) > 2 else "per_kelvin": vector_entry(e, scale) for n, e in found.items()}
+    parts = {n[2] if len(n) > 2 else "per_kelvin": q.vector_entry(e, scale) for n, e in found.items()}
     return {key: parts, "significance": {} if test is None else {test.term: _test(test)}}
 
 
-def _shared(found: SharedLens, scale: Scale) -> dict[str, Any]:
+def _shared(found: SharedLens, scale: q.Scale) -> dict[str, Any]:
     """Whose parameters they are, by how much its own would differ from them, and whether they do."""
     name, k = ("lens", found.camera), len(found.names)
     differences = Estimate(name, found.difference, found.names, found.units, found.cov, ("free",) * k)
-    return {"camera": found.lender, "parameters": list(found.names), "differences": vector_entry(differences, scale),
+    return {"camera": found.lender, "parameters": list(found.names), "differences": q.vector_entry(differences, scale),
             "significance": {found.test.term: _test(found.test)}}  # fmt: skip
 
 
-def _clock(adjustment: Adjustment, name: ParameterName, scale: Scale) -> dict[str, Any]:
+def _clock(adjustment: Adjustment, name: ParameterName, scale: q.Scale) -> dict[str, Any]:
     """The clock of a camera, a table or a station's poses, the times of single epochs about it, and their tests."""
     estimate = adjustment.estimates.get(name)
     if estimate is None:
         return {}
     entry = _terms(adjustment, estimate, scale)
-    own = {n[2]: vector_entry(e, scale) for n, e in adjustment.estimates.items() if n[:2] == name and len(n) > 2}
+    own = {n[2]: q.vector_entry(e, scale) for n, e in adjustment.estimates.items() if n[:2] == name and len(n) > 2}
     test = significance_of_changes(adjustment, name, "clock_jitter", scale.sigmas == "a_posteriori")
     if test is not None:
         entry["significance"] = entry.get("significance", {}) | {test.term: _test(test)}
@@ -351,14 +349,14 @@ def _test(s: Significance) -> dict[str, Any]:
             "significant": s.significant}  # fmt: skip
 
 
-def _terms(adjustment: Adjustment, estimate: Estimate, scale: Scale) -> dict[str, Any]:
+def _terms(adjustment: Adjustment, estimate: Estimate, scale: q.Scale) -> dict[str, Any]:
     """The components, and the tests of those that may be zero."""
     found = significances(adjustment, estimate, scale.sigmas == "a_posteriori")
     tests = {s.term: _test(s) for s in found}
-    return vector_entry(estimate, scale) | ({"significance": tests} if tests else {})
+    return q.vector_entry(estimate, scale) | ({"significance": tests} if tests else {})
 
 
-def _targets(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, Any]:
+def _targets(adjustment: Adjustment, pose: PoseOf, scale: q.Scale) -> dict[str, Any]:
     out = {}
     for target in adjustment.survey.targets:
         name = target.target_id
@@ -371,7 +369,7 @@ def _targets(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, An
     return out
 
 
-def _pairs(adjustment: Adjustment, scale: Scale) -> Mapping[str, Any]:
+def _pairs(adjustment: Adjustment, scale: q.Scale) -> Mapping[str, Any]:
     if not adjustment.survey.pairs:
         return {}
     from survey.solution.pairs import pairs_dict  # here: as above

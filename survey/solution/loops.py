@@ -143,7 +143,7 @@ class _Link:
 
 def _links(survey: Survey, pairs: Sequence[Pair], ends: _Ends, dim: int) -> list[_Link]:
     """What is known without pairs, where it closes loops."""
-    given, stations = _given(survey, ends, dim), {s.station_id: s for s in survey.stations}
+    given, stations = _given(survey, ends, dim), survey.stations_by_id
     fixed = [s for s in given if s != _WORLD] if len(given) > 1 else []
     out = [_Link(s, _WORLD, ("world_from_station", s), stations[s].world_from_station) for s in fixed]
     frames, rig = dict[str, FrameRef](), dict[str, list[_Link]]()
@@ -286,7 +286,8 @@ def closures_dict(adjustment: Adjustment) -> dict[str, Any]:
     """
     survey, out = adjustment.survey, {}
     by_id = {p.pair_id: p for p in survey.pairs}
-    found = {o.ids[0]: np.asarray(o.residual) for o in adjustment.other_residuals if o.kind == "pair"}
+    of_pairs = adjustment.other_residuals if survey.closures else ()
+    found = {o.ids[0]: np.asarray(o.residual) for o in of_pairs if o.kind == "pair"}
     for closure in survey.closures:
         pairs = [by_id[i] for i in closure.pair_ids]
         dim = 6 if all(isinstance(p.b_from_a, Pose3) for p in pairs) else 3

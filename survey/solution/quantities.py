@@ -105,9 +105,32 @@ Status = str | dict[str, str]
 """A word for all components, or one for each."""
 
 
+def sigmas_in(cov: FloatArray) -> FloatArray:
+    """Sigmas (n,) of a covariance (n, n); 0 where rounding made a variance negative."""
+    return np.asarray(np.sqrt(np.clip(np.diag(cov), 0.0, None)))
+
+
+def correlations_in(cov: FloatArray) -> FloatArray:
+    """Correlations (n, n) of a covariance; 0 where a sigma is 0."""
+    s = sigmas_in(cov)
+    safe = np.where(s > 0.0, s, np.inf)
+    return np.asarray(cov / np.outer(safe, safe))
+
+
 def sigmas_of(estimate: Estimate, scale: Scale) -> FloatArray:
     """Sigmas (n,) in the tangent, units inside."""
-    return scale.factor * np.sqrt(np.clip(np.diag(estimate.cov), 0.0, None))
+    return scale.factor * sigmas_in(estimate.cov)
+
+
+def estimated(estimate: Estimate) -> tuple[str, ...]:
+    """The components of an estimate that are not held or tied to others."""
+    return tuple(c for c, s in zip(estimate.components, estimate.status, strict=True) if s in ("free", "prior"))
+
+
+def in_joint(estimate: Estimate) -> tuple[str, ...]:
+    """The components that stand in a joint covariance: all of a pose or point, the estimated ones of a vector."""
+    whole = isinstance(estimate.value, Pose3) or estimate.name[0] == "point"
+    return estimate.components if whole else estimated(estimate)
 
 
 def status_of(estimate: Estimate) -> Status:

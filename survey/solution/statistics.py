@@ -27,7 +27,7 @@ from adjust.statistics.result import (
 from adjust.statistics.system import LinearSystem
 from adjust.statistics.weakness import compared_columns, correlations, weak_directions
 from survey.project.project import Tolerance
-from survey.solution.quantities import PROBABILITY, Scale
+from survey.solution.quantities import PROBABILITY, Scale, correlations_in, estimated, in_joint
 from survey.solution.tolerances import Verdict, verdicts
 
 
@@ -109,11 +109,11 @@ def _is_large_network(adjustment: Adjustment) -> bool:
 def _left_out(adjustment: Adjustment, system: LinearSystem, n_budgets: int) -> tuple[str, ...]:
     """For people: what the statistics show a part of, and which."""
     out, n = [], len(system.columns)
-    compared, needed = compared_columns(system)
-    if len(compared) < needed:
+    compared = len(compared_columns(system))
+    if compared < n:
         out.append(
-            f"correlations: of {needed} components that may correlate with others {len(compared)} were compared with "
-            f"all {n}, points and then those of single epochs last; the rest only within their own unknown"
+            f"correlations: of {n} components {compared} were compared with all others, points and then those of "
+            "single epochs last; the rest only within their own unknown"
         )
     if n_budgets > MOST_BUDGETS:
         out.append(f"uncertainty budgets: of {MOST_BUDGETS} of {n_budgets} parameters, points last")
@@ -198,16 +198,11 @@ def correlation_matrix(adjustment: Adjustment) -> CorrelationMatrix | None:
     sizes = [len(free) for free in components]
     if sum(sizes) < 2:
         return None
-    cov = adjustment.precision.joint(names)
-    sigma = np.sqrt(np.clip(np.diag(cov), 0.0, None))
-    safe = np.where(sigma > 0.0, sigma, np.inf)
     labels = tuple(f"{'/'.join(name)}/{c}" for name, free in zip(names, components, strict=True) for c in free)
     starts = tuple(int(x) for x in np.concatenate([[0], np.cumsum(sizes)[:-1]]))
-    return CorrelationMatrix(labels, starts, tuple(names), cov / np.outer(safe, safe))
+    return CorrelationMatrix(labels, starts, tuple(names), correlations_in(adjustment.precision.joint(names)))
 
 
 def _unknown_components(estimate: Estimate) -> tuple[str, ...]:
-    """The components that stand in a joint covariance: all of a pose or point, the free ones of a vector."""
-    free = tuple(c for c, s in zip(estimate.components, estimate.status, strict=True) if s in ("free", "prior"))
-    whole = isinstance(estimate.value, Pose3) or estimate.name[0] == "point"
-    return estimate.components if whole and free else free
+    """Its components in a joint covariance, none where it is no unknown."""
+    return in_joint(estimate) if estimated(estimate) else ()

@@ -9,7 +9,7 @@ from adjust.model.result import Adjustment, Component, ParameterName
 from adjust.statistics.reliability import observation_name
 from adjust.statistics.result import BudgetEntry, Consistency, Influence, PartTest, RelativePrecision
 from survey.folder.plain import attributes
-from survey.solution.quantities import Scale, key_of, sigma_unit_for_people
+from survey.solution.quantities import Scale, key_of, sigma_unit_for_people, sigmas_in
 from survey.solution.records import Form, Records
 from survey.solution.statistics import Statistics
 from survey.solution.tolerances import Verdict, coverage
@@ -121,7 +121,7 @@ def _relative(x: RelativePrecision) -> dict[str, Any]:
         "ellipsoid_semi_axes_mm": (1e3 * np.asarray(x.ellipsoid.semi_axes)).tolist(),
     }  # fmt: skip
     if x.rotation_cov is not None:
-        sigmas = np.degrees(np.sqrt(np.clip(np.diag(x.rotation_cov), 0.0, None))) * 3600.0
+        sigmas = np.degrees(sigmas_in(x.rotation_cov)) * 3600.0
         entry["sigma_rotation_arcsec"] = sigmas.tolist()
     return entry
 

@@ -28,7 +28,7 @@ from survey.workbench.jobs import Jobs
 
 def camera_of(bench: Jobs, camera_id: str) -> Camera:
     """A camera by its name. Raises SurveyError."""
-    cameras = {c.camera_id: c for c in bench.adjustment.survey.cameras}
+    cameras = bench.adjustment.survey.cameras_by_id
     if camera_id not in cameras:
         raise SurveyError(f"there is no camera {camera_id!r} in the solution; {suggestion(camera_id, cameras)}")
     return cameras[camera_id]

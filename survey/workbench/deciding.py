@@ -237,10 +237,8 @@ class Deciding(Resident):
             self._require_unchanged()
             kept = {kept_name(self.folder, name): step.before[name] for name in step.after} if step.cold else {}
             for name, text in {**kept, **step.after}.items():
-                (place / name).parent.mkdir(parents=True, exist_ok=True)
                 atomic_write(place / name, text)
             if rows:
-                (place / FILE).parent.mkdir(parents=True, exist_ok=True)
                 atomic_write(place / FILE, appended(self.folder / FILE, rows))
             replace_parts(self.folder)
             return signature_of(self.folder)

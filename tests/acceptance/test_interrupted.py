@@ -18,7 +18,7 @@ import pytest
 
 from adjust.model.errors import SurveyError
 from capture.session.folder import session_lock
-from survey.batch.causes import MAY_PASS, cause_of
+from survey.batch.record import MAY_PASS, cause_of
 from survey.cli import FAILED, main
 from survey.folder.locking import LOCK, BusyError, FileLock, holder_of
 from survey.folder.replacing import changing, recover_killed, replace_parts, unfinished, write_set

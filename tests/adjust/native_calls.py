@@ -131,7 +131,9 @@ def _images() -> None:
     batch.local_from_keys(np.array([0]))
     solved = solve_network(pose_networks.simulate(3, 2).network)
     solved.pairs  # noqa: B018  # is computed when asked for
-    solved.precision.tree.among(sparse.csr_array(np.eye(solved.precision.tree.n)[:2]))
+    tree = solved.precision.tree
+    tree.among(sparse.csr_array(np.eye(tree.n)[:2]))
+    trees.clique_covariance(tree.arrays, tree.cliques.n_front, 0)
     ring = [(chr(65 + i), chr(65 + (i + step) % 12)) for step in (1, 2) for i in range(0, 12, step)]
     loop_basis(topology([(a + b, a, b) for a, b in ring]))  # triangles, then a loop through the stations of one pair
     survey, truth = head_on_table(1, n_cameras=2, n_table_epochs=3, n_free_epochs=2)

@@ -21,6 +21,8 @@ from adjust.testing.quadratic_forms import upper_tail, upper_tail_bound
 from survey.simulate import head_on_table
 from tests.adjust import helpers as h
 from tests.adjust import statistics_networks as net
+from tests.benchmarks.data import calibration
+from tests.benchmarks.data import survey as long_session
 
 ARCSEC = np.pi / 180.0 / 3600.0
 
@@ -130,6 +132,26 @@ def test_a_lens_that_changes_is_named_with_its_epoch() -> None:
     assert (worst.kind, worst.name, worst.what, worst.epoch) == ("camera", camera, "lens", late[0])
     (u0,) = (s for s in worst.shifts if s.component == "u0")
     assert u0.amount == pytest.approx(1.0, abs=4 * u0.sigma)
+
+
+@pytest.mark.slow
+def test_a_change_is_looked_for_at_every_border_of_a_long_session() -> None:
+    """400 epochs: from one of them on the lens distorts otherwise, 3 sigmas (0.3 px) at the edge of the image."""
+    given, late = long_session(calibration(1, 400)), "e301"
+
+    def distorted(uv: FloatArray) -> FloatArray:
+        x = (uv - (640.0, 512.0)) / 640.0
+        return uv + 0.3 * x * (x**2).sum(axis=1, keepdims=True)
+
+    moved = tuple(
+        replace(b, uv=distorted(b.uv)) if natural_key(b.epoch_id) >= natural_key(late) else b
+        for b in given.image_blocks
+    )
+    adjustment = adjust(replace(given, image_blocks=moved))
+    found = consistency(adjustment, condensed_system(precision_of(adjustment)))
+    assert not found.left_out
+    assert found.n_changes > 2 * 399
+    assert (found.changes[0].what, found.changes[0].epoch) == ("lens", late)
 
 
 @pytest.mark.slow

@@ -24,8 +24,7 @@ from adjust.design import (
     weak_directions,
     with_candidates,
 )
-from adjust.design.candidates import inform
-from adjust.design.rows import design_matrix
+from adjust.design.candidates import design_matrix, inform
 from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.observations import Coordinates, Distance, ImageBlock, PositionRef
 from adjust.model.survey import Point, PointParameter

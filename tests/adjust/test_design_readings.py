@@ -7,8 +7,8 @@ import pytest
 
 from adjust.adjustment import adjust
 from adjust.design import Candidate, components_of, exact, expect, run_trials, select, with_candidates
+from adjust.design.candidates import design_matrix
 from adjust.design.prediction import Predictor
-from adjust.design.rows import design_matrix
 from adjust.graph.assembly import StartValues
 from adjust.model.errors import SurveyError
 from adjust.model.observations import CoordinateDifferences, OnSurface, PositionRef, Reading, ReadingCovariance

@@ -7,7 +7,7 @@ import pytest
 from adjust.adjustment import adjust
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.diagnosis import diagnose
-from adjust.diagnosis.effects.axes import unsteady_axes
+from adjust.diagnosis.effects.freed import unsteady_axes
 from adjust.diagnosis.hypothesis import SetKey
 from adjust.model.survey import TABLE_GEOMETRY, Survey
 from survey.simulate import resample

@@ -1,7 +1,6 @@
 """Networks of pairs in the compiled core against GTSAM's factors and plain arrays."""
 
 from dataclasses import replace
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -13,9 +12,7 @@ from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.elimination import pose_cliques
 from adjust.graph.pair_normals import PairNormals
 from adjust.graph.solver import damped
-from adjust.model.survey import IntArray
 from adjust.native.elimination import clique_pattern
-from adjust.native.trees import TreeArrays
 from adjust.pose_network.solve import minimize
 from adjust.precision import tree as tree_module
 from adjust.precision.precision import precision_of
@@ -153,34 +150,29 @@ def test_covariances_among_sparse_rows_are_those_of_the_whole_matrix(monkeypatch
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
     np.testing.assert_array_equal(found, found.T)
     assert tree.among(A[:0]).shape == (0, 0)
+    ptr = np.array([0, 12, 12, 30, 40])
+    for i, j, alone in zip(ptr, ptr[1:], tree.each_among(A, ptr), strict=False):
+        np.testing.assert_allclose(alone, found[i:j, i:j], rtol=1e-9, atol=1e-12 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("at_once", [7, 96])
-def test_covariances_among_rows_of_neighbours_go_no_further_up_than_they_have_to(
-    at_once: int, monkeypatch: pytest.MonkeyPatch
-) -> None:  # fmt: skip
-    monkeypatch.setattr(tree_module, "_COLUMNS", at_once)
-    seen: list[int] = []
-    plain = tree_module.solve_cliques
-
-    def counted(tree: TreeArrays, up: IntArray, *rest: Any) -> None:
-        seen.append(len(up))
-        plain(tree, up, *rest)
-
-    monkeypatch.setattr(tree_module, "solve_cliques", counted)
+def test_covariances_among_rows_of_neighbours_go_no_further_up_than_they_have_to() -> None:
+    """What is above the first clique that holds all their keys may be anything."""
     tree = solve_network(pose_networks.simulate(8, 8, 3).network).precision.tree
     Q, rng, cliques = tree.full(), np.random.default_rng(0), tree.cliques
     number = {n: k for k, n in tree.number.items()}
+    data, last = cliques.data.copy(), len(cliques) - 1
     for c in range(len(cliques)):
         keys = cliques.keys_in(c)
-        below = cliques.keys_in(len(cliques) - 1)[0] if c == cliques.parents[-1] else keys[0]  # of the last leaf too
+        with_leaf = c == cliques.parents[-1]
+        below = cliques.keys_in(last)[0] if with_leaf else keys[0]  # of the last leaf too
         rows = tree.rows([number[k] for k in {*keys.tolist(), int(below)}])
         A = np.zeros((20, tree.n))
         A[:, rows] = rng.standard_normal((20, len(rows)))
-        seen.clear()
         expected = A @ Q @ A.T
-        np.testing.assert_allclose(tree.among(sparse.csr_array(A)), expected, rtol=1e-9, atol=1e-9 * np.abs(Q).max())
-        assert max(seen) == (c == cliques.parents[-1])
+        cliques.data[: cliques.at[last] if with_leaf else None] = np.nan
+        found = tree.among(sparse.csr_array(A))
+        cliques.data[:] = data
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(Q).max())
 
 
 @pytest.mark.parametrize("n_last", [0, 2])

@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from adjust.adjustment import AdjustOptions, adjust, assemble, start_values
+from adjust.adjustment import AdjustOptions, adjust, assemble
 from adjust.frames.unknowns import Unknowns
 from adjust.graph.building import GraphBuilder
 from adjust.graph.solver import SolveOptions, solve
@@ -42,7 +42,7 @@ def ours_start_solve(case: Calibration) -> Competitor:
 
     def run() -> Outcome:
         t0 = perf_counter()
-        start = start_values(find_start(given))
+        start = find_start(given)
         t1 = perf_counter()
         graph = GraphBuilder(given, start.lenses).build(start)
         t2 = perf_counter()

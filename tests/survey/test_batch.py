@@ -19,16 +19,14 @@ from scipy import stats
 
 from adjust.model.errors import IndeterminateError, SurveyError
 from survey.batch.cache import unchanged_solution
-from survey.batch.causes import CAUSES, cause_of
 from survey.batch.control import Series, chart, runs
 from survey.batch.journal import Journal, read_journal
 from survey.batch.page import overview_html, write_overview
-from survey.batch.record import FAILED, Record, record_from
+from survey.batch.record import CAUSES, FAILED, Record, cause_of, record_from
 from survey.batch.run import BatchOptions, run_batch
 from survey.batch.tables import folders_csv, overview_json, short_names, summary_table, trends_csv
-from survey.batch.task import adjust_task
 from survey.batch.trends import all_series, trends_of
-from survey.batch.worker import Worker, WorkerDiedError, attempts
+from survey.batch.worker import Worker, WorkerDiedError, adjust_task, attempts
 from tests.browsing import CONTRAST, asked
 from tests.survey.epochs import write_epochs
 

@@ -12,8 +12,8 @@ from adjust.epochs.states import aligned, epoch_state
 from adjust.model.survey import FloatArray, Point, PointParameter, Survey
 from survey.batch.record import Record, record_from
 from survey.batch.tables import overview_json, trend_lines
-from survey.batch.task import adjust_task
 from survey.batch.trends import Trends, comparable, trends_of
+from survey.batch.worker import adjust_task
 from survey.project import write_project
 from tests.adjust.test_congruence import free_hall
 from tests.adjust.test_deformation import chain, measured

@@ -13,7 +13,7 @@ from jinja2 import Environment, nodes
 import adjust
 import survey
 from adjust.model import observations
-from survey.batch.causes import CAUSES
+from survey.batch.record import CAUSES
 from survey.project.tables.terrestrial import READING_KINDS
 from survey.report.language import (
     GROUPS_BY_KIND,

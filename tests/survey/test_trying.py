@@ -25,7 +25,8 @@ from adjust.diagnosis.names.epochs import exchanged_cameras
 from adjust.diagnosis.names.given import wrong_given
 from adjust.diagnosis.names.points import exchanged_points
 from adjust.diagnosis.time.forgotten_motion import forgotten_motion
-from adjust.diagnosis.units.pairs import CONVENTIONS, edits_of, mended, misread_pairs
+from adjust.diagnosis.units.motions import CONVENTIONS, edits_of, mended
+from adjust.diagnosis.units.pairs import misread_pairs
 from adjust.diagnosis.units.readings import misread_readings
 from adjust.model.errors import SurveyError
 from adjust.model.survey import Survey

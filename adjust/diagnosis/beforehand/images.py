@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from adjust.diagnosis.beforehand.finding import Finding
 from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import Finding
 from adjust.diagnosis.time.forgotten_motion import forgotten_motion
 from adjust.frames.lens_times import LensTimes, whole_images
 from adjust.model.errors import listed

@@ -5,13 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.adjustment import start_values
 from adjust.design.expectation import expect, weak_directions
-from adjust.diagnosis.beforehand.finding import Finding
 from adjust.diagnosis.beforehand.images import moved, pictured
 from adjust.diagnosis.beforehand.observations import observed
 from adjust.diagnosis.beforehand.values import valued
 from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import Finding
 from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
@@ -48,11 +47,11 @@ def _expected(survey: Survey) -> tuple[Adjustment | None, list[Finding]]:
     except IndeterminateError as error:
         return None, [_undetermined(error)]
     try:
-        found = find_start(survey)
+        start = find_start(survey)
     except SurveyError as error:
         return None, [Finding("problem", "no start values", (), str(error), "mend that first")]
     try:
-        return expect(survey, start_values(found)), []
+        return expect(survey, start), []
     except IndeterminateError as error:
         return None, [_undetermined(error)]
     except SurveyError as error:

@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 
-from adjust.diagnosis.beforehand.finding import Finding
+from adjust.diagnosis.hypothesis import Finding
 from adjust.model.errors import listed
 from adjust.model.observations import PositionRef
 from adjust.model.result import Adjustment

@@ -5,19 +5,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.diagnosis.beforehand.finding import Finding
 from adjust.diagnosis.case import Case
-from adjust.diagnosis.hypothesis import Hypothesis
+from adjust.diagnosis.hypothesis import Finding, Hypothesis
 from adjust.diagnosis.names.given import wrong_given
 from adjust.diagnosis.units.conventions import ANGLES, LENGTH_RATIOS, LENGTHS, SLIPS
 from adjust.diagnosis.units.readings import misread_readings
+from adjust.diagnosis.weights.sigmas import id_of, odd_among
 from adjust.model.errors import listed
-from adjust.model.observations import PositionRef
+from adjust.model.observations import Distance, PositionRef, Reading
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
 
-_ODD_SIGMA = 100.0
-"""No instrument is a hundred times as good as another in one survey; units of lengths and angles differ by that."""
 _NEAR, _OFF = 0.02, 0.1
 """Of a length and of a turn: what start values miss by at most, and what no right value does."""
 _CLEAR = 20.0
@@ -90,17 +88,14 @@ def _slipped(what: str, value: float, predicted: float, factor: float, unit: str
 
 def _sigmas(survey: Survey) -> Iterator[Finding]:
     """Sigmas and values that look like another unit."""
-    by_kind: dict[str, list[tuple[str, float]]] = {}
-    for r in survey.readings:
-        by_kind.setdefault(r.kind, []).append((r.reading_id, r.sigma))
-    for d in survey.distances:
-        by_kind.setdefault("distance", []).append((d.distance_id, d.sigma))
+    by_kind: dict[str, list[Reading | Distance]] = {}
+    every: tuple[Reading | Distance, ...] = (*survey.readings, *survey.distances)
+    for o in every:
+        by_kind.setdefault(o.kind if isinstance(o, Reading) else "distance", []).append(o)
     for kind, found in by_kind.items():
-        usual = float(np.median([s for _, s in found]))
-        odd = [n for n, s in found if not usual / _ODD_SIGMA < s < usual * _ODD_SIGMA]
-        if odd:
+        if odd := [id_of(o) for o in odd_among(found)[1]]:
             yield Finding("problem", "suspicious sigma", tuple(odd), f"{kind} {listed(odd, 6)}: the sigma is more than "
-                          f"{_ODD_SIGMA:.0f} times off that of the others", "check its unit")  # fmt: skip
+                          "100 times off that of the others", "check its unit")  # fmt: skip
     yield from _lengths(survey)
 
 

@@ -6,8 +6,7 @@ from dataclasses import replace
 from adjust.diagnosis.bodies.cameras import changed_camera, turned_images
 from adjust.diagnosis.bodies.lens_steps import by_themselves, lens_steps
 from adjust.diagnosis.bodies.series import Step, series_of, step_of
-from adjust.diagnosis.bodies.split import epochs_from
-from adjust.diagnosis.bodies.targets import moved_target
+from adjust.diagnosis.bodies.split import epochs_from, moved_target
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.prediction import adjusted_values

@@ -2,24 +2,31 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from gtsam import Pose3
 
 from adjust.diagnosis.bodies.series import Step
 from adjust.diagnosis.bodies.split import split_camera
-from adjust.diagnosis.bodies.targets import motion_text
-from adjust.diagnosis.hypothesis import Edit, Hypothesis, LeaveOut, Place
-from adjust.diagnosis.images.maps import TURNED, turned
-from adjust.diagnosis.lens_keys import block_keys, crop_keys, key_text
+from adjust.diagnosis.hypothesis import (
+    CENTRE,
+    FOCAL,
+    Edit,
+    Hypothesis,
+    LeaveOut,
+    Place,
+    block_keys,
+    crop_keys,
+    found_by,
+    motion_text,
+)
+from adjust.diagnosis.images import TURNED, turned
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 from adjust.spatial.rigid import rotation_log
 from adjust.testing.distributions import chi2
 
 _ALPHA = 1e-5
-_FOCAL, _CENTRE = ("fx", "fy", "c"), ("u0", "v0", "xp", "yp")
 _NEAR = np.radians(10.0)  # lenses that were found in images of both ways are not good
 
 
@@ -40,7 +47,7 @@ class Difference:
         """Whether these components are zero, or follow the first focal length by these factors: a chi-square test."""
         C = np.eye(len(self.d))
         if follow is not None:
-            C[:, next(i for i, name in enumerate(self.names) if name in _FOCAL)] -= follow
+            C[:, next(i for i, name in enumerate(self.names) if name in FOCAL)] -= follow
         at = list(rows)
         off, cov = (C @ self.d)[at], (C @ self.cov @ C.T)[np.ix_(at, at)]
         inverse = np.linalg.pinv(cov, rcond=1e-14, hermitian=True)
@@ -105,49 +112,40 @@ def turned_images(survey: Survey, step: Step, epochs: tuple[str, ...]) -> Iterat
 def _named(survey: Survey, hypothesis: Hypothesis, found: Difference) -> Hypothesis:
     """The same survey under the name of the simplest change that agrees with what was adjusted."""
     camera, first = hypothesis.place.ids[0], hypothesis.place.epochs[0]
-    n, begin = len(found.names), f"camera {hypothesis.place.ids[0]}: from epoch {hypothesis.place.epochs[0]} on "
+    n, begin = len(found.names), f"camera {camera}: from epoch {first} on "
     place = list(range(n, n + 6))
-    other = [i for i, name in enumerate(found.names) if name not in _FOCAL + _CENTRE]
-    focal = [i for i, name in enumerate(found.names) if name in _FOCAL]
-    centre = [i for i, name in enumerate(found.names) if name in _CENTRE]
-    by = {name: f"{value:+.2f}" for name, value in zip(found.names, found.d, strict=False)}
+    other = [i for i, name in enumerate(found.names) if name not in FOCAL + CENTRE]
+    focal, centre = ([i for i, name in enumerate(found.names) if name in of] for of in (FOCAL, CENTRE))
+
+    def named(name: str, parameters: int, keys: tuple[Edit, ...], what: str) -> Hypothesis:
+        return replace(hypothesis, name=name, parameters=parameters, cause=begin + what,
+                       edits=keys or hypothesis.edits, change=found_by(keys, hypothesis.change))  # fmt: skip
+
     if centre and found.vanishes([*focal, *other, *place]):
-        shift = ", ".join(by[found.names[i]] for i in centre)
+        shift = ", ".join(f"{found.d[i]:+.2f}" for i in centre)
         keys = crop_keys(survey, camera, first, 1.0, found.d[centre]) if len(centre) == 2 else ()
-        return replace(hypothesis, name="images shifted", parameters=3, **_keyed(hypothesis, keys),
-                       cause=f"{begin}its images are shifted by ({shift}) px: another crop of the sensor")  # fmt: skip
+        return named("images shifted", 3, keys, f"its images are shifted by ({shift}) px: another crop of the sensor")
     if focal:
-        ratio = 1.0 + found.d[focal[0]] / found.before[focal[0]]
+        ratio = float(1.0 + found.d[focal[0]] / found.before[focal[0]])
         if found.vanishes([*focal[1:], *centre, *other, *place], _resized(found)):
-            return replace(hypothesis, name="images resized", parameters=2,
-                           **_keyed(hypothesis, crop_keys(survey, camera, first, float(ratio))),
-                           cause=f"{begin}its images have {ratio:.5g} times the size")  # fmt: skip
+            keys = crop_keys(survey, camera, first, ratio)
+            return named("images resized", 2, keys, f"its images have {ratio:.5g} times the size")
         if found.vanishes([*other, *place]):
-            names = [found.names[i] for i in (*focal, *centre)]
-            return replace(hypothesis, name="focus touched", parameters=5,
-                           **_keyed(hypothesis, block_keys(survey, camera, names, (first,))),
-                           cause=f"{begin}its focal length is {ratio:.5f} times the former one: focus or zoom was "
-                           "touched")  # fmt: skip
+            keys = block_keys(survey, camera, [found.names[i] for i in (*focal, *centre)], (first,))
+            said = f"its focal length is {ratio:.5f} times the former one: focus or zoom was touched"
+            return named("focus touched", 5, keys, said)
     if found.vanishes([*focal, *centre, *other]):
-        return replace(hypothesis, name="camera moved", parameters=7,
-                       cause=f"camera {camera} was moved on its station before epoch {first} "
-                       f"{motion_text(found.motion)}")  # fmt: skip
+        cause = f"camera {camera} was moved on its station before epoch {first} {motion_text(found.motion)}"
+        return replace(hypothesis, name="camera moved", parameters=7, cause=cause)
     return hypothesis
-
-
-def _keyed(hypothesis: Hypothesis, keys: tuple[Edit, ...]) -> dict[str, Any]:
-    """Keys in place of what is left out, and said before it."""
-    if not keys:
-        return {}
-    return {"edits": keys, "change": f"let the adjustment find it: {key_text(keys)}; or {hypothesis.change}"}
 
 
 def _resized(found: Difference) -> FloatArray:
     """(n + 6,) by the first focal length's difference, where images were scaled about their corner."""
     out = np.zeros_like(found.d)
-    first = next(found.before[i] for i, name in enumerate(found.names) if name in _FOCAL)
+    first = next(found.before[i] for i, name in enumerate(found.names) if name in FOCAL)
     for i, name in enumerate(found.names):
-        if name in _FOCAL:
+        if name in FOCAL:
             out[i] = found.before[i] / first
         elif name in ("u0", "v0"):
             out[i] = (found.before[i] + 0.5) / first

@@ -9,14 +9,12 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from adjust.diagnosis.case import Case
-from adjust.diagnosis.effects.axes import unsteady_axes
-from adjust.diagnosis.effects.bent import bent_targets
 from adjust.diagnosis.effects.clocks import clocks
 from adjust.diagnosis.effects.effect import Effect
+from adjust.diagnosis.effects.freed import bent_targets, unsteady_axes, untied
 from adjust.diagnosis.effects.pixels import pixels
 from adjust.diagnosis.effects.shapes import shapes
 from adjust.diagnosis.effects.steps import steps
-from adjust.diagnosis.effects.ties import untied
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.prediction import Linear
 from adjust.model.errors import SurveyError

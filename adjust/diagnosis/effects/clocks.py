@@ -6,8 +6,8 @@ neighbouring epochs. What is tried are clocks as unknowns (:mod:`adjust.diagnosi
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from gtsam import Pose3, Rot3
@@ -19,8 +19,9 @@ from adjust.diagnosis.late import Freed, as_unknowns, keyed, spoken
 from adjust.diagnosis.prediction import Linear
 from adjust.diagnosis.sequences import hand_poses
 from adjust.model.observations import ImageBlock, TableReading
-from adjust.model.result import Adjustment
-from adjust.model.survey import FloatArray, Survey
+from adjust.model.result import Adjustment, ParameterName
+from adjust.model.rewriting import with_rows
+from adjust.model.survey import Clock, FloatArray, Survey
 from adjust.statistics.score import Score, drift_times
 
 if TYPE_CHECKING:
@@ -90,7 +91,8 @@ def _with_row(_: int, n: int, block: ImageBlock, height: int) -> FloatArray:
     return np.asarray((block.uv[:, 1] + 0.5) / height - 0.5)
 
 
-_CAMERAS: Sequence[tuple[str, Any, tuple[str, ...]]] = (
+_Weight = Callable[[int, int, ImageBlock, int], FloatArray]
+_CAMERAS: Sequence[tuple[str, _Weight, tuple[str, ...]]] = (
     ("cameras not simultaneous", _always, ("offset",)), ("clock drift", _with_time, ("offset", "drift")),
     ("rolling shutter", _with_row, ("line_time",)),
 )  # fmt: skip
@@ -113,7 +115,7 @@ def _of_cameras(case: Case, linear: Linear) -> Iterator[Effect]:
             yield _camera_effect(case, linear, name, weight, clear, {("camera_clock", c): components for c in clear})
 
 
-def _late(survey: Survey, cameras: Sequence[str], weight: Any) -> Shifts:
+def _late(survey: Survey, cameras: Sequence[str], weight: _Weight) -> Shifts:
     """By block the shifts (n, 2, k) px that an interval of each of k cameras makes."""
     out = {}
     for i, (k, n, speed, _) in _motion(survey).items():
@@ -126,20 +128,16 @@ def _late(survey: Survey, cameras: Sequence[str], weight: Any) -> Shifts:
     return out
 
 
-def _camera_effect(case: Case, linear: Linear, name: str, weight: Any, cameras: list[str], freed: Freed) -> Effect:
+def _camera_effect(case: Case, linear: Linear, name: str, weight: _Weight, cameras: list[str], freed: Freed) -> Effect:
     first = of_shifts(linear, _late(linear.result.survey, cameras, weight))
     worst = cameras[int(np.argmax(np.abs(first.theta)))]
-
-    drift = name == "clock drift"
-    text = (
-        f"the rows of camera {worst} are read one after the other while things move" if name == "rolling shutter" else
-        f"camera {worst} does not expose when the others do{', and less and less so' if drift else ''}: its clock "
-        f"{'drifts' if drift else 'is late'}"
-    )  # fmt: skip
-    remedy = ("hold still what moves, or take a camera with a global shutter" if name == "rolling shutter" else
+    drift, rows = name == "clock drift", name == "rolling shutter"
+    late = (f"camera {worst} does not expose when the others do{', and less and less so' if drift else ''}: its clock "
+            f"{'drifts' if drift else 'is late'}")  # fmt: skip
+    text = f"the rows of camera {worst} are read one after the other while things move" if rows else late
+    remedy = ("hold still what moves, or take a camera with a global shutter" if rows else
               "trigger the cameras together, or hold the target still at every epoch, and measure again")  # fmt: skip
     hypothesis = Hypothesis(name, "", remedy, Place("camera", (worst,), "clock"), case.survey, (), 1.0, 0)
-    rows = name == "rolling shutter"
     unit = "from the first row to the last" if rows else "over all epochs" if drift else "throughout"
     model = None if rows else lambda h: as_unknowns(case, replace(hypothesis, evidence=h.evidence), freed)
     said = f"{text} ({{}}, {unit})"
@@ -147,7 +145,7 @@ def _camera_effect(case: Case, linear: Linear, name: str, weight: Any, cameras: 
 
 
 def _by_tracks(
-    case: Case, hypothesis: Hypothesis, weight: Any, cameras: Sequence[str], first: Score, text: str,
+    case: Case, hypothesis: Hypothesis, weight: _Weight, cameras: Sequence[str], first: Score, text: str,
     model: Callable[[Hypothesis], Hypothesis] | None,
 ) -> Effect:  # fmt: skip
     """Image points moved along their tracks to where they were in time: a clock as an unknown costs many times more.
@@ -158,13 +156,13 @@ def _by_tracks(
     factor, of_time = spoken(case.survey)
 
     def mended(_: Adjustment, theta: FloatArray) -> Survey:
-        blocks = list(case.survey.image_blocks)
+        blocks = {}
         for i, (k, n, speed, bend) in _motion(case.survey).items():
-            camera = blocks[i].camera_id
-            if camera in cameras:
-                late = (theta[cameras.index(camera)] * weight(k, n, blocks[i], heights[camera]))[:, None]
-                blocks[i] = replace(blocks[i], uv=blocks[i].uv - late * speed + 0.5 * late**2 * bend)
-        return replace(case.survey, image_blocks=tuple(blocks))
+            b = case.survey.image_blocks[i]
+            if b.camera_id in cameras:
+                late = (theta[cameras.index(b.camera_id)] * weight(k, n, b, heights[b.camera_id]))[:, None]
+                blocks[i] = replace(b, uv=b.uv - late * speed + 0.5 * late**2 * bend)
+        return with_rows(case.survey, "image_blocks", blocks)
 
     def said(theta: FloatArray, sigmas: FloatArray) -> str:
         sizes = zip(cameras, factor * theta, factor * sigmas, strict=True)
@@ -174,8 +172,23 @@ def _by_tracks(
                   further=model)  # fmt: skip
 
 
-def _modelled(case: Case, hypothesis: Hypothesis, freed: Freed, first: Score, text: str) -> Effect:
-    """An effect whose size is an unknown of clocks; text: its cause."""
+def _modelled(
+    case: Case, place: Place, owner: ParameterName, known: Clock | None, remedy: str, texts: tuple[str, str], n: int,
+    score: Callable[[FloatArray], Score],
+) -> Iterator[Effect]:  # fmt: skip
+    """The offset and the drift of a clock as its unknowns, where they are none yet. texts: the causes of either.
+
+    score: of n observations that are late, each by so much (n,).
+    """
+    free = () if known is None else known.parameters.free
+    for name, components, text, late in (("clock offset", ("offset",), texts[0], np.ones(n)),
+                                         ("clock drift", ("offset", "drift"), texts[1], drift_times(n))):  # fmt: skip
+        if components[-1] not in free:
+            hypothesis = Hypothesis(name, "", remedy, place, case.survey, (), 1.0, 0)
+            yield _unknown(case, hypothesis, {owner: components}, score(late), text)
+
+
+def _unknown(case: Case, hypothesis: Hypothesis, freed: Freed, first: Score, text: str) -> Effect:
     return Effect(hypothesis, first, lambda _: first, lambda *_: case.survey, lambda *_: text,
                   model=lambda h: as_unknowns(case, h, freed))  # fmt: skip
 
@@ -191,20 +204,16 @@ def _of_tables(case: Case, linear: Linear) -> Iterator[Effect]:
         angles = np.array([r.angles for r in mine])
         speed = spline(angles)(np.arange(len(mine)), 1)
         ids: list[tuple[str, ...]] = [(r.table_id, r.epoch_id) for r in mine]
-        times = drift_times(len(mine))[:, None]
-        freed = () if table.clock is None else table.clock.parameters.free
-        for name, D, text in (
-            ("clock offset", speed, "its readings are late"), ("clock drift", times * speed, "its clock drifts"),
-        ):  # fmt: skip
-            components = ("offset",) if name == "clock offset" else ("offset", "drift")
-            if components[-1] not in freed:
-                shifts: dict[tuple[str, ...], FloatArray] = {i: d[:, None] for i, d in zip(ids, D, strict=True)}
-                hypothesis = Hypothesis(
-                    name, "", "read the table while it stands still, and measure again",
-                    Place("table", (table.table_id,), "clock"), case.survey, (), 1.0, 0,
-                )  # fmt: skip
-                yield _modelled(case, hypothesis, {("table_clock", table.table_id): components},
-                                of_others(linear, "table", shifts), f"table {table.table_id}: {text}")  # fmt: skip
+
+        def score(late: FloatArray, ids: Sequence[tuple[str, ...]] = ids, speed: FloatArray = speed) -> Score:
+            return of_others(linear, "table", dict(zip(ids, (late[:, None] * speed)[:, :, None], strict=True)))
+
+        name = f"table {table.table_id}"
+        yield from _modelled(
+            case, Place("table", (table.table_id,), "clock"), ("table_clock", table.table_id), table.clock,
+            "read the table while it stands still, and measure again",
+            (f"{name}: its readings are late", f"{name}: its clock drifts"), len(mine), score,
+        )  # fmt: skip
         for k in range(angles.shape[1]):
             D = -np.eye(angles.shape[1])[k] * angles
             yield _gear_effect(case, linear, table.table_id, k, dict(zip(ids, D, strict=True)))
@@ -232,31 +241,26 @@ def _gear_effect(case: Case, linear: Linear, table_id: str, axis: int, D: dict[t
 
 
 def _of_hands(case: Case, linear: Linear) -> Iterator[Effect]:
-    clocks = {s.station_id: () if s.clock is None else s.clock.parameters.free for s in case.survey.stations}
+    known = {s.station_id: s.clock for s in case.survey.stations}
     for station, poses in hand_poses(case.survey).items():
         rows = [i for i, _ in poses.values()]
-        if len(rows) < _FEWEST or station not in clocks:
+        if len(rows) < _FEWEST or station not in known:
             continue
-        path = [p for i in rows if isinstance(p := case.survey.pairs[i].b_from_a, Pose3)]
-        for name, w, components, text in (
-            ("clock offset", np.ones(len(rows)), ("offset",), "are late"),
-            ("clock drift", drift_times(len(rows)), ("offset", "drift"), "are ever later against the images"),
-        ):  # fmt: skip
-            if components[-1] in clocks[station]:
-                continue
-            hypothesis = Hypothesis(
-                name, "", "stop the motion at every epoch, or read pose and image at the same time, and measure again",
-                Place("station", (station,), "clock"), case.survey, (), 1.0, 0,
-            )  # fmt: skip
-            yield _modelled(case, hypothesis, {("pose_clock", station): components},
-                            _of_path(case.survey, linear, rows, path, w), f"the poses of {station} {text}")  # fmt: skip
+        name = f"the poses of {station} are"
+        yield from _modelled(
+            case, Place("station", (station,), "clock"), ("pose_clock", station), known[station],
+            "stop the motion at every epoch, or read pose and image at the same time, and measure again",
+            (f"{name} late", f"{name} ever later against the images"), len(rows),
+            partial(_of_path, case.survey, linear, rows),
+        )  # fmt: skip
 
 
-def _of_path(survey: Survey, linear: Linear, rows: Sequence[int], path: Sequence[Pose3], w: FloatArray) -> Score:
+def _of_path(survey: Survey, linear: Linear, rows: Sequence[int], w: FloatArray) -> Score:
     """Of measured poses that are late, each by so much of the change."""
+    pairs = [survey.pairs[i] for i in rows]
+    path = [p.b_from_a for p in pairs if isinstance(p.b_from_a, Pose3)]
     speed = [a.between(b) for a, b in zip(_at(path, -_STEP * w), _at(path, _STEP * w), strict=True)]
-    late = zip(rows, speed, strict=True)
-    shifts = {survey.pairs[i].pair_id: Pose3.Logmap(d)[:, None] / (2.0 * _STEP) for i, d in late}
+    shifts = {p.pair_id: Pose3.Logmap(d)[:, None] / (2.0 * _STEP) for p, d in zip(pairs, speed, strict=True)}
     ids = {o.ids: shifts[o.ids[0]] for o in linear.system.precision.graph.others
            if o.kind == "pair" and o.ids[0] in shifts}  # fmt: skip
     return of_others(linear, "pair", ids)
@@ -269,12 +273,12 @@ def _at(path: Sequence[Pose3], dt: FloatArray) -> list[Pose3]:
     R = np.array([p.rotation().matrix() for p in path])
     times = np.arange(len(path)) + dt
     turns = RotationSpline(np.arange(len(path)), Rotation.from_matrix(R))
-    places = spline([p.translation() for p in path])
+    places = spline(np.array([p.translation() for p in path]))
     return [Pose3(Rot3(M), t) for M, t in zip(turns(times).as_matrix(), places(times), strict=True)]
 
 
-def spline(values: Any) -> "CubicSpline":
+def spline(values: FloatArray) -> "CubicSpline":
     """Through values (n, ...) at 0, 1, 2 ..."""
     from scipy.interpolate import CubicSpline  # here: it takes longer to load than a small survey to diagnose
 
-    return CubicSpline(np.arange(len(values)), np.array(values))
+    return CubicSpline(np.arange(len(values)), values)

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from adjust.diagnosis.prediction import Linear
 from adjust.diagnosis.trial import misfit_of
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
+from adjust.model.rewriting import Fields, with_rows
 from adjust.model.survey import FloatArray, Survey
 from adjust.precision.precision import noise_of
 from adjust.statistics.score import Score
@@ -41,7 +41,7 @@ class Effect:
     mended: Callable[[Adjustment, FloatArray], Survey]
     said: Callable[[FloatArray, FloatArray], str]
     added: Callable[[FloatArray, FloatArray], FloatArray] = np.add
-    known: Callable[[FloatArray, FloatArray], tuple[FloatArray, Mapping[str, Any]] | None] = lambda theta, sigmas: None
+    known: Callable[[FloatArray, FloatArray], tuple[FloatArray, Fields] | None] = lambda theta, sigmas: None
     nearer: Callable[[Adjustment, FloatArray], "Effect | None"] = lambda result, theta: None
     model: Callable[[Hypothesis], Hypothesis] | None = None
     further: Callable[[Hypothesis], Hypothesis] | None = None
@@ -52,7 +52,7 @@ class Effect:
 
     def formed(self, case: Case, linear: Linear, looked_at: int) -> Hypothesis:
         """The hypothesis, whose survey is found by Gauss-Newton over adjustments (Golub and Pereyra 1973)."""
-        found: list[Mapping[str, Any]] = []
+        found: list[Fields] = []
 
         def made() -> Survey | None:
             begin = self._last[-1][0] if self._last else self.first.theta  # where the time did not suffice before
@@ -153,7 +153,5 @@ def of_others(linear: Linear, kind: str, shifts: Mapping[tuple[str, ...], FloatA
 
 def shifted_back(survey: Survey, shifts: Shifts, theta: FloatArray) -> Survey:
     """The survey with its image points where they are without these shifts."""
-    blocks = tuple(
-        replace(b, uv=b.uv - shifts[i] @ theta) if i in shifts else b for i, b in enumerate(survey.image_blocks)
-    )
-    return replace(survey, image_blocks=blocks)
+    blocks = {i: survey.image_blocks[i] for i in shifts}
+    return with_rows(survey, "image_blocks", {i: replace(b, uv=b.uv - shifts[i] @ theta) for i, b in blocks.items()})

@@ -1,7 +1,6 @@
 """Targets that are a little larger than their owner says, stretched or sheared."""
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -10,6 +9,8 @@ from adjust.diagnosis.effects.effect import Effect, of_shape
 from adjust.diagnosis.hypothesis import Hypothesis, Place, ScaleKey, SetKey
 from adjust.diagnosis.prediction import Linear
 from adjust.diagnosis.targets.size import reshaped, well_known
+from adjust.model.result import Adjustment
+from adjust.model.rewriting import Fields
 from adjust.model.survey import FloatArray, Survey, Target
 from adjust.statistics.score import Score
 
@@ -41,7 +42,7 @@ def _of(case: Case, linear: Linear, given: Target, name: str, by: FloatArray, wh
         now = at.result.survey.targets_by_id[target]
         return of_shape(at, target, (now.x_in_target @ by.T)[:, :, None])
 
-    def known(theta: FloatArray, sigmas: FloatArray) -> tuple[FloatArray, Mapping[str, Any]] | None:
+    def known(theta: FloatArray, sigmas: FloatArray) -> tuple[FloatArray, Fields] | None:
         if name != _SCALE:
             return None
         factor, why = well_known(1.0 + float(theta[0]), float(sigmas[0]))
@@ -63,7 +64,7 @@ def _of(case: Case, linear: Linear, given: Target, name: str, by: FloatArray, wh
         value = float(theta[0]) + float(np.trace(by) > 0.0)
         return f"target {target}: {what.format(value)} (+- {float(sigmas[0]):.2g})"
 
-    def mended(_: Any, theta: FloatArray) -> Survey:
+    def mended(_: Adjustment, theta: FloatArray) -> Survey:
         return reshaped(case.survey, target, np.eye(3) + float(theta[0]) * by)
 
     return Effect(hypothesis, scored(linear), scored, mended, said, known=known)

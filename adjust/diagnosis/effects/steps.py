@@ -1,185 +1,51 @@
 """Unknowns that are taken for constant and are not: another value from some epoch, or row, on; a drift with time."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from gtsam import Pose3
 
-from adjust.diagnosis.bodies.targets import motion_text
 from adjust.diagnosis.case import Case
+from adjust.diagnosis.effects.courses import MOVED, Course, affordable, alike, courses, standing
 from adjust.diagnosis.effects.effect import Effect
-from adjust.diagnosis.hypothesis import Edit, Hypothesis, LeaveOut, Place
-from adjust.diagnosis.lens_keys import block_keys, crop_keys, key_text
+from adjust.diagnosis.hypothesis import (
+    CENTRE,
+    Edit,
+    Hypothesis,
+    LeaveOut,
+    Place,
+    block_keys,
+    crop_keys,
+    found_by,
+    motion_text,
+)
 from adjust.diagnosis.prediction import Linear, Prediction, adjusted_values
-from adjust.diagnosis.sequences import with_pairs
 from adjust.model.observations import FrameRef, ImageBlock, Pair
-from adjust.model.result import Adjustment, ParameterName
-from adjust.model.survey import FloatArray, IntArray, Survey
-from adjust.statistics.normal import DENSE
+from adjust.model.result import Adjustment
+from adjust.model.rewriting import with_rows
+from adjust.model.survey import FloatArray, Survey
 from adjust.statistics.score import Part, Score, drift_times
 
-FOCAL, CENTRE = ("fx", "fy", "c"), ("u0", "v0", "xp", "yp")
-_FEWEST = 4
-_ELIMINATIONS = 12.5
-"""Eliminations of the whole system that all courses together may cost in surveys of many unknowns."""
 _BOUND = 50.0  # of the square of one image point
-_MOVED = {  # name of the unknown: of the mistake, kind of the thing, what happened to it
-    "station_from_camera": ("camera moved", "camera", "camera {} was moved on its station"),
-    "carrier_from_target": ("target moved", "target", "target {} was moved"),
-    "mount_from_station": ("station moved", "station", "station {} was moved on its table"),
-    "world_from_table": ("table moved", "table", "table {}, or all that stands still around it, was moved"),
-    "world_from_station": ("station moved", "station", "station {} was bumped"),
-    "station_body": ("station moved", "station", "station {} was moved on its table"),
-    "target_body": ("target moved", "target", "target {}, which stands for the world, was moved"),
-    "point": ("point moved", "point", "point {} was moved, or exchanged for another one"),
-    "orientation": ("set-up turned", "setup", "the instrument of set-up {} was turned or bumped"),
-}
-
-
-@dataclass(frozen=True, eq=False)
-class _Course:
-    """An unknown, or some components of it, through time, as an adjustment has it. labels: of its parts."""
-
-    linear: Linear
-    name: ParameterName
-    components: tuple[str, ...]
-    kind: str  # of observation: image, pair, reading
-    labels: tuple[str, ...]
-    parts: tuple[Part, ...]
-
-    @property
-    def estimated(self) -> list[str]:
-        """Those of its components that are."""
-        columns = self.linear.system.columns
-        known = [columns.components[i] for i in self.linear.columns(self.name)]
-        return [c for c in self.components if c in known]
-
-    @property
-    def is_pose(self) -> bool:
-        """Whether it is a motion."""
-        return self.name[0].endswith("_body") or isinstance(self.linear.result.estimates[self.name].value, Pose3)
 
 
 def steps(case: Case, linear: Linear) -> Iterator[Effect]:
     """The best step of every unknown that is the same for several epochs, and the drift of every lens."""
-    n, tree = len(linear.system.columns), linear.system.precision.tree
-    # columns of the covariance matrix: as many as it has, or as cost no more than some adjustments
-    room = min(float(n), tree.cliques.columns_for(_ELIMINATIONS)) if n > DENSE else np.inf
-    for course in _courses(linear):
-        room -= sum(B.shape[1] for _, B in course.parts)
-        if not case.few("what moved from some epoch on, of things that fit better than others", int(room < 0.0), 0):
-            return
-        if len(course.parts) < _FEWEST:
-            continue
-        found = linear.steps(course.parts)
-        if found:
-            cut = max(found, key=lambda t: found[t].drop)
-            yield _step(case.survey, course, cut, found[cut], len(found))
-        if course.name[0] == "lens":
-            yield _drift(case.survey, course, linear.drift(course.parts))
+    for some in alike(affordable(case, linear)):
+        for course, found in zip(some, linear.steps([c.parts for c in some]), strict=True):
+            if found:
+                cut = max(found, key=lambda t: found[t].drop)
+                yield _step(case.survey, course, cut, found[cut], len(found))
+            if course.name[0] == "lens":
+                yield _drift(case.survey, course, linear.drift(course.parts))
 
 
-def _courses(
-    linear: Linear, only: ParameterName | None = None, components: tuple[str, ...] | None = None
-) -> Iterator[_Course]:
-    """Of all unknowns, or of one; of a lens by parts of its components, or of some of these alone."""
-    survey, columns = linear.result.survey, linear.system.columns
-    ptr, row_of = linear.system.ptr, linear.system.row_of
-    first_reading = len(ptr) - 1 - len(survey.readings)
-    pairs = {i: survey.pairs[k].pair_id for k, i in enumerate(_other_rows(linear, "pair"))}
-    readings = {first_reading + k: r.reading_id for k, r in enumerate(survey.readings)}
-
-    def course(name: ParameterName, kind: str, ids: Mapping[int, str], rows: IntArray) -> _Course:
-        numbers = [i for i in np.unique(row_of[rows]).tolist() if i in ids]
-        of = [np.arange(ptr[i], ptr[i + 1]) for i in numbers]
-        parts = tuple(linear.parts(columns.at[name], of))
-        return _Course(linear, name, (), kind, tuple(ids[i] for i in numbers), parts)
-
-    yield from _of_held(linear, only)
-    for name in _worst_first(linear) if only is None else [only] if only in columns.at else []:
-        at = columns.at[name]
-        if name[0] not in (*_MOVED, "lens") or not len(at) or len(name) > 2 or _is_the_world(survey, name):
-            continue
-        rows = linear.rows_of(at)
-        if (rows < ptr[linear.system.n_image]).any():
-            yield from _of_images(linear, name, rows, components)
-        elif name[0] == "world_from_station":
-            yield course(name, "pair", pairs, rows)
-        elif name[0] == "orientation":
-            yield course(name, "reading", readings, rows)
-
-
-def _worst_first(linear: Linear) -> list[ParameterName]:
-    """The unknowns; of many those first whose observations fit least."""
-    at = linear.system.columns.at
-    if len(linear.system.columns) <= DENSE:
-        return list(at)
-    some = [name for name in at if name[0] in _MOVED or name[0] == "lens"]
-    misfit = {name: float(np.mean(linear.e[linear.rows_of(at[name])] ** 2)) for name in some if len(at[name])}
-    return sorted(misfit, key=lambda name: -misfit[name])
-
-
-def _is_the_world(survey: Survey, name: ParameterName) -> bool:
-    """Whether a table stands before one target alone: moving either is the same to all observations."""
-    return name[0] == "world_from_table" and len(_standing(survey)) == 1 and not survey.points
-
-
-def _standing(survey: Survey) -> list[str]:
-    return [t.target_id for t in survey.targets if t.motion == "fixed" and t.station_id is None]
-
-
-def _of_images(
-    linear: Linear, name: ParameterName, rows: IntArray, only: tuple[str, ...] | None
-) -> Iterator[_Course]:
-    blocks = linear.result.survey.image_blocks
-    ptr = 2 * linear.result.image_residuals.block_ptr
-    epochs = list(dict.fromkeys(b.epoch_id for b in blocks))
-    number = {e: k for k, e in enumerate(epochs)}
-    of = np.repeat([number[b.epoch_id] for b in blocks], np.diff(ptr))
-    images = rows[rows < ptr[-1]]
-    known = np.unique(of[images])
-    by_epoch = [images[of[images] == k] for k in known]
-    parts = (FOCAL, CENTRE, FOCAL + CENTRE) if name[0] == "lens" else ((),)
-    for components in parts if only is None else (only,):
-        columns = linear.columns(name, components)
-        if len(columns):
-            labels = tuple(epochs[k] for k in known)
-            yield _Course(linear, name, components, "image", labels, tuple(linear.parts(columns, by_epoch)))
-
-
-def _of_held(linear: Linear, only: ParameterName | None) -> Iterator[_Course]:
-    """Bodies whose poses are held: the targets that tell the datum, the mounts of stations; by differences."""
-    survey, free = linear.result.survey, linear.system.columns.at
-    still = [t.target_id for t in survey.targets if t.motion == "fixed"]
-    turned = [s.station_id for s in survey.stations if s.motion == "table"]
-    held = [("target_body", t) for t in still if ("carrier_from_target", t) not in free]
-    held += [("station_body", s) for s in turned if ("mount_from_station", s) not in free]
-    on_table = {r.epoch_id for r in survey.table_readings}
-    for name in held if only is None else [n for n in held if n == only]:
-        by_epoch: dict[str, list[Part]] = {}
-        cameras = {c.camera_id for c in survey.cameras if c.station_id == name[1]}
-        mine = {i for i, b in enumerate(survey.image_blocks) if b.target_id == name[1] or
-                (name[0] == "station_body" and b.camera_id in cameras and b.epoch_id in on_table)}  # fmt: skip
-        for i in sorted(mine):
-            D = linear.prediction.by_motion(survey.image_blocks[i], name)
-            if D is not None:
-                by_epoch.setdefault(survey.image_blocks[i].epoch_id, []).extend(linear.image_parts({i: D}))
-        parts = tuple((np.concatenate([r for r, _ in p]), np.concatenate([B for _, B in p])) for p in by_epoch.values())
-        yield _Course(linear, name, (), "image", tuple(by_epoch), parts)
-
-
-def _other_rows(linear: Linear, kind: str) -> list[int]:
-    """Numbers in the linear system of all observations of a kind, in the order of the survey."""
-    kinds = linear.system.precision.graph.of_others(lambda o: o.kind, lambda _: "pair")
-    return [linear.system.n_image + i for i, k in enumerate(kinds) if k == kind]
-
-
-def _step(survey: Survey, course: _Course, cut: int, first: Score, looked_at: int) -> Effect:
+def _step(survey: Survey, course: Course, cut: int, first: Score, looked_at: int) -> Effect:
     since, thing = course.labels[cut], course.name[1]
     later = course.labels[cut:]
-    name, kind, what = _MOVED.get(course.name[0], ("", "camera", ""))
+    name, kind, what = MOVED.get(course.name[0], ("", "camera", ""))
     if course.name[0] == "lens":
         name = "images shifted" if course.components == CENTRE else "focus touched"
     place = Place(kind, (thing,), epochs=later if course.kind == "image" else ())
@@ -190,15 +56,13 @@ def _step(survey: Survey, course: _Course, cut: int, first: Score, looked_at: in
             by = _sizes(course.estimated, theta, sigmas)
             why = "focus or zoom was touched" if name == "focus touched" else "another crop of the sensor"
             return f"camera {thing}: from epoch {since} on its lens is another one by {by} px: {why}"
-        tables = [t.table_id for t in survey.tables] if len(_standing(survey)) == 1 else []
+        tables = [t.table_id for t in survey.tables] if len(standing(survey)) == 1 else []
         alike = f" (or table {tables[0]}: its images cannot tell)" if name == "target moved" and tables else ""
         return f"{what.format(thing)} {before} {since}{_amount(course.name[0], theta, sigmas)}{alike}"
 
     keys = _lens_keys(survey, course, since, first)
-    change = f"leave out what was observed from {since} on, or give it a name of its own there"
-    change = f"let the adjustment find it: {key_text(keys)}; or {change}" if keys else change
-    edits = keys or _edits(survey, course, later)
-    hypothesis = Hypothesis(name, "", change, place, survey, edits, 1.0, 1, looked_at)
+    change = found_by(keys, f"leave out what was observed from {since} on, or give it a name of its own there")
+    hypothesis = Hypothesis(name, "", change, place, survey, keys or _edits(survey, course, later), 1.0, 1, looked_at)
     chosen = frozenset(later)
     return Effect(
         hypothesis, first,
@@ -210,7 +74,7 @@ def _step(survey: Survey, course: _Course, cut: int, first: Score, looked_at: in
 
 
 def _nearer(
-    survey: Survey, course: _Course, cut: int, first: Score, looked_at: int, result: Adjustment, theta: FloatArray
+    survey: Survey, course: Course, cut: int, first: Score, looked_at: int, result: Adjustment, theta: FloatArray
 ) -> Effect | None:
     """The same step before another epoch, if its images, each as before and as after, say so; None else."""
     if course.kind != "image":
@@ -229,7 +93,7 @@ def _nearer(
     return None if best == cut else _step(survey, course, best, replace(first, theta=theta), looked_at)
 
 
-def _drift(survey: Survey, course: _Course, first: Score) -> Effect:
+def _drift(survey: Survey, course: Course, first: Score) -> Effect:
     thing, weights = course.name[1], dict(zip(course.labels, drift_times(len(course.labels)), strict=True))
 
     def said(theta: FloatArray, sigmas: FloatArray) -> str:
@@ -248,9 +112,9 @@ def _drift(survey: Survey, course: _Course, first: Score) -> Effect:
                   lambda result, theta: _mended(survey, result, course, weights, theta), said)  # fmt: skip
 
 
-def _at(linear: Linear, course: _Course, score: Callable[[Sequence[Part]], Score]) -> Score:
+def _at(linear: Linear, course: Course, score: Callable[[Sequence[Part]], Score]) -> Score:
     """The score of the same course at another adjustment; what that has left out is no part of it."""
-    for again in _courses(linear, course.name, course.components):
+    for again in courses(linear, course.name, course.components):
         if again.components == course.components and again.labels == course.labels:
             return score(again.parts)
     return Score(np.zeros(0), np.zeros((0, 0)), 0.0, 0)
@@ -275,7 +139,7 @@ def _amount(kind: str, theta: FloatArray, sigmas: FloatArray) -> str:
     return f" {motion_text(Pose3.Expmap(theta))}" if len(theta) == 6 else ""
 
 
-def _lens_keys(survey: Survey, course: _Course, since: str, first: Score) -> tuple[Edit, ...]:
+def _lens_keys(survey: Survey, course: Course, since: str, first: Score) -> tuple[Edit, ...]:
     """What lets a lens be another one since then; none of other things."""
     if course.name[0] != "lens":
         return ()
@@ -284,7 +148,7 @@ def _lens_keys(survey: Survey, course: _Course, since: str, first: Score) -> tup
     return block_keys(survey, course.name[1], course.estimated, (since,))
 
 
-def _edits(survey: Survey, course: _Course, later: Sequence[str]) -> tuple[Edit, ...]:
+def _edits(survey: Survey, course: Course, later: Sequence[str]) -> tuple[Edit, ...]:
     """What was observed of it since then, left out."""
     if course.kind == "pair":
         return (LeaveOut(tuple(f"pairs:{p}" for p in later)),)
@@ -306,7 +170,7 @@ def _edits(survey: Survey, course: _Course, later: Sequence[str]) -> tuple[Edit,
     return (LeaveOut(tuple(f"epoch:{e}" for e in later)),) if course.name[0] != "point" else ()
 
 
-def _altered(result: Adjustment, course: _Course, theta: FloatArray) -> Pose3 | FloatArray:
+def _altered(result: Adjustment, course: Course, theta: FloatArray) -> Pose3 | FloatArray:
     """The value of the unknown, changed by theta, which counts its free components alone."""
     if course.name[0].endswith("_body"):
         return Pose3.Expmap(theta)
@@ -328,42 +192,39 @@ def _altered(result: Adjustment, course: _Course, theta: FloatArray) -> Pose3 | 
 
 
 def _mended(
-    survey: Survey, result: Adjustment, course: _Course, weights: Mapping[str, float], theta: FloatArray
+    survey: Survey, result: Adjustment, course: Course, weights: Mapping[str, float], theta: FloatArray
 ) -> Survey:
     """What was observed under another value of the unknown, as it would have been under the first one."""
     if course.kind == "image":
         return _mended_images(survey, result, course, weights, theta)
     if course.kind == "pair":
-        return with_pairs(survey, _mended_pairs(survey, course, weights, theta))
-    chosen = frozenset(weights)
-    readings = tuple(
-        replace(r, value=r.value + float(theta[0])) if r.reading_id in chosen else r for r in survey.readings
-    )
-    return replace(survey, readings=readings)
+        return with_rows(survey, "pairs", _mended_pairs(survey, course, weights, theta))
+    late = {i: r for i, r in enumerate(survey.readings) if r.reading_id in weights}
+    return with_rows(survey, "readings", {i: replace(r, value=r.value + float(theta[0])) for i, r in late.items()})
 
 
 def _mended_images(
-    survey: Survey, result: Adjustment, course: _Course, weights: Mapping[str, float], theta: FloatArray
+    survey: Survey, result: Adjustment, course: Course, weights: Mapping[str, float], theta: FloatArray
 ) -> Survey:
-    prediction, blocks = Prediction(survey, adjusted_values(result)), []
+    prediction, blocks = Prediction(survey, adjusted_values(result)), dict[int, ImageBlock]()
     values: dict[float, Pose3 | FloatArray] = {}
-    for block in survey.image_blocks:
+    for i, block in enumerate(survey.image_blocks):
         w = weights.get(block.epoch_id, 0.0)
         if w and _concerns(block, course):
             altered = values.setdefault(w, _altered(result, course, w * theta))
             now, then = prediction.uv(block), prediction.uv(block, {course.name: altered})
-            block = block if now is None or then is None else replace(block, uv=block.uv - then + now)
-        blocks.append(block)
-    return replace(survey, image_blocks=tuple(blocks))
+            if now is not None and then is not None:
+                blocks[i] = replace(block, uv=block.uv - then + now)
+    return with_rows(survey, "image_blocks", blocks)
 
 
-def _concerns(block: ImageBlock, course: _Course) -> bool:
+def _concerns(block: ImageBlock, course: Course) -> bool:
     if course.name[0] in ("lens", "station_from_camera"):
         return block.camera_id == course.name[1]
     return course.name[0] not in ("carrier_from_target", "target_body") or block.target_id == course.name[1]
 
 
-def _mended_pairs(survey: Survey, course: _Course, weights: Mapping[str, float], theta: FloatArray) -> dict[int, Pair]:
+def _mended_pairs(survey: Survey, course: Course, weights: Mapping[str, float], theta: FloatArray) -> dict[int, Pair]:
     """``a_late = a exp(theta)``: measured was ``b_from_a exp(theta)``, or ``exp(-theta) a_from_b``."""
     out = {}
     for i, pair in enumerate(survey.pairs):

@@ -6,16 +6,16 @@ Evidence: a rig, or a hand and its eye, is rigid; see :mod:`adjust.diagnosis.seq
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.diagnosis.case import Case
-from adjust.diagnosis.hypothesis import Hypothesis, LeaveOut, Place, Rename
+from adjust.diagnosis.hypothesis import Edit, Hypothesis, LeaveOut, Place, Rename
 from adjust.diagnosis.sequences import MOST, Link, Shift, links, shifts
 from adjust.model.errors import listed
 from adjust.model.observations import FrameRef, ImageBlock, Pair, TableReading
+from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, Survey
 from adjust.spatial.averaging import mean_pose
 from adjust.spatial.rigid import inverse
@@ -140,31 +140,31 @@ def _listed(some: tuple[str, ...], every: tuple[str, ...]) -> str:
 def exchanged_cameras(survey: Survey, a: str, b: str, epochs: tuple[str, ...]) -> Survey:
     """The survey with the images of two cameras exchanged at these epochs."""
     other, chosen = {a: b, b: a}, set(epochs)
-    blocks = tuple(
-        replace(x, camera_id=other[x.camera_id]) if x.camera_id in other and x.epoch_id in chosen else x
-        for x in survey.image_blocks
-    )
-    return replace(survey, image_blocks=blocks)
+    mine = {i: x for i, x in enumerate(survey.image_blocks) if x.camera_id in other and x.epoch_id in chosen}
+    return with_rows(survey, "image_blocks", {i: replace(x, camera_id=other[x.camera_id]) for i, x in mine.items()})
 
 
 def _twice(survey: Survey) -> Iterator[Hypothesis]:
     """Two measured poses of the same frames, or two readings of a table at one epoch, that differ: either may go."""
-    pairs: dict[tuple[object, ...], list[tuple[int, Pair]]] = {}
+    of: dict[tuple[object, ...], list[tuple[int, Pair | TableReading]]] = {}
     for i, p in enumerate(survey.pairs):
-        if p.used:
-            pairs.setdefault((p.a, p.b, type(p.b_from_a)), []).append((i, p))
-    readings: dict[tuple[str, str], list[tuple[int, TableReading]]] = {}
+        of.setdefault((p.a, p.b, type(p.b_from_a)), []).extend([(i, p)] * p.used)
     for i, r in enumerate(survey.table_readings):
-        if r.used:
-            readings.setdefault((r.table_id, r.epoch_id), []).append((i, r))
-    for same in pairs.values():
-        (_, first), *others = same
-        if any(_far(_between(first, p), p.cov) for _, p in others):
-            yield from (_without_one(survey, "pairs", i) for i, _ in same)
-    for at_epoch in readings.values():
-        (_, one), *more = at_epoch
-        if any(_far(r.angles - one.angles, r.cov) for _, r in more):
-            yield from (_without_one(survey, "table_readings", i) for i, _ in at_epoch)
+        of.setdefault((r.table_id, r.epoch_id), []).extend([(i, r)] * r.used)
+    for same in of.values():
+        if any(_far(same[0][1], o) for _, o in same[1:]):
+            yield from (_without_one(survey, i, o) for i, o in same)
+
+
+def _far(one: Pair | TableReading, other: Pair | TableReading) -> bool:
+    """Whether the second of two that observe the same lies ten sigmas or more from the first."""
+    if isinstance(one, Pair) and isinstance(other, Pair):
+        difference = _between(one, other)
+    elif isinstance(one, TableReading) and isinstance(other, TableReading):
+        difference = other.angles - one.angles
+    else:
+        raise TypeError("a pair and a table reading do not observe the same")
+    return bool(np.max(np.abs(difference) / np.sqrt(np.diag(other.cov))) >= 10.0)
 
 
 def _between(one: Pair, other: Pair) -> FloatArray:
@@ -177,23 +177,14 @@ def _between(one: Pair, other: Pair) -> FloatArray:
     raise TypeError(f"pairs {one.pair_id} and {other.pair_id} measure different kinds of motion")
 
 
-def _far(difference: FloatArray, cov: FloatArray) -> bool:
-    """Whether a value lies ten sigmas or more from another of the same thing."""
-    return bool(np.max(np.abs(difference) / np.sqrt(np.diag(cov))) >= 10.0)
-
-
-def _without_one(survey: Survey, field: str, row: int) -> Hypothesis:
-    o = getattr(survey, field)[row]
-    what, place = (
-        (f"pair {o.pair_id}", Place("pair", (o.pair_id,)))
-        if field == "pairs"
-        else (
-            f"the reading of table {o.table_id} at epoch {o.epoch_id}",
-            Place("table", (o.table_id,), "axis1_deg", (o.epoch_id,)),
-        )
-    )
-    edits = (LeaveOut((f"pairs:{o.pair_id}",)),) if field == "pairs" else ()
-    kept: dict[str, Any] = {field: tuple(x for i, x in enumerate(getattr(survey, field)) if i != row)}
+def _without_one(survey: Survey, row: int, o: Pair | TableReading) -> Hypothesis:
+    edits: tuple[Edit, ...] = ()
+    if isinstance(o, Pair):
+        what, place, edits = f"pair {o.pair_id}", Place("pair", (o.pair_id,)), (LeaveOut((f"pairs:{o.pair_id}",)),)
+        rest = replace(survey, pairs=survey.pairs[:row] + survey.pairs[row + 1 :])
+    else:
+        what = f"the reading of table {o.table_id} at epoch {o.epoch_id}"
+        place = Place("table", (o.table_id,), "axis1_deg", (o.epoch_id,))
+        rest = replace(survey, table_readings=survey.table_readings[:row] + survey.table_readings[row + 1 :])
     return Hypothesis("the same twice", f"{what} is there twice with different values, and this one (row {row + 1} of "
-                      "those in use) does not fit", "leave it out", place,
-                      replace(survey, **kept), edits, 10.0, 1, 2)  # fmt: skip
+                      "those in use) does not fit", "leave it out", place, rest, edits, 10.0, 1, 2)  # fmt: skip

@@ -12,7 +12,9 @@ import numpy as np
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Edit, Hypothesis, Place, SetKey
 from adjust.diagnosis.screen import Fit, Screen, at_best, improvement, screen
-from adjust.model.survey import FloatArray, Point, Survey
+from adjust.diagnosis.units.conventions import LENGTH_RATIOS
+from adjust.model.rewriting import with_rows
+from adjust.model.survey import FloatArray, Survey
 
 _CLEARLY = 2.0
 _MOST, _TRIALS = 4, 80
@@ -56,11 +58,9 @@ def _evidence(before: Screen | None, after: Fit | None) -> float:
 
 def with_given(survey: Survey, new: dict[str, FloatArray]) -> Survey:
     """The survey with other given coordinates (3,) m of these points."""
-
-    def point(p: Point) -> Point:
-        return replace(p, x_in_world=replace(p.x_in_world, value=new[p.point_id])) if p.point_id in new else p
-
-    return replace(survey, points=tuple(point(p) for p in survey.points))
+    mine = {i: p for i, p in enumerate(survey.points) if p.point_id in new}
+    points = {i: replace(p, x_in_world=replace(p.x_in_world, value=new[p.point_id])) for i, p in mine.items()}
+    return with_rows(survey, "points", points)
 
 
 def _values(survey: Survey, given: list[str]) -> dict[str, FloatArray]:
@@ -71,29 +71,22 @@ def _values(survey: Survey, given: list[str]) -> dict[str, FloatArray]:
 def _exchanges(survey: Survey, given: list[str]) -> Iterator[Hypothesis]:
     x = _values(survey, given)
     for a, b in combinations(given, 2):
-        yield Hypothesis(
-            "given points exchanged", f"the given coordinates of points {a} and {b} are each other's",
-            f"exchange the coordinates of {a} and {b} in survey.toml", Place("point", (a, b), "x_in_world"),
-            with_given(survey, {a: x[b], b: x[a]}), _edits({a: x[b], b: x[a]}),
-        )  # fmt: skip
+        cause = f"the given coordinates of points {a} and {b} are each other's"
+        yield _changed(survey, "given points exchanged", cause, f"exchange the coordinates of {a} and {b}",
+                       "x_in_world", {a: x[b], b: x[a]})  # fmt: skip
 
 
 def _slips(survey: Survey, given: list[str]) -> Iterator[Hypothesis]:
     for name, x in _values(survey, given).items():
         for axis, factor in ((i, f) for i in range(3) for f in _SLIPS):
-            new = x.copy()
+            new, what = x.copy(), "xyz"[axis]
             new[axis] *= factor
             if abs(new[axis] - x[axis]) > 1e-6:
-                yield _slip(survey, name, axis, x[axis], new)
-
-
-def _slip(survey: Survey, name: str, axis: int, read: float, new: FloatArray) -> Hypothesis:
-    what = "xyz"[axis]
-    return Hypothesis(
-        "slipped decimal", f"point {name}: the decimal point of its given {what} has slipped: {read:.10g} m for "
-        f"{new[axis]:.10g} m", f"write {new[axis]:.10g} m for {what} of point {name} in survey.toml",
-        Place("point", (name,), what), with_given(survey, {name: new}), _edits({name: new}),
-    )  # fmt: skip
+                yield _changed(
+                    survey, "slipped decimal", f"point {name}: the decimal point of its given {what} has slipped: "
+                    f"{x[axis]:.10g} m for {new[axis]:.10g} m", f"write {new[axis]:.10g} m for {what} of point {name}",
+                    what, {name: new},
+                )  # fmt: skip
 
 
 def _axes(survey: Survey, given: list[str]) -> Iterator[Hypothesis]:
@@ -102,13 +95,18 @@ def _axes(survey: Survey, given: list[str]) -> Iterator[Hypothesis]:
     for said, remedy, M in (
         ("have x and y exchanged (north first, or left-handed)", "exchange x and y of all of them",
          np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]])),
-        ("are millimetres, read as metres", "multiply all of them by 0.001", 0.001 * np.eye(3)),
-        ("are metres, read as millimetres", "multiply all of them by 1000", 1000.0 * np.eye(3)),
+        *((said, f"multiply all of them by {LENGTH_RATIOS[said]:g}", LENGTH_RATIOS[said] * np.eye(3))
+          for said in ("are millimetres, read as metres", "are metres, read as millimetres")),
     ):  # fmt: skip
-        new = {n: M @ v for n, v in x.items()}
-        yield Hypothesis("axes or unit of given coordinates", f"the given coordinates {said}",
-                         f"{remedy} in survey.toml", Place("point", tuple(given), "x_in_world"),
-                         with_given(survey, new), _edits(new))  # fmt: skip
+        yield _changed(survey, "axes or unit of given coordinates", f"the given coordinates {said}", remedy,
+                       "x_in_world", {n: M @ v for n, v in x.items()})  # fmt: skip
+
+
+def _changed(
+    survey: Survey, name: str, cause: str, remedy: str, key: str, new: dict[str, FloatArray]
+) -> Hypothesis:
+    return Hypothesis(name, cause, f"{remedy} in survey.toml", Place("point", tuple(new), key), with_given(survey, new),
+                      _edits(new))  # fmt: skip
 
 
 def _edits(new: dict[str, FloatArray]) -> tuple[Edit, ...]:

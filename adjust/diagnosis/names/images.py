@@ -13,11 +13,13 @@ from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, LeaveOut, Place, Rename
 from adjust.diagnosis.prediction import Prediction
 from adjust.model.observations import ImageBlock
+from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, Survey
 from adjust.statistics.score import ratio
 
 _CLEARLY = 3.0
 _MEDIAN = 1.386  # of chi-square with two degrees of freedom
+POINTS = "points exchanged", "point_id", "points"
 _POINTS, _TARGETS, _BLOCKS, _MOST = 6, 8, 24, 3
 
 
@@ -44,18 +46,14 @@ def misnamed_images(case: Case) -> Iterator[Hypothesis]:
         scale = max(1.0, float(np.nanmedian(found)) / _MEDIAN)  # start values are rough
         bounded = [_bounded(x, b, scale) for x, b in zip(squares, case.survey.image_blocks, strict=True)]
         now = Now(prediction, bounded, scale)
-        yield from _targets(now)
-        yield from _points(now)
+        yield from _exchanges(now, _targets(case.survey), ("targets exchanged", "target_id", "targets"), True)
+        yield from _exchanges(now, _points(case.survey, now), POINTS, False)
         yield from _cameras(now)
 
 
 def _bounded(squares: FloatArray | None, block: ImageBlock, scale: float) -> FloatArray:
     """Of a block, bounded: the bound where it cannot be predicted."""
     return np.full(len(block.uv), 2.0 * CAP) if squares is None else np.fmin(squares / scale, 2.0 * CAP)
-
-
-def _renamed(survey: Survey, blocks: dict[int, ImageBlock]) -> Survey:
-    return replace(survey, image_blocks=tuple(blocks.get(i, b) for i, b in enumerate(survey.image_blocks)))
 
 
 def _better(now: Now, other: dict[int, ImageBlock]) -> tuple[list[int], float]:
@@ -99,59 +97,65 @@ def _copies(survey: Survey) -> Iterator[Hypothesis]:
                 break
 
 
-def _targets(now: Now) -> Iterator[Hypothesis]:
-    survey = now.prediction.survey
+_Way = tuple[str, str, dict[int, ImageBlock]]
+"""Two names, and the images as they are with these exchanged."""
+
+
+def _targets(survey: Survey) -> list[_Way]:
     points = {t.target_id: len(t.point_ids) for t in survey.targets if t.motion == "fixed"}
-    found = []
-    pairs = [(a, b) for a, b in combinations(list(points)[:_TARGETS], 2) if points[a] == points[b]]
-    for a, b in pairs:
-        other = {a: b, b: a}
-        blocks = {i: replace(x, target_id=other[str(x.target_id)]) for i, x in enumerate(survey.image_blocks)
-                  if x.target_id in other}  # fmt: skip
-        good, gain = _better(now, blocks)
-        if good:  # those, and all from the first of them on: what is spoilt itself may hide the others
-            found.append((gain, (a, b), other, {i: x for i, x in blocks.items() if i >= min(good)}))
-            found.append((0.9 * gain, (a, b), other, {i: blocks[i] for i in good}))
-    yield from _exchanges(now, found, "targets exchanged", "target_id", "targets", len(pairs))
+    return [
+        (a, b, {i: replace(x, target_id=b if x.target_id == a else a) for i, x in enumerate(survey.image_blocks)
+                if x.target_id in (a, b)})
+        for a, b in combinations(list(points)[:_TARGETS], 2) if points[a] == points[b]
+    ]  # fmt: skip
 
 
-def _points(now: Now) -> Iterator[Hypothesis]:
-    survey = now.prediction.survey
-    ids = [p.point_id for p in survey.points]
+def _points(survey: Survey, now: Now) -> list[_Way]:
     share: dict[int, float] = {}
     for i, block in enumerate(survey.image_blocks):
         of = zip(block.point_idx.tolist(), now.squares[i].tolist(), strict=True)
         for p, square in of if block.target_id is None else ():
             share[p] = share.get(p, 0.0) + square
-    found, pairs = [], list(combinations(sorted(share, key=lambda p: -share[p])[:_POINTS], 2))
-    for a, b in pairs:
-        swap = np.arange(len(ids))
-        swap[[a, b]] = b, a
-        blocks = {i: replace(x, point_idx=swap[x.point_idx]) for i, x in enumerate(survey.image_blocks)
-                  if x.target_id is None and bool(np.isin([a, b], x.point_idx).any())}  # fmt: skip
+    worst, ids = sorted(share, key=lambda p: -share[p])[:_POINTS], [p.point_id for p in survey.points]
+    world = [i for i, x in enumerate(survey.image_blocks) if x.target_id is None]
+    return [
+        (ids[a], ids[b], points_exchanged(survey, a, b, [
+            i for i in world if bool(np.isin([a, b], survey.image_blocks[i].point_idx).any())]))
+        for a, b in combinations(worst, 2)
+    ]  # fmt: skip
+
+
+def points_exchanged(survey: Survey, a: int, b: int, blocks: Sequence[int]) -> dict[int, ImageBlock]:
+    """Images with two points of the world, by their positions, under each other's names."""
+    swap = np.arange(len(survey.points))
+    swap[[a, b]] = b, a
+    images = {i: survey.image_blocks[i] for i in blocks}
+    return {i: replace(x, point_idx=swap[x.point_idx]) for i, x in images.items()}
+
+
+def _exchanges(now: Now, ways: Sequence[_Way], kind: tuple[str, str, str], onwards: bool) -> Iterator[Hypothesis]:
+    """The exchanges that are clearly better in some images: in these, or also (first) in all since the first of them.
+
+    What is spoilt itself may hide the others. kind: see :func:`exchange`.
+    """
+    found = []
+    for a, b, blocks in ways:
         good, gain = _better(now, blocks)
+        if good and onwards:
+            found.append((gain, (a, b), {i: x for i, x in blocks.items() if i >= min(good)}))
         if good:
-            found.append((gain, (ids[a], ids[b]), {ids[a]: ids[b], ids[b]: ids[a]}, {i: blocks[i] for i in good}))
-    yield from _exchanges(now, found, "points exchanged", "point_id", "points", len(pairs))
-
-
-_Found = tuple[float, tuple[str, str], dict[str, str], dict[int, ImageBlock]]
-
-
-def _exchanges(
-    now: Now, found: Sequence[_Found], name: str, column: str, things: str, looked_at: int
-) -> Iterator[Hypothesis]:
-    for gain, (a, b), other, blocks in sorted(found, key=lambda f: -f[0])[:_MOST]:
-        kind = name, column, things
-        yield exchange(now.prediction.survey, (a, b), other, blocks, kind, now.ratio(gain), looked_at)
+            found.append(((0.9 if onwards else 1.0) * gain, (a, b), {i: blocks[i] for i in good}))
+    for gain, ids, blocks in sorted(found, key=lambda f: -f[0])[:_MOST]:
+        yield exchange(now.prediction.survey, ids, blocks, kind, now.ratio(gain), len(ways))
 
 
 def exchange(
-    survey: Survey, ids: tuple[str, str], other: dict[str, str], blocks: dict[int, ImageBlock],
-    kind: tuple[str, str, str], evidence: float, looked_at: int,
+    survey: Survey, ids: tuple[str, str], blocks: dict[int, ImageBlock], kind: tuple[str, str, str], evidence: float,
+    looked_at: int,
 ) -> Hypothesis:  # fmt: skip
     """The names of two things exchanged in some images. kind: name of the mistake, column of the table, the things."""
     (name, column, things), (a, b) = kind, ids
+    other = {a: b, b: a}
     where = [survey.image_blocks[i] for i in sorted(blocks)]
     epochs = tuple(dict.fromkeys(x.epoch_id for x in where))
     at = {c: tuple(dict.fromkeys(x.epoch_id for x in where if x.camera_id == c))
@@ -159,7 +163,7 @@ def exchange(
     return Hypothesis(
         name, f"{things} {a} and {b} are called by each other's names in {len(blocks)} images, the first at epoch "
         f"{epochs[0]}: wrong names, or they changed places", f"exchange them in {column} of image_points.csv",
-        Place(column.removesuffix("_id"), (a, b), column, epochs), _renamed(survey, blocks),
+        Place(column.removesuffix("_id"), (a, b), column, epochs), with_rows(survey, "image_blocks", blocks),
         tuple(Rename("image_points", column, other, {"camera_id": (c,), "epoch_id": e}) for c, e in at.items()),
         evidence, 1, looked_at,
     )  # fmt: skip
@@ -185,7 +189,7 @@ def _cameras(now: Now) -> Iterator[Hypothesis]:
         yield Hypothesis(
             "images of another camera", f"the images of camera {camera} at epochs {', '.join(epochs)} are those of "
             f"camera {other}", f"move them to images/{other}", Place("camera", (camera, other), "", tuple(epochs)),
-            _renamed(survey, chosen),
+            with_rows(survey, "image_blocks", chosen),
             (Rename("image_points", "camera_id", {camera: other}, {"epoch_id": tuple(epochs)}),), now.ratio(gain), 1,
             len(bad) * len(survey.cameras),
         )  # fmt: skip

@@ -13,6 +13,7 @@ from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, Rename
 from adjust.diagnosis.screen import Screen, at_best
 from adjust.model.observations import PositionRef, Reading
+from adjust.model.rewriting import with_rows
 from adjust.model.survey import IntArray, Survey
 from adjust.observations.terrestrial.building import reading_refs
 
@@ -74,7 +75,7 @@ def _of_points(survey: Survey, setup_id: str | None, names: tuple[str, str]) -> 
 
 def exchanged(survey: Survey, rows: IntArray, a: str, b: str, columns: Sequence[str] = _ENDS) -> Survey:
     """The survey with the targets a and b of these readings called by each other's names, in these columns."""
-    other, chosen = {a: b, b: a}, set(rows.tolist())
+    other, readings = {a: b, b: a}, survey.readings
 
     def named(ref: PositionRef) -> PositionRef:
         known = ref.frame is None and ref.point_id in other
@@ -84,8 +85,8 @@ def exchanged(survey: Survey, rows: IntArray, a: str, b: str, columns: Sequence[
         second = r.second if r.second is None or "second_id" not in columns else named(r.second)
         return replace(r, to=named(r.to), second=second)
 
-    readings = tuple(renamed(r) if i in chosen else r for i, r in enumerate(survey.readings))
-    return replace(survey, readings=tuple(r if r.at != r.to else survey.readings[i] for i, r in enumerate(readings)))
+    new = {i: r for i in rows.tolist() if (r := renamed(readings[i])).at != r.to}  # nobody sights where he stands
+    return with_rows(survey, "readings", new)
 
 
 def _hypotheses(

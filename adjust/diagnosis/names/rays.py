@@ -12,9 +12,10 @@ import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
-from adjust.diagnosis.names.images import exchange
+from adjust.diagnosis.names.images import POINTS, exchange, points_exchanged
 from adjust.diagnosis.prediction import Prediction
-from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.model.subsets import with_points
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.start.closed_forms.triangulation import intersect
 from adjust.start.views import focal_px, rays_by_block
 
@@ -76,22 +77,15 @@ def exchanged_in_images(case: Case) -> Iterator[Hypothesis]:
             right = np.isin(every, one) == (rays.points[every] == name)
             found.append((gain, a, b, sorted(set(rays.blocks[every[~right]].tolist()))))
     for _, a, b, blocks in sorted(found, key=lambda f: -f[0])[:_MOST]:
-        yield _exchanged(case.survey, a, b, blocks, len(pairs))
-
-
-def _exchanged(survey: Survey, a: int, b: int, blocks: list[int], looked_at: int) -> Hypothesis:
-    ids, swap = [p.point_id for p in survey.points], np.arange(len(survey.points))
-    swap[[a, b]] = b, a
-    new = {i: replace(survey.image_blocks[i], point_idx=swap[survey.image_blocks[i].point_idx]) for i in blocks}
-    names = {ids[a]: ids[b], ids[b]: ids[a]}
-    return exchange(survey, (ids[a], ids[b]), names, new, ("points exchanged", "point_id", "points"), _EVIDENCE,
-                    looked_at)  # fmt: skip
+        ids = case.survey.points[a].point_id, case.survey.points[b].point_id
+        new = points_exchanged(case.survey, a, b, blocks)
+        yield exchange(case.survey, ids, new, POINTS, _EVIDENCE, len(pairs))
 
 
 def _rays(case: Case) -> Rays | None:
     """Of all image points of the world whose cameras are placed without them; None where there are none."""
     survey = case.survey
-    values = case.rough(without_world(survey))
+    values = case.rough(with_points(survey, ()))
     if values is None:
         return None
     prediction = Prediction(survey, values)
@@ -107,10 +101,3 @@ def _rays(case: Case) -> Rays | None:
             o = np.tile(-pose[:3, :3].T @ pose[:3, 3], (n, 1))
             parts.append((np.full(n, i), block.point_idx, o, rays @ pose[:3, :3], np.full(n, focal)))
     return Rays(*(np.concatenate(x) for x in zip(*parts, strict=True))) if parts else None
-
-
-def without_world(survey: Survey) -> Survey:
-    """The survey with its targets, tables and stations alone: no points of the world, and what is measured to them."""
-    blocks = tuple(b for b in survey.image_blocks if b.target_id is not None)
-    return replace(survey, points=(), image_blocks=blocks, distances=(), coordinates=(), coordinate_differences=(),
-                   readings=(), reading_covariances=(), alignments=(), laser_spots=(), on_surfaces=())  # fmt: skip

@@ -10,6 +10,7 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.screen import Screen, at_best
 from adjust.model.observations import Reading
+from adjust.model.rewriting import Fields, with_rows
 from adjust.model.survey import IntArray, Survey
 
 _CLEARLY = 2.0
@@ -54,12 +55,8 @@ def _sights(survey: Survey, before: Screen, setup_id: str) -> list[IntArray]:
 
 def given_to(survey: Survey, rows: IntArray, home: Reading) -> Survey:
     """The survey with these readings taken as the first one of another set-up is."""
-    chosen = set(rows.tolist())
-    readings = tuple(
-        replace(r, setup_id=home.setup_id, at=home.at, instrument_height=home.instrument_height) if i in chosen else r
-        for i, r in enumerate(survey.readings)
-    )
-    return replace(survey, readings=readings)
+    same: Fields = {"setup_id": home.setup_id, "at": home.at, "instrument_height": home.instrument_height}
+    return with_rows(survey, "readings", {i: replace(survey.readings[i], **same) for i in rows.tolist()})
 
 
 def _drops(before: Screen, sets: list[IntArray], setup_id: str) -> list[float]:

@@ -16,8 +16,8 @@ from gtsam import Pose3
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, Rename
 from adjust.diagnosis.screen import Screen, at_best, improvement, screen
-from adjust.diagnosis.sequences import with_pairs
 from adjust.model.observations import FrameRef, Pair, frame_text
+from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, Survey
 from adjust.spatial.averaging import pose_distance
 from adjust.spatial.rigid import inverse
@@ -158,9 +158,9 @@ def _matrix(pair: Pair) -> FloatArray:
 
 
 def _exchanged(survey: Survey, a: FrameRef, b: FrameRef, rows: Sequence[int]) -> Survey:
-    other = {a: b, b: a}
-    pairs = {i: survey.pairs[i] for i in rows}
-    return with_pairs(survey, {i: replace(p, a=other.get(p.a, p.a), b=other.get(p.b, p.b)) for i, p in pairs.items()})
+    other, pairs = {a: b, b: a}, {i: survey.pairs[i] for i in rows}
+    renamed = {i: replace(p, a=other.get(p.a, p.a), b=other.get(p.b, p.b)) for i, p in pairs.items()}
+    return with_rows(survey, "pairs", renamed)
 
 
 def _hypothesis(

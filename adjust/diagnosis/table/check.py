@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from gtsam import Pose3
 
+from adjust.diagnosis.hypothesis import motion_text
 from adjust.diagnosis.table.fit import fit_table
 from adjust.diagnosis.table.places import (
     Places,
@@ -22,12 +23,12 @@ from adjust.diagnosis.table.places import (
     wrapped,
 )
 from adjust.diagnosis.table.readings import shared_mistake
-from adjust.diagnosis.table.signs import SignVerdict, given_constants, sign_mistake
+from adjust.diagnosis.table.signs import SignVerdict, constants, given_constants, sign_mistake
 from adjust.diagnosis.table.views import TableViews, table_views
 from adjust.model.errors import SurveyError, listed
-from adjust.model.result import Adjustment
-from adjust.model.survey import FloatArray, IntArray, Survey, Table
-from adjust.spatial.rigid import inverse, rotation_log
+from adjust.model.result import Adjustment, ParameterName, adjusted_pose
+from adjust.model.survey import FloatArray, IntArray, PoseParameter, Survey, Table
+from adjust.spatial.rigid import inverse
 
 _UNEXPLAINED_RAD = np.radians(1.0)
 _SHOWN = 12
@@ -72,36 +73,13 @@ def only_symptoms(lines: Sequence[str]) -> bool:
 
 def sign_warnings(survey: Survey, result: Adjustment) -> tuple[str, ...]:
     """Axes whose sign contradicts poses that are given as starts: images alone do not see it."""
-    out = []
-    for table in survey.tables:
-        given = given_constants(survey, table)
-        if not given[0] and not given[1]:
-            continue
-        verdict = sign_mistake(table, *_adjusted_constants(survey, table, result), *given)
-        if verdict is not None:
-            out.append(_sign_text(table, verdict))
-    return tuple(out)
 
+    def pose(name: ParameterName, given: PoseParameter) -> FloatArray | None:
+        found = adjusted_pose(result.estimates, name, given)
+        return None if found is None else found.matrix()
 
-def _adjusted_constants(
-    survey: Survey, table: Table, result: Adjustment
-) -> tuple[dict[tuple[str, str], FloatArray], dict[str, FloatArray]]:
-    def pose(*name: str) -> FloatArray | None:
-        estimate = result.estimates.get(name)
-        return estimate.value.matrix() if estimate is not None and isinstance(estimate.value, Pose3) else None
-
-    inner: dict[tuple[str, str], FloatArray] = {}
-    stations = {s.station_id for s in survey.stations if s.motion == "table" and s.table_id == table.table_id}
-    for camera in survey.cameras:
-        mount, own = pose("mount_from_station", camera.station_id), pose("station_from_camera", camera.camera_id)
-        if camera.station_id in stations and own is not None:
-            inner["camera", camera.camera_id] = own if mount is None else mount @ own
-    base, outer = pose("world_from_table", table.table_id), {}
-    for target in survey.targets:
-        own = pose("carrier_from_target", target.target_id)
-        if target.station_id is None and base is not None and own is not None:
-            outer[target.target_id] = inverse(base) @ own
-    return inner, outer
+    verdicts = [(t, sign_mistake(t, constants(survey, t, pose), given_constants(survey, t))) for t in survey.tables]
+    return tuple(_sign_text(table, verdict) for table, verdict in verdicts if verdict is not None)
 
 
 def _causes(survey: Survey, views: TableViews) -> list[str]:
@@ -157,7 +135,7 @@ def _sign_lines(survey: Survey, views: TableViews, found: Places) -> list[str]:
     fit = found.fit
     inner = {name: fit.mount_from_inner[i] for i, name in enumerate(views.inner_ids)}
     outer = {name[1]: fit.table_from_place[i] for i, name in enumerate(views.outer_ids) if name[0] == "target"}
-    verdict = sign_mistake(views.table, inner, outer, *given_constants(survey, views.table))
+    verdict = sign_mistake(views.table, (inner, outer), given_constants(survey, views.table))
     return [] if verdict is None else [_sign_text(views.table, verdict)]
 
 
@@ -179,17 +157,12 @@ def _moved_text(views: TableViews, found: Places) -> str:
     a, b = moved, second
     if views.epoch[later].mean() < views.epoch[first].mean():
         a, b, later = second, moved, first
-    D = inverse(found.fit.table_from_place[a]) @ found.fit.table_from_place[b]
+    how = motion_text(Pose3(inverse(found.fit.table_from_place[a]) @ found.fit.table_from_place[b]))
     epochs = [views.epoch_ids[e] for e in np.unique(views.epoch[later])]
     return (
         f"{' '.join(views.outer_ids[moved])} was moved between images: at epochs {listed(epochs, _SHOWN)} it stands "
-        f"elsewhere than at the others, {_motion_text(D)}; give it a name of its own there, or leave these epochs out"
+        f"elsewhere than at the others, {how}; give it a name of its own there, or leave these epochs out"
     )
-
-
-def _motion_text(D: FloatArray) -> str:
-    shift = ", ".join(f"{1e3 * v:.2f}" for v in D[:3, 3])
-    return f"by ({shift}) mm and {np.degrees(np.linalg.norm(rotation_log(D[:3, :3]))):.2f} deg in its own axes"
 
 
 def _epoch_lines(views: TableViews, found: Places) -> list[str]:
@@ -240,10 +213,10 @@ def _epoch_text(views: TableViews, found: Places, e: int, rows: IntArray, again:
             return f"{_view_text(views, row)} is mis-detected: {how}"
     if again.explains:
         return _reading_text(views, e, again)
-    D = displacement(views, found, int(rows[0]))
+    moved = motion_text(Pose3(displacement(views, found, int(rows[0]))))
     return (
         f"{_view_text(views, int(rows[0]))}: {' '.join(views.outer_ids[views.outer[rows[0]]])} appears displaced "
-        f"{_motion_text(D)}, which no reading of table {views.table.table_id} explains: it was moved at epoch {epoch}, "
+        f"{moved}, which no reading of table {views.table.table_id} explains: it was moved at epoch {epoch}, "
         "or is mis-detected there; leave the image out"
     )
 

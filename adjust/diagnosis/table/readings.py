@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -28,57 +29,44 @@ _UNITS = (  # factor from what stands there to what is meant, and how that comes
 
 
 @dataclass(frozen=True, eq=False)
-class Hypothesis:
-    """What may have happened to the readings: ``meant`` turns those (e, k) rad that stand there into those meant."""
+class Misread:
+    """What may have happened to the readings (e, k) rad: of which axes and of which epochs they are, and what factors.
+
+    axes: (k,) positions of the columns meant. epochs: rearranges the rows.
+    """
 
     text: str
-    meant: Callable[[FloatArray], FloatArray]
+    factors: FloatArray
+    axes: tuple[int, ...]
+    epochs: Callable[[FloatArray], FloatArray] = lambda a: a
+
+    def meant(self, angles: FloatArray) -> FloatArray:
+        """Those meant, of those that stand there."""
+        return self.epochs(angles[:, self.axes]) * self.factors
 
 
 @dataclass(frozen=True)
 class Verdict:
     """The likeliest hypothesis and the typical disagreement (rad) of the turns, as it stands and under it."""
 
-    hypothesis: Hypothesis
+    hypothesis: Misread
     as_given: float
     corrected: float
 
 
-def hypotheses(n_axes: int) -> list[Hypothesis]:
+def hypotheses(n_axes: int) -> list[Misread]:
     """All mistakes, the simplest first."""
-    names = [f"axis{i + 1}" for i in range(n_axes)]
-    both = " and ".join(names)
-    out = [Hypothesis("", lambda a: a)]
-    if n_axes == 2:
-        out.append(Hypothesis("axis1 and axis2 are exchanged", lambda a: a[:, ::-1]))
-    for factor, what in _UNITS:
-        out.append(Hypothesis(f"the readings of {both} {what}", _scaled(np.full(n_axes, factor))))
-    if n_axes == 2:
-        for i, name in enumerate(names):
-            for factor, what in _UNITS:
-                single = np.where(np.arange(2) == i, factor, 1.0)
-                out.append(Hypothesis(f"the readings of {name} {what}", _scaled(single)))
-    for shift in (1, -1):
-        late = "following" if shift == 1 else "preceding"
-        out.append(Hypothesis(f"every epoch has the reading of the {late} one", _rolled(shift)))
-    out.append(Hypothesis("the readings are in the opposite order of the epochs", lambda a: a[::-1]))
-    if n_axes == 2:
-        for factor, what in _UNITS:
-            turned = _scaled(np.full(2, factor))
-            out.append(Hypothesis(f"axis1 and axis2 are exchanged, and the readings {what}", _exchanged(turned)))
-    return out
-
-
-def _scaled(factors: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    return lambda a: a * factors
-
-
-def _rolled(shift: int) -> Callable[[FloatArray], FloatArray]:
-    return lambda a: np.roll(a, shift, axis=0)
-
-
-def _exchanged(then: Callable[[FloatArray], FloatArray]) -> Callable[[FloatArray], FloatArray]:
-    return lambda a: then(a[:, ::-1])
+    names, one, own = [f"axis{i + 1}" for i in range(n_axes)], np.ones(n_axes), tuple(range(n_axes))
+    two, other, exchanged = n_axes == 2, own[::-1], "axis1 and axis2 are exchanged"
+    out = [Misread("", one, own)] + [Misread(exchanged, one, other)] * two
+    out += [Misread(f"the readings of {' and '.join(names)} {what}", factor * one, own) for factor, what in _UNITS]
+    out += [Misread(f"the readings of {name} {what}", np.where(np.arange(2) == i, factor, 1.0), own)
+            for i, name in enumerate(names if two else ()) for factor, what in _UNITS]  # fmt: skip
+    out += [Misread(f"every epoch has the reading of the {which} one", one, own, partial(np.roll, shift=by, axis=0))
+            for by, which in ((1, "following"), (-1, "preceding"))]  # fmt: skip
+    out.append(Misread("the readings are in the opposite order of the epochs", one, own, np.flipud))
+    both = [Misread(f"{exchanged}, and the readings {what}", factor * one, other) for factor, what in _UNITS]
+    return out + both * two
 
 
 def shared_mistake(views: TableViews) -> tuple[Verdict | None, float]:
@@ -106,7 +94,7 @@ def shared_mistake(views: TableViews) -> tuple[Verdict | None, float]:
     return Verdict(known[best], scores[0], scores[best]), scores[0]
 
 
-def _misfit(views: TableViews, hypothesis: Hypothesis) -> float:
+def _misfit(views: TableViews, hypothesis: Misread) -> float:
     """Typical angle (rad) by which views miss what one base and one mount would show; zero where that is open."""
     M = views.motions(hypothesis.meant(views.angles))
     medians = []

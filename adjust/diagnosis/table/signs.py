@@ -4,13 +4,14 @@ A table whose inner axis is read with the wrong sign moves like one whose base a
 the outer axis: ``R1(a1) R2(-a2) = S R1(a1) R2(a2) S`` with S half a turn about axis 1.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, PoseParameter, Survey, Table
-from adjust.spatial.rigid import inverse, rotation_exp, rotation_log
+from adjust.spatial.rigid import inverse, rigid, rotation_exp, rotation_log
 from adjust.start.network import given_pose
 
 _WRONG_RAD = np.radians(90.0)
@@ -27,52 +28,49 @@ class SignVerdict:
     corrected: float
 
 
-def given_constants(survey: Survey, table: Table) -> tuple[dict[tuple[str, str], FloatArray], dict[str, FloatArray]]:
-    """What is given: ``mount_from_inner`` by ("camera" or "target", id), ``table_from_target`` by target id."""
+Constants = tuple[dict[tuple[str, str], FloatArray], dict[str, FloatArray]]
+"""``mount_from_inner`` (4, 4) by ("camera" or "target", id), and ``table_from_target`` by target id."""
+
+
+def given_constants(survey: Survey, table: Table) -> Constants:
+    """What is given."""
+    return constants(survey, table, lambda _, parameter: given_pose(parameter))
+
+
+def constants(
+    survey: Survey, table: Table, pose: Callable[[ParameterName, PoseParameter], FloatArray | None]
+) -> Constants:
+    """As far as the poses (4, 4) on the way are known."""
     stations = {s.station_id: s for s in survey.stations if s.motion == "table" and s.table_id == table.table_id}
     inner: dict[tuple[str, str], FloatArray] = {}
-    things: list[tuple[str, str, str | None, PoseParameter]] = [
-        ("camera", c.camera_id, c.station_id, c.station_from_camera) for c in survey.cameras
-    ]
-    things += [("target", t.target_id, t.station_id, t.carrier_from_target) for t in survey.targets]
-    for kind, name, station_id, parameter in things:
-        mount = given_pose(stations[station_id].mount_from_station) if station_id in stations else None
-        own = given_pose(parameter)
+    outer: dict[str, FloatArray] = {}
+    base = pose(("world_from_table", table.table_id), table.world_from_table)
+    cameras = [("camera", c.camera_id, c.station_id, ("station_from_camera", c.camera_id), c.station_from_camera)
+               for c in survey.cameras]  # fmt: skip
+    targets = [("target", t.target_id, t.station_id or "", ("carrier_from_target", t.target_id), t.carrier_from_target)
+               for t in survey.targets if t.motion == "fixed"]  # fmt: skip
+    for kind, name, station, parameter, given in (*cameras, *targets):
+        own = pose(parameter, given)
+        mounted = stations.get(station)
+        mount = None if mounted is None else pose(("mount_from_station", station), mounted.mount_from_station)
         if mount is not None and own is not None:
             inner[kind, name] = mount @ own
-    outer: dict[str, FloatArray] = {}
-    base = given_pose(table.world_from_table)
-    if base is not None:
-        for t in survey.targets:
-            own = given_pose(t.carrier_from_target)
-            if t.station_id is None and t.motion == "fixed" and own is not None:
-                outer[t.target_id] = inverse(base) @ own
+        elif not station and base is not None and own is not None:
+            outer[name] = inverse(base) @ own
     return inner, outer
 
 
-def sign_mistake(
-    table: Table,
-    found_inner: Mapping[tuple[str, str], FloatArray],
-    found_outer: Mapping[str, FloatArray],
-    given_inner: Mapping[tuple[str, str], FloatArray],
-    given_outer: Mapping[str, FloatArray],
-) -> SignVerdict | None:
-    """Compare the constants (4, 4) found with those given, as they stand and with axes negated."""
-    pairs = [(f"{k[0]} {k[1]} on the mount", found_inner[k], given_inner[k]) for k in given_inner if k in found_inner]
-    pairs += [
-        (f"target {k} against the table", found_outer[k], given_outer[k]) for k in given_outer if k in found_outer
-    ]
+def sign_mistake(table: Table, found: Constants, given: Constants) -> SignVerdict | None:
+    """Compare the constants found with those given, as they stand and with axes negated."""
+    (inner, outer), (known, behind) = found, given
+    pairs = [(f"{k[0]} {k[1]} on the mount", inner[k], x) for k, x in known.items() if k in inner]
+    pairs += [(f"target {k} against the table", outer[k], x) for k, x in behind.items() if k in outer]
     if not pairs:
         return None
     axes = ["xyz".index(a) for a in table.axes]
     as_given = [_apart(table, f, g) for _, f, g in pairs]
-    trials = _half_turns(axes)
-    results = []
-    for names, S in trials:
-        turned = np.eye(4)
-        turned[:3, :3] = S
-        results.append((max(_apart(table, turned @ f, g) for _, f, g in pairs), names))
-    best, names = min(results)
+    turns = [(names, rigid(S, np.zeros(3))) for names, S in _half_turns(axes)]
+    best, names = min((max(_apart(table, S @ f, g) for _, f, g in pairs), names) for names, S in turns)
     worst = int(np.argmax(as_given))
     if as_given[worst] < _WRONG_RAD or best > _RIGHT_RAD:
         return None

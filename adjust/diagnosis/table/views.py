@@ -100,13 +100,14 @@ def table_views(survey: Survey) -> tuple[TableViews, ...]:
     if not readings or not carried or not blocks:
         return ()
     cameras, targets = survey.cameras_by_id, survey.targets_by_id
+    still = {s.station_id for s in survey.stations if s.motion == "fixed"}
     sides: list[tuple[str, bool] | None] = []
     for block in blocks:
         target = targets[str(block.target_id)]
         by_camera, by_target = carried.get(cameras[block.camera_id].station_id), carried.get(target.station_id or "")
         table_id = by_camera or by_target
         fixed = target.motion == "fixed" and (by_camera is None or target.station_id is None)
-        fixed = fixed and (by_camera is not None or _stands(survey, cameras[block.camera_id].station_id))
+        fixed = fixed and (by_camera is not None or cameras[block.camera_id].station_id in still)
         usable = (by_camera is None) != (by_target is None) and (table_id, block.epoch_id) in readings and fixed
         sides.append((str(table_id), by_target is not None) if usable else None)
     if not any(sides):
@@ -164,10 +165,6 @@ def poses_of_views(survey: Survey) -> dict[int, View]:
     found = single_views(survey, {camera_id: own_lens(survey, survey.cameras_by_id[camera_id]) for camera_id in seen})
     reasons, _ = untrustworthy(found, survey)
     return {view.block_idx: view for view in found if view.block_idx not in reasons}
-
-
-def _stands(survey: Survey, station_id: str) -> bool:
-    return any(s.station_id == station_id and s.motion == "fixed" for s in survey.stations)
 
 
 def _gathered(

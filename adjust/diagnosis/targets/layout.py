@@ -1,12 +1,12 @@
 """Boards of another number of columns than their owner says, squares counted for corners: points in other rows."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, SetKey
+from adjust.model.rewriting import with_changed
 from adjust.model.survey import FloatArray, IntArray, Survey
 
 _CLEARLY = 5.0
@@ -68,14 +68,11 @@ def _normalized(x: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _hypothesis(survey: Survey, target: str, columns: int, square: float, evidence: float) -> Hypothesis:
     n = len(survey.targets_by_id[target].point_ids)
     rows = -(-n // columns)
-    targets = tuple(
-        replace(t, x_in_target=lattice(n, columns, square)) if t.target_id == target else t for t in survey.targets
-    )
     return Hypothesis(
         "rows and columns", f"target {target} has {columns} columns of points, and {rows} rows: as it is said, its "
         "images are not those of a plane; perhaps squares were counted for corners, or rows for columns",
         f"write columns = {columns}, rows = {rows}", Place("target", (target,), "columns"),
-        replace(survey, targets=targets),
+        with_changed(survey, "targets", target, x_in_target=lattice(n, columns, square)),
         (SetKey(("targets", target, "columns"), columns), SetKey(("targets", target, "rows"), rows)),
         1e5 * evidence, 1, _WIDEST,
     )  # fmt: skip

@@ -1,7 +1,6 @@
 """A target of another size than its owner says: its places, seen by cameras that the rest determines, tell it."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
@@ -9,6 +8,7 @@ from adjust.diagnosis.bodies.series import placed_views
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, ScaleKey
 from adjust.diagnosis.prediction import Altered
+from adjust.model.rewriting import with_changed
 from adjust.model.survey import FloatArray, Survey
 
 KNOWN = (  # factor from what is said to what is meant, and how that comes about
@@ -79,8 +79,7 @@ def _hypothesis(survey: Survey, target: str, factor: float, why: str, parameters
 
 def reshaped(survey: Survey, target: str, A: FloatArray) -> Survey:
     """The survey with the points of a target times A (3, 3)."""
-    targets = tuple(replace(t, x_in_target=t.x_in_target @ A.T) if t.target_id == target else t for t in survey.targets)
-    return replace(survey, targets=targets)
+    return with_changed(survey, "targets", target, x_in_target=survey.targets_by_id[target].x_in_target @ A.T)
 
 
 def _ratio(case: Case, values: Altered, target: str) -> tuple[float, float] | None:

@@ -4,16 +4,17 @@ Evidence: poses of single images, ``camera_from_target`` of a camera that stands
 fits its own image.
 """
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, SetKey
-from adjust.model.survey import FloatArray, Survey
-from adjust.spatial.averaging import mean_pose
+from adjust.model.rewriting import with_changed
+from adjust.model.survey import Survey
+from adjust.spatial.averaging import mean_pose, typical_distance
 from adjust.spatial.rigid import inverse
+from adjust.start.views import View
 
 _CLEARLY = 10.0
 _FEWEST = 2
@@ -28,55 +29,33 @@ def forgotten_motion(case: Case) -> Iterator[Hypothesis]:
     station_of = {c.camera_id: c.station_id for c in survey.cameras}
     carriers = {t.target_id: t.station_id for t in survey.targets}
     moves: dict[tuple[str, str], tuple[float, int]] = {}
-    for (camera_id, target_id), (poses, error_px, focal) in _poses(case).items():
+    for (camera_id, target_id), views in case.views_of.items():
         joined = carriers[target_id] == station_of[camera_id]
-        if target_id in still and station_of[camera_id] in fixed and not joined and len(poses) > 1:
-            key, ratio = (station_of[camera_id], target_id), _scatter(poses, error_px / focal)
+        if target_id in still and station_of[camera_id] in fixed and not joined and len(views) > 1:
+            key, ratio = (station_of[camera_id], target_id), _scatter([*views.values()])
             if ratio > _CLEARLY:
                 most, n = moves.get(key, (0.0, 0))
-                moves[key] = max(most, ratio), n + len(poses) - 1
-    for which, made in ((1, _target), (0, _station)):
+                moves[key] = max(most, ratio), n + len(views) - 1
+    for which, kind, share in ((1, "target", 1.0), (0, "station", 0.9)):
         for owner in dict.fromkeys(key[which] for key in moves):
             ratios, numbers = zip(*(found for key, found in moves.items() if key[which] == owner), strict=True)
             if sum(numbers) >= _FEWEST:
-                yield made(survey, owner, max(ratios))
+                yield _moving(survey, kind, owner, share * max(ratios))
 
 
-def _poses(case: Case) -> dict[tuple[str, str], tuple[FloatArray, float, float]]:
-    """By camera and target: poses target_from_camera (n, 4, 4), the typical error and the focal length, px."""
-    found: dict[tuple[str, str], list[int]] = {}
-    for i, view in sorted(case.views.items()):
-        block = case.survey.image_blocks[i]
-        if len(view.poses):
-            found.setdefault((block.camera_id, str(block.target_id)), []).append(i)
-    return {
-        key: (inverse(np.array([case.views[i].poses[0] for i in rows])),
-              float(np.median([case.views[i].error_px[0] for i in rows])), case.views[rows[0]].focal_px)
-        for key, rows in found.items()
-    }  # fmt: skip
-
-
-def _scatter(target_from_camera: FloatArray, error_rad: float) -> float:
+def _scatter(views: Sequence[View]) -> float:
     """How far the poses are apart, as angles at the camera, over the error of a single image."""
-    lever = float(np.median(np.linalg.norm(target_from_camera[:, :3, 3], axis=1)))
+    target_from_camera = inverse(np.array([v.poses[0] for v in views]))
+    error = float(np.median([v.error_px[0] for v in views])) / views[0].focal_px
+    lever = typical_distance(target_from_camera)
     apart = mean_pose(target_from_camera, lever)[1]
-    return float(np.median(apart) / lever / max(10.0 * error_rad, 1e-5))
+    return float(np.median(apart) / lever / max(10.0 * error, 1e-5))
 
 
-def _target(survey: Survey, target_id: str, evidence: float) -> Hypothesis:
-    targets = tuple(replace(t, motion="epoch") if t.target_id == target_id else t for t in survey.targets)
+def _moving(survey: Survey, kind: str, owner: str, evidence: float) -> Hypothesis:
     return Hypothesis(
-        "motion forgotten", f"target {target_id} moves between epochs, but is said to stand still",
-        f'write motion = "epoch" below [targets.{target_id}] in survey.toml', Place("target", (target_id,), "motion"),
-        replace(survey, targets=targets), (SetKey(("targets", target_id, "motion"), "epoch"),), evidence, 6,
-    )  # fmt: skip
-
-
-def _station(survey: Survey, station_id: str, evidence: float) -> Hypothesis:
-    stations = tuple(replace(s, motion="epoch") if s.station_id == station_id else s for s in survey.stations)
-    return Hypothesis(
-        "motion forgotten", f"station {station_id} moves between epochs, but is said to stand still",
-        f'write motion = "epoch" below [stations.{station_id}] in survey.toml',
-        Place("station", (station_id,), "motion"), replace(survey, stations=stations),
-        (SetKey(("stations", station_id, "motion"), "epoch"),), 0.9 * evidence, 6,
+        "motion forgotten", f"{kind} {owner} moves between epochs, but is said to stand still",
+        f'write motion = "epoch" below [{kind}s.{owner}] in survey.toml', Place(kind, (owner,), "motion"),
+        with_changed(survey, f"{kind}s", owner, motion="epoch"), (SetKey((f"{kind}s", owner, "motion"), "epoch"),),
+        evidence, 6,
     )  # fmt: skip

@@ -14,7 +14,8 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.late import Freed, as_unknowns
 from adjust.diagnosis.sequences import Link, links
-from adjust.model.survey import Camera, PoseParameter, Station, Survey
+from adjust.model.rewriting import with_rows
+from adjust.model.survey import PoseParameter, Station, Survey
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import norm
 
@@ -101,31 +102,19 @@ def apart(survey: Survey, cameras: tuple[str, ...]) -> tuple[Survey | None, int]
     chosen = {c.camera_id: c for c in survey.cameras if c.camera_id in cameras}
     if any(survey.stations_by_id[c.station_id].motion != "fixed" for c in chosen.values()):
         return None, 0
-    blocks = tuple(
-        replace(b, epoch_id=_own(b.epoch_id, b.camera_id)) if b.camera_id in chosen else b for b in survey.image_blocks
-    )
-    new = tuple(
-        replace(c, station_id=_own("body", c.camera_id), station_from_camera=_held())
-        if c.camera_id in chosen else c for c in survey.cameras
-    )  # fmt: skip
-    bodies = tuple(Station(_own("body", c), world_from_station=_held()) for c in chosen)
-    added = {b.epoch_id for b in blocks} - {b.epoch_id for b in survey.image_blocks}
-    return replace(survey, cameras=new, image_blocks=blocks, stations=survey.stations + bodies), len(added)
+    mine = {i: b for i, b in enumerate(survey.image_blocks) if b.camera_id in chosen}
+    blocks = {i: replace(b, epoch_id=f"{b.epoch_id} of {b.camera_id}") for i, b in mine.items()}
+    held = PoseParameter(Pose3(), "held")
+    new = {i: replace(c, station_id=f"body of {c.camera_id}", station_from_camera=held)
+           for i, c in enumerate(survey.cameras) if c.camera_id in chosen}  # fmt: skip
+    bodies = tuple(Station(f"body of {c}", world_from_station=held) for c in chosen)
+    added = {b.epoch_id for b in blocks.values()} - {b.epoch_id for b in survey.image_blocks}
+    out = with_rows(with_rows(survey, "image_blocks", blocks), "cameras", new)
+    return replace(out, stations=survey.stations + bodies), len(added)
 
 
 def _with_own_lenses(survey: Survey, case: Case, cameras: tuple[str, ...]) -> Survey:
     """Each of these cameras with the lens that its own images give: alone, its focal length and poses wander."""
-
-    def own(c: Camera) -> Camera:
-        known = c.camera_id in cameras and c.camera_id in case.lenses
-        return replace(c, lens=replace(c.lens, values=case.lenses[c.camera_id], free=(), prior=None)) if known else c
-
-    return replace(survey, cameras=tuple(own(c) for c in survey.cameras))
-
-
-def _own(name: str, camera_id: str) -> str:
-    return f"{name} of {camera_id}"
-
-
-def _held() -> PoseParameter:
-    return PoseParameter(Pose3(), "held")
+    known = {i: c for i, c in enumerate(survey.cameras) if c.camera_id in cameras and c.camera_id in case.lenses}
+    lenses = {i: replace(c.lens, values=case.lenses[c.camera_id], free=(), prior=None) for i, c in known.items()}
+    return with_rows(survey, "cameras", {i: replace(c, lens=lenses[i]) for i, c in known.items()})

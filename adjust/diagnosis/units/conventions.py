@@ -43,6 +43,10 @@ class Misreading:
         """(n,) true values of values as they were read."""
         return np.asarray(self.factor * values + self.offset)
 
+    def text(self, whose: str) -> str:
+        """What is wrong with which of them; whose: "their" or "its"."""
+        return f"{'its decimal point' if self.name == 'slipped decimal' else f'{whose} values'} {self.said}"
+
     def may_be(self, widest: float) -> bool:
         """Whether values of which the largest is that (rad or m) can have been read so: a circle has one turn.
 

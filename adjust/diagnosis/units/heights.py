@@ -12,6 +12,7 @@ from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.screen import Screen, at_best
 from adjust.model.observations import Reading
+from adjust.model.rewriting import with_rows
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.statistics.score import LinearScores
 
@@ -81,37 +82,36 @@ def _by_scores(case: Case, constants: list[_Constant]) -> list[tuple[float, floa
 
 
 def _constants(survey: Survey, before: Screen) -> Iterator[_Constant]:
+    """Those that enough readings show."""
     batch = before.graph.terrestrial
-    if batch is None:
-        return
-    A, kinds = batch.A, np.array([r.kind for r in survey.readings])
-    setups = np.array([r.setup_id for r in survey.readings])
-    targets = np.array([str(r.to.point_id) for r in survey.readings])
-    up_to, up_at, along = A[:, 5], A[:, 2], np.ones(len(A))  # by the heights of the two ends' positions, and by lengths
-    tilted = np.isin(kinds, ("zenith", "slope_distance", "height_difference"))
-    lengths = np.isin(kinds, ("slope_distance", "horizontal_distance"))
-
-    def constant(
-        name: str, text: str, place: Place, which: BoolArray, by: FloatArray, remedy: str
-    ) -> Iterator[_Constant]:
+    for name, text, place, which, by, remedy in () if batch is None else _possible(survey, batch.A):
         rows = np.flatnonzero(which)
         if len(rows) >= _FEWEST:
             yield _Constant(name, text, place, rows, by[rows], remedy)
 
+
+def _possible(
+    survey: Survey, A: FloatArray
+) -> Iterator[tuple[str, str, Place, BoolArray, FloatArray, str]]:
+    """Fields of constants, with all readings (N,) that they change. A: (N, 9) derivatives by positions."""
+    kinds, setups = (np.array([getattr(r, of) for r in survey.readings]) for of in ("kind", "setup_id"))
+    targets = np.array([str(r.to.point_id) for r in survey.readings])
+    up_to, up_at, along = A[:, 5], A[:, 2], np.ones(len(A))  # by the heights of the two ends' positions, and by lengths
+    tilted = np.isin(kinds, ("zenith", "slope_distance", "height_difference"))
+    lengths = np.isin(kinds, ("slope_distance", "horizontal_distance"))
+    rows = "of its rows in terrestrial.csv"
     for setup_id in dict.fromkeys(s for s in setups.tolist() if s):
         mine = setups == setup_id
-        yield from constant("instrument height", f"the instrument's height at set-up {setup_id}",
-                            Place("setup", (setup_id,), "instrument_height_m"), mine & tilted, up_at,
-                            "change instrument_height of its rows in terrestrial.csv")  # fmt: skip
-        yield from constant("prism constant", f"the reflector's constant at set-up {setup_id}",
-                            Place("setup", (setup_id,), "value"), mine & lengths, along,
-                            "change the distances of its rows in terrestrial.csv")  # fmt: skip
+        yield ("instrument height", f"the instrument's height at set-up {setup_id}",
+               Place("setup", (setup_id,), "instrument_height_m"), mine & tilted, up_at,
+               f"change instrument_height {rows}")  # fmt: skip
+        yield ("prism constant", f"the reflector's constant at set-up {setup_id}",
+               Place("setup", (setup_id,), "value"), mine & lengths, along, f"change the distances {rows}")  # fmt: skip
     for target in dict.fromkeys(targets.tolist()):
-        yield from constant("target height", f"the target's height on point {target}",
-                            Place("point", (target,), "target_height_m"), (targets == target) & tilted, up_to,
-                            "change target_height of its rows in terrestrial.csv")  # fmt: skip
-    yield from constant("prism constant", "the reflector's constant of all distances", Place("instrument", (), ""),
-                        lengths, along, "give an instrument's distance_offset, or change all distances")  # fmt: skip
+        yield ("target height", f"the target's height on point {target}", Place("point", (target,), "target_height_m"),
+               (targets == target) & tilted, up_to, f"change target_height {rows}")  # fmt: skip
+    yield ("prism constant", "the reflector's constant of all distances", Place("instrument", (), ""), lengths, along,
+           "give an instrument's distance_offset, or change all distances")  # fmt: skip
 
 
 def _evidence(before: Screen, constant: _Constant) -> tuple[float, float]:
@@ -139,16 +139,12 @@ def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
 
 def _changed(survey: Survey, constant: _Constant, metres: float) -> Survey:
     """With the constant as it probably was; its readings then fit without it."""
-    rows = set(constant.rows.tolist())
 
-    def mended(i: int) -> Reading:
-        r = survey.readings[i]
-        if i not in rows:
-            return r
+    def mended(r: Reading) -> Reading:
         if constant.name == "instrument height":
             return replace(r, instrument_height=r.instrument_height + metres)
         if constant.name == "target height":
             return replace(r, target_height=r.target_height + metres)
         return replace(r, value=r.value - metres)
 
-    return replace(survey, readings=tuple(mended(i) for i in range(len(survey.readings))))
+    return with_rows(survey, "readings", {i: mended(survey.readings[i]) for i in constant.rows.tolist()})

@@ -9,19 +9,18 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from gtsam import Pose3, Rot3
+from gtsam import Pose3
 
 from adjust.diagnosis.case import CAP, Case
-from adjust.diagnosis.hypothesis import ChangeColumns, Edit, ExchangeColumns, Hypothesis, Place
+from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.screen import Screen, at_best, screen
-from adjust.diagnosis.sequences import Link, fitted, links, typical, with_pairs
+from adjust.diagnosis.sequences import Link, fitted, links, typical
 from adjust.diagnosis.units.conventions import Scope, shrinking
-from adjust.model.errors import SurveyError
+from adjust.diagnosis.units.motions import CONVENTIONS, Convention, Motion, edits_of, mended, miss, rotation_of
+from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.spatial.rigid_motions import Motions
-from adjust.spatial.rotation_forms import euler_from_matrix, matrix_from_euler, quaternion_wxyz
 
-Motion = Pose3 | Rot3
 _CLEARLY = 3.0
 _SURE = 20.0
 """Evidence that hardly leaves more than noise: what is tried at the robust start is bounded."""
@@ -30,110 +29,6 @@ _MISSED = 25.0
 """Mean square over sigmas at the start that the typical one of several pairs that are misread has at least."""
 _LARGE = 500
 """Pairs up to which start values are found anew for every convention."""
-
-
-@dataclass(frozen=True)
-class Convention:
-    """name: of the kind of mistake. said: what is wrong. remedy: in pairs.csv. mend: the motion as it was meant.
-
-    columns: the numbers of pairs.csv that change, and by which matrix, where that mends it. shifts: what the lengths of
-    shifts are multiplied by.
-    """
-
-    name: str
-    said: str
-    remedy: str
-    mend: Callable[[Motion], Motion | None]
-    columns: tuple[tuple[str, ...], FloatArray] | None = None
-    shifts: float = 1.0
-
-
-def _inverted(m: Motion) -> Motion:
-    return m.inverse()
-
-
-def _rotated(m: Motion, R: FloatArray) -> Motion:
-    return Pose3(Rot3(R), m.translation()) if isinstance(m, Pose3) else Rot3(R)
-
-
-def _matrix(m: Motion) -> FloatArray:
-    return np.asarray((m.rotation() if isinstance(m, Pose3) else m).matrix())
-
-
-def _last_first(m: Motion) -> Motion:
-    """The four numbers stood as x y z w in the columns w x y z."""
-    w, x, y, z = quaternion_wxyz(m.rotation() if isinstance(m, Pose3) else m)
-    return _rotated(m, Rot3.Quaternion(z, w, x, y).matrix())
-
-
-def _first_last(m: Motion) -> Motion:
-    """The four numbers stood as w x y z in columns named x y z w."""
-    w, x, y, z = quaternion_wxyz(m.rotation() if isinstance(m, Pose3) else m)
-    return _rotated(m, Rot3.Quaternion(x, y, z, w).matrix())
-
-
-def _turned_back(m: Motion) -> Motion:
-    return _rotated(m, _matrix(m).T)
-
-
-def _reversed_euler(m: Motion) -> Motion | None:
-    """Angles about z, y, x were applied in the order x, y, z: ``Rz Ry Rx`` was read, ``Rx Ry Rz`` meant."""
-    return _by_euler(m, lambda a: matrix_from_euler(-a, "zyx").T)
-
-
-def _other_euler(m: Motion) -> Motion | None:
-    return _by_euler(m, lambda a: matrix_from_euler(a, "213"))
-
-
-def _by_euler(m: Motion, meant: Callable[[FloatArray], FloatArray]) -> Motion | None:
-    try:
-        return _rotated(m, meant(euler_from_matrix(_matrix(m), "zyx")))
-    except SurveyError:  # gimbal lock: the angles are not known
-        return None
-
-
-def _left_handed(m: Motion) -> Motion:
-    """Both frames have one axis the other way round: S R S and S t with S = diag(1, 1, -1)."""
-    S = np.diag([1.0, 1.0, -1.0])
-    R = S @ _matrix(m) @ S
-    return Pose3(Rot3(R), S @ m.translation()) if isinstance(m, Pose3) else Rot3(R)
-
-
-def _origin_of_a(m: Motion) -> Motion | None:
-    """The shift stands in the axes of a: ``-R t`` was meant for ``t``."""
-    return Pose3(m.rotation(), -(_matrix(m) @ m.translation())) if isinstance(m, Pose3) else None
-
-
-def _scaled(factor: float) -> Callable[[Motion], Motion | None]:
-    return lambda m: Pose3(m.rotation(), factor * m.translation()) if isinstance(m, Pose3) else None
-
-
-def _of_shifts(said: str, factor: float) -> Convention:
-    return Convention("unit of shifts", f"have shifts in {said}", f"multiply tx, ty, tz by {factor:g}",
-                      _scaled(factor), (_SHIFT, factor * np.eye(3)), factor)  # fmt: skip
-
-
-_SHIFT, _QUATERNION = ("tx_mm", "ty_mm", "tz_mm"), ("qw", "qx", "qy", "qz")
-CONVENTIONS: tuple[Convention, ...] = (
-    Convention("pairs inverted", "are a_from_b, read as b_from_a", "exchange a_id and b_id", _inverted),
-    _of_shifts("metres, read as millimetres", 1000.0),
-    _of_shifts("millimetres, read as metres", 0.001),
-    _of_shifts("inches, read as millimetres", 25.4),
-    Convention("order of quaternions", "have quaternions in the order x y z w, read as w x y z",
-               "put the last of the four numbers first", _last_first, (_QUATERNION, np.roll(np.eye(4), 1, axis=0))),
-    Convention("order of quaternions", "have quaternions in the order w x y z, read as x y z w",
-               "put the first of the four numbers last", _first_last, (_QUATERNION, np.roll(np.eye(4), -1, axis=0))),
-    Convention("rotations inverted", "have the rotation of a_from_b beside the shift of b_from_a",
-               "negate qx, qy and qz", _turned_back, (_QUATERNION[1:], -np.eye(3))),
-    Convention("shift in other axes", "have the origin of b in a, read as that of a in b",
-               "replace the shifts t by -R t", _origin_of_a),
-    Convention("order of Euler angles", "have Euler angles about x, y, z, read as about z, y, x",
-               "give them in the order of the columns", _reversed_euler),
-    Convention("order of Euler angles", "have Euler angles of order 2-1-3, read as z, y, x",
-               "name the columns by that order", _other_euler),
-    Convention("left-handed frames", "are of frames whose z axis points the other way (left-handed)",
-               "negate qx, qy and tz", _left_handed, (("qx", "qy", "tz_mm"), -np.eye(3))),
-)  # fmt: skip
 
 
 def misread_pairs(case: Case) -> Iterator[Hypothesis]:
@@ -181,18 +76,8 @@ def _lengths(survey: Survey, hands: list[Link]) -> str:
     return "".join(out)
 
 
-def mended(survey: Survey, rows: IntArray, convention: Convention) -> Survey | None:
-    """The survey with these pairs as they were meant; None where they cannot have been misread so.
-
-    The covariance is in the tangent of the motion as it is written; rotation and shift keep their sigmas.
-    """
-    new = {i: convention.mend(survey.pairs[i].b_from_a) for i in rows.tolist()}
-    known = {i: motion for i, motion in new.items() if motion is not None}
-    return _with(survey, known) if len(known) == len(new) else None
-
-
 def _with(survey: Survey, new: Mapping[int, Motion]) -> Survey:
-    return with_pairs(survey, {i: replace(survey.pairs[i], b_from_a=motion) for i, motion in new.items()})
+    return with_rows(survey, "pairs", {i: replace(survey.pairs[i], b_from_a=m) for i, m in new.items()})
 
 
 def _scopes(survey: Survey, worst: IntArray) -> Iterator[Scope]:
@@ -311,7 +196,7 @@ def _loop_tests(survey: Survey) -> Callable[[Sequence[Mapping[int, Motion]]], Fl
     def meant(new: Mapping[int, Motion]) -> Motions:
         R, t = read.rotation.copy(), np.array(read.translation)
         for i, motion in new.items():
-            R[i] = _matrix(motion)
+            R[i] = rotation_of(motion)
             if isinstance(motion, Pose3):
                 t[i] = motion.translation()
         return Motions(R, t)
@@ -327,21 +212,3 @@ def _read_as(found: Screen, new: Mapping[int, Motion]) -> FloatArray:
         v = miss(motion, found.motions[pair.pair_id])
         out.append(float(v @ np.linalg.solve(pair.cov, v)) / len(v))
     return np.array(out)
-
-
-def miss(motion: Motion, other: FloatArray) -> FloatArray:
-    """(k,) rad and m: logarithm from a motion to the one with this logarithm (6,), of rotations alone (3,)."""
-    if isinstance(motion, Pose3):
-        return np.asarray(Pose3.Logmap(motion.between(Pose3.Expmap(other))))
-    return np.asarray(Rot3.Logmap(motion.between(Rot3.Expmap(other))))
-
-
-def edits_of(survey: Survey, rows: IntArray, convention: Convention) -> tuple[Edit, ...]:
-    """The change of these pairs in ``pairs.csv``; none where that is no matter of its columns."""
-    where = {"pair_id": tuple(survey.pairs[i].pair_id for i in rows)}
-    if convention.mend is _inverted:
-        return (ExchangeColumns("pairs", ("a_id", "b_id"), where),)
-    if convention.columns is None:
-        return ()
-    columns, matrix = convention.columns
-    return (ChangeColumns("pairs", columns, matrix, np.zeros(len(columns)), where),)

@@ -23,7 +23,7 @@ from adjust.diagnosis.units.conventions import (
     shrinking,
     slips,
 )
-from adjust.model.observations import Reading
+from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, IntArray, Survey
 
 _CLEARLY = 3.0
@@ -76,33 +76,23 @@ def _slips(survey: Survey, before: Screen | None, values: FloatArray) -> list[_F
 
 def scopes(survey: Survey) -> Iterator[Scope]:
     """All readings of a kind; of a set-up, by kind and all its angles; single ones."""
-    readings = survey.readings
-    kinds = list(dict.fromkeys(r.kind for r in readings))
-    for kind in kinds:
-        rows = _rows(readings, (kind,))
-        yield Scope(rows, f"all readings of kind {kind}", Place("reading", (kind,), "value"))
-    for names in (ANGLES, TURNS):
-        rows = _rows(readings, names)
-        if len({readings[i].kind for i in rows}) > 1:
-            what = "angles" if names is ANGLES else "horizontal angles"
+    kinds, setups = (np.array([getattr(r, of) for r in survey.readings]) for of in ("kind", "setup_id"))
+
+    def of(names: Sequence[str], setup_id: str = "") -> IntArray:
+        return np.flatnonzero(np.isin(kinds, names) & ((setups == setup_id) | (not setup_id)))
+
+    for kind in dict.fromkeys(kinds.tolist()):
+        yield Scope(of([kind]), f"all readings of kind {kind}", Place("reading", (kind,), "value"))
+    for what, names in (("angles", ANGLES), ("horizontal angles", TURNS), ("lengths", LENGTHS)):
+        if len(set(kinds[rows := of(names)].tolist())) > 1:
             yield Scope(rows, f"all {what}", Place("reading", (what,), "value"))
-    lengths = _rows(readings, LENGTHS)
-    if len({readings[i].kind for i in lengths}) > 1:
-        yield Scope(lengths, "all lengths", Place("reading", ("lengths",), "value"))
-    setups = list(dict.fromkeys(r.setup_id for r in readings if r.setup_id))
-    for setup_id in setups if len(setups) > 1 else []:
-        mine = np.array([i for i, r in enumerate(readings) if r.setup_id == setup_id], dtype=np.int64)
+    every = list(dict.fromkeys(s for s in setups.tolist() if s))
+    for setup_id in every if len(every) > 1 else []:
         place = Place("setup", (setup_id,), "value")
-        for kind in dict.fromkeys(readings[i].kind for i in mine):
-            rows = np.array([i for i in mine if readings[i].kind == kind], dtype=np.int64)
-            yield Scope(rows, f"the readings of kind {kind} of set-up {setup_id}", place)
-        angles = np.array([i for i in mine if readings[i].kind in ANGLES], dtype=np.int64)
-        if len({readings[i].kind for i in angles}) > 1:
-            yield Scope(angles, f"the angles of set-up {setup_id}", place)
-
-
-def _rows(readings: Sequence[Reading], kinds: Sequence[str]) -> IntArray:
-    return np.array([i for i, r in enumerate(readings) if r.kind in kinds], dtype=np.int64)
+        for kind in dict.fromkeys(kinds[setups == setup_id].tolist()):
+            yield Scope(of([kind], setup_id), f"the readings of kind {kind} of set-up {setup_id}", place)
+        if len(set(kinds[rows := of(ANGLES, setup_id)].tolist())) > 1:
+            yield Scope(rows, f"the angles of set-up {setup_id}", place)
 
 
 def _possible(survey: Survey, scope: Scope, values: FloatArray) -> Iterator[Misreading]:
@@ -115,9 +105,8 @@ def _possible(survey: Survey, scope: Scope, values: FloatArray) -> Iterator[Misr
 def mended(survey: Survey, rows: IntArray, misreading: Misreading) -> Survey:
     """The survey with these readings as they were meant."""
     values = misreading.mend(np.array([survey.readings[i].value for i in rows]))
-    new = dict(zip(rows.tolist(), values.tolist(), strict=True))
-    readings = tuple(replace(r, value=new[i]) if i in new else r for i, r in enumerate(survey.readings))
-    return replace(survey, readings=readings)
+    new = zip(rows.tolist(), values.tolist(), strict=True)
+    return with_rows(survey, "readings", {i: replace(survey.readings[i], value=v) for i, v in new})
 
 
 def _evidence(survey: Survey, before: Screen | None, values: FloatArray, ways: Sequence[_Way]) -> list[float]:
@@ -180,15 +169,10 @@ def _fits_as_it_is(before: Screen, rows: IntArray) -> bool:
 def _hypothesis(survey: Survey, scope: Scope, misreading: Misreading, evidence: float, looked_at: int) -> Hypothesis:
     ids = tuple(survey.readings[i].reading_id for i in scope.rows)
     return Hypothesis(
-        misreading.name, _cause(scope, misreading), _remedy(misreading), scope.place,
+        misreading.name, f"{scope.text}: {misreading.text('their')}", _remedy(misreading), scope.place,
         mended(survey, scope.rows, misreading), (ChangeReadings(ids, misreading.factor, misreading.offset),), evidence,
         1, max(looked_at, 1), penalty=shrinking(misreading.factor, len(scope.rows)),
     )  # fmt: skip
-
-
-def _cause(scope: Scope, misreading: Misreading) -> str:
-    what = "its decimal point" if misreading.name == "slipped decimal" else "their values"
-    return f"{scope.text}: {what} {misreading.said}"
 
 
 def _remedy(misreading: Misreading) -> str:

@@ -5,23 +5,22 @@ The rest of the survey predicts them, with the sigma of that; nothing is adjuste
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 
 from adjust.diagnosis.hypothesis import ChangeReadings, Edit, Hypothesis, Place
 from adjust.diagnosis.ranking import Candidate
 from adjust.diagnosis.units.conventions import MISREADINGS, Misreading, slips
-from adjust.diagnosis.units.pairs import CONVENTIONS, edits_of, mended, miss
+from adjust.diagnosis.units.motions import CONVENTIONS, edits_of, mended, miss
 from adjust.model.observations import Distance, Reading
 from adjust.model.result import Adjustment, ObservationResidual
+from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, Survey
 from adjust.observations.terrestrial.equations import wrapped
 from adjust.observations.terrestrial.layout import KINDS
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
 
-_T = TypeVar("_T", Distance, Reading)
 _ALPHA, _FITS = 1e-4, 1e-3
 """Levels at which an observation is wrong as it stands, shared by all ways to read it, and at which it fits."""
 _MOST = 3
@@ -81,21 +80,15 @@ def _of_value(survey: Survey, o: ObservationResidual, row: int) -> Iterator[tupl
     for way in ways:
         value = way.mend(np.array([of.value]))
         other = replace(of, value=float(value[0]))
-        changed = replace(survey, readings=_with(survey.readings, row, other)) if isinstance(other, Reading) else \
-            replace(survey, distances=_with(survey.distances, row, other))  # fmt: skip
+        changed = with_rows(survey, "readings" if isinstance(of, Reading) else "distances", {row: other})
         yield wrapped(np.array([KINDS[kind]]), o.adjusted, value), _misread(of, way, changed)
-
-
-def _with(every: tuple[_T, ...], row: int, other: _T) -> tuple[_T, ...]:
-    return tuple(other if i == row else o for i, o in enumerate(every))
 
 
 def _misread(o: Distance | Reading, way: Misreading, changed: Survey) -> Hypothesis:
     named, table, name = (f"reading {o.reading_id}", "terrestrial", o.reading_id) if isinstance(o, Reading) else (
         f"distance {o.distance_id}", "distances", o.distance_id)  # fmt: skip
     edits: tuple[Edit, ...] = (ChangeReadings((name,), way.factor, way.offset, table),)
-    what = "its decimal point" if way.name == "slipped decimal" else "its values"
     return Hypothesis(
-        way.name, f"{named}: {what} {way.said}", f"write {way.factor * o.value + way.offset:.9g} (SI) in {table}.csv",
+        way.name, f"{named}: {way.text('its')}", f"write {way.factor * o.value + way.offset:.9g} (SI) in {table}.csv",
         Place("reading", (name,), "value"), changed, edits,
     )  # fmt: skip

@@ -4,9 +4,8 @@ A group with r redundancy and v'Pv Omega whose sigmas are all wrong by the same 
 residual stands out from the others: what stands out is a gross error, not a wrong sigma.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from adjust.diagnosis.hypothesis import Hypothesis, Place, ScaleKey
 from adjust.model.errors import listed
 from adjust.model.observations import Distance, Level, OnSurface, Reading
 from adjust.model.result import Adjustment
+from adjust.model.rewriting import Fields
 from adjust.model.survey import FloatArray
 from adjust.statistics.scaling import scaled_survey
 from adjust.testing.distributions import chi2
@@ -23,7 +23,10 @@ _ALPHA = 1e-4
 _FEWEST = 8.0
 """Redundancy from which a factor says anything."""
 _ODD = 100.0
-"""Ratio of a sigma to the usual one of its kind that nobody means: a sigma of zero, or of a metre."""
+"""Ratio of a sigma to the usual one of its kind that nobody means: a sigma of zero, or of a metre.
+
+No instrument is a hundred times as good as another in one survey; units of lengths and angles differ by that.
+"""
 _TAILS = 3.0
 """How much heavier than normal the residuals' largest fifth may be for one factor to explain all of them."""
 _LAST = 2.0
@@ -88,17 +91,22 @@ def odd_sigmas(case: Case) -> Iterator[Hypothesis]:
         for o in observed:
             by_kind.setdefault((getattr(o, "kind", field), o.group), []).append(o)
         for (kind, group), members in by_kind.items():
-            usual = float(np.median([o.sigma for o in members]))
-            odd = [o for o in members if not 1.0 / _ODD < o.sigma / usual < _ODD]
+            usual, odd = odd_among(members)
             if odd and len(members) > 2 * len(odd) + 1:
                 yield _with_usual(case, field, kind, group, odd, usual)
 
 
+def odd_among(members: Sequence[_One]) -> tuple[float, list[_One]]:
+    """The usual sigma of observations of a kind, and those whose sigma is a hundred times that, or a hundredth."""
+    usual = float(np.median([o.sigma for o in members]))
+    return usual, [o for o in members if not usual / _ODD < o.sigma < usual * _ODD]
+
+
 def _with_usual(case: Case, field: str, kind: str, group: str, odd: list[_One], usual: float) -> Hypothesis:
-    ids = [_id(o) for o in odd]
+    ids = [id_of(o) for o in odd]
     chosen = {id(o) for o in odd}
     every = getattr(case.survey, field)
-    changed: dict[str, Any] = {field: tuple(replace(o, sigma=usual) if id(o) in chosen else o for o in every)}
+    changed: Fields = {field: tuple(replace(o, sigma=usual) if id(o) in chosen else o for o in every)}
     ratio = max(max(o.sigma / usual, usual / max(o.sigma, 1e-300)) for o in odd)
     return Hypothesis(
         "odd sigma", f"{kind} {listed(ids, 5)}: the sigma "
@@ -109,6 +117,7 @@ def _with_usual(case: Case, field: str, kind: str, group: str, odd: list[_One], 
     )  # fmt: skip
 
 
-def _id(o: _One) -> str:
+def id_of(o: _One) -> str:
+    """Of an observation."""
     names = ("reading_id", "distance_id", "level_id", "surface_id")
     return str(next(getattr(o, n) for n in names if hasattr(o, n)))

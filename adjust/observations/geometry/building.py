@@ -42,8 +42,10 @@ SURFACE_UNITS: Mapping[str, tuple[str, ...]] = {
 
 
 def position_refs(survey: Survey) -> list[PositionRef]:
-    """The positions that geometric observations need."""
-    refs = [ref for d in survey.coordinate_differences for ref in (*d.at, *d.to)]
+    """The positions that distances, coordinates and geometric observations need."""
+    refs = [ref for d in survey.distances for ref in (d.a, d.b)]
+    refs += [ref for c in survey.coordinates for ref in c.positions]
+    refs += [ref for d in survey.coordinate_differences for ref in (*d.at, *d.to)]
     return refs + [o.position for o in survey.on_surfaces]
 
 

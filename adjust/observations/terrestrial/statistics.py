@@ -61,7 +61,7 @@ def reading_residuals(batch: TerrestrialBatch, tree: KeyCovariances, values: gts
     observed = batch.layout.arrays.observed
     return ReadingResiduals(
         observed, observed + batch.residual, batch.residual.copy(), sigma, redundancy, standardized, test,
-        e**2, used,
+        e**2, used, influence,
     )  # fmt: skip
 
 
@@ -96,7 +96,7 @@ def reading_unit(kind: str) -> str:
 class JoinedResiduals(Sequence[ObservationResidual]):
     """Residuals of single observations, followed by those of all readings, each made when it is asked for."""
 
-    def __init__(self, first: tuple[ObservationResidual, ...], survey: Survey, readings: ReadingResiduals) -> None:
+    def __init__(self, first: Sequence[ObservationResidual], survey: Survey, readings: ReadingResiduals) -> None:
         self.first, self.survey, self.readings = first, survey, readings
 
     def __len__(self) -> int:
@@ -106,10 +106,12 @@ class JoinedResiduals(Sequence[ObservationResidual]):
     def __getitem__(self, index: int) -> ObservationResidual: ...
 
     @overload
-    def __getitem__(self, index: slice) -> tuple[ObservationResidual, ...]: ...
+    def __getitem__(self, index: slice) -> Sequence[ObservationResidual]: ...
 
-    def __getitem__(self, index: int | slice) -> ObservationResidual | tuple[ObservationResidual, ...]:
+    def __getitem__(self, index: int | slice) -> ObservationResidual | Sequence[ObservationResidual]:
         if isinstance(index, slice):
+            if index.indices(len(self)) == (0, len(self.first), 1):
+                return self.first
             return tuple(self[i] for i in range(*index.indices(len(self))))
         i = index + len(self) if index < 0 else index
         if not 0 <= i < len(self):

@@ -39,11 +39,18 @@ def best_poses(
     x: FloatArray, rays: FloatArray, ptr: IntArray, refinements: int
 ) -> tuple[FloatArray, FloatArray]:
     """Of every view the refined pose (B, 4, 4) with the least error (B,), rms rad, infinite where there is none."""
+    if len(ptr) < 2:
+        return np.zeros((0, 4, 4)), np.zeros(0)
+    poses, of, _ = view_poses(x, rays, ptr)
+    return best_of(poses, of, x, rays, ptr, refinements)
+
+
+def best_of(
+    poses: FloatArray, of: IntArray, x: FloatArray, rays: FloatArray, ptr: IntArray, refinements: int
+) -> tuple[FloatArray, FloatArray]:
+    """The same from poses (K, 4, 4) to begin with, of the views ``of`` (K,)."""
     n = len(ptr) - 1
     best, least = np.tile(np.eye(4), (n, 1, 1)), np.full(n, np.inf)
-    if not n:
-        return best, least
-    poses, of, _ = view_poses(x, rays, ptr)
     poses = refine_poses(poses, x, rays, ptr, refinements, of=of)
     error, in_front = view_errors(poses, x, rays, ptr, of)
     order = np.lexsort((error, of))

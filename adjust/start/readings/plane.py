@@ -161,8 +161,8 @@ class PlaneStart:
             if turns:
                 system.turn[name] = circular_median(np.array(turns))
 
-    def _rays(self, system: System, node: Node) -> list[tuple[complex, float]]:
-        """Points and directions (rad) of the rays that reach a node."""
+    def _rays(self, system: System, node: Node) -> list[tuple[Node, complex, float]]:
+        """Points with their places, and directions (rad), of the rays that reach a node."""
         out = []
         for name in self.sets_to.get(node, ()):
             a, targets = self.sights.directions[name]
@@ -170,26 +170,18 @@ class PlaneStart:
                 out.append((a, system.xy[a], targets[node] + system.turn[name]))
         if system.absolute:
             out += [(a, system.xy[a], angle) for a, angle in self.azimuths_to.get(node, ()) if a in system.xy]
-        return [(z, angle) for _, z, angle in out]
+        return out
 
     def _polar(self, system: System, node: Node) -> complex | None:
-        found = []
-        for name in self.sets_to.get(node, ()):
-            a, targets = self.sights.directions[name]
-            if name in system.turn and a in system.xy and (a, node) in self.distance:
-                angle = targets[node] + system.turn[name]
-                found.append(system.xy[a] + cmath.rect(self.distance[a, node], angle))
-        if system.absolute:
-            found += [system.xy[a] + cmath.rect(self.distance[a, node], angle)
-                      for a, angle in self.azimuths_to.get(node, ())
-                      if a in system.xy and (a, node) in self.distance]  # fmt: skip
+        far = self.distance
+        found = [z + cmath.rect(far[a, node], angle) for a, z, angle in self._rays(system, node) if (a, node) in far]
         return middle(found) if found else None
 
     def _intersection(self, system: System, node: Node) -> complex | None:
         rays = self._rays(system, node)
         found = []
-        for i, (p, alpha) in enumerate(rays):
-            for q, beta in rays[:i]:
+        for i, (_, p, alpha) in enumerate(rays):
+            for _, q, beta in rays[:i]:
                 sine = np.sin(beta - alpha)
                 if abs(sine) > _SURE:
                     s = ((q - p) * cmath.rect(1.0, -beta)).imag / -np.sin(beta - alpha)
@@ -204,7 +196,7 @@ class PlaneStart:
 
     def candidates(self, system: System, node: Node) -> list[complex]:
         """Where a point can be: resection, arcs and their mixtures, by least squares from many sides."""
-        rays = self._rays(system, node)
+        rays = [(z, angle) for _, z, angle in self._rays(system, node)]
         circles = [(system.xy[b], self.distance[node, b]) for b in self.around.get(node, ()) if b in system.xy]
         sets = []
         for name in self.sets_at.get(node, ()):

@@ -13,10 +13,9 @@ from adjust.model.boards import deformed
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, PositionRef
 from adjust.model.survey import FloatArray, Survey
-from adjust.native.views import refine_poses, view_errors
 from adjust.observations.terrestrial.batch import circular_median
 from adjust.spatial.rigid import align, inverse, rotation_exp
-from adjust.start.closed_forms.absolute_pose import pose_solutions
+from adjust.start.closed_forms.absolute_pose import best_of, pose_solutions
 from adjust.start.closed_forms.triangulation import intersect
 from adjust.start.network import ChainObservation
 from adjust.start.positions import Positions
@@ -227,13 +226,9 @@ def _station_pose(mine: list[TiltedSight], known: Mapping[Node, FloatArray], few
     candidates = _resections(x, rays)
     if not len(candidates):
         return None
-    n = len(candidates)
-    ptr, every, seen = np.arange(n + 1) * len(x), np.tile(x, (n, 1)), np.tile(rays, (n, 1))
-    candidates = refine_poses(candidates, every, seen, ptr, 10)
-    error, in_front = view_errors(candidates, every, seen, ptr)
-    error = np.where(in_front & np.isfinite(error), error, np.inf)
-    best = int(np.argmin(error))
-    return inverse(candidates[best]) if error[best] < _OFF else None
+    one = np.zeros(len(candidates), dtype=np.int64)
+    poses, errors = best_of(candidates, one, x, rays, np.array([0, len(x)]), 10)
+    return inverse(poses[0]) if errors[0] < _OFF else None
 
 
 def _resections(x: FloatArray, rays: FloatArray) -> FloatArray:

@@ -10,11 +10,12 @@ from adjust.model.observations import ImageBlock, ReadingCovariance
 from adjust.model.rewriting import Fields
 from adjust.model.survey import BoolArray, IntArray, Survey
 
-_FIELD = {
+FIELDS = {
     "pair": "pairs", "distance": "distances", "coordinates": "coordinates", "level": "levels",
     "alignment": "alignments", "laser": "laser_spots", "surface": "on_surfaces",
     "coordinate_difference": "coordinate_differences",
 }  # fmt: skip
+"""Of a survey that hold the factors of a kind, one each in their order."""
 _READINGS = "readings"
 
 
@@ -54,10 +55,10 @@ def candidates(graph: AdjustmentGraph, images: bool = True) -> Candidates:
     for kind, mine in rows.items():
         if kind == "table":
             place |= {o: ("table_readings", tables[graph.other(o - n_image).ids]) for o in mine}
-        elif kind in _FIELD:
-            if len(mine) != (n := len(getattr(survey, _FIELD[kind]))):
+        elif kind in FIELDS:
+            if len(mine) != (n := len(getattr(survey, FIELDS[kind]))):
                 raise ValueError(f"{len(mine)} factors of kind {kind} for {n} observations")
-            place |= {o: (_FIELD[kind], k) for k, o in enumerate(mine)}
+            place |= {o: (FIELDS[kind], k) for k, o in enumerate(mine)}
     first = n_image + graph.n_others
     place |= {first + i: (_READINGS, i) for i in range(len(survey.readings))}
     return Candidates(place, n_image, first + len(survey.readings), tuple(ptr.tolist()))

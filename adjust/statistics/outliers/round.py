@@ -45,7 +45,9 @@ class Round:
         self.given = used_at(now, self.found) if given is None else given
         allowed = self.found.mask() & self.given
         if options.kinds is not None:
-            allowed &= [self._name(o)[0] in options.kinds for o in range(len(allowed))]
+            kinds = ["image"] * self.found.n_image + precision.graph.of_others(lambda o: o.kind, lambda _: "pair")
+            kinds += [r.kind for r in now.survey.readings]
+            allowed &= [kind in options.kinds for kind in kinds]
         self._everything = tests_of_all(now) if watchable(now) else None
         if self._everything is None:
             self._follow_all(precision, allowed, 2 * points)

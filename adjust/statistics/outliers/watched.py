@@ -31,7 +31,7 @@ def large(n_rows: int, n_unknowns: int) -> bool:
 
 def watchable(now: Adjustment) -> bool:
     """Whether a survey is so large that the search must not follow all of it, and has nothing but single rows."""
-    rows = sum(len(o.components) for o in now.other_residuals) if now.reading_residuals is None else 0
+    rows = int(now.other_arrays.n_components.sum()) if now.reading_residuals is None else 0
     return large(rows, now.n_unknowns) and not len(now.image_residuals.used) and not precision_of(now).hidden
 
 

@@ -230,10 +230,10 @@ def _moving_target(values: CameraValues) -> str | None:
 
 
 def _frames(values: CameraValues) -> dict[tuple[str, str], list[ImageBlock]]:
-    station = {c.camera_id: c.station_id for c in values.survey.cameras}
+    cameras = values.survey.cameras_by_id
     out: dict[tuple[str, str], list[ImageBlock]] = {}
     for block in values.blocks():
-        out.setdefault((station[block.camera_id], block.epoch_id), []).append(block)
+        out.setdefault((cameras[block.camera_id].station_id, block.epoch_id), []).append(block)
     return out
 
 
@@ -325,7 +325,7 @@ def _seen(
             else:
                 yield (name,), x, uv
         return
-    target = next(t for t in values.survey.targets if t.target_id == block.target_id)
+    target = values.survey.targets_by_id[str(block.target_id)]
     pose = Pose3() if moving else values.world_from(FrameRef("target", target.target_id, block.epoch_id))
     stands = moving or (target.motion == "fixed" and target.station_id is None)
     x_all = values.x_in_target(target)

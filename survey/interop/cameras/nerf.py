@@ -99,7 +99,7 @@ def nerf_files(values: CameraValues, station: str | None) -> tuple[dict[str, str
     lenses = {k: mapped_lens(c, values.lens(c), CHOICES) for k, c in cameras.items()}
     seen = dict.fromkeys((b.camera_id, b.epoch_id) for b in values.blocks() if b.camera_id in cameras)
     if not seen:  # poses alone, as from another file
-        stations = {s.station_id: s for s in values.survey.stations}
+        stations = values.survey.stations_by_id
         seen = dict.fromkeys((k, e) for k, c in cameras.items() for e in values.epochs_of(stations[c.station_id]))
     frames = []
     for camera_id, epoch in seen:

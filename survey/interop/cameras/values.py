@@ -204,7 +204,7 @@ def one_station(values: CameraValues, station_id: str | None, format: str) -> St
         raise SurveyError(f"station {station_id!r} carries no camera; choose one of {', '.join(ids)}")
     if station_id is None and len(ids) > 1:
         raise SurveyError(f"{format} holds the cameras of one station; choose with --station: {', '.join(ids)}")
-    return next(s for s in values.survey.stations if s.station_id == (station_id or ids[0]))
+    return values.survey.stations_by_id[station_id or ids[0]]
 
 
 @dataclass(frozen=True, eq=False)

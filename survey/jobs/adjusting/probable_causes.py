@@ -171,10 +171,10 @@ def separate_epochs(survey: Survey) -> tuple[str, ...]:
             seen.setdefault(block.camera_id, set()).add((str(block.target_id), block.epoch_id))
         else:
             joined.add(block.camera_id)  # a fixed target or beacons join it to others at any epoch
-    station = {c.camera_id: c.station_id for c in survey.cameras}
+    on = survey.cameras_by_id
     found = []
     for a, b in itertools.combinations((c for c in seen if c not in joined), 2):
-        if station[a] == station[b] and not seen[a] & seen[b]:
+        if on[a].station_id == on[b].station_id and not seen[a] & seen[b]:
             names = ", ".join(repr(sorted(epoch for _, epoch in seen[c])[0]) for c in (a, b))
             found.append(
                 f"cameras {a} and {b} share no epoch (the first are {names}): give images of one moment the same "

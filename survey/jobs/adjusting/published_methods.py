@@ -18,7 +18,7 @@ from adjust.published.relay import PaperOptions, PaperSolution, adjusted_covaria
 from adjust.relay.network import network_from_pairs
 from survey.folder.plain import plain
 from survey.solution.pairs import pairs_dict
-from survey.solution.quantities import ARCSEC_PER_RAD, Scale
+from survey.solution.quantities import ARCSEC_PER_RAD, Scale, sigmas_in
 
 MOST_PAIRS = 400  # its equations are dense: 3 corrections a pair, 9 equations a loop
 
@@ -108,7 +108,7 @@ def _pair_entry(
     out: dict[str, Any] = {}
     for name, solution in found.items():
         rotation = Rot3(solution.b_from_a.rotation[e])
-        sigma = ARCSEC_PER_RAD * factor * np.sqrt(np.clip(np.diag(covs[name][e]), 0.0, None))
+        sigma = ARCSEC_PER_RAD * factor * sigmas_in(covs[name][e])
         out[name] = {"rotation_euler_xyz_deg": np.degrees(rotation.xyz()), "sigma_rotation_arcsec": sigma}
         if adjusted is not None:
             out[name]["difference_arcsec"] = ARCSEC_PER_RAD * Rot3.Logmap(adjusted.between(rotation))

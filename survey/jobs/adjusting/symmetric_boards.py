@@ -145,7 +145,7 @@ def _undecided(survey: Survey, symmetric: _Symmetric) -> tuple[str, ...]:
 
 def _stations_undecided(survey: Survey, target: str, mine: list[int]) -> list[str]:
     """A line where poses of stations rest on a symmetric board alone that stands still: each may be turned with it."""
-    if survey.pairs or survey.levels or next(t for t in survey.targets if t.target_id == target).motion == "epoch":
+    if survey.pairs or survey.levels or survey.targets_by_id[target].motion == "epoch":
         return []
     unknowns = Unknowns()
     frames = FrameTree(survey, unknowns)

@@ -62,7 +62,6 @@ def carried_out(folder: Path, chosen: Hypothesis) -> str:
         if names:
             texts[FILE] = appended(folder / FILE, new_rows(after, names, reason_of(chosen)))
         for name, text in texts.items():
-            (place / name).parent.mkdir(parents=True, exist_ok=True)
             atomic_write(place / name, text)
         replace_parts(folder)
     lines = [f"{file.name}: changed; as it was: {file.kept}" for file in changed]

@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 from gtsam import Pose3
 
-from adjust.adjustment import start_values
 from adjust.graph.assembly import StartValues
 from adjust.lenses.models import MODELS
 from adjust.model.boards import BOARD
@@ -76,10 +75,9 @@ def network_poses(survey: Survey, known: Mapping[ParameterName, Pose3]) -> dict[
 
 def survey_start(survey: Survey, previous: Previous) -> StartValues | None:
     """Start values with what is known from before; None where images contradict it."""
-    found = find_start(_Known(previous)(survey))
-    if found.excluded_blocks:
+    start = find_start(_Known(previous)(survey))
+    if start.excluded_blocks:
         return None
-    start = start_values(found)
     return replace(start, vectors={**start.vectors, **_known_vectors(survey, previous, start)})
 
 

@@ -123,7 +123,7 @@ def require_one_time(survey: Survey, station_id: str) -> tuple[str, ...]:
     Raises SurveyError where clocks say that it is not.
     """
     cameras = [c for c in survey.cameras if c.station_id == station_id]
-    carried = next(s for s in survey.stations if s.station_id == station_id).table_id
+    carried = survey.stations_by_id[station_id].table_id
     owners = {f"cameras.{c.camera_id}": c.clock for c in cameras}
     owners |= {f"tables.{t.table_id}": t.clock for t in survey.tables if t.table_id == carried}
     clocked = {name: clock for name, clock in owners.items() if clock is not None}
@@ -144,7 +144,7 @@ def calibrating(project: Project, station: str, epochs: Sequence[str]) -> Survey
     survey, out = project.survey, set(epochs)
     own = {c.camera_id for c in survey.cameras if c.station_id == station}
     blocks = tuple(b for b in survey.image_blocks if not (b.camera_id in own and b.epoch_id in out))
-    carried = next(s for s in survey.stations if s.station_id == station).table_id
+    carried = survey.stations_by_id[station].table_id
     readings = tuple(r for r in survey.table_readings if not (r.table_id == carried and r.epoch_id in out))
     left = with_images_left(survey, replace(survey, image_blocks=blocks, table_readings=readings))
     return supported(with_known_points(left))[0]
@@ -180,7 +180,7 @@ def observed_epochs(
     for b in survey.image_blocks:
         if b.target_id is None and b.camera_id in own and b.epoch_id in spots:
             spots[b.epoch_id].append(_spots_of(b, survey, None if request.unnamed else named))
-    carried = next(s for s in survey.stations if s.station_id == station).table_id
+    carried = survey.stations_by_id[station].table_id
     readings = {r.epoch_id: (r.angles, r.cov) for r in reversed(survey.table_readings) if r.table_id == carried}
     return [
         NavigationEpoch(e, tuple(spots[e]), time_s, *readings.get(e, (None, None)))

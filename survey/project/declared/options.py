@@ -11,7 +11,7 @@ from adjust.model.survey import Survey
 from adjust.model.tables import unit_of
 from survey.folder.units import from_si, to_si
 from survey.project.declared.node import Node
-from survey.project.declared.poses import quaternion_wxyz, rotation_from_euler, rotation_from_quaternion
+from survey.project.declared.poses import quaternion_wxyz, read_rotation
 from survey.project.declared.toml_text import Section
 from survey.project.project import (
     DEMANDED,
@@ -136,9 +136,6 @@ def closure_sections(closures: tuple[Closure, ...]) -> list[Section]:
     ]  # fmt: skip
 
 
-_ROTATIONS = ("rotation_quaternion_wxyz", "rotation_euler_xyz_deg")
-
-
 def read_alignment_tasks(root: Node, survey: Survey) -> tuple[AlignmentTask, ...]:
     """The tables [align.*]."""
     names = Names.of(survey)
@@ -151,22 +148,9 @@ def read_alignment_tasks(root: Node, survey: Survey) -> tuple[AlignmentTask, ...
         feet = tuple(Foot(name, *to_si(feet_node.numbers(name, (2,)), "mm").tolist()) for name in feet_node.values)
         if feet and (len(feet) < 3 or np.linalg.matrix_rank(np.diff([(f.x, f.y) for f in feet], axis=0), 1e-9) < 2):
             raise node.error(f"found {len(feet)} feet; three that are not in a row make a plane", "feet_mm")
-        tasks.append(AlignmentTask(task_id, frames[0], frames[1], _wanted(node), feet, node.si("pitch_mm", None),
-                                   node.si("tolerance_arcsec", None)))  # fmt: skip
+        tasks.append(AlignmentTask(task_id, frames[0], frames[1], read_rotation(node) or Rot3(), feet,
+                                   node.si("pitch_mm", None), node.si("tolerance_arcsec", None)))  # fmt: skip
     return tuple(tasks)
-
-
-def _wanted(node: Node) -> Rot3:
-    if all(node.has(key) for key in _ROTATIONS):
-        raise node.error("the rotation is given twice; keep the quaternion or the Euler angles", _ROTATIONS[1])
-    if node.has(_ROTATIONS[1]):
-        return rotation_from_euler(to_si(node.numbers(_ROTATIONS[1], (3,)), "deg"))
-    if not node.has(_ROTATIONS[0]):
-        return Rot3()
-    rotation = rotation_from_quaternion(node.numbers(_ROTATIONS[0], (4,)))
-    if rotation is None:
-        raise node.error("the quaternion has not the length 1; correct it (w first)", _ROTATIONS[0])
-    return rotation
 
 
 def task_sections(tasks: Iterable[AlignmentTask]) -> list[Section]:

@@ -62,7 +62,7 @@ def read_pose(node: Node) -> PoseParameter:
     cov = _pose_cov(node) if treatment == "prior" else None
     if treatment != "prior":
         _refuse_sigmas(node, treatment, _SIGMAS)
-    rotation, translation = _rotation(node), _translation(node)
+    rotation, translation = read_rotation(node), _translation(node)
     if rotation is None and translation is None and treatment == "free":
         if held:
             raise node.error("components are held but the pose has no value; give rotation and translation", "held")
@@ -134,7 +134,8 @@ def _translation(node: Node) -> FloatArray | None:
     return to_si(node.numbers("translation_mm", (3,)), "mm") if node.has("translation_mm") else None
 
 
-def _rotation(node: Node) -> Rot3 | None:
+def read_rotation(node: Node) -> Rot3 | None:
+    """The rotation that a table gives as quaternion or Euler angles, None where it gives none."""
     given = [key for key in _ROTATIONS if key in node.values]
     if len(given) > 1:
         raise node.error("the rotation is given twice; keep the quaternion or the Euler angles", _ROTATIONS[1])

@@ -7,51 +7,11 @@ from typing import Any
 from adjust.model.observations import position_text
 from adjust.model.survey import Survey
 from survey.project.project import Sigmas
-from survey.project.tables.coordinates import (
-    COORDINATES,
-    COORDINATES_COVARIANCE,
-    DIFFERENCES,
-    DIFFERENCES_COVARIANCE,
-    coordinate_columns,
-    difference_columns,
-    read_coordinates,
-    read_differences,
-)
-from survey.project.tables.geometric import (
-    ALIGNMENTS,
-    LASER_SPOTS,
-    LEVELS,
-    ON_SURFACES,
-    alignment_columns,
-    laser_columns,
-    level_columns,
-    read_alignments,
-    read_laser_spots,
-    read_levels,
-    read_on_surfaces,
-    surface_columns,
-)
+from survey.project.tables import coordinates, geometric, measurements, terrestrial
 from survey.project.tables.image_points import IMAGE_POINTS, SPOTS
-from survey.project.tables.measurements import (
-    ANGLES,
-    DISTANCES,
-    angle_columns,
-    distance_columns,
-    read_angles,
-    read_distances,
-)
 from survey.project.tables.pairs import PAIRS, pair_columns, read_pairs
 from survey.project.tables.reading import Columns, Layout, Table
 from survey.project.tables.references import Names
-from survey.project.tables.terrestrial import (
-    READING_KINDS,
-    TERRESTRIAL,
-    TERRESTRIAL_COVARIANCE,
-    correlation_columns,
-    read_reading_covariances,
-    read_readings,
-    reading_columns,
-)
 
 
 @dataclass(frozen=True)
@@ -74,20 +34,26 @@ class Kind:
 
 _ENDS = ("from_id", "to_id")
 KINDS = (
-    Kind(ANGLES, "table_readings", ("table",), lambda r: f"{r.table_id}/{r.epoch_id}", read_angles, angle_columns),
+    Kind(measurements.ANGLES, "table_readings", ("table",), lambda r: f"{r.table_id}/{r.epoch_id}",
+         measurements.read_angles, measurements.angle_columns),
     Kind(PAIRS, "pairs", ("pair",), lambda p: p.pair_id, read_pairs, pair_columns),
-    Kind(DISTANCES, "distances", ("distance",), lambda d: d.distance_id, read_distances, distance_columns, _ENDS),
-    Kind(COORDINATES, "coordinates", ("coordinates",), lambda c: c.set_id or position_text(c.positions[0]),
-         read_coordinates, coordinate_columns, ("point_id",), COORDINATES_COVARIANCE),
-    Kind(TERRESTRIAL, "readings", READING_KINDS, lambda r: r.reading_id, read_readings, reading_columns,
-         (*_ENDS, "second_id"), TERRESTRIAL_COVARIANCE),
-    Kind(DIFFERENCES, "coordinate_differences", ("coordinate_difference",), lambda d: d.set_id,
-         read_differences, difference_columns, _ENDS, DIFFERENCES_COVARIANCE),
-    Kind(LEVELS, "levels", ("level",), lambda x: x.level_id, read_levels, level_columns),
-    Kind(ALIGNMENTS, "alignments", ("alignment",), lambda x: x.alignment_id, read_alignments, alignment_columns),
-    Kind(LASER_SPOTS, "laser_spots", ("laser",), lambda x: x.spot_id, read_laser_spots, laser_columns),
-    Kind(ON_SURFACES, "on_surfaces", ("surface",), lambda o: f"{o.surface_id}/{position_text(o.position)}",
-         read_on_surfaces, surface_columns, ("point_id",)),
+    Kind(measurements.DISTANCES, "distances", ("distance",), lambda d: d.distance_id, measurements.read_distances,
+         measurements.distance_columns, _ENDS),
+    Kind(coordinates.COORDINATES, "coordinates", ("coordinates",), lambda c: c.set_id or position_text(c.positions[0]),
+         coordinates.read_coordinates, coordinates.coordinate_columns, ("point_id",),
+         coordinates.COORDINATES_COVARIANCE),
+    Kind(terrestrial.TERRESTRIAL, "readings", terrestrial.READING_KINDS, lambda r: r.reading_id,
+         terrestrial.read_readings, terrestrial.reading_columns, (*_ENDS, "second_id"),
+         terrestrial.TERRESTRIAL_COVARIANCE),
+    Kind(coordinates.DIFFERENCES, "coordinate_differences", ("coordinate_difference",), lambda d: d.set_id,
+         coordinates.read_differences, coordinates.difference_columns, _ENDS, coordinates.DIFFERENCES_COVARIANCE),
+    Kind(geometric.LEVELS, "levels", ("level",), lambda x: x.level_id, geometric.read_levels, geometric.level_columns),
+    Kind(geometric.ALIGNMENTS, "alignments", ("alignment",), lambda x: x.alignment_id, geometric.read_alignments,
+         geometric.alignment_columns),
+    Kind(geometric.LASER_SPOTS, "laser_spots", ("laser",), lambda x: x.spot_id, geometric.read_laser_spots,
+         geometric.laser_columns),
+    Kind(geometric.ON_SURFACES, "on_surfaces", ("surface",), lambda o: f"{o.surface_id}/{position_text(o.position)}",
+         geometric.read_on_surfaces, geometric.surface_columns, ("point_id",)),
 )  # fmt: skip
 LAYOUTS = {
     layout.name: layout
@@ -108,9 +74,9 @@ def with_observations(survey: Survey, tables: Mapping[str, Table], sigmas: Sigma
             elif extra is not None:
                 raise extra.error(0, f"there is no table of {name} beside it; add {name}.csv or remove this file")
         survey = replace(survey, **found)
-    joint = tables.get(TERRESTRIAL_COVARIANCE.name)
+    joint = tables.get(terrestrial.TERRESTRIAL_COVARIANCE.name)
     return survey if joint is None else replace(
-        survey, reading_covariances=read_reading_covariances(joint, survey.readings)
+        survey, reading_covariances=terrestrial.read_reading_covariances(joint, survey.readings)
     )  # fmt: skip
 
 
@@ -123,4 +89,5 @@ def observation_tables(survey: Survey) -> dict[str, Columns]:
             found |= dict(zip((kind.layout.name, kind.beside.name if kind.beside else ""), made, strict=True))
         else:
             found[kind.layout.name] = made
-    return found | {TERRESTRIAL_COVARIANCE.name: correlation_columns(survey.reading_covariances)}
+    found[terrestrial.TERRESTRIAL_COVARIANCE.name] = terrestrial.correlation_columns(survey.reading_covariances)
+    return found

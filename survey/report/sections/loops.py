@@ -6,28 +6,9 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from survey.report import markup as m
 from survey.report.context import Context
 from survey.report.language import t
-from survey.report.markup import (
-    MISSING,
-    code,
-    count,
-    decimals_for,
-    definition,
-    element,
-    fixed,
-    general,
-    joined,
-    listed,
-    p_text,
-    part,
-    pill,
-    section,
-    sigma_text,
-    table,
-    value_text,
-    with_sigma,
-)
 
 _MOST_LOOPS = 60
 _MOST_PAIRS = 150
@@ -40,25 +21,25 @@ def network(c: Context) -> Markup:
     if n is None:
         return Markup()
     each = t("poses") if n["equations_per_condition"] == 6 else t("rotations")
-    measured = t("{n} of {most} measurable", n=count(n["measured_pairs"]), most=count(n["measurable_pairs"]))
+    measured = t("{n} of {most} measurable", n=m.count(n["measured_pairs"]), most=m.count(n["measurable_pairs"]))
     facts = [
-        (t("stations"), count(n["n_stations"])),
-        (t("parts"), count(n["n_parts"])),
-        (t("independent unknown {each}", each=each), count(n["independent_unknown_poses"])),
+        (t("stations"), m.count(n["n_stations"])),
+        (t("parts"), m.count(n["n_parts"])),
+        (t("independent unknown {each}", each=each), m.count(n["independent_unknown_poses"])),
         (t("pairs measured"), measured),
-        (t("triangle conditions"), count(n["triangle_conditions"])),
-        (t("independent conditions"), count(n["independent_conditions"])),
-        (t("redundancy"), t("{n} equations", n=count(n["redundancy"]))),
-        (t("conditions per pair"), fixed(n["conditions_per_pair"], 2)),
+        (t("triangle conditions"), m.count(n["triangle_conditions"])),
+        (t("independent conditions"), m.count(n["independent_conditions"])),
+        (t("redundancy"), t("{n} equations", n=m.count(n["redundancy"]))),
+        (t("conditions per pair"), m.fixed(n["conditions_per_pair"], 2)),
     ]
     if n["conditions_through_given_stations"]:
-        facts.insert(6, (t("of these through given stations"), count(n["conditions_through_given_stations"])))
+        facts.insert(6, (t("of these through given stations"), m.count(n["conditions_through_given_stations"])))
     note = t(
         "n stations have n − 1 independent relative poses; every independent loop of pairs adds a condition. A pair "
         "that closes no loop cannot be checked. Pairs that share all their loops: an error in one is seen, but not "
         "told from one in the others."
     )
-    return section("network", "Network of measured pairs", definition(facts) + listed(_weak(n)), note)
+    return m.section("network", "Network of measured pairs", m.definition(facts) + m.listed(_weak(n)), note)
 
 
 def _weak(n: dict[str, Any]) -> list[Markup]:
@@ -70,13 +51,13 @@ def _weak(n: dict[str, Any]) -> list[Markup]:
     groups = n["inseparable_pairs"]
     out += [t("Errors seen but not told apart: {names}", names=_named(group)) for group in groups[:10]]
     if len(groups) > 10:
-        out.append(t("{n} more such groups in solution.json", n=count(len(groups) - 10)))
+        out.append(t("{n} more such groups in solution.json", n=m.count(len(groups) - 10)))
     return out
 
 
 def _named(ids: Sequence[str]) -> Markup:
-    more = t(" and {n} more", n=count(len(ids) - _MOST_NAMES)) if len(ids) > _MOST_NAMES else ""
-    return joined(map(code, ids[:_MOST_NAMES]), ", ") + more
+    more = t(" and {n} more", n=m.count(len(ids) - _MOST_NAMES)) if len(ids) > _MOST_NAMES else ""
+    return m.joined(map(m.code, ids[:_MOST_NAMES]), ", ") + more
 
 
 def loops(c: Context) -> Markup:
@@ -90,17 +71,17 @@ def loops(c: Context) -> Markup:
     columns = ["<Loop", "<", "Misclosure", "σ [″]"] + (["[mm]", "σ [mm]"] if poses else [])
     columns += ["Test", "p", "After", *(["[mm]"] if poses else []), "<Pairs"]
     shown = (
-        t("All {n}", n=count(found["n_loops"]))
+        t("All {n}", n=m.count(found["n_loops"]))
         if len(rows) == found["n_loops"]
-        else t("The worst {shown} of {n}", shown=count(len(rows)), n=count(found["n_loops"]))
+        else t("The worst {shown} of {n}", shown=m.count(len(rows)), n=m.count(found["n_loops"]))
     )
     note = t(
         "{shown} independent loops ({note}), from the measured pairs alone, before any adjustment. σ: "
         "of the misclosure, along its direction, from the covariances of the pairs. Test: w′C⁻¹w, chi-square with "
         "{freedom} degrees of freedom; a loop is open where its p is too small for chance at {alpha} % for all loops "
         "together ({failed} are).",
-        shown=shown, note=found["note"], freedom=6 if poses else 3, alpha=general(100 * found["alpha"]),
-        failed=count(found["n_failed"]),
+        shown=shown, note=found["note"], freedom=6 if poses else 3, alpha=m.general(100 * found["alpha"]),
+        failed=m.count(found["n_failed"]),
     )  # fmt: skip
     note += " " + t(
         "After: by the adjusted pairs, {form}.",
@@ -108,7 +89,7 @@ def loops(c: Context) -> Markup:
                "each by the poses of its frames"),
     )
     classes = ["" if e["closes"] else "suspect" for e in entries]
-    return section("loops", "Loop closures", table(columns, rows, "", classes), note) + _mounts(c)
+    return m.section("loops", "Loop closures", m.table(columns, rows, "", classes), note) + _mounts(c)
 
 
 def _mounts(c: Context) -> Markup:
@@ -121,38 +102,38 @@ def _mounts(c: Context) -> Markup:
         measured = _both(e["misclosure_arcsec"], e.get("misclosure_mm"))
         given = _both(e["sigma_arcsec"], e["sigma_mm"] if "misclosure_mm" in e else None)
         play = _both(e["play_arcsec"], e.get("play_mm")) if "play_arcsec" in e else ""
-        rows.append([name, measured, given, play, general(e["test"], 4), p_text(e["p_value"]),
-                     element("small", ", ".join(_shortened(e["pairs"])))])  # fmt: skip
+        rows.append([name, measured, given, play, m.general(e["test"], 4), m.p_text(e["p_value"]),
+                     m.element("small", ", ".join(_shortened(e["pairs"])))])  # fmt: skip
     columns = ["<Mount", "Misclosure", "σ of the mount", "Its play", "Test", "p", "<Pairs"]
     note = t("Loops through a mount close as well as it repeats: σ as given, about and along each axis; its play is "
              "what the adjustment leaves of the misclosure to it.")  # fmt: skip
-    return section("mounts", "Loops through a mount", table(columns, rows, ""), note)
+    return m.section("mounts", "Loops through a mount", m.table(columns, rows, ""), note)
 
 
 def _both(arcsec: float, mm: float | None) -> str:
-    return f"{general(arcsec, 3)}″" + ("" if mm is None else f" {general(mm, 3)} mm")
+    return f"{m.general(arcsec, 3)}″" + ("" if mm is None else f" {m.general(mm, 3)} mm")
 
 
 def _left(value: float | None, unit: str) -> str:
     """What is left of a misclosure; below a millionth of its unit it is rounding."""
     if value is None:
         return ""
-    return f"{general(value, 3) if value > 1e-6 else '0'}{unit}"
+    return f"{m.general(value, 3) if value > 1e-6 else '0'}{unit}"
 
 
 def _loop_row(e: dict[str, Any], poses: bool) -> list[str]:
     stations = " → ".join(_shortened([*e["stations"], e["stations"][0]]))
     left_out = set(e["pairs_not_used"])
-    pairs = joined((element("s", p) if p in left_out else p for p in _shortened(e["pairs"])), ", ")
-    flag = Markup() if e["closes"] else pill("bad", t("open"))
-    flag += " " + pill("soft", t("pair not used")) if left_out else ""
+    pairs = m.joined((m.element("s", p) if p in left_out else p for p in _shortened(e["pairs"])), ", ")
+    flag = Markup() if e["closes"] else m.pill("bad", t("open"))
+    flag += " " + m.pill("soft", t("pair not used")) if left_out else ""
     sigma = e["sigma_misclosure_arcsec"]
-    cells: list[str] = [stations, flag, angle_text(e["misclosure_arcsec"], sigma), sigma_text(sigma)]
+    cells: list[str] = [stations, flag, angle_text(e["misclosure_arcsec"], sigma), m.sigma_text(sigma)]
     if poses:
-        cells += [value_text(e["misclosure_mm"], e["sigma_misclosure_mm"]), sigma_text(e["sigma_misclosure_mm"])]
-    cells += [general(e["test"], 4), p_text(e["p_value"]), _left(e.get("misclosure_after_arcsec"), "″")]
+        cells += [m.value_text(e["misclosure_mm"], e["sigma_misclosure_mm"]), m.sigma_text(e["sigma_misclosure_mm"])]
+    cells += [m.general(e["test"], 4), m.p_text(e["p_value"]), _left(e.get("misclosure_after_arcsec"), "″")]
     cells += [_left(e.get("misclosure_after_mm"), "")] if poses else []
-    return [*cells, element("small", pairs)]
+    return [*cells, m.element("small", pairs)]
 
 
 def _shortened(names: Sequence[str], most: int = 12) -> list[str]:
@@ -162,10 +143,10 @@ def _shortened(names: Sequence[str], most: int = 12) -> list[str]:
 def angle_text(arcsec: float, sigma: float | None) -> str:
     """An angle of a few arcminutes or more in those too: 2′ 05″."""
     if arcsec < 60.0:
-        return f"{value_text(arcsec, sigma) if sigma else general(arcsec, 3)}″"
+        return f"{m.value_text(arcsec, sigma) if sigma else m.general(arcsec, 3)}″"
     if arcsec >= 3600.0:
         return f"{arcsec / 3600.0:.4g}°"
-    decimals = min(decimals_for(sigma) or 0, 2)
+    decimals = min(m.decimals_for(sigma) or 0, 2)
     minutes = int(arcsec // 60.0)
     rest = round(arcsec - 60.0 * minutes, decimals)
     if rest >= 60.0:
@@ -185,7 +166,7 @@ def pairs(c: Context) -> Markup:
     rows = [_pair_row(p, every[p], poses) for p in order]
     columns = ["<Pair, from a to b", "Residual", *(["[mm]"] if poses else []), "Redundancy", "Largest std."]
     columns += ["Test", "p", "<", "x [°]", "y [°]", "z [°]", *(["x [mm]", "y [mm]", "z [mm]"] if poses else [])]
-    more = " " + t("The worst {shown} of {n}", shown=count(len(rows)), n=count(len(every))) + "."
+    more = " " + t("The worst {shown} of {n}", shown=m.count(len(rows)), n=m.count(len(every))) + "."
     more = more if len(every) > len(rows) else Markup()
     note = t(
         "Adjusted b_from_a: quaternion w x y z, Euler angles of R = Rz(z) Ry(y) Rx(x) with the σ of small rotations "
@@ -194,32 +175,32 @@ def pairs(c: Context) -> Markup:
         "Redundancy: mean of its components, 0 where nothing checks the pair, 1 where the others alone determine it."
     ) + more
     classes = ["off" if not every[p]["used"] else "" for p in order]
-    return section("pairs", "Adjusted pairs", table(columns, rows, "", classes), note)
+    return m.section("pairs", "Adjusted pairs", m.table(columns, rows, "", classes), note)
 
 
 def _pair_row(pair_id: str, e: dict[str, Any], poses: bool) -> list[str]:
     value = e.get("adjusted", {})
-    quaternion = " ".join(fixed(q, 7) for q in value.get("rotation_quaternion_wxyz", ()))
+    quaternion = " ".join(m.fixed(q, 7) for q in value.get("rotation_quaternion_wxyz", ()))
     ends = " → ".join(e[end].removeprefix("station:") for end in "ab")
-    cells: list[str] = [part("below", joined((element("b", pair_id), ends), " "), quaternion)]
-    cells.append(angle_text(e["misfit_arcsec"], None) if e.get("misfit_arcsec") is not None else MISSING)
-    cells += [general(e.get("misfit_mm"), 4)] if poses else []
+    cells: list[str] = [m.part("below", m.joined((m.element("b", pair_id), ends), " "), quaternion)]
+    cells.append(angle_text(e["misfit_arcsec"], None) if e.get("misfit_arcsec") is not None else m.MISSING)
+    cells += [m.general(e.get("misfit_mm"), 4)] if poses else []
     redundancy = [r for r in e.get("redundancy", ()) if r is not None]
     largest = max((abs(s) for s in e.get("standardized", ()) if s is not None), default=None)
-    cells += [fixed(sum(redundancy) / len(redundancy), 2) if redundancy else MISSING, fixed(largest, 2)]
-    cells += [general(e.get("test"), 4), p_text(e.get("p_value")), _pair_flag(e)]
+    cells += [m.fixed(sum(redundancy) / len(redundancy), 2) if redundancy else m.MISSING, m.fixed(largest, 2)]
+    cells += [m.general(e.get("test"), 4), m.p_text(e.get("p_value")), _pair_flag(e)]
     sigmas = value.get("sigma_rotation_arcsec", [None] * 3)
     for angle, sigma in zip(value.get("rotation_euler_xyz_deg", [None] * 3), sigmas, strict=True):
-        shown = value_text(angle, None if not sigma else sigma / 3600.0)
-        cells.append(part("below", shown, f"± {sigma_text(sigma)}″"))
+        shown = m.value_text(angle, None if not sigma else sigma / 3600.0)
+        cells.append(m.part("below", shown, f"± {m.sigma_text(sigma)}″"))
     if poses:
         shift = value.get("translation_mm", [None] * 3)
         along = value.get("sigma_translation_mm", [None] * 3)
-        cells += [with_sigma(x, s) if s else value_text(x, None) for x, s in zip(shift, along, strict=True)]
+        cells += [m.with_sigma(x, s) if s else m.value_text(x, None) for x, s in zip(shift, along, strict=True)]
     return cells
 
 
 def _pair_flag(e: dict[str, Any]) -> str:
     if not e["used"]:
-        return pill("soft", t("not used"))
-    return "" if e.get("controlled", True) else pill("warn", t("uncontrolled"))
+        return m.pill("soft", t("not used"))
+    return "" if e.get("controlled", True) else m.pill("warn", t("uncontrolled"))

@@ -6,20 +6,9 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from survey.report import markup as m
 from survey.report.context import Context
 from survey.report.language import t
-from survey.report.markup import (
-    count,
-    element,
-    fixed,
-    general,
-    joined,
-    listed,
-    section,
-    sigma_text,
-    table,
-    value_text,
-)
 
 _MOST_PAIRS = 150
 
@@ -29,7 +18,7 @@ def published(c: Context) -> Markup:
     found = c.solution.get("published")
     if found is None:
         return Markup()
-    body = joined(make(found[part]) for part, make in (("head", _head), ("pairs", _pairs)) if part in found)
+    body = m.joined(make(found[part]) for part, make in (("head", _head), ("pairs", _pairs)) if part in found)
     said = [n for part in ("head", "pairs") for n in found.get(part, {}).get("notes", ())]
     said += [f"{t(_TITLES[name])}: {t('not run')}: {why}" for name, why in found["not_run"].items()]
     note = t(
@@ -37,7 +26,7 @@ def published(c: Context) -> Markup:
         "all steps before taken as free of error. Published: the sigma that the observations cause, through all "
         "steps. Difference: published minus joint, rotations as small turns about the axes on the right."
     )
-    return section("published", "Published methods", body + listed(said), note)
+    return m.section("published", "Published methods", body + m.listed(said), note)
 
 
 _TITLES = {"head": "Calibration of the head, step by step", "pairs": "Iteration of measured pairs over their loops"}
@@ -52,11 +41,12 @@ def _head(found: Mapping[str, Any]) -> Markup:
         sigma, joint = entry[f"published_sigma_{small}"], entry[f"joint_sigma_{small}"]
         rows.append([
             pose, f"{component} [{'°' if unit == 'deg' else 'mm'}]",
-            value_text(entry[f"published_{unit}"], sigma / per), sigma_text(entry[f"claimed_sigma_{small}"]) + mark,
-            sigma_text(sigma) + mark, value_text(entry[f"joint_{unit}"], joint / per if joint else None),
-            sigma_text(joint) + mark, general(entry[f"difference_{small}"], 3) + mark, fixed(entry["sigma_ratio"], 1),
+            m.value_text(entry[f"published_{unit}"], sigma / per), m.sigma_text(entry[f"claimed_sigma_{small}"]) + mark,
+            m.sigma_text(sigma) + mark, m.value_text(entry[f"joint_{unit}"], joint / per if joint else None),
+            m.sigma_text(joint) + mark, m.general(entry[f"difference_{small}"], 3) + mark,
+            m.fixed(entry["sigma_ratio"], 1),
         ])  # fmt: skip
-    return element("h3", t(_TITLES["head"])) + table(columns, rows)
+    return m.element("h3", t(_TITLES["head"])) + m.table(columns, rows)
 
 
 def _pairs(found: Mapping[str, Any]) -> Markup:
@@ -71,21 +61,21 @@ def _pairs(found: Mapping[str, Any]) -> Markup:
             )
             rows.append([
                 pair_id if i == 0 else "", f"{axis} [°]",
-                value_text(entry["weighted"]["rotation_euler_xyz_deg"][i], sigma / 3600.0), sigma_text(sigma) + "″",
-                sigma_text(entry["equal_weights"]["sigma_rotation_arcsec"][i]) + "″",
-                value_text(joint, joint_sigma / 3600.0 if joint_sigma else None), sigma_text(joint_sigma) + "″",
-                general(entry["weighted"].get("difference_arcsec", [None] * 3)[i], 3) + "″",
+                m.value_text(entry["weighted"]["rotation_euler_xyz_deg"][i], sigma / 3600.0), m.sigma_text(sigma) + "″",
+                m.sigma_text(entry["equal_weights"]["sigma_rotation_arcsec"][i]) + "″",
+                m.value_text(joint, joint_sigma / 3600.0 if joint_sigma else None), m.sigma_text(joint_sigma) + "″",
+                m.general(entry["weighted"].get("difference_arcsec", [None] * 3)[i], 3) + "″",
             ])  # fmt: skip
-    said = joined(
-        element("p", _steps(t(text), found["steps"][name]))
+    said = m.joined(
+        m.element("p", _steps(t(text), found["steps"][name]))
         for name, text in (("weighted", "Weighted"), ("equal_weights", "Equal weights"))
     )
-    return element("h3", t(_TITLES["pairs"])) + said + table(columns, rows)
+    return m.element("h3", t(_TITLES["pairs"])) + said + m.table(columns, rows)
 
 
 def _steps(name: Markup, steps: Mapping[str, Any]) -> Markup:
-    left = general(steps["misclosure_left_arcsec"], 2)
-    return t("{name}: {n} iterations, misclosure left {left}″", name=name, n=count(steps["iterations"]), left=left)
+    left = m.general(steps["misclosure_left_arcsec"], 2)
+    return t("{name}: {n} iterations, misclosure left {left}″", name=name, n=m.count(steps["iterations"]), left=left)
 
 
 def head_rows(found: Mapping[str, Any]) -> list[tuple[str, str, str, Mapping[str, Any]]]:

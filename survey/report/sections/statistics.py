@@ -8,25 +8,10 @@ from markupsafe import Markup
 from adjust.model.result import Adjustment, Component, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.statistics.result import BudgetEntry, Correlation, Influence, RelativePrecision, WeakDirection
+from survey.report import markup as m
 from survey.report.charts import heat_map, quantiles
 from survey.report.context import Context
 from survey.report.language import esc, group_name, known, t
-from survey.report.markup import (
-    MISSING,
-    code,
-    count,
-    element,
-    figures,
-    fixed,
-    general,
-    joined,
-    listed,
-    pill,
-    section,
-    sigma_text,
-    table,
-    value_text,
-)
 from survey.solution.quantities import sigma_unit_for_people
 
 _MOST_ROWS = 120
@@ -54,19 +39,19 @@ def components(c: Context) -> Markup:
         method=found.method, n=found.iterations,
     )  # fmt: skip
     if not found.converged:
-        said += " " + pill("bad", t("not converged"))
+        said += " " + m.pill("bad", t("not converged"))
     mixed = [
         t("Not separable, only their mixture is known: {names}", names=", ".join(group)) for group in found.unseparable
     ]
-    return section("components", "Variance components", table(columns, rows) + listed(mixed), said)
+    return m.section("components", "Variance components", m.table(columns, rows) + m.listed(mixed), said)
 
 
 def _component_row(x: Component) -> tuple[str, ...]:
     kind = "warn" if x.status == "estimated" and x.p < 0.01 else "quiet" if x.status == "estimated" else "soft"
     return (
-        group_name(x.group), value_text(x.factor, x.sigma), sigma_text(x.sigma),
-        fixed(float(np.sqrt(max(x.factor, 0.0))), 3),
-        count(x.n), fixed(x.redundancy, 1), general(x.p, 2), pill(kind, known(x.status)),
+        group_name(x.group), m.value_text(x.factor, x.sigma), m.sigma_text(x.sigma),
+        m.fixed(float(np.sqrt(max(x.factor, 0.0))), 3),
+        m.count(x.n), m.fixed(x.redundancy, 1), m.general(x.p, 2), m.pill(kind, known(x.status)),
     )  # fmt: skip
 
 
@@ -83,9 +68,9 @@ def reliability(c: Context) -> Markup:
     said = t(
         "External reliability: what the least detectable bias (power {power} %, {method}, level of a single test "
         "{level}) of an observation would do to the unknowns if it stayed undetected. Worst first.",
-        power=fixed(100 * o.power, 0), method=method, level=general(float(r.criteria.alpha[0]), 2),
+        power=m.fixed(100 * o.power, 0), method=method, level=m.general(float(r.criteria.alpha[0]), 2),
     )  # fmt: skip
-    return section("reliability", "Reliability", uncontrolled + (table(columns, rows) if rows else Markup()), said)
+    return m.section("reliability", "Reliability", uncontrolled + (m.table(columns, rows) if rows else Markup()), said)
 
 
 def _influence_row(c: Context, x: Influence) -> tuple[str, ...]:
@@ -94,11 +79,11 @@ def _influence_row(c: Context, x: Influence) -> tuple[str, ...]:
     unit, factor = sigma_unit_for_people(x.unit)
     detectable = float(tests.detectable[x.row]) if tests is not None else float("nan")
     external = float(tests.external[x.row]) if tests is not None else float("nan")
-    place = name_text(x.position) if x.position else MISSING
+    place = name_text(x.position) if x.position else m.MISSING
     return (
-        row, fixed(detectable, 1), fixed(external, 2), joined((name_text(x.name), code(x.component)), " "),
-        general(x.shift * factor, 2), unit, fixed(x.ratio, 2), place,
-        general(1e3 * x.position_shift, 2) if x.position else MISSING,
+        row, m.fixed(detectable, 1), m.fixed(external, 2), m.joined((name_text(x.name), m.code(x.component)), " "),
+        m.general(x.shift * factor, 2), unit, m.fixed(x.ratio, 2), place,
+        m.general(1e3 * x.position_shift, 2) if x.position else m.MISSING,
     )  # fmt: skip
 
 
@@ -119,22 +104,22 @@ def relative(c: Context) -> Markup:
     found = sorted(c.statistics.relative, key=lambda r: -float(r.ellipsoid.semi_axes[0]))
     rows = [_relative_row(r) for r in found[:_MOST_ROWS]]
     columns = ("<From", "<To", "Distance [mm]", "σ [mm]", "a [mm]", "b [mm]", "c [mm]", "Rotation σ [″]")
-    level = fixed(100 * found[0].ellipsoid.level, 0)
+    level = m.fixed(100 * found[0].ellipsoid.level, 0)
     said = t(
         "Relative precision of neighbours, independent of where the datum is: sigma of the distance, semi-axes of the "
         "relative {level} % ellipsoid, and of stations the largest sigma of their relative rotation.",
         level=level,
     )
-    return section("relative", "Relative precision", table(columns, rows), said)
+    return m.section("relative", "Relative precision", m.table(columns, rows), said)
 
 
 def _relative_row(r: RelativePrecision) -> list[str]:
-    axes = [sigma_text(1e3 * float(a)) for a in r.ellipsoid.semi_axes] + [MISSING] * (3 - r.ellipsoid.dimension)
-    turn = MISSING
+    axes = [m.sigma_text(1e3 * float(a)) for a in r.ellipsoid.semi_axes] + [m.MISSING] * (3 - r.ellipsoid.dimension)
+    turn = m.MISSING
     if r.rotation_cov is not None:
-        turn = sigma_text(float(np.degrees(np.sqrt(np.linalg.eigvalsh(r.rotation_cov)[-1]))) * 3600.0)
+        turn = m.sigma_text(float(np.degrees(np.sqrt(np.linalg.eigvalsh(r.rotation_cov)[-1]))) * 3600.0)
     distance, sigma = 1e3 * r.distance, 1e3 * r.sigma_distance
-    return [name_text(r.a), name_text(r.b), value_text(distance, sigma), sigma_text(sigma), *axes, turn]
+    return [name_text(r.a), name_text(r.b), m.value_text(distance, sigma), m.sigma_text(sigma), *axes, turn]
 
 
 def budget(c: Context) -> Markup:
@@ -148,24 +133,24 @@ def budget(c: Context) -> Markup:
     heads = [esc(f"{group_name(s)} ({kinds[s]}) [%]") for s in sources]
     columns = ["<Result", "<", "u", "<Unit", *heads, "ν", "k", "U"]
     left_out = len(entries) - _MOST_ROWS
-    more = " " + t("{n} more in solution.json.", n=count(left_out)) if left_out > 0 else Markup()
+    more = " " + t("{n} more in solution.json.", n=m.count(left_out)) if left_out > 0 else Markup()
     said = t(
         "Standard uncertainty u of every result and the share of each source in its variance (GUM, JCGM 100:2008). "
         "Type A: from the scatter of this survey's own residuals; type B: given. ν: effective degrees of freedom; "
         "U = k u is the expanded uncertainty at {level} %.",
-        level=general(100 * entries[0].level),
+        level=m.general(100 * entries[0].level),
     )
-    return section("budget", "Uncertainty budget", table(columns, rows), said + more)
+    return m.section("budget", "Uncertainty budget", m.table(columns, rows), said + more)
 
 
 def _budget_row(e: BudgetEntry, sources: list[str]) -> list[str]:
     unit, factor = sigma_unit_for_people(e.unit)
     share = {line.source: line.share for line in e.lines}
-    shares = [fixed(100 * share[s], 1) if s in share else MISSING for s in sources]
-    freedom = "∞" if not np.isfinite(e.freedom) else fixed(e.freedom, 0)
+    shares = [m.fixed(100 * share[s], 1) if s in share else m.MISSING for s in sources]
+    freedom = "∞" if not np.isfinite(e.freedom) else m.fixed(e.freedom, 0)
     return [
-        name_text(e.name), code(e.component), sigma_text(e.u * factor), unit, *shares, freedom,
-        fixed(e.coverage, 2), sigma_text(e.expanded * factor),
+        name_text(e.name), m.code(e.component), m.sigma_text(e.u * factor), unit, *shares, freedom,
+        m.fixed(e.coverage, 2), m.sigma_text(e.expanded * factor),
     ]  # fmt: skip
 
 
@@ -174,38 +159,38 @@ def correlations(c: Context) -> Markup:
     if c.statistics is None:
         return Markup()
     s = c.statistics
-    drawn = element("figure", heat_map(s.correlations)) if s.correlations is not None else Markup()
+    drawn = m.element("figure", heat_map(s.correlations)) if s.correlations is not None else Markup()
     pairs = _most([_correlated(x) for x in s.correlated[:_MOST_WEAK]], len(s.correlated))
     strong = _titled("Correlated above 95 %", pairs)
     weak = _titled("Weak directions", [_weak_text(x) for x in s.weak[:10]])
     note = t("Blue: positive, red: negative; empty: none. Lines separate the parameters.")
-    return section("correlations", "Correlations", drawn + strong + weak, note)
+    return m.section("correlations", "Correlations", drawn + strong + weak, note)
 
 
 def _titled(title: str, items: Sequence[str]) -> Markup:
-    return element("h3", t(title)) + listed(items, "") if items else Markup()
+    return m.element("h3", t(title)) + m.listed(items, "") if items else Markup()
 
 
 def _most(first: Sequence[str], n: int) -> list[str]:
     """The first of ``n``, and how many more there are."""
     more = n - len(first)
-    return [*first, *([t("{n} more in solution.json.", n=count(more))] if more else [])]
+    return [*first, *([t("{n} more in solution.json.", n=m.count(more))] if more else [])]
 
 
 def _correlated(x: Correlation) -> Markup:
-    first, second = (name_text(x.a), code(x.a_component)), (name_text(x.b), code(x.b_component))
-    return joined((*first, t("with"), *second), " ") + f": {fixed(100 * x.coefficient, 1)} %"
+    first, second = (name_text(x.a), m.code(x.a_component)), (name_text(x.b), m.code(x.b_component))
+    return m.joined((*first, t("with"), *second), " ") + f": {m.fixed(100 * x.coefficient, 1)} %"
 
 
 def _weak_text(x: WeakDirection) -> Markup:
     parts = []
     for part in x.parts[:_MOST_PARTS]:
         unit, factor = sigma_unit_for_people(part.unit)
-        amount = general(part.amount * factor, 2)
-        parts.append(joined((name_text(part.name), code(part.component), amount, unit), " "))
+        amount = m.general(part.amount * factor, 2)
+        parts.append(m.joined((name_text(part.name), m.code(part.component), amount, unit), " "))
     left_out = len(x.parts) - _MOST_PARTS
     more = t(" and {n} more", n=left_out) if left_out > 0 else Markup()
-    return t("{n} times weaker together than alone: ", n=general(x.inflation, 3)) + joined(parts, ", ") + more
+    return t("{n} times weaker together than alone: ", n=m.general(x.inflation, 3)) + m.joined(parts, ", ") + more
 
 
 def normality(c: Context) -> Markup:
@@ -215,7 +200,7 @@ def normality(c: Context) -> Markup:
         "Standardized residuals of each group in order, against the quantiles that as many normally distributed ones "
         "would have. The band holds 95 % of such points one by one."
     )
-    return section("normality", "Distribution of residuals", figures(drawn[:12]), note)
+    return m.section("normality", "Distribution of residuals", m.figures(drawn[:12]), note)
 
 
 def standardized_by_group(adjustment: Adjustment) -> dict[str, FloatArray]:

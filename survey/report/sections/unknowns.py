@@ -9,24 +9,9 @@ from markupsafe import Markup
 
 from adjust.model.survey import IntArray
 from survey.report import charts
+from survey.report import markup as m
 from survey.report.context import Context
 from survey.report.language import known, t
-from survey.report.markup import (
-    code,
-    count,
-    element,
-    fixed,
-    general,
-    joined,
-    note,
-    part,
-    pill,
-    section,
-    sigma_text,
-    table,
-    value_text,
-    with_sigma,
-)
 from survey.solution.quantities import Status
 from survey.solution.records import having, keys_of
 
@@ -46,8 +31,10 @@ _POSE_NOTE = (
 def status_pill(status: Status) -> Markup:
     """The status of a component, or of a whole parameter."""
     if isinstance(status, dict):
-        return joined((joined((k, status_pill(v)), " ") for k, v in status.items()), " ")
-    return pill({"free": "quiet", "held": "plain", "prior": "soft", "tied": "soft"}.get(status, "quiet"), known(status))
+        return m.joined((m.joined((k, status_pill(v)), " ") for k, v in status.items()), " ")
+    return m.pill(
+        {"free": "quiet", "held": "plain", "prior": "soft", "tied": "soft"}.get(status, "quiet"), known(status)
+    )
 
 
 def _components(entry: dict[str, Any]) -> Iterator[tuple[str, float | None, str, float | None, str, str]]:
@@ -62,7 +49,7 @@ def _components(entry: dict[str, Any]) -> Iterator[tuple[str, float | None, str,
 def _value_in(unit: str, value: float | None, sigma: float | None, sigma_unit: str) -> str:
     """A value with decimals that suit a sigma in another unit."""
     same = sigma / 3600.0 if (unit, sigma_unit) == ("deg", "arcsec") and sigma else sigma
-    return value_text(value, same)
+    return m.value_text(value, same)
 
 
 def vector_table(entry: dict[str, Any], ratios: dict[str, float] | None = None) -> Markup:
@@ -70,33 +57,33 @@ def vector_table(entry: dict[str, Any], ratios: dict[str, float] | None = None) 
     rows, idle = [], []
     for name, value, unit, sigma, sigma_unit, status in _components(entry):
         if status == "held" and not value:
-            idle.append(code(name))
+            idle.append(m.code(name))
             continue
-        row: list[str] = [code(name), _value_in(unit, value, sigma, sigma_unit), sigma_text(sigma)]
+        row: list[str] = [m.code(name), _value_in(unit, value, sigma, sigma_unit), m.sigma_text(sigma)]
         shown = unit if unit == sigma_unit else f"{unit} (σ {sigma_unit})"
         row += [shown.replace("_", " "), status_pill(status)]
         if ratios is not None:
             ratio = ratios.get(name)
             weak = name in entry.get("not_significant", ())
-            row.append(pill("warn", fixed(ratio, 1)) if weak else fixed(ratio, 1))
+            row.append(m.pill("warn", m.fixed(ratio, 1)) if weak else m.fixed(ratio, 1))
         rows.append(row)
     columns = ["<Parameter", "Value", "σ", "<Unit", "<Status"] + ([] if ratios is None else ["|value| / σ"])
-    at_zero = note(t("Held at zero: {names}.", names=joined(idle, ", "))) if idle else Markup()
-    return (table(columns, rows) if rows else Markup()) + at_zero + _tests(entry.get("significance", {}))
+    at_zero = m.note(t("Held at zero: {names}.", names=m.joined(idle, ", "))) if idle else Markup()
+    return (m.table(columns, rows) if rows else Markup()) + at_zero + _tests(entry.get("significance", {}))
 
 
 def _tests(found: dict[str, Any]) -> Markup:
     """Which terms of a model differ from zero, and which do not."""
     parts = []
     for term, test in found.items():
-        kind = pill("quiet", t("significant")) if test["significant"] else pill("warn", t("not significant"))
+        kind = m.pill("quiet", t("significant")) if test["significant"] else m.pill("warn", t("not significant"))
         if term == "lens_shared":
-            kind = pill("warn", t("does not hold")) if test["significant"] else pill("quiet", t("holds"))
+            kind = m.pill("warn", t("does not hold")) if test["significant"] else m.pill("quiet", t("holds"))
         said = t("{term}: {statistic} with {freedom} degrees of freedom, p {p}", term=term.replace("_", " "),
-                 statistic=general(test["statistic"], 4), freedom=", ".join(map(count, test["freedom"])),
-                 p=general(test["p_value"], 2))  # fmt: skip
-        parts.append(note(joined((kind, said), " ")))
-    return joined(parts)
+                 statistic=m.general(test["statistic"], 4), freedom=", ".join(map(m.count, test["freedom"])),
+                 p=m.general(test["p_value"], 2))  # fmt: skip
+        parts.append(m.note(m.joined((kind, said), " ")))
+    return m.joined(parts)
 
 
 def _pose_row(pose: _Pose) -> list[str]:
@@ -104,13 +91,14 @@ def _pose_row(pose: _Pose) -> list[str]:
     (thing_id, name, epoch, _), entry = pose, pose[-1]()
     smallest = min((s for s in entry["sigma_translation_mm"] if s), default=None)
     cells = [
-        with_sigma(v, s, smallest) for v, s in zip(entry["translation_mm"], entry["sigma_translation_mm"], strict=True)
+        m.with_sigma(v, s, smallest)
+        for v, s in zip(entry["translation_mm"], entry["sigma_translation_mm"], strict=True)
     ]
     least = min((s for s in entry["sigma_rotation_arcsec"] if s), default=None)
     for angle, sigma in zip(entry["rotation_euler_xyz_deg"], entry["sigma_rotation_arcsec"], strict=True):
-        below = f"± {sigma_text(sigma)}″" if sigma else t("held")
-        cells.append(part("below", _value_in("deg", angle, least, "arcsec"), below))
-    return [joined((element("b", thing_id), code(name)), " "), epoch, *cells, status_pill(entry["status"])]
+        below = f"± {m.sigma_text(sigma)}″" if sigma else t("held")
+        cells.append(m.part("below", _value_in("deg", angle, least, "arcsec"), below))
+    return [m.joined((m.element("b", thing_id), m.code(name)), " "), epoch, *cells, status_pill(entry["status"])]
 
 
 def _poses(thing_id: str, entries: Mapping[str, dict[str, Any]]) -> Iterator[_Pose]:
@@ -133,11 +121,11 @@ def _limited(columns: Sequence[str], things: Sequence[T], row: Callable[[T], lis
     """A table with a row for each of the first things, and how many more there are."""
     if not things:
         return Markup()
-    return table(columns, map(row, things[:_MOST_ROWS])) + _more(len(things) - _MOST_ROWS)
+    return m.table(columns, map(row, things[:_MOST_ROWS])) + _more(len(things) - _MOST_ROWS)
 
 
 def _more(n: int) -> Markup:
-    return note(t("{n} more in solution.json.", n=count(n))) if n > 0 else Markup()
+    return m.note(t("{n} more in solution.json.", n=m.count(n))) if n > 0 else Markup()
 
 
 def cameras(c: Context) -> Markup:
@@ -158,15 +146,15 @@ def cameras(c: Context) -> Markup:
         )  # fmt: skip
         parts.append(_camera(camera.camera_id, entries[camera.camera_id], residuals))
     if others:
-        n = count(len(others))
+        n = m.count(len(others))
         title = t("{n} more cameras, with smaller residuals; their lenses and poses in solution.json", n=n)
         columns = ("<Camera", "Images", "Points", "RMS residual [px]")
-        parts.append(part("details", title, _limited(columns, others, lambda k: _camera_row(k, entries[k])), True))
+        parts.append(m.part("details", title, _limited(columns, others, lambda k: _camera_row(k, entries[k])), True))
     said = t(
         "Residual vectors point from the observed to the adjusted position. Red: suspect, orange: not used. "
         "A pattern in the mean per cell is what the lens model leaves over; empty cells hold no points."
     )
-    return section("cameras", "Cameras", joined(parts), said)
+    return m.section("cameras", "Cameras", m.joined(parts), said)
 
 
 def _rows_of(blocks: IntArray, ptr: IntArray) -> IntArray | slice:
@@ -177,7 +165,7 @@ def _rows_of(blocks: IntArray, ptr: IntArray) -> IntArray | slice:
 
 
 def _camera_row(camera_id: str, entry: dict[str, Any]) -> list[str]:
-    numbers = (count(entry["n_images"]), count(entry["n_image_points"]), fixed(entry["rms_residual_px"], 3))
+    numbers = (m.count(entry["n_images"]), m.count(entry["n_image_points"]), m.fixed(entry["rms_residual_px"], 3))
     return [camera_id, *numbers]
 
 
@@ -185,19 +173,19 @@ def _camera(camera_id: str, entry: dict[str, Any], residuals: charts.CameraResid
     width, height = entry["image_size_px"]
     facts = t(
         "{width} × {height} px on station {station} · {images} images, {points} points", width=width, height=height,
-        station=entry["station"], images=count(entry["n_images"]), points=count(entry["n_image_points"]),
+        station=entry["station"], images=m.count(entry["n_images"]), points=m.count(entry["n_image_points"]),
     )  # fmt: skip
     facts += " · " + t("lens model {model}", model=entry["lens"]["model"]) if "lens" in entry else ""
-    facts += " · " + t("RMS residual {rms} px", rms=fixed(entry["rms_residual_px"], 3))
+    facts += " · " + t("RMS residual {rms} px", rms=m.fixed(entry["rms_residual_px"], 3))
     lens = entry.get("lens")
     shown = Markup() if lens is None else vector_table(lens, lens["value_over_sigma"]) + _remarks(lens)
-    shown += joined(_changes(entry[key], part) for key, part in _OF_LENS.items() if key in entry)
+    shown += m.joined(_changes(entry[key], part) for key, part in _OF_LENS.items() if key in entry)
     shown += _clock(entry)
     makers = (charts.vector_field, charts.mean_field, charts.histogram)
     drawn = [make(residuals) for make in makers] if len(residuals.uv) else []
     rows = [row[:1] + row[2:] for row in map(_pose_row, _poses(camera_id, {camera_id: entry}))]
-    poses = table(_POSE_COLUMNS[:1] + _POSE_COLUMNS[2:], rows) if rows else ""
-    return part("camera", camera_id, facts, shown, drawn, poses, of="report.html")
+    poses = m.table(_POSE_COLUMNS[:1] + _POSE_COLUMNS[2:], rows) if rows else ""
+    return m.part("camera", camera_id, facts, shown, drawn, poses, of="report.html")
 
 
 _OF_LENS = {"lens_drift": "changes", "lens_crop": "crops", "lens_shared": "differences"}
@@ -206,8 +194,8 @@ _OF_LENS = {"lens_drift": "changes", "lens_crop": "crops", "lens_shared": "diffe
 def _changes(entry: dict[str, Any], key: str) -> Markup:
     """How the lens changes, images are cropped or a shared lens would differ: a table for each, and what is clear."""
     changes = [(entry["camera"], entry[key])] if key == "differences" else list(entry[key].items())
-    parts = [note(_change_head(key, name)) + vector_table(change) for name, change in changes]
-    return joined((*parts[:_MOST_BLOCKS], _more(len(parts) - _MOST_BLOCKS))) + _tests(entry["significance"])
+    parts = [m.note(_change_head(key, name)) + vector_table(change) for name, change in changes]
+    return m.joined((*parts[:_MOST_BLOCKS], _more(len(parts) - _MOST_BLOCKS))) + _tests(entry["significance"])
 
 
 def _change_head(key: str, name: str) -> Markup | str:
@@ -227,31 +215,32 @@ def _clock(entry: dict[str, Any], owner: str = "") -> Markup:
     if clock is None:
         return Markup()
     own = [(epoch, *found) for epoch, e in clock.get("epochs", {}).items() for found in _components(e)]
-    rows = [[e, _value_in(unit, v, s, s_unit), sigma_text(s), unit] for e, _, v, unit, s, s_unit, _ in own]
+    rows = [[e, _value_in(unit, v, s, s_unit), m.sigma_text(s), unit] for e, _, v, unit, s, s_unit, _ in own]
     head = t("Clock of {name}", name=owner) if owner else t("Clock")
-    title = t("{n} epochs: times of their own", n=count(len(rows)))
-    shown = element("h3", head) + vector_table(clock)
-    return shown + (part("details", title, _limited(_OWN_TIMES, rows, list), False) if rows else Markup())
+    title = t("{n} epochs: times of their own", n=m.count(len(rows)))
+    shown = m.element("h3", head) + vector_table(clock)
+    return shown + (m.part("details", title, _limited(_OWN_TIMES, rows, list), False) if rows else Markup())
 
 
 def _remarks(lens: dict[str, Any]) -> Markup:
     """What is weak about a lens: parameters that could as well be zero, correlations."""
     strong, weak = lens["correlations_over_95_percent"], lens["not_significant"]
     pairs = (
-        joined((code(p["a"]), t("with"), code(p["b"]), fixed(100 * p["correlation"], 1), "%"), " ") for p in strong
+        m.joined((m.code(p["a"]), t("with"), m.code(p["b"]), m.fixed(100 * p["correlation"], 1), "%"), " ")
+        for p in strong
     )
     # fx and fy of a camera always go together; alone they are no warning
     kind = "warn" if any({p["a"], p["b"]} != {"fx", "fy"} for p in strong) else "quiet"
     correlation = (
-        joined((pill(kind, t("correlated above 95 %")), joined(pairs, ", ")), " ")
+        m.joined((m.pill(kind, t("correlated above 95 %")), m.joined(pairs, ", ")), " ")
         if strong
         else t("No correlation above 95 % within the lens.")
     )
     remarks = [correlation]
     if weak:
-        said = t("{names}: not distinguishable from zero at 95 %.", names=joined(map(code, weak), ", "))
-        remarks.append(joined((pill("warn", t("not significant")), said), " "))
-    return joined(map(note, remarks))
+        said = t("{names}: not distinguishable from zero at 95 %.", names=m.joined(map(m.code, weak), ", "))
+        remarks.append(m.joined((m.pill("warn", t("not significant")), said), " "))
+    return m.joined(map(m.note, remarks))
 
 
 def stations(c: Context) -> Markup:
@@ -262,10 +251,10 @@ def stations(c: Context) -> Markup:
     many = len(by_epoch) > _MANY_EPOCHS
     body = _limited(_POSE_COLUMNS, [pose for pose in poses if not pose[2]] if many else poses, _pose_row)
     if many:
-        title = t("{n} poses by epoch", n=count(len(by_epoch)))
-        body += part("details", title, _limited(_POSE_COLUMNS, by_epoch, _pose_row), False)
-    body += joined(_clock(e, k) for k, e in having(c.solution["stations"], "clock").items())
-    return section("poses", "Poses of stations, tables and targets", body, t(_POSE_NOTE))
+        title = t("{n} poses by epoch", n=m.count(len(by_epoch)))
+        body += m.part("details", title, _limited(_POSE_COLUMNS, by_epoch, _pose_row), False)
+    body += m.joined(_clock(e, k) for k, e in having(c.solution["stations"], "clock").items())
+    return m.section("poses", "Poses of stations, tables and targets", body, t(_POSE_NOTE))
 
 
 def tables(c: Context) -> Markup:
@@ -273,7 +262,7 @@ def tables(c: Context) -> Markup:
     parts = []
     for table_id, entry in c.solution["tables"].items():
         axes = t(" then ").join(entry["axes"])
-        body = element("h3", joined((table_id, t("axes {axes}", axes=axes)), ", "))
+        body = m.element("h3", m.joined((table_id, t("axes {axes}", axes=axes)), ", "))
         if "geometry" in entry:
             body += vector_table(entry["geometry"])
         body += _clock(entry, table_id)
@@ -281,15 +270,15 @@ def tables(c: Context) -> Markup:
             names = list(next(iter(entry["epochs"].values()))["status"])
             columns = ("<Epoch", *(x for n in names for x in (f"{n} [°]", "σ [″]")))
             epochs = list(entry["epochs"].items())
-            title = t("{n} epochs: adjusted angles", n=count(len(epochs)))
-            body += part("details", title, _limited(columns, epochs, _angles_row), len(epochs) <= _MANY_EPOCHS)
+            title = t("{n} epochs: adjusted angles", n=m.count(len(epochs)))
+            body += m.part("details", title, _limited(columns, epochs, _angles_row), len(epochs) <= _MANY_EPOCHS)
         parts.append(body)
-    return section("tables", "Turntables", joined(parts))
+    return m.section("tables", "Turntables", m.joined(parts))
 
 
 def _angles_row(epoch: tuple[str, dict[str, Any]]) -> list[str]:
     name, angles = epoch
-    parts = ((_value_in(unit, v, s, s_unit), sigma_text(s)) for _, v, unit, s, s_unit, _ in _components(angles))
+    parts = ((_value_in(unit, v, s, s_unit), m.sigma_text(s)) for _, v, unit, s, s_unit, _ in _components(angles))
     return [name, *(x for both in parts for x in both)]
 
 
@@ -298,15 +287,21 @@ def targets(c: Context) -> Markup:
     entries = list(c.solution["targets"].items())
     columns = ("<Target", "Points", "<Stands on", "<Motion", "Poses per epoch")
     bent = [(k, e["warp"]) for k, e in entries if "warp" in e]
-    warps = [element("h3", t("Warp of {name}", name=k)) + vector_table(warp) for k, warp in bent[:_MOST_BLOCKS]]
-    body = joined((_limited(columns, entries, _target_row), *warps, _more(len(bent) - _MOST_BLOCKS)))
-    return section("targets", "Targets", body)
+    warps = [m.element("h3", t("Warp of {name}", name=k)) + vector_table(warp) for k, warp in bent[:_MOST_BLOCKS]]
+    body = m.joined((_limited(columns, entries, _target_row), *warps, _more(len(bent) - _MOST_BLOCKS)))
+    return m.section("targets", "Targets", body)
 
 
 def _target_row(target: tuple[str, dict[str, Any]]) -> list[str]:
     target_id, entry = target
     carrier = t("station {name}", name=entry["station"]) if "station" in entry else t("the world")
-    return [target_id, count(entry["n_points"]), carrier, known(entry["motion"]), count(len(entry.get("epochs", {})))]
+    return [
+        target_id,
+        m.count(entry["n_points"]),
+        carrier,
+        known(entry["motion"]),
+        m.count(len(entry.get("epochs", {}))),
+    ]
 
 
 def points(c: Context) -> Markup:
@@ -319,17 +314,17 @@ def points(c: Context) -> Markup:
     def row(point: tuple[str, dict[str, Any]]) -> list[str]:
         point_id, p = point
         axes = p["ellipsoid_95_semi_axes_mm"]
-        bar = part("bar", f"{100.0 * axes[0] / worst if worst else 0.0:.0f}")
-        cells = [element("b", point_id), *(with_sigma(p[f"{a}_mm"], p[f"sigma_{a}_mm"], typical) for a in "xyz")]
-        return [*cells, *(sigma_text(a) for a in axes), bar, status_pill(p["status"])]
+        bar = m.part("bar", f"{100.0 * axes[0] / worst if worst else 0.0:.0f}")
+        cells = [m.element("b", point_id), *(m.with_sigma(p[f"{a}_mm"], p[f"sigma_{a}_mm"], typical) for a in "xyz")]
+        return [*cells, *(m.sigma_text(a) for a in axes), bar, status_pill(p["status"])]
 
     columns = ("<Point", "x [mm]", "y [mm]", "z [mm]", "a [mm]", "b [mm]", "c [mm]", "<", "<Status")
     said = t(
         "World coordinates with sigmas below; a, b, c: semi-axes of the 95 % confidence ellipsoid ({k} sigmas). "
         "Least precise first.",
-        k=general(c.scale.ellipsoid, 4),
+        k=m.general(c.scale.ellipsoid, 4),
     )
-    return section("points", "Points", _limited(columns, entries, row), said)
+    return m.section("points", "Points", _limited(columns, entries, row), said)
 
 
 def instruments(c: Context) -> Markup:
@@ -337,27 +332,27 @@ def instruments(c: Context) -> Markup:
     parts: list[Markup] = []
     vertical = c.solution.get("vertical")
     if vertical is not None:
-        parts += [element("h3", t("Vertical")), _vector(t("upwards in the world"), vertical["up_in_world"])]
+        parts += [m.element("h3", t("Vertical")), _vector(t("upwards in the world"), vertical["up_in_world"])]
         parts += [vector_table(vertical["tilt"])] if "tilt" in vertical else []
     for instrument_id, entry in c.solution.get("instruments", {}).items():
-        parts += [element("h3", joined((t("Instrument"), instrument_id), " ")), vector_table(entry)]
+        parts += [m.element("h3", m.joined((t("Instrument"), instrument_id), " ")), vector_table(entry)]
     setups = list(c.solution.get("setups", {}).items())
     for setup_id, entry in setups[:_MOST_BLOCKS]:
         of = f" ({entry['instrument']})" if "instrument" in entry else ""
-        parts += [element("h3", joined((t("Setup"), f"{setup_id}{of}"), " "))]
+        parts += [m.element("h3", m.joined((t("Setup"), f"{setup_id}{of}"), " "))]
         parts += [vector_table(entry[kind]) for kind in ("orientation", "centring") if kind in entry]
     parts += [_more(len(setups) - _MOST_BLOCKS)]
     for beam_id, entry in c.solution.get("beams", {}).items():
         carrier = next(f"{kind} {entry[kind]}" for kind in ("mount", "station") if kind in entry)
         head = f"{t('Laser beam')} {beam_id} ({carrier}, {t('along')} {entry['axis']})"
-        parts += [element("h3", head), vector_table(entry["parameters"])]
+        parts += [m.element("h3", head), vector_table(entry["parameters"])]
     for surface_id, entry in c.solution.get("surfaces", {}).items():
         key = next((k for k in ("normal", "direction") if k in entry), None)
-        parts += [element("h3", joined((t(entry["kind"]), surface_id), " "))]
+        parts += [m.element("h3", m.joined((t(entry["kind"]), surface_id), " "))]
         parts += [_vector(t(key), entry[key])] if key else []
         parts += [vector_table(entry["parameters"])]
-    return section("instruments", "Instruments and surfaces", joined(parts))
+    return m.section("instruments", "Instruments and surfaces", m.joined(parts))
 
 
 def _vector(what: str, components: list[float | None]) -> Markup:
-    return note(f"{what}: ({', '.join(fixed(x, 6) for x in components)})")
+    return m.note(f"{what}: ({', '.join(m.fixed(x, 6) for x in components)})")

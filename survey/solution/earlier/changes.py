@@ -10,7 +10,7 @@ from gtsam import Pose3
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import FloatArray
 from survey.folder.plain import plain
-from survey.solution.quantities import sigma_unit_for_people, unit_for_people
+from survey.solution.quantities import sigma_unit_for_people, sigmas_in, unit_for_people
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,7 @@ def _kind(e: Estimate) -> bool:
 
 
 def _components(a: Estimate, b: Estimate) -> list[Change]:
-    sigma_a, sigma_b = (np.sqrt(np.clip(np.diag(e.cov), 0.0, None)) for e in (a, b))
+    sigma_a, sigma_b = sigmas_in(a.cov), sigmas_in(b.cov)
     d = _difference(a, b)
     with np.errstate(divide="ignore", invalid="ignore"):
         sigmas = np.where(sigma_a > 0.0, np.abs(d) / sigma_a, np.where(d == 0.0, 0.0, np.nan))

@@ -19,7 +19,7 @@ from survey.project import Project
 from survey.project.declared.poses import rotation_from_quaternion
 from survey.project.project import RESULTS
 from survey.solution.covariances import read_covariances
-from survey.solution.quantities import ARCSEC_PER_RAD, SigmaKind, key_of, unit_for_people
+from survey.solution.quantities import ARCSEC_PER_RAD, SigmaKind, key_of, sigmas_in, unit_for_people
 
 # what damaged or foreign content makes the readers below raise
 _MOST_MOVES, _MOST_SHOWN = 200, 8
@@ -223,7 +223,7 @@ def _move(
     cov = previous.covs.get(name)
     if cov is None:
         return None
-    sigma = np.sqrt(np.clip(np.diag(cov), 0.0, None)) / factor
+    sigma = sigmas_in(cov) / factor
     known = sigma > 0.0
     if not known.any():
         return None

@@ -113,7 +113,6 @@ def record_run(
     said = Run(number, run.date, author, run.command, False, snapshot(adjustment).summary, dict(run.input_hashes),
                tuple(one.exclusion for one in run.left_out), fingerprint)  # fmt: skip
     into = place / RUNS / f"{number:04d}"
-    into.mkdir(parents=True)
     atomic_write(into / _RUN, json_text(said.as_dict()))
     atomic_write(into / _SOLUTION, (place / RESULTS / _SOLUTION).read_bytes())
     atomic_write(into / _ESTIMATES, _estimates_npz(adjustment.estimates.values()))
@@ -185,9 +184,7 @@ def pin_run(folder: Path, number: int, pinned: bool = True) -> Run:
     """Keep a run for ever, or no longer. Raises SurveyError."""
     with changing(folder) as place:
         said = find_run(folder, number).as_dict() | {"pinned": pinned}
-        into = place / RUNS / f"{number:04d}"
-        into.mkdir(parents=True)
-        atomic_write(into / _RUN, json_text(said))
+        atomic_write(place / RUNS / f"{number:04d}" / _RUN, json_text(said))
         replace_parts(folder)
     return find_run(folder, number)
 

@@ -1,1 +1,0 @@
-"""Images that are not as the camera saw them: mirrored, turned. Changes from some epoch on begin in ``bodies``."""
