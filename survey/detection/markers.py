@@ -74,8 +74,7 @@ def find_markers(gray: Gray32, seen: SeenMarkers, target: MarkerGrid | MarkerBlo
 def find_charuco(gray: Gray32, gray8: Gray8, target: Charuco) -> Detection:
     """The board's inner corners that are seen, part of it being enough; a longer look only where markers lack."""
     board, squares = charuco_board(target), target.points()[1][:, :2] / target.square_m
-    coarse, factor = reduced(gray8, _COARSE_PX)
-    every = cv2.aruco.DetectorParameters()
+    every, (coarse, factor) = cv2.aruco.DetectorParameters(), reduced(gray8, _COARSE_PX)
     looks = [(coarse, factor, one_threshold()), (coarse, factor, every), (gray8, np.ones(2), every)]
     for image, scale, parameters in looks[: 2 + (coarse is not gray8)]:
         detector = cv2.aruco.CharucoDetector(board, cv2.aruco.CharucoParameters(), parameters)
@@ -88,8 +87,7 @@ def find_charuco(gray: Gray32, gray8: Gray8, target: Charuco) -> Detection:
         return nothing_found(f"{n} corners by {len(seen)} markers ({target.dictionary}) found; at least 4 are needed")
     if H is None:
         return nothing_found(f"the {n} corners found lie on one line")
-    edges = _board_edges(squares[point_idx], H)
-    margin = (target.square_m - target.marker_m) / (2.0 * target.square_m)
+    edges, margin = _board_edges(squares[point_idx], H), 0.5 * (1.0 - target.marker_m / target.square_m)
     fit = refine_corners(gray, start, edges, margin * _across(edges))
     return _detection(point_idx, unbent(fit, squares[point_idx], fit.good), (), "corners")
 
@@ -157,9 +155,8 @@ def _homography(xy: FloatArray, start: FloatArray) -> FloatArray | None:
 def _in_view(board: cv2.aruco.CharucoBoard, H: FloatArray, gray8: Gray8) -> set[int]:
     """The board's markers that lie in the image, by the homography of its squares."""
     quads = np.array(board.getObjPoints())[:, :, :2] / board.getSquareLength() - 1.0
-    places, size = cv2.perspectiveTransform(quads, H), np.array(gray8.shape[::-1])
-    border = _BORDER * size.max()
-    inside = ((places > border) & (places < size - border)).all((1, 2))
+    places, border = cv2.perspectiveTransform(quads, H), _BORDER * max(gray8.shape)
+    inside = ((places > border) & (places < np.array(gray8.shape[::-1]) - border)).all((1, 2))
     return {int(m) for m in np.ravel(board.getIds())[inside]}
 
 
