@@ -98,6 +98,9 @@ def station_deformations(
     """
     chosen = _consecutive(first, second) if pairs is None else tuple(pairs)
     factors = [_factor(x, s) for x, s in zip((first, second), scale, strict=True)]
+    for x in (first, second):
+        ends = [[_station(x, s) for s in pair] for pair in chosen]
+        x.precision.bring_together((a.name, b.name) for a, b in ends if all({*e.status} - {"held"} for e in (a, b)))
     found = [_deformation(first, second, a, b, factors) for a, b in chosen]
     tested = max(1, sum(d.test.freedom > 0 for d in found))
     level = sidak(alpha, tested)

@@ -35,7 +35,7 @@ from adjust.observations.geometry.building import GeometryFactors, position_refs
 from adjust.observations.images.batch import ImageBatch
 from adjust.observations.images.bundle_layout import may_be_hidden
 from adjust.observations.images.bundles import BundleBatch
-from adjust.observations.images.helmert_blocks import helmert_blocks
+from adjust.observations.images.helmert_blocks import helmert_blocks, runs_of_epochs
 from adjust.observations.images.reduction import reduction
 from adjust.observations.terrestrial.building import build_batch, reading_refs
 from adjust.observations.terrestrial.parameters import collect_terrestrial, full_start
@@ -107,14 +107,14 @@ class GraphBuilder:
         parts = self._parts([b for _, b, _ in unknown], [chain for *_, chain in unknown], outside | of_images)
         bundles = tuple(
             BundleBatch(self.unknowns, state, [unknown[k][1] for k in part], [unknown[k][2] for k in part],
-                        self.point_ids, outside | of_images | shared)
-            for part, shared in parts
+                        self.point_ids, outside | of_images | shared, by_rows)
+            for part, shared, by_rows in parts
         )  # fmt: skip
         for bundle in bundles:
             outside |= set(bundle.order) | set(bundle.point_key.values())
         # a free datum is found and completed with all unknowns in sight
         reduced = None if survey.datum.kind == "inner" else reduction(images, self.unknowns, outside)
-        part_of = {unknown[k][0]: p for p, (part, _) in enumerate(parts, 1) for k in part}
+        part_of = {unknown[k][0]: p for p, (part, *_) in enumerate(parts, 1) for k in part}
         order = [(i, part_of.get(i, 0)) for i, _, _ in split]
         return AdjustmentGraph(
             survey, self.unknowns, state, values, images, bundles, order, numbers, self.others, others, readings,
@@ -134,8 +134,11 @@ class GraphBuilder:
 
     def _parts(
         self, blocks: Sequence[ImageBlock], chains: Sequence[Chain], outside: set[int]
-    ) -> list[tuple[list[int], set[int]]]:
-        """Image blocks of unknown points by number, in parts, and the keys of the points that others see too."""
+    ) -> list[tuple[list[int], set[int], bool]]:
+        """Image blocks of unknown points by number, in parts, and the keys of the points that others see too.
+
+        Last whether a part is of few rows that hide nothing, which stand as they are.
+        """
         if not blocks:
             return []
         number: dict[tuple[int, ...], int] = {}
@@ -147,12 +150,17 @@ class GraphBuilder:
         free = np.array([u is not None and u.key not in outside for u in point_key])
         seen = [b.point_idx[free[b.point_idx]] for b in blocks]
         part = helmert_blocks(owner, seen, hidden)
+        open_ = [k for k, (s, h) in enumerate(zip(seen, may_hide, strict=True)) if not len(s) and not h]
+        run = runs_of_epochs([blocks[k] for k in open_])
+        first_run = int(part.max()) + 1
+        if run.max(initial=0):
+            part[open_] = first_run + run
         count = np.zeros(len(free), dtype=np.int64)
-        parts = [np.flatnonzero(part == p).tolist() for p in range(int(part.max()) + 1)]
+        parts = [np.flatnonzero(part == p).tolist() for p in np.unique(part)]
         for mine in parts:
             count[np.unique(np.concatenate([blocks[k].point_idx for k in mine]))] += 1
         shared = {u.key for u, n in zip(point_key, count, strict=True) if u is not None and n > 1}
-        return [(mine, shared) for mine in parts]
+        return [(mine, shared, bool(part[mine[0]] >= first_run)) for mine in parts]
 
     def _register_points(self) -> None:
         for point in self.survey.points:

@@ -93,7 +93,7 @@ class PairNormals:
 
     def tree(self, linear: PairLinear) -> tuple[PoseTree, gtsam.VectorValues] | None:
         """The Bayes tree and the solution; None as above."""
-        if not self._eliminated(linear):
+        if not self.kept and not self._eliminated(linear):
             return None
         return PoseTree(self.factor.pattern, self.keys, self.factor.data), self._solved(linear)[0]
 

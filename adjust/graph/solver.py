@@ -53,6 +53,7 @@ class SolveOptions:
     Lemarechal, Pedersen and Powell 1982; Nocedal and Wright 2006, section 15.6). determined: what the observations
     determine was judged before; where GTSAM's Cholesky refuses, QR solves. settled: share of chi-square that two steps
     one after the other have to gain for the search to go on: of a survey that is only compared with others.
+    covariances: whether they are wanted; the tree of nothing but pairs may else be that of a step before.
     """
 
     max_step: float = 1e-6
@@ -61,6 +62,7 @@ class SolveOptions:
     patience: int = 0
     determined: bool = False
     settled: float = 0.0
+    covariances: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,6 +186,7 @@ class _Loop:
     def _tree(self) -> tuple[gtsam.GaussianBayesTree | PoseTree, gtsam.VectorValues] | None:
         """The Bayes tree of the system as it is now, and its solution; None where the elimination finds none."""
         if isinstance(self.linear, PairLinear):
+            self.linear.normals.kept &= not self.options.covariances
             return self.linear.normals.tree(self.linear)
         return self.elimination.tree(self.linear)
 

@@ -83,6 +83,7 @@ class ReadingResiduals:
     sigma: a priori, with the target's centring. residual: adjusted minus observed.
     redundancy: diag(Q_vv P). test: w^2 with w = (P v)_i / sqrt((P Q_vv P)_ii), chi-square with one degree of freedom,
     the square of ``standardized`` but for readings with a joint covariance. weighted_square: shares of v'Pv.
+    influence: diag(A Q A'), whitened.
     """
 
     observed: FloatArray
@@ -94,6 +95,7 @@ class ReadingResiduals:
     test: FloatArray
     weighted_square: FloatArray
     used: BoolArray
+    influence: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +162,8 @@ class Residuals(Sequence[ObservationResidual]):
 
     def __init__(self, arrays: OtherArrays, named: Callable[[int], Named]) -> None:
         self.arrays, self._named = arrays, named
-        self._ptr = np.cumsum([0, *arrays.n_components]).tolist()
+        self._ptr = [0, *np.cumsum(arrays.n_components).tolist()]
+        self._made: list[ObservationResidual | None] = [None] * len(arrays.used)
 
     def __len__(self) -> int:
         return len(self.arrays.used)
@@ -173,22 +176,22 @@ class Residuals(Sequence[ObservationResidual]):
 
     def __getitem__(self, index: int | slice) -> ObservationResidual | Sequence[ObservationResidual]:
         if isinstance(index, slice):
-            return self if index.indices(len(self)) == (0, len(self), 1) else self._every[index]
+            mine = range(len(self))[index]
+            return self if len(mine) == len(self) and mine.step == 1 else tuple(map(self._one, mine))
         return self._one(range(len(self))[index])
 
     def __iter__(self) -> Iterator[ObservationResidual]:
-        return iter(self._every)
-
-    @cached_property
-    def _every(self) -> tuple[ObservationResidual, ...]:
-        return tuple(map(self._one, range(len(self))))
+        return map(self._one, range(len(self)))
 
     def _one(self, i: int) -> ObservationResidual:
-        a, of = self.arrays, slice(self._ptr[i], self._ptr[i + 1])
-        return ObservationResidual(
-            *self._named(i), a.observed[of], a.adjusted[of], a.residual[of], a.sigma[of], a.redundancies[of],
-            a.standardized[of], a.test[i].item(), a.used[i].item(),
-        )  # fmt: skip
+        found = self._made[i]
+        if found is None:
+            a, of = self.arrays, slice(self._ptr[i], self._ptr[i + 1])
+            found = self._made[i] = ObservationResidual(
+                *self._named(i), a.observed[of], a.adjusted[of], a.residual[of], a.sigma[of], a.redundancies[of],
+                a.standardized[of], a.test[i].item(), a.used[i].item(),
+            )  # fmt: skip
+        return found
 
 
 def arrays_of(residuals: Sequence[ObservationResidual]) -> OtherArrays:

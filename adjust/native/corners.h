@@ -213,7 +213,7 @@ inline FittedCorner fit_corner(In<float, 2> image, const double *start, const do
     return o;
 }
 
-constexpr double ROUGH_PX = 1e-2, FINE_PX = 2e-5;  // steps after which the first and the second fit of a corner may stop
+constexpr double ROUGH_PX = 1e-3, FINE_PX = 2e-5;  // steps after which the first and the second fit of a corner may stop
 constexpr double NEAR_PX = 5.0;  // from a crossing, as far as the first fit looks where the edges' blur ends before that
 
 // The window of a corner: it keeps clear of the neighbouring edges, blurred as those are. edges: both, px, to where they

@@ -4,7 +4,7 @@
 
 namespace {
 
-constexpr int WINDOW = 64;  // pixels evaluated together
+constexpr int WINDOW = 256;  // pixels evaluated together
 
 template <int N> struct Normals {  // of N parameters: matrix, right side, sum of squared residuals
     double H[N][N], g[N], cost;
@@ -85,11 +85,11 @@ template <int N, class Row> inline void add_pixels(const Pixels &w, const Row &r
 
 // The first n_free of N parameters p, in place, with the normal equations at, which are those of the start and then of a
 // place as near the end as the last step is short; false without convergence. The first two are the place (px), which may
-// be off by tolerance; steps shrink at least as the damping does. evaluate(p, out) makes the normal equations, clamp(p)
-// keeps parameters where they mean something.
+// be off by tolerance: the end is where the step that would follow is shorter, by the rate at which steps shrink (Hairer
+// and Wanner 1996, IV.8). evaluate(p, out) makes the normal equations, clamp(p) keeps parameters where they mean something.
 template <int N, class Evaluate, class Clamp>
 inline bool levenberg_marquardt(double (&p)[N], int n_free, double tolerance, const Evaluate &evaluate, const Clamp &clamp, Normals<N> &at) {
-    double damping = 1e-3, trial[N], step[N][1];
+    double damping = 1e-3, before = 0.0, trial[N], step[N][1];
     Normals<N> there;
     for (int iteration = 0; iteration < 40; ++iteration) {
         for (int i = 0; i < N; ++i) trial[i] = p[i], step[i][0] = at.g[i];
@@ -100,17 +100,19 @@ inline bool levenberg_marquardt(double (&p)[N], int n_free, double tolerance, co
         double gain = 0.0;  // of the squares, as the equations foretell it
         for (int i = 0; i < n_free; ++i) trial[i] += step[i][0], gain += step[i][0] * at.g[i];
         clamp(trial);
-        const bool small = magnitude(trial[0] - p[0]) + magnitude(trial[1] - p[1]) < tolerance;
-        const bool last = small && gain <= 0.05 * tolerance * at.cost + 1e-12;
+        const double moved = magnitude(trial[0] - p[0]) + magnitude(trial[1] - p[1]);
+        const double left = gain < before ? gain / before : 1.0;  // the next step is to this one as this to the one before
+        const bool last = moved * root(left) < tolerance && gain * left <= 0.05 * tolerance * at.cost + 1e-12;
         if (!last) evaluate(trial, there);
         if (last || there.cost <= at.cost) {
             std::memcpy(p, trial, sizeof p);
+            if (last) at.cost = larger(at.cost - gain, 0.0);
             if (last) return true;
             at = there;
-            damping *= 0.2;
+            damping *= 0.2, before = gain;
         } else {
-            if (small) return true;
-            damping *= 6.0;
+            if (moved < tolerance) return true;
+            damping *= 6.0, before = 0.0;
         }
     }
     return false;

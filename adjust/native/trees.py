@@ -149,5 +149,5 @@ def sets_among(
     rows, work = np.empty(int(tree.width.max(initial=0)), dtype=np.int64), np.empty(_sets_room(tree.width, m))
     _sets_among(set_ptr, row_ptr, columns, entries, *tree, parents, n_front, *marks, key_of, first, data, out, x, rows,
                 work)  # fmt: skip
-    ends = np.cumsum(sizes**2)[:-1]
-    return [square.reshape(n, n) for square, n in zip(np.split(out, ends), sizes.tolist(), strict=True)]
+    ends = np.cumsum(sizes**2).tolist()
+    return [out[end - n * n : end].reshape(n, n) for end, n in zip(ends, sizes.tolist(), strict=True)]

@@ -25,7 +25,7 @@ _SEEN = 100
 """Stations among which another way is looked for between the ends of a pair."""
 _SOUND = 0.1
 """Share of the loops that go through no wrong pair, at least: their tests tell whether the sigmas are too small."""
-_PROPOSING = NetworkOptions(max_step=1e-2)
+_PROPOSING = NetworkOptions(max_step=1e-2, covariances=False)
 """Sigmas: what is proposed is tested again at a minimum to the last digit."""
 
 

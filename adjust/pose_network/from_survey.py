@@ -1,10 +1,12 @@
 """From a survey of stations and pairs to a pose network."""
 
 from dataclasses import fields
+from functools import lru_cache
 
 import numpy as np
 
 from adjust.model.errors import IndeterminateError, SurveyError, listed
+from adjust.model.observations import Pair
 from adjust.model.survey import FloatArray, PoseParameter, Survey
 from adjust.observations.pairs import pair_arrays
 from adjust.pose_network.network import PoseNetwork, Topology, check_determined, network_of
@@ -60,6 +62,37 @@ def network_from_survey(survey: Survey, any_datum: bool = False) -> PoseNetwork:
     any_datum: a survey that gives none is solved as a free network. Raises SurveyError for pairs that join other frames
     than fixed stations, IndeterminateError where the survey gives no datum.
     """
+    network = _network(_AllUsed(survey), any_datum)
+    used = np.array([p.used for p in survey.pairs], dtype=np.bool_)
+    return network if np.array_equal(network.used, used) else network.with_used(used)
+
+
+class _AllUsed:
+    """Surveys that are equal to others but for which pairs these use, by identity."""
+
+    def __init__(self, survey: Survey) -> None:
+        self.survey = survey
+
+    def __hash__(self) -> int:
+        return len(self.survey.pairs)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, _AllUsed) or len(self.survey.pairs) != len(other.survey.pairs):
+            return False
+        rest = all(_same(self.survey, other.survey, f.name) for f in fields(Survey) if f.name != "pairs")
+        return rest and all(
+            p is q or all(_same(p, q, f.name) for f in fields(Pair) if f.name != "used")
+            for p, q in zip(self.survey.pairs, other.survey.pairs, strict=True)
+        )
+
+
+def _same(a: object, b: object, name: str) -> bool:
+    return getattr(a, name) is getattr(b, name)
+
+
+@lru_cache(1)  # for all solutions of a search
+def _network(of: _AllUsed, any_datum: bool) -> PoseNetwork:
+    survey = of.survey
     stations = survey.stations_by_id
     if not survey.pairs_join_fixed_stations:
         for pair, ref in ((p, r) for p in survey.pairs for r in (p.a, p.b)):

@@ -25,13 +25,14 @@ class NetworkOptions:
     """How a network is solved.
 
     max_step: convergence, what is left to go in sigmas. patience: steps that may fail to lower the weighted square sum
-    before damping begins. settled: as of every survey.
+    before damping begins. settled, covariances: as of every survey.
     """
 
     max_step: float = 1e-6
     max_iterations: int = 100
     patience: int = 8
     settled: float = 0.0
+    covariances: bool = True
 
 
 DEFAULTS = NetworkOptions()
@@ -83,7 +84,8 @@ def minimize(
     at = np.zeros_like(t) if network.rotation_only else t
     graph = builder.build(StartValues({}, {n: Pose3(Rot3(a), b) for n, a, b in zip(names, R, at, strict=True)}, {}))
     try:
-        how = SolveOptions(options.max_step, options.max_iterations, 1e-5, options.patience, True, options.settled)
+        how = SolveOptions(options.max_step, options.max_iterations, 1e-5, options.patience, True, options.settled,
+                           options.covariances)  # fmt: skip
         solved = solve(graph, how, progress)
     except NotConvergedError as error:
         raise NotConvergedError(

@@ -42,7 +42,7 @@ from adjust.testing.distributions import chi2
 if TYPE_CHECKING:
     from adjust.observations.pairs import PairStatistics
 
-_PAIRS = 24
+_PAIRS = 200
 """Pairs of unknowns that are brought together in one go."""
 
 
@@ -135,7 +135,7 @@ class Precision(Covariances):
             self.transformation = s_transformation(
                 solved.datum.rows, motions, lambda rows: self.stacked.by_key(rows, self.stacked.times)
             )
-            self.stacked.move_to(self.transformation)
+            self.stacked.move_to(self.transformation, solved.datum.rows)
 
     def datum_products(self, rows: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
         """Covariance times the transpose of ``rows`` (k, dim per key): (dim, k) for every unknown."""
@@ -168,9 +168,7 @@ class Precision(Covariances):
         elif tuple(keys) in self._together:
             Q = self._together[keys[0], keys[1]]
         else:
-            rows = np.concatenate([self.stacked.rows(k) for k in keys])
-            half = self.stacked.columns(rows)[rows]
-            Q = 0.5 * (half + half.T)
+            Q = self.stacked.joint(keys)
         return _in_datum(self.transformation, keys, Q)
 
     def bring_together(self, pairs: Iterable[tuple[ParameterName, ParameterName]]) -> None:
@@ -180,12 +178,13 @@ class Precision(Covariances):
         self.tree.bring_together((a, b) for a, b in keys if a not in self.hidden and b not in self.hidden)
         below = [(a, b) for a, b in keys if a in self.hidden or b in self.hidden]
         for k in range(0, len(below), _PAIRS):
-            columns = np.concatenate([self.stacked.rows(a) for a in dict.fromkeys(a for a, _ in below[k : k + _PAIRS])])
-            found = self.stacked.columns(columns)
+            some = list(dict.fromkeys(key for pair in below[k : k + _PAIRS] for key in pair))
+            ends = np.cumsum([0, *(self.unknowns.by_key[key].dim for key in some)])
+            at = {key: np.arange(*ends[i : i + 2]) for i, key in enumerate(some)}
+            Q = self.stacked.joint(some)
             for a, b in below[k : k + _PAIRS]:
-                across = found[self.stacked.rows(b)][:, np.isin(columns, self.stacked.rows(a))].T
-                Qa, Qb = (self.hidden[x] if x in self.hidden else self.tree.marginal(x) for x in (a, b))
-                self._together[a, b] = np.block([[Qa, across], [across.T, Qb]])
+                rows = np.concatenate([at[a], at[b]])
+                self._together[a, b] = Q[np.ix_(rows, rows)]
 
     def rows(self, item: ObservationFactor) -> ObservationRows:
         """An observation that is neither image point nor reading, linearised at the solution: built once, and kept."""

@@ -15,8 +15,6 @@ from adjust.precision.tree import TreeCovariance
 
 AT_ONCE = 64
 """Columns that the matrix is multiplied by in one go."""
-_SAME = 1e-6
-"""Share of the longest motion below which one is told from another."""
 
 
 class Stacked:
@@ -27,8 +25,11 @@ class Stacked:
         self.n = tree.n + sum(below.n for below in hidden)
         self._datum: tuple[FloatArray, FloatArray, FloatArray] | None = None
 
-    def move_to(self, datum: STransformation) -> None:
-        """Let the survey's datum be this one."""
+    def move_to(self, datum: STransformation, rows: Mapping[int, FloatArray]) -> None:
+        """Let the survey's datum be this one, of these rows (d, dim per key)."""
+        self._datum_rows = np.zeros((len(datum.core), self.n))
+        for key, row in rows.items():
+            self._datum_rows[:, self.places[key]] = row
         G, W = (np.concatenate([of[key] for key in self.places]) for of in (datum.motions, datum.spread))
         self._datum = G, W, datum.core
 
@@ -72,15 +73,11 @@ class Stacked:
             out -= W @ moved
         return out
 
-    def columns(self, columns: IntArray) -> FloatArray:
-        """Some columns (n, k), as solved."""
-        out = np.empty((self.n, len(columns)))
-        for i in range(0, len(columns), AT_ONCE):
-            some = columns[i : i + AT_ONCE]
-            right = np.zeros((self.n, len(some)))
-            right[some, np.arange(len(some))] = 1.0
-            out[:, i : i + AT_ONCE] = self.times(right)
-        return out
+    def joint(self, keys: Sequence[int]) -> FloatArray:
+        """Joint covariance of any unknowns, as solved, stacked in this order."""
+        rows = np.concatenate([self.rows(k) for k in keys])
+        entries = np.ones(len(rows)), rows, np.arange(len(rows) + 1)
+        return self.among(sparse.csr_array(entries, (len(rows), self.n)))
 
     def by_key(
         self, rows: Mapping[int, FloatArray], times: Callable[[FloatArray], FloatArray]
@@ -94,33 +91,28 @@ class Stacked:
 
     def among(self, A: sparse.csr_array) -> FloatArray:
         """A Q A' (m, m) of rows A (m, n): in any datum, where they are of observations."""
-        out, in_tree = np.zeros((A.shape[0],) * 2), A[:, : self.tree.n]
+        by_column = A.tocsc()
+        out, in_tree = np.zeros((A.shape[0],) * 2), by_column[:, : self.tree.n].tocsr()
         for below, mine, interface in self._parts:
-            hidden = A[:, mine]
-            rows = np.flatnonzero(np.diff(hidden.indptr))
+            hidden = by_column[:, mine]
+            number = np.bincount(hidden.indices, minlength=len(out))
+            rows = np.flatnonzero(number)
             if len(rows):
-                own, over = below.among(hidden[rows].toarray())
+                number[rows], right = np.arange(len(rows)), np.zeros((below.n, len(rows)))
+                right[np.repeat(np.arange(below.n), np.diff(hidden.indptr)), number[hidden.indices]] = hidden.data
+                own, over = below.among(right)
                 out[np.ix_(rows, rows)] += own
                 places = np.repeat(rows, len(interface)), np.tile(interface, len(rows))
                 in_tree = in_tree + sparse.csr_array((over.ravel(), places), in_tree.shape)
         return out + self.tree.among(in_tree)
 
-    def most_correlated(self, sigmas: FloatArray) -> FloatArray:
-        """Bounds (n,): components of two unknowns correlate no more than the larger of theirs, in the survey's datum.
-
-        An unknown is ``T s + e``, s what stands between it and all that is eliminated later, e its own: with that it
-        correlates no more than ``T s`` may make it. sigmas: (n,) in the survey's datum. inf where nothing is known.
-        """
-        none = np.zeros((self.n, 0))
-        G, W = (none, none) if self._datum is None else self._datum[:2]
-        d, columns = G.shape[1], np.hstack([G, W])
-        left, own = self.tree.given_separators(columns[: self.tree.n])
-        hidden = [below.given_interface(columns[mine], columns[at]) for below, mine, at in self._parts]
-        left, own = (np.concatenate(x) for x in zip((left, own), *hidden, strict=True))
-        scale = np.where(sigmas > 0.0, sigmas, np.inf)[:, None]
-        # the datum moves all, and what is left of its motions is nothing but where it was chosen; e moves the datum
-        moved = (np.abs(left[:, :d]) > _SAME * np.abs(G).max(axis=0)).any(axis=1)
-        most = np.abs(left[:, d:] / scale) @ np.abs(G / scale).max(axis=0)
-        through = sigmas**2 - own + 2.0 * np.einsum("ij,ij->i", G, left[:, d:])
-        bound = np.sqrt(np.maximum(through, 0.0)) / scale[:, 0] + most
-        return np.where(moved | np.isinf(own), np.inf, bound)
+    def drawn(self, k: int) -> FloatArray:
+        """Errors (n, k) of k solutions, drawn with the covariance in the survey's datum; always the same."""
+        w = np.random.default_rng(0).standard_normal((self.n, k))
+        tree = self.tree.drawn(w[: self.tree.n])
+        hidden = (below.drawn(tree[interface], w[mine]) for below, mine, interface in self._parts)
+        out = np.concatenate([tree, *hidden])
+        if self._datum is not None:
+            G, R = self._datum[0], self._datum_rows
+            out -= G @ np.linalg.solve(R @ G, R @ out)
+        return out

@@ -58,28 +58,15 @@ class TreeCovariance:
         return self._across.get((a, b))
 
     def bring_together(self, pairs: Iterable[tuple[int, int]]) -> None:
-        """Find what :meth:`joint` of these pairs of keys takes, of those in different cliques, many columns at once."""
-        home, dims = self.cliques.home, self.cliques.dims
-        apart: dict[int, list[int]] = {}
-        for a, b in ((self.number[i], self.number[j]) for i, j in pairs):
-            if self._block(a, b) is None:
-                apart.setdefault(a, []).append(b)
-        left = sorted(apart, key=lambda a: int(home[a]))  # neighbours in the tree side by side
-        while left:
-            n = max(1, int(np.searchsorted(np.cumsum(dims[left]), _COLUMNS, side="right")))
-            some, left = left[:n], left[n:]
-            others = [b for a in some for b in apart[a]]
-            up, down = (self.cliques.ancestors(set(home[of].tolist())) for of in (some, some + others))
-            first, rows = self.cliques.gathered(down)
-            columns = self.cliques.rows_of(np.array(some, dtype=np.int64), first)
-            x = np.zeros((rows, len(columns)))
-            x[columns, np.arange(len(columns))] = 1.0
-            solve_cliques(self.arrays, up, down, first, self.cliques.data, x)
-            at = 0
-            for a in some:
-                own = slice(at, at := at + int(dims[a]))
-                for b in apart[a]:
-                    self._across[a, b] = x[first[b] : first[b] + dims[b], own].T.copy()
+        """Find what :meth:`joint` of these pairs of keys takes, of those in different cliques, all at once."""
+        numbers = ((self.number[i], self.number[j]) for i, j in pairs)
+        apart = [(a, b) for a, b in numbers if self._block(a, b) is None]
+        both = np.array(apart, dtype=np.int64).reshape(-1, 2)
+        columns, ptr = self.cliques.rows_of(both.ravel()), np.append(0, np.cumsum(self.cliques.dims[both].sum(axis=1)))
+        units = sparse.csr_array((np.ones(len(columns)), columns, np.arange(len(columns) + 1)), (len(columns), self.n))
+        for (a, b), Q in zip(apart, self.each_among(units, ptr), strict=True):
+            n = int(self.cliques.dims[a])
+            self._across[a, b] = Q[:n, n:]
 
     def marginal(self, key: int) -> FloatArray:
         """Covariance (dim, dim) of one unknown."""
@@ -151,8 +138,17 @@ class TreeCovariance:
     def times(self, columns: FloatArray) -> FloatArray:
         """The whole covariance matrix times columns (n, m), without forming it."""
         x = np.array(columns, dtype=float, order="C")
-        every = np.arange(len(self.cliques), dtype=np.int64)
-        solve_cliques(self.arrays, every, every, self.cliques.first, self.cliques.data, x)
+        c, every = self.cliques, np.arange(len(self.cliques), dtype=np.int64)
+        begun = set(c.home[c.key_of[x.any(axis=1)]].tolist())
+        up = every if 2 * len(begun) > len(c) else c.ancestors(begun)
+        solve_cliques(self.arrays, up, every, c.first, c.data, x)
+        return x
+
+    def drawn(self, w: FloatArray) -> FloatArray:
+        """R^-1 w (n, m): errors with the whole covariance matrix, where w are independent with unit variance."""
+        x, c = np.array(w), self.cliques
+        none, every = np.zeros(0, dtype=np.int64), np.arange(len(c), dtype=np.int64)
+        solve_cliques(self.arrays, none, every, c.first, c.data, x)
         return x
 
     def each_among(self, A: sparse.csr_array, ptr: IntArray) -> list[FloatArray]:
@@ -185,12 +181,15 @@ class TreeCovariance:
             way = np.zeros(len(c), dtype=np.bool_)
             way[up] = True
             rows = np.flatnonzero(way[home])
-            done.append((rows, U))
             for k, (before, V) in enumerate(done):
                 _, here, there = np.intersect1d(rows, before, assume_unique=True, return_indices=True)
-                out[i : i + _COLUMNS, k * _COLUMNS : (k + 1) * _COLUMNS] = U[here].T @ V[there]
+                across = U[here].T @ V[there]
+                out[i : i + _COLUMNS, k * _COLUMNS : (k + 1) * _COLUMNS] = across
+                out[k * _COLUMNS : (k + 1) * _COLUMNS, i : i + _COLUMNS] = across.T
+            done.append((rows, U))
+            out[i : i + _COLUMNS, i : i + _COLUMNS] = U.T @ U
         back = np.argsort(order)
-        return np.asarray((np.tril(out) + np.tril(out, -1).T)[np.ix_(back, back)])
+        return np.asarray(out[np.ix_(back, back)])
 
     def full(self) -> FloatArray:
         """The whole covariance matrix (n, n) of all unknowns, rows as :meth:`places` says, parents before children.
@@ -214,21 +213,6 @@ class TreeCovariance:
                 Q[:done, own] = across.T
                 Q[own, own] += across[:, rows[nf:]] @ T.T
         return Q
-
-    def given_separators(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What does not follow from the separator of its clique, as all between it and the cliques that are not below.
-
-        Of columns (n, k) that part, and of every unknown the variance (n,) that is left: inf where a clique has others
-        of its own, with which it may share anything.
-        """
-        left, own, cliques = np.array(columns), np.full(self.n, np.inf), self.cliques
-        for c in range(len(cliques)):
-            nf, n, at = int(cliques.front[c]), int(cliques.width[c]), int(cliques.at[c])
-            A, rows = cliques.data[at : at + nf * n].reshape(nf, n), cliques.rows_of(cliques.keys_in(c))
-            left[rows[:nf]] -= A[:, nf:] @ columns[rows[nf:]]
-            if cliques.n_front[c] == 1:
-                own[rows[:nf]] = (np.triu(A[:, :nf]) ** 2).sum(axis=1)
-        return left, own
 
     def pairs(self, first: IntArray, second: IntArray, dim: int) -> FloatArray:
         """Joint covariances (p, 2 dim, 2 dim) of pairs of keys that share a factor; -1 stands for a constant.

@@ -60,7 +60,7 @@ class Unit:
 class _Candidates:
     """A unit's possible changes (J, ...), scaled so that B'B has a unit diagonal: M (J, q, q), g (J, q), scale (J, q).
 
-    X: (n, j q) A'B of the j runs by themselves, one after the other; a change has the sum of those from its run on.
+    X: (j q, n) B'A of the j runs by themselves, one after the other; a change has the sum of those from its run on.
     """
 
     unit: Unit
@@ -213,13 +213,14 @@ class ChangeSearch:
     def _candidates(self, u: Unit) -> _Candidates:
         """Of the runs from j on, j = 1, 2, ..., or of the only one."""
         J, q = len(u.epochs), u.B.shape[1]
-        columns = u.run[:, None] * q + np.arange(q)
-        order, length = np.argsort(u.rows, kind="stable"), np.zeros(len(self.e), dtype=np.int64)
-        length[u.rows] = q
-        ptr = np.concatenate([[0], np.cumsum(length)])
-        wide = sparse.csr_matrix((u.B[order].ravel(), columns[order].ravel(), ptr), (len(length), J * q))
-        wide.eliminate_zeros()
-        X = (self.A.T @ wide).tocsr()
+        of_run = np.bincount(u.run, minlength=J)
+        ptr, before = np.cumsum([0, *np.repeat(of_run, q)]), np.cumsum(of_run) - of_run
+        place = (ptr[u.run * q] + np.arange(len(u.run)) - before[u.run])[:, None] + of_run[u.run, None] * np.arange(q)
+        values, rows = np.empty(u.B.size), np.empty(u.B.size, dtype=np.int64)
+        values[place], rows[place] = u.B, u.rows[:, None]
+        by_run = sparse.csr_matrix((values, rows, ptr), (J * q, len(self.e)))
+        by_run.eliminate_zeros()
+        X = (by_run @ self.A).tocsr()
         both = _from_runs_on(_by_run(u, np.column_stack([u.B, self.e[u.rows]])))
         P, g = both[:, :, :q], both[:, :, q]
         taken = _taken(self.system, X, J)[1 if J > 1 else 0 :]
@@ -245,18 +246,18 @@ class ChangeSearch:
 
 
 def _taken(system: LinearSystem, X: sparse.csr_matrix, J: int) -> FloatArray:
-    """X'QX of the runs from j on together (J, q, q); X (n, J q) of the runs by themselves."""
-    q, sums = X.shape[1] // J, system.structured
+    """XQX' of the runs from j on together (J, q, q); X (J q, n) of the runs by themselves."""
+    q, sums = X.shape[0] // J, system.structured
     if sums is None:
-        M, out = system.among(X.T.tocsr()).reshape(J, q, J, q), np.empty((J, q, q))
+        M, out = system.among(X).reshape(J, q, J, q), np.empty((J, q, q))
         for j in range(J):
             later = M[j, :, j + 1 :].sum(axis=1)
             out[j] = M[j, :, j] + later + later.T
         return np.cumsum(out[::-1], axis=0)[::-1]
-    own = (X.T @ (sums.own @ X)).tocoo()
+    own = (X @ (sums.own @ X.T)).tocoo()
     (a, i), (b, k) = np.divmod(own.row, q), np.divmod(own.col, q)
     of_run = np.bincount((np.minimum(a, b) * q + i) * q + k, own.data, J * q * q).reshape(J, q, q)
-    shared = np.asarray(X.T @ sums.U.T).reshape(J, q, -1)
+    shared = np.asarray(X @ sums.U.T).reshape(J, q, -1)
     own_on, shared_on = (np.cumsum(x[::-1], axis=0)[::-1] for x in (of_run, shared))
     return np.asarray(own_on + shared_on @ shared_on.transpose(0, 2, 1))
 
@@ -298,7 +299,7 @@ def _from_runs_on(of_runs: FloatArray) -> FloatArray:
 def _given(c: _Candidates, known: _Chosen) -> _Candidates:
     """Candidates with M and g where one more change is part of the model."""
     u = c.unit
-    across = _by_run(u, known.B[u.rows]) - np.asarray(c.X.T @ known.Y).reshape(len(u.epochs), u.B.shape[1], -1)
+    across = _by_run(u, known.B[u.rows]) - np.asarray(c.X @ known.Y).reshape(len(u.epochs), u.B.shape[1], -1)
     K = _from_runs_on(across) * c.scale[:, :, None]
     M = c.M - K @ known.inverse @ K.transpose(0, 2, 1)
     return replace(c, M=0.5 * (M + M.transpose(0, 2, 1)), g=c.g - K @ known.amounts)

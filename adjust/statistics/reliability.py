@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.model.arrays import largest
-from adjust.model.result import Adjustment
+from adjust.model.result import Adjustment, ReadingResiduals
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.point_tests import AdjustedPoints, controlled_directions, point_tests
-from adjust.observations.terrestrial.statistics import influences as influences_of_readings
 from adjust.precision.precision import Precision, precision_of
 from adjust.statistics.condensed import CondensedSystem, condensed_system
 from adjust.statistics.influence import influences
@@ -53,7 +52,7 @@ def reliability(
     system: of this adjustment, where it is known already.
     """
     precision = system.system.precision if system is not None else precision_of(adjustment)
-    points, batches = precision.image_points, [*_others(precision), *_readings(precision)]
+    points, batches = precision.image_points, [*_others(precision), *_readings(precision, adjustment.reading_residuals)]
     n_image = len(points.v)
     sizes = np.full(n_image + sum(len(b.rows) for b in batches), 2, dtype=np.int64)
     freedom = np.empty_like(sizes)
@@ -118,13 +117,13 @@ def _pairs(precision: Precision, n_image: int) -> list[_Batch]:
     return out
 
 
-def _readings(precision: Precision) -> list[_Batch]:
+def _readings(precision: Precision, known: ReadingResiduals | None) -> list[_Batch]:
     """All readings, one component each; those with a joint covariance by a bias of each alone (Baarda 1968)."""
     batch = precision.graph.terrestrial
-    if batch is None:
+    if batch is None or known is None:
         return []
-    e = batch.unweighted(precision.solved.values).copy()
-    M, W = influences_of_readings(batch, precision.tree), 1.0 / batch.sigma
+    e = batch.unweighted(precision.solved.values).copy() if batch.correlated else known.residual / known.sigma
+    M, W = known.influence, 1.0 / known.sigma
     K, g = np.where(batch.used, 1.0 - M, 1.0 / (1.0 + M)), np.where(batch.used, e, e / (1.0 + M))
     for c in batch.correlated:
         chunk = batch.layout.chunks[c]

@@ -16,7 +16,6 @@ import numpy.typing as npt
 from scipy import sparse
 
 from adjust.graph.assembly import AdjustmentGraph
-from adjust.graph.datum import gauge
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.lenses import MAX_LENS
@@ -142,12 +141,9 @@ class LinearSystem:
         entries = rows.data, self._stacked[rows.indices], rows.indptr
         return self.precision.tree.each_among(sparse.csr_array(entries, (rows.shape[0], self.precision.tree.n)), ptr)
 
-    @cached_property
-    def most_correlated(self) -> FloatArray:
-        """Of the components of two unknowns the larger of their bounds (n,) is one of their correlation; or inf."""
-        sigmas = np.zeros(self.precision.stacked.n)
-        sigmas[self._stacked] = self.sigmas
-        return self.precision.stacked.most_correlated(sigmas)[self._stacked]
+    def drawn(self, k: int) -> FloatArray:
+        """Errors (n, k) of k solutions, drawn with the covariance in the survey's datum; always the same."""
+        return self.precision.stacked.drawn(k)[self._stacked]
 
     @cached_property
     def normal(self) -> Normal:
@@ -190,11 +186,7 @@ class LinearSystem:
         of_size: dict[int, list[int]] = {}
         names = [self.columns.names[first] for first in columns[:, 0].tolist()] if columns.size else []
         for i, name in enumerate(names):
-            free = self.columns.free[name]
-            if by_name[name].key in self.precision.hidden:
-                out[i] = self.precision.cov(by_name[name].key)[free[:, None], free]
-            else:
-                of_size.setdefault(by_name[name].dim, []).append(i)
+            of_size.setdefault(by_name[name].dim, []).append(i)
         for dim, rows in of_size.items():
             found = self.precision.covs(np.array([by_name[names[i]].key for i in rows]), dim)
             for i, Q in zip(rows, found, strict=True):
@@ -431,24 +423,16 @@ def _known_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> Rows
 def bundle_rows(bundle: BundleBatch, n: int, key_columns: KeyColumns) -> Rows:
     """Whitened rows of the image points of unknown points, used or not, in the order of the bundle's blocks."""
     bundle.whitened_squares()  # leaves the rows of all points, used or not, with their own weights
-    k = len(bundle.point)
-    local, points = Entries(), Entries()
-    for camera in np.unique(bundle.camera_of):
-        mine, lens = np.flatnonzero(bundle.camera_of == camera), int(bundle.state.lenses.n_free[camera])
-        local.add_many(mine, np.tile(int(bundle.lens_at[camera]) + np.arange(lens), (len(mine), 1)),
-                       bundle.A[mine, :, :lens])  # fmt: skip
-    local.add_many(np.arange(k), bundle.pose_at[:, None] + np.arange(6), bundle.A[:, :, MAX_LENS : MAX_LENS + 6])
-    by_point = bundle.A[:, :, MAX_LENS + 3 : MAX_LENS + 6]
-    tied = np.flatnonzero(bundle.point_at >= 0)
-    local.add_many(tied, bundle.point_at[tied][:, None] + np.arange(3), by_point[tied])
+    k, points = len(bundle.point), Entries()
     of_point = np.full((len(bundle.point_ids), 3), -1, dtype=np.int64)
     for i in bundle.reduced:
         of_point[i] = key_columns[bundle.point_key[i]]
-    points.add_many(np.arange(k), np.where(bundle.point_at[:, None] >= 0, -1, of_point[bundle.point]), by_point)
+    points.add_many(np.arange(k), np.where(bundle.point_at[:, None] >= 0, -1, of_point[bundle.point]),
+                    bundle.A[:, :, MAX_LENS + 3 : MAX_LENS + 6])  # fmt: skip
     columns = np.concatenate([key_columns[key] for key in bundle.order])
     kept = columns >= 0
     select = sparse.csr_matrix((np.ones(int(kept.sum())), (np.flatnonzero(kept), columns[kept])), (len(columns), n))
-    A_keys = local.matrix((2 * k, bundle.n_local)) @ bundle.local_from_keys() @ select + points.matrix((2 * k, n))
+    A_keys = bundle.local_rows() @ (bundle.local_from_keys() @ select) + points.matrix((2 * k, n))
     order = bundle_order(bundle)
     return A_keys.tocsr()[order], bundle.A[:, :, MAX_LENS + 6].ravel()[order]
 
@@ -507,13 +491,12 @@ def _reading_rows(graph: AdjustmentGraph, values: gtsam.Values, n: int, key_colu
 
 
 def _datum(precision: Precision, n: int, key_columns: KeyColumns) -> tuple[sparse.csr_matrix, FloatArray]:
-    datum = precision.solved.datum
-    if datum is None:
+    datum, transformation = precision.solved.datum, precision.transformation
+    if datum is None or transformation is None:
         return sparse.csr_matrix((0, n)), np.zeros((n, 0))
     entries, motions = Entries(), np.zeros((n, datum.defect))
     for key, rows in datum.rows.items():
         entries.add(np.arange(datum.defect), key_columns[key], rows / datum.sigma)
     for key, columns in key_columns.items():
-        moved = gauge(precision.graph, precision.graph.unknowns.by_key[key], precision.solved.values) @ datum.directions
-        motions[columns[columns >= 0]] = moved[columns >= 0]
+        motions[columns[columns >= 0]] = transformation.motions[key][columns >= 0]
     return entries.matrix((datum.defect, n)), motions

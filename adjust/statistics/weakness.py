@@ -1,6 +1,6 @@
 """What is badly determined, by name: correlations, unknowns that replace each other, the weakest deformation."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,13 +14,20 @@ from adjust.statistics.normal import DENSE, FEW, PLAIN, Inverse
 from adjust.statistics.result import Correlation, WeakDirection, WeakPart
 from adjust.statistics.system import LinearSystem, linear_system
 
-_MOST = 200
+_MOST, _KEPT = 200, 4000
+"""Correlations that are named, and that are looked at for these."""
 _SHARE = 0.1
 _WHOLE = 10_000
-"""Unknowns up to which all are compared that may correlate."""
-_WORK = 20_000_000
-"""Correlations that are looked at in surveys of still more, or of hidden ones."""
+"""Unknowns up to which all may share something, where small sets meet in few others."""
+_WORK, _SOLVED = 100_000_000, 5_000_000
+"""Correlations that are looked at in drawn solutions, and those in columns of the covariance matrix."""
+_DRAWS, _SURE = 64, 7.0
+"""Drawn solutions, and by how many sigmas what they tell may be wrong."""
+_COMPARED = 256
+"""Components that are compared with all others in one go."""
 _KRYLOV, _RESTARTS = 40, 50
+_Found = list[tuple[int, int, float]]
+"""Two components and their correlation."""
 
 
 def covariance_columns(system: LinearSystem, columns: IntArray) -> FloatArray:
@@ -34,32 +41,17 @@ def _units(system: LinearSystem, columns: IntArray) -> FloatArray:
     return out
 
 
-def compared_columns(system: LinearSystem, limit: float = 0.95) -> tuple[IntArray, int]:
-    """Columns that are compared with all others, and how many correlations as large as ``limit`` would take.
+def compared_columns(system: LinearSystem) -> IntArray:
+    """Columns that are compared with all others.
 
-    That is all of them in small surveys, and in large ones those that may correlate so. Where these are too many: first
-    what is there once, then points, last what is there at one epoch alone, as many as ``_WORK`` allows.
+    That is all of them where ``_WORK`` allows; else what is there once, then points, last what is there at one epoch.
     """
     n, columns = len(system.columns), system.columns
-    if _as_a_whole(system) or _structure(system, limit) is not None:
-        return np.arange(n), n
-    sizes = [len(at) for at in columns.at.values() if len(at)]
-    first = np.cumsum([0, *sizes])[:-1]
-    possible = np.repeat(np.maximum.reduceat(system.most_correlated, first) >= limit, sizes)
-    whole = n <= _WHOLE and not system.precision.hidden
-    needed, most = int(np.count_nonzero(possible)), n if whole else max(_WORK // n, 1)
-    if needed <= most:
-        return np.flatnonzero(possible), needed
+    if n * n <= _WORK or _structure(system) is not None:
+        return np.arange(n)
     epochs = {b.epoch_id for b in system.precision.graph.survey.image_blocks}
     rank = {name: 2 if len(name) == 3 and name[2] in epochs else 1 if name[0] == "point" else 0 for name in columns.at}
-    ordered = columns.of(sorted(columns.at, key=lambda name: rank[name]))
-    return ordered[possible[ordered]][:most], needed
-
-
-def _as_a_whole(system: LinearSystem) -> bool:
-    """Whether the covariance matrix is at hand."""
-    n = len(system.columns)
-    return n <= PLAIN or (n <= DENSE and system.structured is not None)
+    return columns.of(sorted(columns.at, key=lambda name: rank[name]))[: _WORK // n]
 
 
 def correlations(
@@ -67,40 +59,85 @@ def correlations(
 ) -> tuple[Correlation, ...]:
     """Pairs of components whose correlation is at least ``limit`` in size, largest first, 200 at most.
 
-    Where unknowns are too many and share too much, of the :func:`compared_columns` with all, and of the components of
-    every unknown with each other.
+    Where unknowns are too many, of the :func:`compared_columns` with all, and of the components of every unknown with
+    each other.
     """
     system = system or linear_system(adjustment)
-    n, index = len(system.columns), compared_columns(system, limit)[0]
-    number = np.full(n, -1)
-    number[index] = np.arange(len(index))
-    whole = system.covariance if _as_a_whole(system) else None
-    sigma = np.maximum(system.sigmas if whole is None else np.sqrt(np.maximum(np.diag(whole), 0.0)), 1e-150)
-    structure = _structure(system, limit)
+    n, index, structure = len(system.columns), compared_columns(system), _structure(system, limit)
     if structure is not None:
-        return _named(system, _of_structure(structure, sigma, limit))
-
-    def above(first: int) -> list[tuple[int, int, float]]:
-        part = index[first : first + AT_ONCE]
-        rows = np.arange(n) if n > len(index) else index[: first + len(part)]
-        C = (system.through_tree(_units(system, part)) if whole is None else whole[:, part])[rows]
-        C /= sigma[rows, None]
-        C /= sigma[part]
-        size = np.abs(C)
-        size[number[rows][:, None] >= number[part]] = 0.0  # each pair once, nothing with itself
-        high = size >= limit
-        if (k := int(np.count_nonzero(high))) > _MOST:
-            high = size >= np.partition(size[high], k - _MOST)[k - _MOST]
-        a, b = np.nonzero(high) if k else np.zeros((2, 0), dtype=np.int64)
-        return list(zip(rows[a].tolist(), part[b].tolist(), C[a, b].tolist(), strict=True))
-
-    found = [x for part in side_by_side(above, range(0, len(index), AT_ONCE)) for x in part]
+        return _named(system, _of_structure(structure, np.maximum(system.sigmas, 1e-150), limit))
+    if n <= PLAIN or (n <= DENSE and system.structured is not None):
+        sigma = np.sqrt(np.maximum(np.diag(system.covariance), 1e-300))
+        whole = system.covariance / sigma / sigma[:, None]
+        largest = _largest(lambda first, part: whole[first:, part], n, limit, limit)
+        return _named(system, [(int(b), int(a), x) for a, b, x in largest.tolist()])
+    found = _exact(system, _likely(system, index, limit), limit)
     if len(index) < n:
+        number = np.full(n, -1)
+        number[index] = 0
         found += _within(system, number, limit)
     return _named(system, found)
 
 
-_Found = list[tuple[int, int, float]]
+def _likely(system: LinearSystem, index: IntArray, limit: float) -> IntArray:
+    """Pairs (k, 2) that may correlate so, the likeliest first, by errors of drawn solutions.
+
+    Fisher's z of a correlation from k draws, atanh r, is normal with variance 1 / (k - 2): one of 1e11 is overlooked.
+    """
+    drawn = system.drawn(_DRAWS)
+    drawn /= np.maximum(np.linalg.norm(drawn, axis=1), 1e-150)[:, None]
+    order = np.concatenate([index, np.delete(np.arange(len(drawn)), index)])
+    u, z = drawn[order].astype(np.float32), np.arctanh(limit) - _SURE / np.sqrt(_DRAWS - 2.0)
+    found = _largest(lambda first, part: u[first:] @ u[part].T, len(index), limit, np.tanh(max(z, 1e-9)))
+    return np.asarray(order[found[:, :2].astype(np.int64)])
+
+
+def _largest(block: Callable[[int, slice], FloatArray], n: int, limit: float, least: float) -> FloatArray:
+    """The largest of n columns with each other and with all others, at least of a size: (k, 3), row, column, value.
+
+    block: of the columns ``part`` the rows from ``first`` on, where these begin. limit: what is asked for in the end.
+    """
+
+    def above(first: int) -> FloatArray:
+        part = slice(first, min(first + _COMPARED, n))
+        C = block(first, part)
+        size = np.abs(C)
+        size[: size.shape[1]] = np.tril(size[: size.shape[1]], -1)  # each pair once, nothing with itself
+        high = size >= limit  # where these are enough no others are needed
+        high = high if np.count_nonzero(high) >= _KEPT else size >= least
+        a, b = np.divmod(np.flatnonzero(high), size.shape[1])
+        return _first(np.stack([first + a, first + b, C[a, b]], axis=1))
+
+    return _first(np.concatenate(side_by_side(above, range(0, n, _COMPARED))))
+
+
+def _first(found: FloatArray) -> FloatArray:
+    """Rows (k, 3) by the size of the last number, the largest first; not more than are to be looked at."""
+    size = np.abs(found[:, 2])
+    kept = np.flatnonzero(size >= np.partition(size, -_KEPT)[-_KEPT]) if len(size) > _KEPT else slice(None)
+    return np.asarray(found[kept][np.argsort(-size[kept], kind="stable")])
+
+
+def _exact(system: LinearSystem, likely: IntArray, limit: float) -> _Found:
+    """Of pairs, the likeliest first, those that do correlate so; as many as ``_SOLVED`` numbers of columns tell of."""
+    n = len(system.columns)
+    often = np.bincount(likely.ravel(), minlength=n)
+    row, column = np.where((often[likely[:, 0]] > often[likely[:, 1]])[:, None], likely[:, ::-1], likely).T
+    columns = np.array(list(dict.fromkeys(column.tolist()))[: max(_SOLVED // n, AT_ONCE)], dtype=np.int64)
+    number = np.full(n, -1)
+    number[columns] = np.arange(len(columns))
+    at = number[column]
+
+    def of(first: int) -> _Found:
+        part = columns[first : first + AT_ONCE]
+        mine = np.flatnonzero((at >= first) & (at < first + len(part)))
+        i, j = row[mine], column[mine]
+        C = system.through_tree(_units(system, part))[i, at[mine] - first] / (system.sigmas[i] * system.sigmas[j])
+        high = np.abs(C) >= limit
+        ends = (f(i, j)[high].tolist() for f in (np.minimum, np.maximum))
+        return list(zip(*ends, C[high].tolist(), strict=True))
+
+    return [x for part in side_by_side(of, range(0, len(columns), AT_ONCE)) for x in part]
 
 
 def _named(system: LinearSystem, found: _Found) -> tuple[Correlation, ...]:
@@ -176,7 +213,7 @@ def weak_directions(
     A, used = system.A, system.used[system.row_of]
     squares = A.data**2 * np.repeat(used, np.diff(A.indptr))
     alone = np.sqrt(np.maximum(np.bincount(A.indices, squares, A.shape[1]), 1e-300))
-    values, vectors = _largest(system, np.arange(len(alone)), alone, most)
+    values, vectors = _eigen(system, np.arange(len(alone)), alone, most)
     c, out = system.columns, []
     for inflation, shares, order in inflated(values, vectors, least_inflation, _SHARE):
         amount = inflation * shares / np.linalg.norm(shares) / alone * np.sign(shares[order[0]])
@@ -201,7 +238,7 @@ def inflated(
         yield float(np.sqrt(value)), shares, large[np.argsort(-np.abs(shares[large]), kind="stable")].tolist()
 
 
-def _largest(system: LinearSystem, index: IntArray, scale: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
+def _eigen(system: LinearSystem, index: IntArray, scale: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
     """Largest eigenvalues (k,), the first first, and vectors (n, k) of the covariance of these columns times scales.
 
     In large surveys by Lanczos' method, every step of it one solution of the normal equations (Golub and Van Loan 2013,

@@ -86,7 +86,8 @@ def _outer_levels(levels: Gray32 | Gray8) -> tuple[float, float]:
     k = int(place)
     last = len(levels) - 1
     ends = [k, min(k + 1, last), max(last - k - 1, 0), last - k]
-    a, b, c, d = (float(level) for level in np.partition(levels, ends)[ends])
+    whole = levels.dtype == np.uint8  # a radix sort takes less than a partition of many equal values
+    a, b, c, d = (np.sort(levels, kind="stable") if whole else np.partition(levels, ends))[ends].tolist()
     return a + (place - k) * (b - a), d + (place - k) * (c - d)
 
 

@@ -23,12 +23,9 @@ from adjust.model.survey import (
 )
 from survey.examples.folders import truth_json
 from survey.project import write_project
+from survey.simulate.draft import ARCSEC, FREE_LENS, HELD, IMAGE_SIZE
 from survey.simulate.scene import BROWN, Scene, Truth
 
-_ARCSEC = np.pi / 180.0 / 3600.0
-_SIZE = (1280, 1024)
-_HELD = PoseParameter(Pose3(), "held")
-_FREE_LENS = ("fx", "fy", "u0", "v0", "k1", "k2", "p1", "p2")
 _TRIES = 20_000
 
 
@@ -53,9 +50,9 @@ def head_files(seed: int) -> dict[str, str]:
         truth["lens", k] = _lens(rng, 1600.0)
     corners = np.stack(np.meshgrid(0.02 * np.arange(11), -0.02 * np.arange(8)), axis=-1).reshape(-1, 2)
     board = Target("board", tuple(f"c{i}" for i in range(88)), np.column_stack([corners, np.zeros(88)]),
-                   carrier_from_target=_HELD)  # fmt: skip
+                   carrier_from_target=HELD)  # fmt: skip
     survey = Survey(
-        cameras=tuple(Camera(k, "head", _SIZE, LensParameter("brown", _FREE_LENS)) for k in looks),
+        cameras=tuple(Camera(k, "head", IMAGE_SIZE, LensParameter("brown", FREE_LENS)) for k in looks),
         stations=(Station("head", "table", table_id="turntable", mount_from_station=PoseParameter(mount, "held")),),
         tables=(Table("turntable", geometry=VectorParameter(TABLE_GEOMETRY, np.zeros(4))),),
         targets=(board,),
@@ -91,7 +88,7 @@ def station_files(seed: int) -> dict[str, str]:
         plate = Pose3(turned * looking, turned.rotate(np.array([2.0, 0.1, 0.0])))
         truth["carrier_from_target", f"plate_{name}"] = plate
         lens = LensParameter("brown", (), own)
-        cameras.append(Camera(name, "relay", _SIZE, lens, PoseParameter() if i else _held(truth, name)))
+        cameras.append(Camera(name, "relay", IMAGE_SIZE, lens, PoseParameter() if i else _held(truth, name)))
         ids = tuple(f"p{j}" for j in range(len(points)))
         targets.append(Target(f"plate_{name}", ids, points, carrier_from_target=PoseParameter(
             plate if not i else None, "held" if not i else "free")))  # fmt: skip
@@ -152,8 +149,8 @@ class _Photographer:
             angles = np.radians(draw())
             self._truth[name] = angles
             if self.image(camera_id, epoch_id, "board", 88):
-                read = angles + 8.0 * _ARCSEC * self._rng.standard_normal(2)
-                self._readings.append(TableReading("turntable", epoch_id, read, (8.0 * _ARCSEC) ** 2 * np.eye(2)))
+                read = angles + 8.0 * ARCSEC * self._rng.standard_normal(2)
+                self._readings.append(TableReading("turntable", epoch_id, read, (8.0 * ARCSEC) ** 2 * np.eye(2)))
                 return
         raise ValueError(f"camera {camera_id} does not see the board from the table")
 

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -138,7 +138,6 @@ class AddOutcome:
     before: Previous
     start: str
     seconds: float
-    paths: dict[str, Path] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
         """As plain values."""

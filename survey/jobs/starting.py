@@ -138,13 +138,14 @@ def _shown(image: Any) -> tuple[tuple[int, int] | None, bool]:
     import cv2
 
     from survey.detection.gray import for_finding, gray_values
+    from survey.detection.markers import one_threshold
 
     gray: Any = for_finding(gray_values(image))
     factor = min(1.0, _LONGEST_PX / max(gray.shape))
     gray = cv2.resize(gray, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     for name in _FAMILIES:
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
-        ids = cv2.aruco.ArucoDetector(dictionary).detectMarkers(gray)[1]
+        ids = cv2.aruco.ArucoDetector(dictionary, one_threshold()).detectMarkers(gray)[1]
         if ids is not None and len(ids) >= _MARKERS:
             return None, True
     how = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE

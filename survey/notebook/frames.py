@@ -3,12 +3,12 @@
 Every function gives a new frame; changing one changes no result. Sigmas are scaled as in the report.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from gtsam import Pose3
 
-from adjust.model.result import Estimate, ParameterName
+from adjust.model.result import Adjustment, Estimate, ParameterName
 from survey.folder.extras import library
 from survey.solution.quantities import (
     ARCSEC_PER_RAD,
@@ -21,11 +21,25 @@ from survey.solution.quantities import (
     unit_for_people,
 )
 from survey.solution.residual_tables import image_rows
-
-if TYPE_CHECKING:
-    from survey.notebook.solution import Solution
+from survey.solution.statistics import Statistics
 
 _POSES = ("station_from_camera", "mount_from_station", "world_from_station", "world_from_table", "carrier_from_target")
+
+
+class Solved(Protocol):
+    """What frames are made of: a solution."""
+
+    @property
+    def adjustment(self) -> Adjustment:
+        """The adjusted survey."""
+
+    @property
+    def scale(self) -> Scale:
+        """What covariances are multiplied with."""
+
+    @property
+    def precision(self) -> Statistics:
+        """Tests, reliability, relative precision, budget."""
 
 
 def pandas() -> Any:
@@ -39,7 +53,7 @@ def frame(rows: list[dict[str, Any]], index: list[str], columns: list[str]) -> A
     return made.set_index(index if len(index) > 1 else index[0])
 
 
-def points(s: "Solution") -> Any:
+def points(s: Solved) -> Any:
     """World points: coordinates, sigmas, semi-axes of the 95 % ellipsoid (mm), status."""
     rows = []
     for name, e in s.adjustment.estimates.items():
@@ -61,17 +75,17 @@ def _status(e: Estimate) -> str:
     return found if isinstance(found, str) else " ".join(found.values())
 
 
-def poses(s: "Solution", kinds: tuple[str, ...] = _POSES) -> Any:
+def poses(s: Solved, kinds: tuple[str, ...] = _POSES) -> Any:
     """Adjusted poses a_from_b: translation (mm) along a, rotation as Euler angles (deg) and quaternion, sigmas."""
     return frame(_pose_rows(s, kinds), ["transform", "id", "epoch_id"], _POSE_COLUMNS)
 
 
-def stations(s: "Solution") -> Any:
+def stations(s: Solved) -> Any:
     """Poses of stations in the world or on their mount, by epoch where they move."""
     return poses(s, ("world_from_station", "mount_from_station"))
 
 
-def _pose_rows(s: "Solution", kinds: tuple[str, ...]) -> list[dict[str, Any]]:
+def _pose_rows(s: Solved, kinds: tuple[str, ...]) -> list[dict[str, Any]]:
     return [_pose_row(name, e, s.scale) for name, e in s.adjustment.estimates.items()
             if name[0] in kinds and isinstance(e.value, Pose3)]  # fmt: skip
 
@@ -91,7 +105,7 @@ def _pose_row(name: ParameterName, e: Estimate, scale: Scale) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def cameras(s: "Solution") -> Any:
+def cameras(s: Solved) -> Any:
     """Cameras: station, size, number of images and points used, RMS residual (px), pose in the station."""
     found, rows = s.adjustment.image_residuals, []
     blocks = s.adjustment.survey.image_blocks
@@ -112,17 +126,17 @@ def cameras(s: "Solution") -> Any:
     return frame(rows, ["camera_id"], first + _POSE_COLUMNS)
 
 
-def lenses(s: "Solution") -> Any:
+def lenses(s: Solved) -> Any:
     """Parameters of lenses by (camera, parameter): value and sigma in ``unit``, value over sigma, status."""
     return _vectors(s, "lens")
 
 
-def tables(s: "Solution") -> Any:
+def tables(s: Solved) -> Any:
     """Geometry of turntables by (table, parameter), as :func:`lenses`."""
     return _vectors(s, "table_geometry")
 
 
-def _vectors(s: "Solution", kind: str) -> Any:
+def _vectors(s: Solved, kind: str) -> Any:
     rows = []
     for name, e in s.adjustment.estimates.items():
         if name[0] == kind and not isinstance(e.value, Pose3):
@@ -139,7 +153,7 @@ def _vectors(s: "Solution", kind: str) -> Any:
     return frame(rows, ["id", "component"], ["value", "sigma", "unit", "value_over_sigma", "status"])
 
 
-def unknowns(s: "Solution") -> Any:
+def unknowns(s: Solved) -> Any:
     """Every component of every estimate in the tangent, SI units and radians: what ``covariance.npz`` is about."""
     rows = []
     for name, e in s.adjustment.estimates.items():
@@ -153,7 +167,7 @@ def unknowns(s: "Solution") -> Any:
     return frame(rows, ["kind", "id", "epoch_id", "component"], ["value", "sigma", "unit", "status"])
 
 
-def image_residuals(s: "Solution") -> Any:
+def image_residuals(s: Solved) -> Any:
     """Image points: observed place, residual (predicted minus observed), sigma, redundancy, test; one row each."""
     rows, found = image_rows(s.adjustment), s.adjustment.image_residuals
     blocks = s.adjustment.survey.image_blocks
@@ -166,7 +180,7 @@ def image_residuals(s: "Solution") -> Any:
     return pandas().DataFrame(columns | {"test": found.test, "used": found.used})
 
 
-def readings(s: "Solution") -> Any:
+def readings(s: Solved) -> Any:
     """Every observation that is no image point, a row per component: mm and deg, residual and sigma mm and arcsec."""
     rows = []
     for o in s.adjustment.other_residuals:
@@ -184,7 +198,7 @@ def readings(s: "Solution") -> Any:
     return pandas().DataFrame(rows, columns=columns)
 
 
-def groups(s: "Solution") -> Any:
+def groups(s: Solved) -> Any:
     """Groups of observations: number, redundancy, weighted square sum, variance factor and its root."""
     rows = [{"group": g.group, "n": g.n_observations, "redundancy": g.redundancy, "omega": g.omega,
              "variance_factor": g.factor, "sigma_scale": float(np.sqrt(g.factor)) if g.factor >= 0 else float("nan")}
@@ -192,7 +206,7 @@ def groups(s: "Solution") -> Any:
     return frame(rows, ["group"], ["n", "redundancy", "omega", "variance_factor", "sigma_scale"])
 
 
-def reliability(s: "Solution") -> Any:
+def reliability(s: Solved) -> Any:
     """Every observation: tests, redundancy, least detectable bias in its sigmas (MDB), external reliability."""
     tests, rows = s.precision.reliability.tests, image_rows(s.adjustment)
     blocks, image = s.adjustment.survey.image_blocks, []
@@ -208,7 +222,7 @@ def reliability(s: "Solution") -> Any:
     })  # fmt: skip
 
 
-def relative_precision(s: "Solution") -> Any:
+def relative_precision(s: Solved) -> Any:
     """Relative precision of neighbours: distance, its sigma and semi-axes of the relative ellipsoid, mm."""
     rows = []
     for r in s.precision.relative:
@@ -224,7 +238,7 @@ def relative_precision(s: "Solution") -> Any:
     return frame(rows, ["a", "b"], columns)
 
 
-def budget(s: "Solution") -> Any:
+def budget(s: Solved) -> Any:
     """Uncertainty budget: a row per source of every result, with its share of the variance."""
     rows = []
     for e in s.precision.budget:

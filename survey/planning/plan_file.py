@@ -60,9 +60,8 @@ class ByHand:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """A series of epochs under one name; ``by_hand`` where their poses are still to be drawn."""
+    """A series of epochs; ``by_hand`` where their poses are still to be drawn."""
 
-    prefix: str
     moments: tuple[Moment, ...]
     by_hand: ByHand | None = None
 
@@ -187,7 +186,7 @@ def _moments(node: Node, survey: Survey, number: int) -> Moments:
         for group in each:
             own = f"{prefix}{i + 1:0{width}d}" + (f"-{group[0]}" if len(each) > 1 else "")
             moments.append(Moment(own, group, targets, points, **place))
-    return Moments(prefix, tuple(moments), hand)
+    return Moments(tuple(moments), hand)
 
 
 def _places(node: Node, survey: Survey, kind: str) -> tuple[list[dict[str, Any]], ByHand | None]:

@@ -65,7 +65,7 @@ def _by_hand(survey: Survey, expected: Adjustment) -> Iterator[Moments]:
                           (float(np.min(far)), float(np.max(far))), _TILT, number)  # fmt: skip
             moments = [Moment(f"{target.target_id} at the {cell} of {camera.camera_id}, tilted", cameras,
                               (target.target_id,), False) for cell in _CELLS]  # fmt: skip
-            yield Moments("", tuple(moments), hand)
+            yield Moments(tuple(moments), hand)
 
 
 def _can_be_held(survey: Survey, camera: Camera, target: Target) -> bool:
@@ -84,7 +84,7 @@ def _by_table(survey: Survey) -> Iterator[Moments]:
         ends = [sorted({lo, 0.5 * (lo + hi), hi}) for lo, hi in zip(read.min(axis=0), read.max(axis=0), strict=True)]
         moments = [Moment(f"{table.table_id} {i + 1}", cameras, targets, bool(survey.points), table.table_id,
                           np.array(angles)) for i, angles in enumerate(product(*ends))]  # fmt: skip
-        yield Moments("", tuple(moments))
+        yield Moments(tuple(moments))
 
 
 def _sights(survey: Survey) -> Iterator[Reading]:

@@ -286,7 +286,8 @@ def closures_dict(adjustment: Adjustment) -> dict[str, Any]:
     """
     survey, out = adjustment.survey, {}
     by_id = {p.pair_id: p for p in survey.pairs}
-    found = {o.ids[0]: np.asarray(o.residual) for o in adjustment.other_residuals if o.kind == "pair"}
+    of_pairs = adjustment.other_residuals if survey.closures else ()
+    found = {o.ids[0]: np.asarray(o.residual) for o in of_pairs if o.kind == "pair"}
     for closure in survey.closures:
         pairs = [by_id[i] for i in closure.pair_ids]
         dim = 6 if all(isinstance(p.b_from_a, Pose3) for p in pairs) else 3

@@ -109,11 +109,11 @@ def _is_large_network(adjustment: Adjustment) -> bool:
 def _left_out(adjustment: Adjustment, system: LinearSystem, n_budgets: int) -> tuple[str, ...]:
     """For people: what the statistics show a part of, and which."""
     out, n = [], len(system.columns)
-    compared, needed = compared_columns(system)
-    if len(compared) < needed:
+    compared = len(compared_columns(system))
+    if compared < n:
         out.append(
-            f"correlations: of {needed} components that may correlate with others {len(compared)} were compared with "
-            f"all {n}, points and then those of single epochs last; the rest only within their own unknown"
+            f"correlations: of {n} components {compared} were compared with all others, points and then those of "
+            "single epochs last; the rest only within their own unknown"
         )
     if n_budgets > MOST_BUDGETS:
         out.append(f"uncertainty budgets: of {MOST_BUDGETS} of {n_budgets} parameters, points last")

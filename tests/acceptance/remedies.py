@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from adjust.adjustment import adjust
+from adjust.graph.assembly import values_of
 from adjust.lenses.models import MODELS
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import CROP, FloatArray, ImageCrop, LensDrift, LensSharing, Survey, VectorParameter
@@ -215,15 +216,20 @@ REMEDIES: dict[str, Callable[[], Remedy]] = {
 
 
 def outcome(remedy: Remedy, repeats: int, seed: int = 1) -> Outcome:
-    """Adjusted again and again with fresh noise, with the terms and without."""
+    """Adjusted again and again with fresh noise, with the terms and without: from nothing, then from the first."""
     squares, found, false, k = [], 0, 0, 0
+    start = None
     for i in range(repeats):
         truth = remedy.drawn(remedy.truth, np.random.default_rng(seed + i))
-        d, cov, test = _estimated(adjust(resample(remedy.survey, truth, 1000 * seed + i)), remedy, truth)
+        result = adjust(resample(remedy.survey, truth, 1000 * seed + i), start)
+        start = start or values_of(result, result.survey)
+        d, cov, test = _estimated(result, remedy, truth)
         squares.append(float(d @ np.linalg.solve(cov, d)))
         found, k = found + test.significant, len(d)
+    start = None
     for i in range(repeats):
-        result = adjust(resample(remedy.survey, remedy.innocent, 1000 * seed + i))
+        result = adjust(resample(remedy.survey, remedy.innocent, 1000 * seed + i), start)
+        start = start or values_of(result, result.survey)
         false += _estimated(result, remedy, remedy.innocent)[2].significant
     return Outcome(k, np.array(squares), found, false)
 

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adjust.graph.assembly import AdjustmentGraph
+from adjust.adjustment import adjust
+from adjust.graph.assembly import AdjustmentGraph, values_of
 from adjust.graph.building import GraphBuilder
 from adjust.graph.solver import solve
 from adjust.model.observations import Distance, PositionRef
@@ -14,6 +15,7 @@ from adjust.model.survey import Datum, FloatArray, IntArray, Survey
 from adjust.observations.images import helmert_blocks as blocks
 from adjust.observations.images.helmert_blocks import helmert_blocks
 from adjust.precision.precision import Precision, image_residuals
+from survey.simulate.labs import LabSize, full_lab
 from tests.benchmarks import bundle
 from tests.benchmarks.building import Building, Plan, build
 from tests.benchmarks.dissection import survey_of
@@ -84,6 +86,35 @@ def test_cut_and_whole_give_the_same(monkeypatch: pytest.MonkeyPatch, inner: boo
     for field in ("residuals", "redundancy", "standardized", "test"):
         np.testing.assert_allclose(getattr(b, field), getattr(a, field), rtol=1e-5, atol=1e-6)
     np.testing.assert_array_equal(a.used, b.used)
+
+
+@pytest.mark.slow
+def test_runs_of_epochs_and_one_matrix_give_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of beacons that other instruments measure too, seen from a table: steps, covariances, residuals, redundancy."""
+    survey = full_lab(1, size=LabSize(n_night_epochs=30))[0]
+    start = values_of(adjust(survey))
+    found = []
+    monkeypatch.setattr(blocks, "_GAIN", 100.0)
+    for epochs in (1000, 5):
+        monkeypatch.setattr(blocks, "_EPOCHS", epochs)
+        graph = GraphBuilder(survey, start.lenses).build(start)
+        solved = solve(graph)
+        found.append((graph, solved, Precision(graph, solved)))
+    (whole, before, a), (cut, after, b) = found
+    assert [x.by_rows for x in whole.bundles] == [False]
+    assert len(cut.bundles) > 2
+    assert all(x.by_rows for x in cut.bundles)
+    assert after.iterations <= before.iterations
+    for name, unknown in whole.unknowns.by_name.items():
+        key = cut.unknowns.by_name[name].key
+        assert relative(a.cov(unknown.key), b.cov(key)) < 1e-6
+    sigmas = np.sqrt(np.diag(a.cov(whole.unknowns.by_name["lens", "X"].key)))
+    difference = before.values.atVector(whole.unknowns.by_name["lens", "X"].key)
+    difference = difference - after.values.atVector(cut.unknowns.by_name["lens", "X"].key)
+    assert np.abs(difference / sigmas).max() < 1e-5
+    one, other = image_residuals(a), image_residuals(b)
+    for field in ("residuals", "redundancy", "standardized", "test"):
+        np.testing.assert_allclose(getattr(other, field), getattr(one, field), rtol=1e-5, atol=1e-6)
 
 
 def bars(building: Building) -> tuple[Distance, ...]:

@@ -12,6 +12,7 @@ from survey.detection import detect_image, markers
 from survey.detection.batch import detect_targets
 from survey.detection.corners import CROSSING_FLOOR_PX, MARKER_FLOOR_PX
 from survey.detection.gray import gray_values, reduced, saturation_level
+from survey.project.dictionaries import charuco_board
 from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid
 from survey.simulate.rendering import BrownCamera, Imaging, PlacedTarget, render
 from tests.data import data_folder
@@ -273,6 +274,22 @@ def test_targets_of_one_dictionary_share_the_search_for_its_markers(monkeypatch)
         assert np.array_equal(detection.uv, alone[name].uv)
         assert np.array_equal(detection.cov, alone[name].cov)
         assert detection.reason == alone[name].reason
+
+
+@pytest.mark.parametrize("aside", [0.0, 0.07])
+def test_one_look_finds_of_a_charuco_board_what_all_thresholds_do(monkeypatch, aside):
+    at = placed(CHARUCO, VIEWS[1])
+    view = PlacedTarget(CHARUCO, Pose3(Rot3(), np.array([aside, 0.0, 0.0])) * at.camera_from_target)
+    image, looks, look = render(CAMERA, [view]), [], markers.board_corners
+    monkeypatch.setattr(markers, "board_corners", lambda *given: looks.append(look(*given)) or looks[-1])
+    found = detect_image(image, CHARUCO)
+    assert len(looks) == 1
+    every = look(cv2.aruco.CharucoDetector(charuco_board(CHARUCO)), image)[0]
+    assert set(found.point_idx) == set(every)
+    assert (len(every) == len(CHARUCO.points()[0])) == (aside == 0.0)
+    image[np.ix_(*(range(int(x) - 40, int(x) + 40) for x in found.uv[len(found) // 2, ::-1]))] = 128  # a marker or two
+    assert len(detect_image(image, CHARUCO)) < len(found)
+    assert len(looks) == 3  # it might be there after all
 
 
 @pytest.mark.parametrize("crossing", [True, False])

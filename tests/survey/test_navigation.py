@@ -35,7 +35,7 @@ def unnamed(lab, tmp_path):
         for b in survey.image_blocks
         if b.target_id is None
     ]
-    write_project(tmp_path / "dark", type(survey)(**{**vars(survey), "image_blocks": tuple(blocks)}), spots=spots)
+    write_project(tmp_path / "dark", replace(survey, image_blocks=tuple(blocks)), spots=spots)
     return tmp_path / "dark"
 
 

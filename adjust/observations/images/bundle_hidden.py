@@ -153,22 +153,25 @@ class BundleHidden:
         dX = b.points_following(np.asarray(b.G @ d), -right[nh:].reshape(-1, 3, k))
         return np.concatenate([d[:nh], dX.reshape(-1, k)])
 
-    def given_interface(self, hidden: FloatArray, interface: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What of the reduced points follows from no pose and not from the interface: of columns, and their variances.
-
-        Of columns (n, k) and (n_interface, k) that part (n, k), and (n,); inf of the poses, which share anything.
-        """
-        b, nh, left = self.batch, self.batch.n_hidden, hidden.copy()
-        left[:nh] = 0.0
-        poses, none = np.vstack([hidden[:nh], interface]), np.zeros((len(b.reduced), 3, hidden.shape[1]))
-        left[nh:] -= b.points_following(np.asarray(b.G @ poses), none).reshape(left[nh:].shape)
-        return left, np.concatenate([np.full(nh, np.inf), np.diagonal(b.Vi, axis1=1, axis2=2).ravel()])
-
-    def among(self, A: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Of rows A (m, n) over what is hidden: A Q A' (m, m) were the interface held, and what they are over it."""
-        b, right = self.batch, np.ascontiguousarray(A.T)
-        nh, u = b.n_hidden, self.on_poses(right)
-        own = A[:, nh:] @ (b.Vi @ right[nh:].reshape(-1, 3, len(A))).reshape(-1, len(A))
+    def drawn(self, interface: FloatArray, w: FloatArray) -> FloatArray:
+        """Errors of what is hidden (n, k) with those of the interface (n_interface, k); w (n, k): independent, unit."""
+        b = self.batch
+        nh, k = b.n_hidden, interface.shape[1]
+        d = np.vstack([np.zeros((nh, k)), interface])
         if nh:
-            own += u[:nh].T @ (self._hidden_poses_given_interface()[1] @ u[:nh])
+            own = scipy.linalg.lapack.dtrtrs(b.C, w[:nh], lower=0)[0]
+            d[:nh] = self._hidden_poses_given_interface()[0] @ interface + own / b.scale[:nh, None]
+        own = np.linalg.cholesky(b.Vi) @ w[nh:].reshape(-1, 3, k)
+        dX = b.points_following(np.asarray(b.G @ d), np.zeros_like(own)) + own
+        return np.concatenate([d[:nh], dX.reshape(-1, k)])
+
+    def among(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Of rows over what is hidden, right (n, m): A Q A' (m, m) were the interface held; what they are over it."""
+        b, m = self.batch, right.shape[1]
+        nh, u = b.n_hidden, self.on_poses(right)
+        half = (np.swapaxes(np.linalg.cholesky(b.Vi), 1, 2) @ right[nh:].reshape(-1, 3, m)).reshape(-1, m)
+        own = half.T @ half
+        if nh:
+            half = scipy.linalg.lapack.dtrtrs(b.C, u[:nh] / b.scale[:nh, None], lower=0, trans=1)[0]
+            own += half.T @ half
         return own, self.on_interface(u).T

@@ -1,6 +1,7 @@
 """What a bundle of image points is a factor on, what it hides, and where everything stands in it."""
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -11,6 +12,7 @@ from adjust.frames.unknowns import Chain, Unknowns
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.bundles import BundleArrays
+from adjust.native.lenses import MAX_LENS
 from adjust.native.parallel import workers
 from adjust.observations.images.batch import Chains, square_root_information
 
@@ -178,6 +180,15 @@ class BundleLayout:
                 v.append(J.ravel())
         entries = (np.concatenate(v), (np.concatenate(r), np.concatenate(c)))
         return sparse.csr_matrix(entries, shape=(self.n_local, self.n_keys))
+
+    @cached_property
+    def row_columns(self) -> IntArray:
+        """Local unknowns (K, MAX_LENS + 9) of every image point: lens, pose, point that stays; -1 for none."""
+        lens = np.arange(MAX_LENS)
+        free = lens < self.state.lenses.n_free[self.camera_of][:, None]
+        of_lens = np.where(free, self.lens_at[self.camera_of][:, None] + lens, -1)
+        of_point = np.where(self.point_at[:, None] >= 0, self.point_at[:, None] + np.arange(3), -1)
+        return np.hstack([of_lens, self.pose_at[:, None] + np.arange(6), of_point])
 
     def unsorted(self, rows: _Rows) -> _Rows:
         """Rows in sorted order, back in the order of the blocks."""

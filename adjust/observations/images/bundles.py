@@ -49,9 +49,11 @@ class BundleBatch(BundleLayout):
 
     def __init__(
         self, unknowns: Unknowns, state: State, blocks: Sequence[ImageBlock], chains: Sequence[Chain],
-        points: Sequence[str], outside: set[int],
+        points: Sequence[str], outside: set[int], by_rows: bool = False,
     ) -> None:  # fmt: skip
+        """by_rows: of few image points, all on unknowns that others touch: no normal equations, which would round."""
         super().__init__(unknowns, state, blocks, chains, points, outside)
+        self.by_rows = by_rows and not self.n_hidden and not self.reduced
         self.used: BoolArray = np.concatenate([b.mask for b in self.blocks])[self.sorted]
         self.W = self.W_all * self.used[:, None]
         k, p = len(self.point), len(self.reduced)
@@ -82,8 +84,27 @@ class BundleBatch(BundleLayout):
         self.chains.evaluate(self.state)
         self.evaluate_rows(self.W)
         self.chi_square = float(self.chi.sum())
-        if jacobians:
+        if jacobians and self.by_rows:
+            self.G = self.local_from_keys()
+            J = np.column_stack([(self.local_rows() @ self.G).toarray(), self.A[:, :, MAX_LENS + 6].ravel()])
+            R: FloatArray = np.asarray(np.linalg.qr(J, mode="r") if len(J) > self.n_rows else J)
+            self._serve_rows(R[:, :-1], R[:, -1])
+        elif jacobians:
             self._condense(values, damping)
+
+    def local_rows(self) -> sparse.csr_matrix:
+        """Rows (2K, n_local) by lenses, poses and points that stay, in sorted order, as last evaluated."""
+        columns, n = np.repeat(self.row_columns, 2, axis=0), MAX_LENS + 6
+        values = np.concatenate([self.A[:, :, :n], self.A[:, :, n - 3 : n]], axis=2).reshape(columns.shape)
+        kept, ptr = columns >= 0, np.zeros(len(columns) + 1, dtype=np.int64)
+        np.cumsum(kept.sum(axis=1), out=ptr[1:])
+        return sparse.csr_matrix((values[kept], columns[kept], ptr), (len(columns), self.n_local))
+
+    @property
+    def n_rows(self) -> int:
+        """Of the factor."""
+        n = self.n_keys - self.n_hidden + 1
+        return min(2 * len(self.point), n) if self.by_rows else n
 
     def _condense(self, values: gtsam.Values, damping: float) -> None:
         S, g = np.zeros((self.n_local, self.n_local)), np.zeros(self.n_local)
@@ -235,19 +256,16 @@ class BundleBatch(BundleLayout):
         if rank:  # LAPACK's solver refuses, on stderr, where there is nothing to solve
             R = np.asfortranarray(U[:rank, :rank])
             y[:rank] = scipy.linalg.lapack.dtrtrs(R, z[perm][:rank], lower=0, trans=1)[0]
-        self.r = np.zeros(n + 1)
-        self.r[:n] = y
-        self.r[n] = np.sqrt(max(0.0, rest - float(y @ y)))
         R = np.zeros((n + 1, n))
         R[:n, perm] = U
         R -= (R @ blind) @ blind.T
-        R *= d
-        self.views = []
-        at = 0
-        for key in self.interface:
-            k = self.unknowns.by_key[key].dim
-            self.views.append(np.ascontiguousarray(R[:, at : at + k]))
-            at += k
+        self._serve_rows(R * d, np.append(y, np.sqrt(max(0.0, rest - float(y @ y)))))
+
+    def _serve_rows(self, R: FloatArray, r: FloatArray) -> None:
+        """Rows (n_rows, n_interface) and residuals (n_rows,) of the factor."""
+        ends = np.cumsum([self.unknowns.by_key[key].dim for key in self.interface])
+        self.views = [np.ascontiguousarray(part) for part in np.split(R, ends[:-1], axis=1)]
+        self.r = r
 
     def residual(self, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
         """What GTSAM's custom factor returns."""
@@ -255,7 +273,7 @@ class BundleBatch(BundleLayout):
             self.state.load(values)
             self.prepare(values, jacobians is not None)
         if jacobians is None:
-            out = np.zeros(self.n_keys - self.n_hidden + 1)
+            out = np.zeros(self.n_rows)
             out[-1] = np.sqrt(self.chi_square)
             return out
         for i, view in enumerate(self.views):
@@ -277,8 +295,7 @@ class BundleBatch(BundleLayout):
 
     def add_factor(self, graph: gtsam.NonlinearFactorGraph) -> None:
         """The one factor of this batch, for :func:`adjust.graph.solver.solve`, which moves what it hides."""
-        n = self.n_keys - self.n_hidden + 1
-        graph.add(evaluated(gtsam.noiseModel.Unit.Create(n), self.interface, self.residual))
+        graph.add(evaluated(gtsam.noiseModel.Unit.Create(self.n_rows), self.interface, self.residual))
 
     def complete(self, delta: gtsam.VectorValues) -> None:
         """Insert the steps of the hidden poses and points, which follow from those of the interface."""

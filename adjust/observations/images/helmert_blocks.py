@@ -9,11 +9,14 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import sparse
 
+from adjust.model.observations import ImageBlock
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 
 SMALLEST = 150
 """Poses below which a block is not cut."""
 _STEPS = 200
+_EPOCHS = 24
+"""Epochs in one run, where nothing is hidden."""
 _GAIN = 0.5
 """Share of the work of reducing a block that may be left when it is cut."""
 
@@ -40,6 +43,24 @@ def helmert_blocks(owner: IntArray, seen: Sequence[IntArray], hidden: FloatArray
             count += 1
             open_ += [poses[at], poses[~at]]
     return block_of[owner]
+
+
+def runs_of_epochs(blocks: Sequence[ImageBlock]) -> IntArray:
+    """Run (B,) of image blocks that hide nothing: few epochs each where their own rows are less work than one matrix.
+
+    What an epoch has of its own is then eliminated with those of its run, and not with all.
+    """
+    number: dict[str, int] = {}
+    epoch = np.array([number.setdefault(b.epoch_id, len(number)) for b in blocks], dtype=np.int64)
+    run, points = epoch // _EPOCHS, [np.unique(b.point_idx) for b in blocks]
+
+    def columns(mine: IntArray) -> float:
+        seen = np.unique(np.concatenate([points[k] for k in mine]))
+        return 6.0 * len(np.unique(epoch[mine])) + 3.0 * len(seen)
+
+    of_run = [np.flatnonzero(run == i) for i in range(int(run.max(initial=-1)) + 1)]
+    work = sum(4.0 * sum(len(points[k]) for k in mine) * columns(mine) ** 2 for mine in of_run)
+    return run if len(of_run) > 1 and work < _GAIN * _work(columns(np.arange(len(blocks))), 0.0) else np.zeros_like(run)
 
 
 def _cut(incidence: sparse.csr_array, hidden: FloatArray) -> BoolArray | None:

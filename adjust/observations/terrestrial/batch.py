@@ -259,10 +259,12 @@ class TerrestrialBatch:
         poses: keys of stations that are turned instead, by setup whose orientation is held for their sake.
         """
         self.evaluate(values)
-        a = self.layout.arrays
-        for i, (setup_id, vector) in enumerate(self.parameters.orientations.items()):
-            rows = np.flatnonzero((a.orientation == i) & (a.kind == k.DIRECTION))
-            turn = self.residual[rows]
+        a, orientations = self.layout.arrays, self.parameters.orientations
+        rows = np.flatnonzero(a.kind == k.DIRECTION)
+        rows = rows[np.argsort(a.orientation[rows], kind="stable")]
+        first = np.searchsorted(a.orientation[rows], np.arange(1, len(orientations)))
+        turns = np.split(self.residual[rows], first) if orientations else []
+        for i, (turn, (setup_id, vector)) in enumerate(zip(turns, orientations.items(), strict=True)):
             if setup_id not in known and vector.key is not None:
                 values.update(vector.key, self.orientation[i : i + 1] + circular_median(turn[np.isfinite(turn)]))
             elif setup_id not in known and setup_id in poses:

@@ -61,7 +61,7 @@ def reading_residuals(batch: TerrestrialBatch, tree: KeyCovariances, values: gts
     observed = batch.layout.arrays.observed
     return ReadingResiduals(
         observed, observed + batch.residual, batch.residual.copy(), sigma, redundancy, standardized, test,
-        e**2, used,
+        e**2, used, influence,
     )  # fmt: skip
 
 

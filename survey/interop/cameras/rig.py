@@ -1,6 +1,6 @@
 """What most calibration files of other programs hold: cameras fixed to each other, or one that moves, with lenses."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,6 @@ from adjust.model.observations import ImageBlock
 from adjust.model.survey import Camera, FloatArray, LensParameter, Point, PoseParameter, Station, Survey, VectorPrior
 from adjust.spatial.rigid import nearest_rotation
 from survey.interop.networks.foreign import ForeignNetwork, Where, safe_ids
-from survey.project.targets import TargetKind
 
 _ROTATION_TOLERANCE = 1e-3
 """What a written rotation matrix may miss orthonormality by: files round to four digits and fewer."""
@@ -40,7 +39,6 @@ class Rig:
     rig_id: str
     cameras: tuple[RigCamera, ...]
     notes: tuple[str, ...] = ()
-    kinds: dict[str, TargetKind] = field(default_factory=dict)
 
 
 def lens_of(model: str, **values: float) -> LensParameter:
