@@ -19,7 +19,7 @@ _MOST, _KEPT = 200, 4000
 _SHARE = 0.1
 _WHOLE = 10_000
 """Unknowns up to which all may share something, where small sets meet in few others."""
-_WORK, _SOLVED = 100_000_000, 5_000_000
+_WORK, _SOLVED = 1_000_000_000, 5_000_000
 """Correlations that are looked at in drawn solutions, and those in columns of the covariance matrix."""
 _DRAWS, _SURE = 64, 7.0
 """Drawn solutions, and by how many sigmas what they tell may be wrong."""
@@ -69,7 +69,7 @@ def correlations(
     if n <= PLAIN or (n <= DENSE and system.structured is not None):
         sigma = np.sqrt(np.maximum(np.diag(system.covariance), 1e-300))
         C = system.covariance / sigma / sigma[:, None]
-        pairs = _largest(lambda first, part: C[first:, part], n, limit)
+        pairs = _largest(lambda rows, part: C[rows, part], n, n, limit)
         return _named(system, _above(pairs, C[pairs[:, 0], pairs[:, 1]], limit))
     pairs = _likely(system, index, limit)
     columns = np.array(list(dict.fromkeys(pairs[:, 1].tolist()))[: max(_SOLVED // n, AT_ONCE)], dtype=np.int64)
@@ -97,30 +97,36 @@ def _likely(system: LinearSystem, index: IntArray, limit: float) -> IntArray:
     drawn /= np.maximum(np.linalg.norm(drawn, axis=1), 1e-150)[:, None]
     order = np.concatenate([index, np.delete(np.arange(len(drawn)), index)])
     u, z = drawn[order].astype(np.float32), np.arctanh(limit) - _SURE / np.sqrt(_DRAWS - 2.0)
-    pairs = order[_largest(lambda first, part: u[first:] @ u[part].T, len(index), np.tanh(max(z, 1e-9)))]
+    pairs = order[_largest(lambda rows, part: u[rows] @ u[part].T, len(u), len(index), np.tanh(max(z, 1e-9)))]
     often = np.bincount(pairs.ravel(), minlength=len(u))[pairs]
     return np.where(often[:, :1] > often[:, 1:], pairs[:, ::-1], pairs)
 
 
-def _largest(block: Callable[[int, slice], FloatArray], n: int, least: float) -> IntArray:
+def _largest(block: Callable[[slice, slice], FloatArray], total: int, n: int, least: float) -> IntArray:
     """Pairs (k, 2) of n columns with each other and with all others, those at least of a size, the largest first.
 
-    block: of the columns ``part`` the rows from ``first`` on, where these begin.
+    block: of some rows and columns. total: rows. Small blocks: what is not so large is never written to memory.
     """
 
     def above(first: int) -> FloatArray:
-        size = np.abs(block(first, slice(first, min(first + _COMPARED, n))))
-        k = size.shape[1]
-        size[:k] = np.tril(size[:k], -1)  # each pair once, nothing with itself
-        at = np.flatnonzero(size >= least)
-        values = size.ravel()[at]
-        if len(at) > _KEPT:
-            at = at[high := values >= np.partition(values, -_KEPT)[-_KEPT]]
-            values = values[high]
-        return np.stack([*(first + x for x in np.divmod(at, k)), values], axis=1)
+        part, found = slice(first, min(first + _COMPARED, n)), [np.zeros((0, 3))]
+        for row in range(first, total, 4 * _COMPARED):
+            size = np.abs(block(slice(row, row + 4 * _COMPARED), part))
+            if row == first:
+                size[: size.shape[1]] = np.tril(size[: size.shape[1]], -1)  # each pair once, nothing with itself
+            if size.max() >= least:
+                i, j = np.nonzero(size >= least)
+                found.append(np.stack([row + i, first + j, size[i, j]], axis=1))
+        return _first(np.concatenate(found))
 
-    found = np.concatenate(side_by_side(above, range(0, n, _COMPARED)))
-    return found[np.argsort(-found[:, 2], kind="stable")[:_KEPT], :2].astype(np.int64)
+    return _first(np.concatenate(side_by_side(above, range(0, n, _COMPARED))))[:, :2].astype(np.int64)
+
+
+def _first(found: FloatArray) -> FloatArray:
+    """Rows (k, 3) by their last number, the largest first; as many as are looked at."""
+    if len(found) > _KEPT:
+        found = found[found[:, 2] >= np.partition(found[:, 2], -_KEPT)[-_KEPT]]
+    return found[np.argsort(-found[:, 2], kind="stable")[:_KEPT]]
 
 
 def _named(system: LinearSystem, found: _Found) -> tuple[Correlation, ...]:
