@@ -176,12 +176,10 @@ inline double interpolated(Vector x, Vector y, double at) {
     return y[k - 1] + (y[k] - y[k - 1]) * (at - x[k - 1]) / (x[k] - x[k - 1]);
 }
 
-enum CornerStatus : int64_t { GOOD, AT_BORDER, TOO_FEW, NO_CONVERGENCE, AWAY };
-
 struct FittedCorner {
     double p[CORNER], cov[4] = {}, rms = 0.0;  // u, v of p absolute where the fit is good
     int64_t n = -1, n_free = 0;
-    CornerStatus status = AT_BORDER;
+    bool good = false;
 };
 // One corner: start u, v px, angles of the two edges, the second clockwise (in the image) of the first, blur px, shape of
 // the window. tolerance: px, where the fit may stop; enough: pixels from which the slopes of the illumination are free.
@@ -194,22 +192,18 @@ inline FittedCorner fit_corner(In<float, 2> image, const double *start, const do
     const double first[CORNER] = {start[0] - double(u0), start[1] - double(v0), angles[0], angles[1], 0, 0, std::log(blur), 0, 0};
     std::memcpy(o.p, first, sizeof first);
     o.n = corner_window(image, u0, v0, o.p, shape, crossing, window), o.n_free = o.n >= enough ? 9 : 7;
-    if (o.n < 20) {
-        o.status = o.n < 0 ? AT_BORDER : TOO_FEW;
-        return o;
-    }
+    if (o.n < 20) return o;
     const Pixels w{window.x, window.y, window.value, int(o.n)};
     Normals<CORNER> at;
     const auto evaluate = [&](const double *q, Normals<CORNER> &out) { add_pixels(w, Wedge(q, crossing), out); };
     const auto clamp = [](double *p) { p[6] = smaller(larger(p[6], std::log(0.2)), std::log(12.0)); };
     start_levels(o.p, int(o.n), evaluate, at);
-    o.status = NO_CONVERGENCE;
     if (!levenberg_marquardt(o.p, int(o.n_free), tolerance, evaluate, clamp, at)) return o;
     const double variance = at.cost / double(o.n - o.n_free);
     o.rms = root(variance);
     if (!place_covariance(at, int(o.n_free), variance, o.cov)) return o;
     o.p[0] += double(u0), o.p[1] += double(v0);
-    o.status = magnitude(o.p[0] - start[0]) + magnitude(o.p[1] - start[1]) > max_shift ? AWAY : GOOD;
+    o.good = magnitude(o.p[0] - start[0]) + magnitude(o.p[1] - start[1]) <= max_shift;
     return o;
 }
 
@@ -266,9 +260,9 @@ inline void refine_corners(In<float, 2> image, In<double, 2> start, In<double, 3
         close[0] = smaller(shape[0], NEAR_PX);
         const bool strips = shape[1] > 0.0;
         FittedCorner first = fit_corner(image, centre, turned, spread, strips ? shape : close, crossing, 3.0, ROUGH_PX, enough);
-        if (!strips && (first.status != GOOD || first.p[6] > std::log(NEAR_PX / 3.5)))
+        if (!strips && (!first.good || first.p[6] > std::log(NEAR_PX / 3.5)))
             first = fit_corner(image, centre, turned, spread, shape, crossing, 3.0, ROUGH_PX, enough);
-        if (first.status == GOOD) centre = first.p, turned[0] = first.p[2], turned[1] = first.p[3], spread = std::exp(first.p[6]);
+        if (first.good) centre = first.p, turned[0] = first.p[2], turned[1] = first.p[3], spread = std::exp(first.p[6]);
         window_shape(edge, free[i], crossing, spread, shape);
         FittedCorner o = fit_corner(image, centre, turned, spread, shape, crossing, 0.5, FINE_PX, enough);
         const double whole = std::exp(o.p[6]), length[2] = {larger(shape[0], shape[2]), larger(shape[0], shape[3])};
@@ -278,7 +272,7 @@ inline void refine_corners(In<float, 2> image, In<double, 2> start, In<double, 3
         for (double &x : o.cov) x *= student;
         add_sampling(interpolated(blurs, displaced, blur.data[i]), o.p + 2, length, crossing, o.cov);
         o.cov[0] += floor * floor, o.cov[3] += floor * floor;
-        good.data[i] = o.status == GOOD && first.status == GOOD && o.rms < 0.2 * contrast.data[i] && o.cov[0] + o.cov[3] < 1.0
+        good.data[i] = o.good && first.good && o.rms < 0.2 * contrast.data[i] && o.cov[0] + o.cov[3] < 1.0
                        && whole < larger(0.5 * larger(shape[0], larger(shape[2], shape[3])), 1.0);
         std::memcpy(&cov(i, 0, 0), o.cov, sizeof o.cov);
         for (int a = 0; a < 2; ++a) {

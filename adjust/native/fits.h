@@ -100,14 +100,12 @@ inline bool levenberg_marquardt(double (&p)[N], int n_free, double tolerance, co
         double gain = 0.0;  // of the squares, as the equations foretell it
         for (int i = 0; i < n_free; ++i) trial[i] += step[i][0], gain += step[i][0] * at.g[i];
         clamp(trial);
-        const double moved = magnitude(trial[0] - p[0]) + magnitude(trial[1] - p[1]);
-        const double left = gain < before ? gain / before : 1.0;  // the next step is to this one as this to the one before
+        const double moved = magnitude(trial[0] - p[0]) + magnitude(trial[1] - p[1]), left = gain < before ? gain / before : 1.0;
         const bool last = moved * root(left) < tolerance && gain * left <= 0.05 * tolerance * at.cost + 1e-12;
         if (!last) evaluate(trial, there);
         if (last || there.cost <= at.cost) {
             std::memcpy(p, trial, sizeof p);
-            if (last) at.cost = larger(at.cost - gain, 0.0);
-            if (last) return true;
+            if (last) return at.cost = larger(at.cost - gain, 0.0), true;
             at = there;
             damping *= 0.2, before = gain;
         } else {

@@ -70,7 +70,9 @@ def saturation_level(image: AnyImage) -> float:
 def for_finding(gray: Gray32 | Gray8) -> Gray8:
     """8 bit for OpenCV's finders; deeper images and dim ones are stretched between their 0.1 and 99.9 percentiles."""
     step = max(7, int(np.sqrt(gray.size / _SAMPLE)))
-    low, high = _outer_levels(gray[::step, ::step].ravel())
+    some = gray[::step, ::step].ravel()
+    levels = np.asarray(np.sort(some, kind="stable") if some.dtype == np.uint8 else np.sort(some), np.float64)  # radix
+    low, high = np.interp(np.array([0.001, 0.999]) * (len(levels) - 1), np.arange(len(levels)), levels).tolist()
     if low >= 0.0 and high - low >= 60.0 and high <= 255.0:
         if gray.dtype == np.uint8:
             return np.asarray(gray, np.uint8)
@@ -78,17 +80,6 @@ def for_finding(gray: Gray32 | Gray8) -> Gray8:
     scale = 255.0 / max(high - low, 1.0)
     # one pass over the image that scales, shifts, rounds and clips
     return np.asarray(cv2.addWeighted(gray, scale, gray, 0.0, -low * scale, dtype=cv2.CV_8U), np.uint8)
-
-
-def _outer_levels(levels: Gray32 | Gray8) -> tuple[float, float]:
-    """The 0.1 and 99.9 percentiles, linear between neighbours."""
-    place = 0.001 * (len(levels) - 1)
-    k = int(place)
-    last = len(levels) - 1
-    ends = [k, min(k + 1, last), max(last - k - 1, 0), last - k]
-    whole = levels.dtype == np.uint8  # a radix sort takes less than a partition of many equal values
-    a, b, c, d = (np.sort(levels, kind="stable") if whole else np.partition(levels, ends))[ends].tolist()
-    return a + (place - k) * (b - a), d + (place - k) * (c - d)
 
 
 def halved(gray8: Gray8, longest_px: int) -> tuple[Gray8, FloatArray]:

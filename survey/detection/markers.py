@@ -45,9 +45,8 @@ class SeenMarkers:
 
     def _in(self, dictionary: str, full: bool) -> tuple[IntArray, FloatArray]:
         if (dictionary, full) not in self._found:
-            self._found[dictionary, full] = _markers_in(
-                self._full if full else self._reduced[0], dictionary, self._first
-            )
+            image = self._full if full else self._reduced[0]
+            self._found[dictionary, full] = _markers_in(image, dictionary, self._first)
         return self._found[dictionary, full]
 
 
@@ -64,7 +63,8 @@ def find_markers(gray: Gray32, seen: SeenMarkers, target: MarkerGrid | MarkerBlo
         return nothing_found(f"none of the {len(wanted)} markers ({target.dictionary}) was found", notes)
     markers, quads = markers[keep], quads[keep]
     cells = int(marker_dictionary(target.dictionary).markerSize) + 2
-    fit = _fit_quads(gray, quads, cells, _gap_cells(target, cells))
+    gap = cells * target.gap_m / target.marker_m if isinstance(target, MarkerGrid) else 1.0  # what a finder needs
+    fit = _fit_quads(gray, quads, cells, gap)
     point_idx = np.array([wanted[m] + corner for m in markers.tolist() for corner in range(4)], np.int64)
     # the faces of a block do not share a plane
     fit = unbent(fit, target.points()[1][point_idx, :2], fit.good & isinstance(target, MarkerGrid))
@@ -72,29 +72,24 @@ def find_markers(gray: Gray32, seen: SeenMarkers, target: MarkerGrid | MarkerBlo
 
 
 def find_charuco(gray: Gray32, gray8: Gray8, target: Charuco) -> Detection:
-    """The board's inner corners that are seen, part of the board being enough.
-
-    One threshold shows most boards; all of them, and then the full image, are for those of which markers lack.
-    """
-    board, n_points, every = charuco_board(target), len(target.points()[0]), cv2.aruco.DetectorParameters()
-    coarse, factor = reduced(gray8, _COARSE_PX)
+    """The board's inner corners that are seen, part of it being enough; a longer look only where markers lack."""
+    board, squares = charuco_board(target), target.points()[1][:, :2] / target.square_m
+    every, (coarse, factor) = cv2.aruco.DetectorParameters(), reduced(gray8, _COARSE_PX)
     looks = [(coarse, factor, one_threshold()), (coarse, factor, every), (gray8, np.ones(2), every)]
     for image, scale, parameters in looks[: 2 + (coarse is not gray8)]:
         detector = cv2.aruco.CharucoDetector(board, cv2.aruco.CharucoParameters(), parameters)
         point_idx, start, seen = board_corners(detector, image)
         start = (start + 0.5) * scale - 0.5
-        H = _homography(target, point_idx, start)
-        if len(point_idx) == n_points or (H is not None and _in_view(board, H, gray8).issubset(seen)):
+        H = _homography(squares[point_idx], start)
+        if len(point_idx) == len(squares) or (H is not None and _in_view(board, H, gray8).issubset(seen)):
             break
     if (n := len(point_idx)) < 4:
         return nothing_found(f"{n} corners by {len(seen)} markers ({target.dictionary}) found; at least 4 are needed")
     if H is None:
         return nothing_found(f"the {n} corners found lie on one line")
-    edges = _board_edges(target, point_idx, H)
-    margin = (target.square_m - target.marker_m) / (2.0 * target.square_m)
+    edges, margin = _board_edges(squares[point_idx], H), 0.5 * (1.0 - target.marker_m / target.square_m)
     fit = refine_corners(gray, start, edges, margin * _across(edges))
-    fit = unbent(fit, target.points()[1][point_idx, :2], fit.good)
-    return _detection(point_idx, fit, (), "corners")
+    return _detection(point_idx, unbent(fit, squares[point_idx], fit.good), (), "corners")
 
 
 def one_threshold() -> cv2.aruco.DetectorParameters:
@@ -118,13 +113,6 @@ def _first_indices(target: MarkerGrid | MarkerBlock) -> dict[int, int]:
     if isinstance(target, MarkerGrid):
         return {target.first_id + k: 4 * k for k in range(target.rows * target.columns)}
     return {marker: 4 * k for k, marker in enumerate(sorted(target.corners))}
-
-
-def _gap_cells(target: MarkerGrid | MarkerBlock, cells: int) -> float:
-    """Width of the bright margin around a marker, in cells; one cell is what a finder needs."""
-    if isinstance(target, MarkerGrid):
-        return min(1.0, cells * target.gap_m / target.marker_m)
-    return 1.0
 
 
 def _markers_in(gray8: Gray8, dictionary: str, first: int | None) -> tuple[IntArray, FloatArray]:
@@ -156,9 +144,8 @@ def _across(edges: FloatArray) -> FloatArray:
     return np.asarray(area / np.maximum(np.linalg.norm(edges, axis=-1).max(-1), 1e-9))
 
 
-def _homography(target: Charuco, point_idx: IntArray, start: FloatArray) -> FloatArray | None:
-    """From squares of the board, corner 0 at the origin, to px; None for corners on one line."""
-    xy = target.points()[1][point_idx, :2] / target.square_m
+def _homography(xy: FloatArray, start: FloatArray) -> FloatArray | None:
+    """From corners (n, 2) in squares of the board to px (n, 2); None where they lie on one line."""
     if len(np.unique(xy[:, 0])) < 2 or len(np.unique(xy[:, 1])) < 2 or len(xy) < 4:
         return None
     H, _ = cv2.findHomography(xy, start, cv2.RANSAC, 5.0)
@@ -168,15 +155,13 @@ def _homography(target: Charuco, point_idx: IntArray, start: FloatArray) -> Floa
 def _in_view(board: cv2.aruco.CharucoBoard, H: FloatArray, gray8: Gray8) -> set[int]:
     """The board's markers that lie in the image, by the homography of its squares."""
     quads = np.array(board.getObjPoints())[:, :, :2] / board.getSquareLength() - 1.0
-    places, size = cv2.perspectiveTransform(quads, H), np.array(gray8.shape[::-1])
-    border = _BORDER * size.max()
-    inside = ((places > border) & (places < size - border)).all((1, 2))
+    places, border = cv2.perspectiveTransform(quads, H), _BORDER * max(gray8.shape)
+    inside = ((places > border) & (places < np.array(gray8.shape[::-1]) - border)).all((1, 2))
     return {int(m) for m in np.ravel(board.getIds())[inside]}
 
 
-def _board_edges(target: Charuco, point_idx: IntArray, H: FloatArray) -> FloatArray:
+def _board_edges(xy: FloatArray, H: FloatArray) -> FloatArray:
     """Vectors (n, 2, 2) px along the board's rows and columns at its corners, one square long, from a homography."""
-    xy = target.points()[1][point_idx, :2] / target.square_m
     q = np.column_stack([xy, np.ones(len(xy))]) @ H.T
     jacobian = (H[None, :2, :2] - (q[:, :2] / q[:, 2:])[:, :, None] * H[None, 2:, :2]) / q[:, 2, None, None]
     return np.asarray(jacobian.transpose(0, 2, 1))

@@ -53,8 +53,9 @@ ROWS: dict[str, tuple[str, Callable[[], Any]]] = {
     "26 photographs, OpenCV": (finding.CLASSIC, _photographs),
     **{f"{'ChArUco' if charuco else 'board'}, {w} x {h}": (finding.OURS, partial(finding.rendered, w, h, charuco))
        for w, h in finding.SIZES for charuco in (False, True)},
-    **{f"board, {w} x {h}, OpenCV": (finding.CLASSIC, partial(finding.rendered, w, h, False))
-       for w, h in finding.SIZES},
+    **{f"{'ChArUco' if charuco else 'board'}, {w} x {h}, OpenCV":
+       (finding.ARUCO if charuco else finding.CLASSIC, partial(finding.rendered, w, h, charuco))
+       for w, h in finding.SIZES for charuco in (False, True)},
 }  # fmt: skip
 
 
