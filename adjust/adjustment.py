@@ -20,7 +20,7 @@ from adjust.model.errors import NotConvergedError, listed
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, Survey
 from adjust.native.parallel import Beside
-from adjust.observations.terrestrial.statistics import JoinedResiduals, reading_residuals
+from adjust.observations.terrestrial.statistics import joined_residuals, reading_residuals
 from adjust.precision.precision import Precision, global_test, group_summaries, image_residuals, other_residuals
 from adjust.start import Start, find_start
 from adjust.start.choice import Begun, adjusted_from_own_start
@@ -215,7 +215,7 @@ def assemble(
     readings = None
     if graph.terrestrial is not None:
         readings = reading_residuals(graph.terrestrial, precision.tree, solved.values)
-    every = others if readings is None else JoinedResiduals(others, graph.survey, readings)
+    every = others if readings is None else joined_residuals(others, graph.survey, readings)
     with Beside() as made:
         summed = made.of(lambda: group_summaries(precision, images, others, readings))
         unknowns, groups = estimates(precision), summed()

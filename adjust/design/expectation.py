@@ -1,6 +1,7 @@
 """The precision of a survey before it is measured: its adjustment without the observations' values."""
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from adjust.graph.assembly import StartValues
 from adjust.graph.building import GraphBuilder
 from adjust.graph.rank import readable
 from adjust.graph.solver import settled
+from adjust.model.names import grouped
 from adjust.model.result import CAUTIOUS_SIGMAS, Adjustment, ParameterName
 from adjust.model.survey import FloatArray, Survey
 from adjust.precision.precision import precision_of
@@ -91,14 +93,12 @@ def weak_directions(adjustment: Adjustment, n: int = 5, least: float = 10.0) -> 
 
 def group_redundancy(adjustment: Adjustment) -> dict[str, tuple[int, float, FloatArray]]:
     """By group: number of observations, redundancy, and its smallest, median and largest redundancy number."""
-    numbers: dict[str, list[FloatArray]] = {}
-    images = adjustment.image_residuals
-    for i, block in enumerate(adjustment.survey.image_blocks):
-        rows = slice(images.block_ptr[i], images.block_ptr[i + 1])
-        numbers.setdefault(block.group, []).append(images.redundancy[rows][images.used[rows]].ravel())
-    for item in adjustment.other_residuals:
-        if item.used:
-            numbers.setdefault(item.group, []).append(item.redundancy)
+    images, blocks = adjustment.image_residuals, adjustment.survey.image_blocks
+    rows = [slice(a, b) for a, b in pairwise(images.block_ptr.tolist())]
+    numbers = grouped([
+        *((b.group, images.redundancy[r][images.used[r]].ravel()) for b, r in zip(blocks, rows, strict=True)),
+        *((o.group, o.redundancy) for o in adjustment.other_residuals if o.used),
+    ])  # fmt: skip
     out = {}
     for group, parts in numbers.items():
         r = np.concatenate(parts)

@@ -16,7 +16,6 @@ import numpy as np
 from adjust.design.expectation import shared_names
 from adjust.design.noise import displaced, disturbed
 from adjust.design.prediction import Predictor
-from adjust.frames.unknowns import Unknown
 from adjust.graph.assembly import StartValues
 from adjust.graph.building import GraphBuilder
 from adjust.graph.solver import settled
@@ -129,19 +128,10 @@ class _Task:
             except SurveyError as error:
                 out.append(str(error))
                 continue
-            by_name = graph.unknowns.by_name
-            errors = [_error(by_name[name], truth, found.values) for name in self.names]
+            by_name, away = graph.unknowns.by_name, truth.localCoordinates(found.values)  # where the covariances are
+            errors = [np.asarray(away.at(by_name[name].key)) for name in self.names]
             out.append((np.concatenate(errors), found.omega))
         return out
-
-
-def _error(unknown: Unknown, truth: gtsam.Values, found: gtsam.Values) -> FloatArray:
-    """The error (dim,) of an unknown in its tangent at the truth, where the predicted covariance is."""
-    if unknown.kind == "pose":
-        return np.asarray(truth.atPose3(unknown.key).localCoordinates(found.atPose3(unknown.key)))
-    if unknown.kind == "point":
-        return np.asarray(found.atPoint3(unknown.key)) - np.asarray(truth.atPoint3(unknown.key))
-    return np.asarray(found.atVector(unknown.key)) - np.asarray(truth.atVector(unknown.key))
 
 
 _task: Sequence[_Task] = ()

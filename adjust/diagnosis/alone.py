@@ -12,7 +12,7 @@ from adjust.frames.lens_times import whole_images
 from adjust.graph.assembly import StartValues
 from adjust.model.boards import deformed
 from adjust.model.errors import SurveyError
-from adjust.model.result import ParameterName
+from adjust.model.names import grouped
 from adjust.model.survey import Camera, FloatArray, Survey
 from adjust.spatial.averaging import mean_pose
 from adjust.spatial.rigid import inverse
@@ -79,11 +79,8 @@ def completed(survey: Survey, start: StartValues) -> StartValues:
     new = {c.camera_id: own_lens(survey, c) for c in survey.cameras if c.camera_id not in start.lenses}
     start = replace(start, lenses={**start.lenses, **new})
     prediction = Prediction(survey, started_values(start))
-    missing: dict[ParameterName, list[int]] = {}
-    for i, block in enumerate(survey.image_blocks):
-        for name, _ in prediction.links(block) if block.target_id is not None else ():
-            if prediction.link(name) is None:
-                missing.setdefault(name, []).append(i)
+    seen = [(i, b) for i, b in enumerate(survey.image_blocks) if b.target_id is not None]
+    missing = grouped((n, i) for i, b in seen for n, _ in prediction.links(b) if prediction.link(n) is None)
     if not missing:
         return start
     chosen = sorted({i for of in missing.values() for i in of})

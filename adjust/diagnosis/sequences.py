@@ -8,6 +8,7 @@ in the base (closed form: Shah 2013, in :mod:`adjust.start.closed_forms.hand_eye
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -107,15 +108,13 @@ def _rigs(survey: Survey, seen: _Views, error: float) -> Iterator[Link]:
     rigid = {s.station_id for s in survey.stations if s.motion == "fixed"}
     bodies = {c.camera_id: "world" if c.station_id in rigid else c.station_id for c in survey.cameras}
     moving = {t.target_id for t in survey.targets if t.station_id is None}
-    keys = list(seen)
-    for i, (camera, target) in enumerate(keys):
-        for other, its in keys[i + 1 :]:
-            if its == target and target in moving and bodies[camera] == bodies[other] and camera != other:
-                a, b = seen[camera, target], seen[other, target]
-                epochs = tuple(e for e in a if e in b)
-                if len(epochs) >= _FEWEST:
-                    first, second = (np.array([x[e] for e in epochs]) for x in (a, b))
-                    yield Link("rig", (camera, other), epochs, first, second, target, error)
+    for (camera, target), (other, its) in combinations(seen, 2):
+        if its == target and target in moving and bodies[camera] == bodies[other]:
+            a, b = seen[camera, target], seen[other, target]
+            epochs = tuple(e for e in a if e in b)
+            if len(epochs) >= _FEWEST:
+                first, second = (np.array([x[e] for e in epochs]) for x in (a, b))
+                yield Link("rig", (camera, other), epochs, first, second, target, error)
 
 
 def _hands(survey: Survey, seen: _Views, error: float) -> Iterator[Link]:

@@ -135,10 +135,7 @@ class GraphBuilder:
     def _parts(
         self, blocks: Sequence[ImageBlock], chains: Sequence[Chain], outside: set[int]
     ) -> list[tuple[list[int], set[int], bool]]:
-        """Image blocks of unknown points by number, in parts, and the keys of the points that others see too.
-
-        Last whether a part is of few rows that hide nothing, which stand as they are.
-        """
+        """Image blocks of unknown points by number, in parts; keys of points that others see too; if rows stay rows."""
         if not blocks:
             return []
         number: dict[tuple[int, ...], int] = {}

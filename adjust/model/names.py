@@ -1,8 +1,20 @@
-"""The order of names, as people count: epochs and points that are numbered."""
+"""The order of names, as people count: epochs and points that are numbered; and what belongs to each of them."""
 
 import re
+from collections.abc import Hashable, Iterable
+from typing import TypeVar
 
 _PARTS = re.compile(r"\d+|\D+")
+_Key = TypeVar("_Key", bound=Hashable)
+_Value = TypeVar("_Value")
+
+
+def grouped(items: Iterable[tuple[_Key, _Value]]) -> dict[_Key, list[_Value]]:
+    """By key all values that come with it; both in the order in which they come."""
+    out: dict[_Key, list[_Value]] = {}
+    for key, value in items:
+        out.setdefault(key, []).append(value)
+    return out
 
 
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Literal, Protocol, overload
 
@@ -158,12 +158,12 @@ class OtherArrays:
 
 
 class Residuals(Sequence[ObservationResidual]):
-    """Observations of which the ``arrays`` (M) are known; each is made when it is asked for."""
+    """Observations of which the ``arrays`` (M) are known; each is made when it is asked for, the first ones once."""
 
-    def __init__(self, arrays: OtherArrays, named: Callable[[int], Named]) -> None:
+    def __init__(self, arrays: OtherArrays, named: Callable[[int], Named], n_kept: int) -> None:
         self.arrays, self._named = arrays, named
-        self._ptr = [0, *np.cumsum(arrays.n_components).tolist()]
-        self._made: list[ObservationResidual | None] = [None] * len(arrays.used)
+        self._ptr = np.concatenate([[0], np.cumsum(arrays.n_components)])
+        self._made: list[ObservationResidual | None] = [None] * n_kept
 
     def __len__(self) -> int:
         return len(self.arrays.used)
@@ -184,16 +184,18 @@ class Residuals(Sequence[ObservationResidual]):
         return map(self._one, range(len(self)))
 
     def _one(self, i: int) -> ObservationResidual:
-        found = self._made[i]
+        found = self._made[i] if i < len(self._made) else None
         if found is None:
             a, of = self.arrays, slice(self._ptr[i], self._ptr[i + 1])
-            found = self._made[i] = ObservationResidual(
+            found = ObservationResidual(
                 *self._named(i), a.observed[of], a.adjusted[of], a.residual[of], a.sigma[of], a.redundancies[of],
                 a.standardized[of], a.test[i].item(), a.used[i].item(),
             )  # fmt: skip
+            self._made[i : i + 1] = [found] if i < len(self._made) else []
         return found
 
 
+@lru_cache(2)  # those of an adjustment that is given another warning are the same
 def arrays_of(residuals: Sequence[ObservationResidual]) -> OtherArrays:
     """Observations as arrays; none of ``Residuals`` is made for that."""
     if isinstance(residuals, Residuals):
@@ -203,16 +205,6 @@ def arrays_of(residuals: Sequence[ObservationResidual]) -> OtherArrays:
     redundancy = np.maximum.reduceat(columns[4], np.cumsum(n) - n) if len(n) else np.zeros(0)
     used = np.array([o.used for o in residuals], dtype=np.bool_)
     return OtherArrays(n, used, np.array([o.test for o in residuals]), redundancy, *columns)
-
-
-@lru_cache(2)  # those of an adjustment that is given another warning are the same
-def _other_arrays(residuals: Sequence[ObservationResidual], readings: ReadingResiduals | None) -> OtherArrays:
-    first = arrays_of(residuals[: len(residuals) - (0 if readings is None else len(readings.used))])
-    if readings is None:
-        return first
-    one, r = np.ones(len(readings.used), dtype=np.int64), readings
-    last = OtherArrays(one, r.used, r.test, r.redundancy, *(getattr(r, name) for name in _OF_COMPONENTS))
-    return OtherArrays(*(np.concatenate([getattr(x, f.name) for x in (first, last)]) for f in fields(first)))
 
 
 @dataclass(frozen=True)
@@ -412,7 +404,7 @@ class Adjustment:
     @cached_property
     def other_arrays(self) -> OtherArrays:
         """``other_residuals`` as arrays; of readings none is made for that."""
-        return _other_arrays(self.other_residuals, self.reading_residuals)
+        return arrays_of(self.other_residuals)
 
     def joint(self, names: Sequence[ParameterName]) -> FloatArray:
         """Joint covariance (n, n), a priori, of all components of these estimates in this order; zero of held ones."""

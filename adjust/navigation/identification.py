@@ -42,14 +42,13 @@ def without_prior(system: System, seen: Sightings, options: NavigateOptions) -> 
     """All explanations of an epoch that are worth naming, best first; empty where fewer than three spots are there."""
     if len(seen.uv) < 3:
         return ()
-    poses, matches = _hypotheses(system, seen, allowed_namings(system, seen), options)
-    return judged(system, seen, list(zip(poses, matches, strict=True)), None, options)
+    return judged(system, seen, _hypotheses(system, seen, allowed_namings(system, seen), options), None, options)
 
 
 def _hypotheses(
     system: System, seen: Sightings, allowed: BoolArray, options: NavigateOptions
-) -> tuple[FloatArray, IntArray]:
-    """Poses (k, 4, 4) and namings (k, n) by the coarse consensus, best first."""
+) -> list[tuple[FloatArray, IntArray]]:
+    """Poses (4, 4) and namings (n,) by the coarse consensus, best first."""
     n, x = len(seen.uv), np.ascontiguousarray(system.beacons.x_in_world, dtype=float)
     farthest = options.farthest_m
     if farthest is None:
@@ -68,7 +67,7 @@ def _hypotheses(
     )
     order = np.argsort(-score[:kept], kind="stable")
     order = order[score[order] > score[order[:1]] - _COARSE]
-    return rigid(R[order], t[order]), match[order]
+    return list(zip(rigid(R[order], t[order]), match[order], strict=True))
 
 
 def _sky(system: System) -> FloatArray:
@@ -95,8 +94,7 @@ def with_prior(system: System, seen: Sightings, prior: Prior, options: NavigateO
     distance, support = gate_distances(system, seen, prior, options)
     near = (distance < GATE) & allowed_namings(system, seen) & (support > 0.0)
     if len(seen.uv) >= 3 and near.sum() > _CROWDED * near.any(axis=1).sum():
-        poses, matches = _hypotheses(system, seen, near, options)
-        trials = _doubted(list(zip(poses, matches, strict=True)), support)
+        trials = _doubted(_hypotheses(system, seen, near, options), support)
         found = judged(system, seen, trials, prior, options)
         if found:
             return _agreed(system, seen, prior, found, options)
@@ -145,8 +143,7 @@ def _with_partial_prior(
     system: System, seen: Sightings, prior: Prior, options: NavigateOptions
 ) -> tuple[Candidate, ...]:
     if len(seen.uv) >= 3:
-        poses, matches = _hypotheses(system, seen, allowed_namings(system, seen), options)
-        return judged(system, seen, list(zip(poses, matches, strict=True)), prior, options)
+        return judged(system, seen, _hypotheses(system, seen, allowed_namings(system, seen), options), prior, options)
     if np.any(seen.label < 0):
         return ()
     return judged(system, seen, [(prior.pose, seen.label)], prior, options)

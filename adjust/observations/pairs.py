@@ -393,7 +393,7 @@ class PairBatch:
         columns = self.arrays.logs, adjusted, v, sigma, stats.redundancy, standardized
         most = np.where(measured, stats.redundancy, -np.inf).max(axis=1)
         arrays = OtherArrays(sizes, self.arrays.used, stats.test, most, *(x[measured] for x in columns))
-        return Residuals(arrays, partial(_named, [pairs[row] for row in self.rows.tolist()], sizes.tolist()))
+        return Residuals(arrays, partial(_named, [pairs[row] for row in self.rows.tolist()], sizes.tolist()), len(self))
 
 
 def _named(pairs: Sequence[Pair], sizes: Sequence[int], e: int) -> Named:

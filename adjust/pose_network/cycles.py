@@ -217,12 +217,12 @@ def _ways_back(a: IntArray, b: IntArray, forest: Forest, chords: IntArray) -> It
 
 
 def short_loops(
-    n: int, a: IntArray, b: IntArray, pairs: IntArray, through: IntArray, most: int
+    n: int, a: IntArray, b: IntArray, pairs: IntArray, through: IntArray, most: int, growing: bool = False
 ) -> list[list[int]]:  # fmt: skip
     """For each of these pairs a short loop that it closes with those: its pairs, it first, walked from its a.
 
     Two searches meet that begin at its ends; where they have seen ``most`` stations without, there is none. Loops that
-    are there already are not given again.
+    are there already are not given again. growing: with the pairs before it, too, which makes the loops independent.
     """
     starts, neighbour, way = adjacency(n, a[through], b[through])
     all_ways = list(zip(neighbour.tolist(), through[way].tolist(), strict=True))
@@ -237,6 +237,9 @@ def short_loops(
         if meet >= 0:
             loop = [e, *_back(came[1], meet)[::-1], *_back(came[0], meet)]
             found.setdefault(frozenset(loop), loop)
+        if growing:
+            ways[v].append((w, e))
+            ways[w].append((v, e))
     return list(found.values())
 
 

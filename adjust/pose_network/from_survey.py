@@ -1,12 +1,11 @@
 """From a survey of stations and pairs to a pose network."""
 
-from dataclasses import fields
+from dataclasses import dataclass, field, fields
 from functools import lru_cache
 
 import numpy as np
 
 from adjust.model.errors import IndeterminateError, SurveyError, listed
-from adjust.model.observations import Pair
 from adjust.model.survey import FloatArray, PoseParameter, Survey
 from adjust.observations.pairs import pair_arrays
 from adjust.pose_network.network import PoseNetwork, Topology, check_determined, network_of
@@ -62,32 +61,18 @@ def network_from_survey(survey: Survey, any_datum: bool = False) -> PoseNetwork:
     any_datum: a survey that gives none is solved as a free network. Raises SurveyError for pairs that join other frames
     than fixed stations, IndeterminateError where the survey gives no datum.
     """
-    network = _network(_AllUsed(survey), any_datum)
-    used = np.array([p.used for p in survey.pairs], dtype=np.bool_)
-    return network if np.array_equal(network.used, used) else network.with_used(used)
+    parts = [id(getattr(survey, f.name)) for f in fields(survey) if f.name != "pairs"]
+    parts += [id(x) for p in survey.pairs for x in (p.pair_id, p.a, p.b, p.b_from_a, p.cov, p.group)]
+    network, used = _network(_AllUsed(tuple(parts), survey), any_datum), [p.used for p in survey.pairs]
+    return network if network.used.tolist() == used else network.with_used(np.array(used, dtype=np.bool_))
 
 
+@dataclass(frozen=True)
 class _AllUsed:
-    """Surveys that are equal to others but for which pairs these use, by identity."""
+    """A survey, equal to others of the same ``parts``: all but which pairs it uses."""
 
-    def __init__(self, survey: Survey) -> None:
-        self.survey = survey
-
-    def __hash__(self) -> int:
-        return len(self.survey.pairs)
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, _AllUsed) or len(self.survey.pairs) != len(other.survey.pairs):
-            return False
-        rest = all(_same(self.survey, other.survey, f.name) for f in fields(Survey) if f.name != "pairs")
-        return rest and all(
-            p is q or all(_same(p, q, f.name) for f in fields(Pair) if f.name != "used")
-            for p, q in zip(self.survey.pairs, other.survey.pairs, strict=True)
-        )
-
-
-def _same(a: object, b: object, name: str) -> bool:
-    return getattr(a, name) is getattr(b, name)
+    parts: tuple[int, ...]
+    survey: Survey = field(compare=False)
 
 
 @lru_cache(1)  # for all solutions of a search

@@ -119,7 +119,7 @@ class Precision(Covariances):
         self.tree = TreeCovariance(solved.tree, dims, solved.leaves)
         self.hidden: dict[int, FloatArray] = {}
         self._together: dict[tuple[int, int], FloatArray] = {}
-        """Joint covariances, as solved, of pairs of keys that were brought together, one of them hidden."""
+        """Joint covariances, as solved, of pairs of keys that were brought together, which share no clique."""
         self.bundle_influence: list[FloatArray] = []
         """Whitened A Q A' (K, 3) of the image points of every bundle, in its sorted order."""
         self._hidden = [BundleHidden(bundle) for bundle in graph.bundles]
@@ -163,10 +163,10 @@ class Precision(Covariances):
     def joint(self, names: Sequence[ParameterName]) -> FloatArray:
         """See :class:`Covariances`."""
         keys = [self.graph.unknowns.by_name[name].key for name in names]
-        if not any(k in self.hidden for k in keys):
-            Q = self.tree.joint(keys)
-        elif tuple(keys) in self._together:
+        if tuple(keys) in self._together:
             Q = self._together[keys[0], keys[1]]
+        elif not any(k in self.hidden for k in keys):
+            Q = self.tree.joint(keys)
         else:
             Q = self.stacked.joint(keys)
         return _in_datum(self.transformation, keys, Q)
@@ -175,8 +175,7 @@ class Precision(Covariances):
         """See :class:`Covariances`."""
         by_name = self.graph.unknowns.by_name
         keys = [(by_name[a].key, by_name[b].key) for a, b in pairs]
-        self.tree.bring_together((a, b) for a, b in keys if a not in self.hidden and b not in self.hidden)
-        below = [(a, b) for a, b in keys if a in self.hidden or b in self.hidden]
+        below = [(a, b) for a, b in keys if a in self.hidden or b in self.hidden or self.tree.shared(a, b) is None]
         for k in range(0, len(below), _PAIRS):
             some = list(dict.fromkeys(key for pair in below[k : k + _PAIRS] for key in pair))
             ends = np.cumsum([0, *(self.unknowns.by_key[key].dim for key in some)])

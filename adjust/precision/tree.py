@@ -5,7 +5,7 @@ subset of Takahashi, Fagan and Chen 1973; Golub and Plemmons 1980 for geodetic n
 lie together in one clique, so all redundancy numbers follow from it.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import gtsam
 import numpy as np
@@ -45,28 +45,13 @@ class TreeCovariance:
             raise ZeroDivisionError("the Bayes tree is singular")
         self.arrays = TreeArrays(c.home, c.key_ptr, c.keys, c.dims, c.front, c.width, c.at, np.empty_like(c.data))
         """What the compiled look-up of two keys' covariance needs."""
-        self._across: dict[tuple[int, int], FloatArray] = {}
-        """Blocks of keys in different cliques that were asked for together, by number."""
         covariance_rows(self.arrays, c.n_front, c.data)
 
-    def _block(self, a: int, b: int) -> FloatArray | None:
-        out = np.empty((self.cliques.dims[a], self.cliques.dims[b]))
-        if fill_block(self.arrays, a, b, out):
-            return out
-        if (b, a) in self._across:
-            return self._across[b, a].T
-        return self._across.get((a, b))
-
-    def bring_together(self, pairs: Iterable[tuple[int, int]]) -> None:
-        """Find what :meth:`joint` of these pairs of keys takes, of those in different cliques, all at once."""
-        numbers = ((self.number[i], self.number[j]) for i, j in pairs)
-        apart = [(a, b) for a, b in numbers if self._block(a, b) is None]
-        both = np.array(apart, dtype=np.int64).reshape(-1, 2)
-        columns, ptr = self.cliques.rows_of(both.ravel()), np.append(0, np.cumsum(self.cliques.dims[both].sum(axis=1)))
-        units = sparse.csr_array((np.ones(len(columns)), columns, np.arange(len(columns) + 1)), (len(columns), self.n))
-        for (a, b), Q in zip(apart, self.each_among(units, ptr), strict=True):
-            n = int(self.cliques.dims[a])
-            self._across[a, b] = Q[:n, n:]
+    def shared(self, a: int, b: int) -> FloatArray | None:
+        """Covariance (dim a, dim b) of two keys; None where they share no clique."""
+        i, j = self.number[a], self.number[b]
+        out = np.empty((self.cliques.dims[i], self.cliques.dims[j]))
+        return out if fill_block(self.arrays, i, j, out) else None
 
     def marginal(self, key: int) -> FloatArray:
         """Covariance (dim, dim) of one unknown."""
@@ -84,8 +69,8 @@ class TreeCovariance:
         c, numbers = self.cliques, np.array([self.number[k] for k in keys], dtype=np.int64)
         deepest = int(c.home[numbers].max())
         together = set(c.keys_in(deepest).tolist()).issuperset(numbers.tolist())
-        if not self._across and not together:
-            return self._apart(numbers)
+        if not together:
+            return self._apart(c.rows_of(numbers))
         at = np.concatenate([[0], np.cumsum(c.dims[numbers])])
         if together and len(numbers) > _MANY and 2 * at[-1] >= c.width[deepest]:  # all of the clique at once
             inside, first = c.keys_in(deepest), np.zeros(len(c.dims), dtype=np.int64)
@@ -93,33 +78,20 @@ class TreeCovariance:
             rows = c.rows_of(numbers, first)
             return np.asarray(clique_covariance(self.arrays, c.n_front, deepest)[np.ix_(rows, rows)])
         out = np.empty((at[-1], at[-1]))
-        for i, a in enumerate(numbers.tolist()):
-            for j, b in enumerate(numbers[: i + 1].tolist()):
-                block = self._block(a, b)
-                if block is None:
-                    return self._apart(numbers)
+        for i, a in enumerate(keys):
+            for j, b in enumerate(keys[: i + 1]):
+                block = self.shared(a, b)
+                if block is None:  # both are frontal further up
+                    return self._apart(c.rows_of(numbers))
                 out[at[i] : at[i + 1], at[j] : at[j + 1]] = block
                 out[at[j] : at[j + 1], at[i] : at[i + 1]] = block.T
         return out
 
-    def _apart(self, numbers: IntArray) -> FloatArray:
-        """Joint covariance of unknowns of different cliques: columns of the inverse, on their ways to the root only.
-
-        Of the last one none: its own covariance is known, and the rest is in the columns of the others. Of most
-        unknowns the whole matrix is less work.
-        """
-        c = self.cliques
-        every, asked = c.rows_of(numbers), c.rows_of(numbers[:-1])
-        if 2 * len(every) > self.n:
-            return np.asarray(self.full()[np.ix_(every, every)])
-        x = np.zeros((self.n, len(asked)))
-        x[asked, np.arange(len(asked))] = 1.0
-        home = c.home[numbers].tolist()
-        solve_cliques(self.arrays, c.ancestors(set(home[:-1])), c.ancestors(set(home)), c.first, c.data, x)
-        out, n = np.empty((len(every),) * 2), len(asked)
-        out[:, :n], out[:n, n:] = x[every], x[every[n:]].T
-        out[n:, n:] = self._block(int(numbers[-1]), int(numbers[-1]))
-        return np.asarray(0.5 * (out + out.T))
+    def _apart(self, rows: IntArray) -> FloatArray:
+        """Joint covariance of rows of a stacked vector; of most unknowns the whole matrix is less work."""
+        if 2 * len(rows) > self.n:
+            return np.asarray(self.full()[np.ix_(rows, rows)])
+        return self.among(sparse.csr_array((np.ones(len(rows)), rows, np.arange(len(rows) + 1)), (len(rows), self.n)))
 
     def rows(self, keys: Sequence[int]) -> IntArray:
         """Rows of these keys in a stacked vector of all unknowns, as :meth:`times` takes it."""

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from adjust.model.survey import FloatArray, IntArray
-from adjust.pose_network.cycles import adjacency, breadth_first, shortest_loops
+from adjust.pose_network.cycles import adjacency, breadth_first, flat, short_loops, shortest_loops
 from adjust.pose_network.loops import Loops, misclosures, tree_loops, walked
 from adjust.pose_network.network import Topology
 from adjust.relay.network import MeasuredPairs
@@ -15,8 +15,10 @@ from adjust.testing.distributions import chi2
 
 LoopKind = Literal["shortest", "tree"]
 
-# larger networks get the loops of a spanning tree
+# larger networks get short loops, each closed by a pair with a spanning tree and the pairs nearer to its root
 MAX_SHORTEST_LOOPS = 20_000
+# stations among which these are looked for
+_SEEN = 200
 # elementary steps, some seconds
 SEARCH_BUDGET = 20_000_000
 
@@ -48,8 +50,8 @@ class LoopBasis(Loops):
 def loop_basis(topology: Topology, kind: LoopKind = "shortest", budget: int = SEARCH_BUDGET) -> LoopBasis:
     """Independent loops: ``shortest`` (a minimal cycle basis) or ``tree`` (of a spanning tree from the busiest).
 
-    Above ``MAX_SHORTEST_LOOPS`` loops the spanning tree's are taken; where the search exceeds its budget they complete
-    what was found. ``minimal`` and ``note`` say so.
+    Above ``MAX_SHORTEST_LOOPS`` loops short ones are taken; where the search exceeds its budget the spanning tree's
+    complete what was found. ``minimal`` and ``note`` say so.
     """
     n = topology.n_stations
     walk = adjacency(n, topology.a_idx, topology.b_idx)
@@ -58,18 +60,26 @@ def loop_basis(topology: Topology, kind: LoopKind = "shortest", budget: int = SE
     in_tree = np.zeros(topology.n_pairs, dtype=np.bool_)
     in_tree[forest.by[forest.by >= 0]] = True
     chords = np.flatnonzero(~in_tree)
-    many = len(chords) > MAX_SHORTEST_LOOPS
-    if kind == "tree" or not len(chords) or many:
-        found = tree_loops(topology.a_idx, topology.b_idx, forest, chords)
-        too_many = f": more than {MAX_SHORTEST_LOOPS} loops are too many for the shortest ones"
-        note = "loops of a spanning tree" + (too_many if many and kind != "tree" else "")
-        return _basis(topology, found, False, note, chords)
-    pairs, start, led = shortest_loops(walk, chords, budget)
-    found = walked(topology.a_idx, topology.b_idx, pairs, start)
-    if len(found) == len(chords):
+    many, a, b = len(chords) > MAX_SHORTEST_LOOPS, topology.a_idx, topology.b_idx
+    if kind == "tree" or not len(chords):
+        found = tree_loops(a, b, forest, chords)
+        return _basis(topology, found, False, "loops of a spanning tree", chords)
+    if many:
+        reached = np.argsort(forest.order)
+        chords = chords[np.argsort(np.maximum(reached[a[chords]], reached[b[chords]]), kind="stable")]
+        short = short_loops(n, a, b, chords, np.flatnonzero(in_tree), _SEEN, growing=True)
+        first = np.array([loop[0] for loop in short], dtype=np.int64)
+        pairs, start, led = flat(short), a[first], np.isin(chords, first)
+    else:
+        pairs, start, led = shortest_loops(walk, chords, budget)
+    found = walked(a, b, pairs, start)
+    if len(found) == len(chords) and not many:
         return _basis(topology, found, True, "shortest independent loops")
-    rest = tree_loops(topology.a_idx, topology.b_idx, forest, chords[~led])  # as long as the network is wide, maybe
-    note = f"the {len(found)} shortest loops, and {len(rest)} of a spanning tree: the search used up its budget"
+    rest = tree_loops(a, b, forest, chords[~led])  # as long as the network is wide, maybe
+    more = f", and {len(rest)} of a spanning tree" if len(rest) else ""
+    note = f"the {len(found)} shortest loops{more}: the search used up its budget"
+    if many:
+        note = f"{len(found)} short loops{more}: more than {MAX_SHORTEST_LOOPS} are too many for the shortest ones"
     return _basis(topology, found.and_then(rest), False, note)
 
 

@@ -7,6 +7,7 @@ from scipy.sparse import coo_array
 
 from adjust.frames.unknowns import Chain
 from adjust.model.errors import SurveyError
+from adjust.model.names import grouped
 from adjust.model.survey import FloatArray, IntArray
 from adjust.spatial.averaging import pose_distance
 from adjust.spatial.rigid import inverse, rotation_log
@@ -69,10 +70,7 @@ def solve_motion(network: FrameNetwork, degenerate: bool = True) -> str | None:
 
 def _shared(network: FrameNetwork, groups: list[_Group], minimum_norm: bool) -> str | None:
     """Hand-eye over all groups with the same unknown; also from turns about one axis with ``minimum_norm``."""
-    by_second: dict[tuple[int, bool], list[_Group]] = {}
-    for group in groups + [g.swapped() for g in groups]:
-        if len(group.motions) >= 2:
-            by_second.setdefault(group.second, []).append(group)
+    by_second = grouped((g.second, g) for g in groups + [g.swapped() for g in groups] if len(g.motions) >= 2)
     for link, sharing in sorted(by_second.items(), key=lambda item: item[0]):
         found = _hand_eye([relative_motions(g.motions, g.products) for g in sharing], minimum_norm)
         if found is not None:
@@ -219,10 +217,8 @@ def _connected(found: _RowsOfPoses) -> list[_RowsOfPoses]:
 
 def _groups(found: _RowsOfPoses) -> list[_Group]:
     """Chains that lack the same two single poses, together."""
-    alike: dict[tuple[tuple[int, bool], tuple[int, bool]], list[int]] = {}
-    for i, (first, second) in enumerate(zip(found.first, found.second, strict=True)):
-        if len(found.rows[first]) == len(found.rows[second]) == 1:
-            alike.setdefault((found.rows[first][0], found.rows[second][0]), []).append(i)
+    ends = [(found.rows[a], found.rows[b]) for a, b in zip(found.first, found.second, strict=True)]
+    alike = grouped(((a[0], b[0]), i) for i, (a, b) in enumerate(ends) if len(a) == len(b) == 1)
     groups = []
     for (a, b), mine in sorted(alike.items()):
         clear = [i for i in mine if len(found.products[i]) == 1]

@@ -9,6 +9,7 @@ import numpy as np
 
 from adjust.lenses.models import camera_constants, focal_length_px, lens_model, unit_rays
 from adjust.model.errors import SurveyError
+from adjust.model.names import grouped
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import BoolArray, Camera, FloatArray, IntArray, Survey
 from adjust.native.parallel import side_by_side
@@ -114,10 +115,7 @@ def rays_by_block(
     """Rays (n, 3) of the image points ``seen`` (n, 2) px of some blocks, and the reason for each that has none."""
     rays: dict[int, FloatArray] = {}
     failed: dict[int, str] = {}
-    mine: dict[str, list[int]] = {}
-    for i, uv in seen.items():
-        if len(uv):
-            mine.setdefault(survey.image_blocks[i].camera_id, []).append(i)
+    mine = grouped((survey.image_blocks[i].camera_id, i) for i, uv in seen.items() if len(uv))
     cameras = [c for c in survey.cameras if c.camera_id in mine]
     found = side_by_side(
         lambda c: rays_of_images(c, lenses[c.camera_id], [seen[i] for i in mine[c.camera_id]]), cameras

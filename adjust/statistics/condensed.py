@@ -64,12 +64,10 @@ class CondensedSystem:
         images, at = graph.images, int(graph.image_rows[row])
         if at >= images.n_points:  # its rows are among those of the system
             i = int(np.searchsorted(self._first_points, row, side="right")) - 1
-            first, A = self._first_rows[i] + 2 * (row - int(self._first_points[i])), self.system.A
-            mine = slice(A.indptr[first], A.indptr[first + 2])
-            columns, place = np.unique(A.indices[mine], return_inverse=True)
-            rows = np.zeros((2, len(columns)))
-            rows[np.repeat(np.arange(2), np.diff(A.indptr[first : first + 3])), place] = A.data[mine]
-            return columns, rows
+            first = int(np.flatnonzero(self.block == i)[0]) + 2 * (row - int(self._first_points[i]))
+            A = self.system.A[first : first + 2]
+            columns = np.unique(A.indices)
+            return columns, A[:, columns].toarray()
         b = int(np.searchsorted(images.ptr, at, side="right")) - 1
         which, point = np.array([b]), at - int(images.ptr[b])
         local = images.rows(which)[0, 2 * point : 2 * point + 2, :-1]
@@ -81,11 +79,6 @@ class CondensedSystem:
     def n_points(self) -> int:
         """Image points."""
         return int(self._first_points[-1])
-
-    @cached_property
-    def _first_rows(self) -> dict[int, int]:
-        """First row of every block."""
-        return dict(zip(*(x.tolist() for x in np.unique(self.block, return_index=True)), strict=True))
 
     @cached_property
     def _first_points(self) -> IntArray:

@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 from scipy import sparse
 
-from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import side_by_side
 from adjust.precision.s_transformation import without_datum_rows
 
@@ -25,7 +25,7 @@ _AT_ONCE = 64
 _PIECE = 4096
 """Unknowns of small sets that are solved in one go: what stays in a core's own memory."""
 _ROOM, _WIDEST = 20_000_000, 500
-"""Numbers that the shared part of an inverse may need, and its rows: the tree of a solution is faster than more."""
+"""Numbers that the shared part of an inverse may need, and unknowns of a core: more are faster through a tree."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,19 +105,14 @@ class Arrow:
         return Inverse(sparse.csr_matrix((values, (i, j)), (self.n, self.n)), U, member)
 
 
-def _in_core(N: sparse.csc_matrix) -> BoolArray:
-    """Which unknowns (n,) so many others touch that they are the core, if it has one."""
-    degree = np.diff(N.indptr)
-    return np.asarray(degree > 2 * np.median(degree))
-
-
 def _arrow(scaled: sparse.csc_matrix) -> Arrow | None:
     """The matrix as an arrow, where it is one."""
     from scipy.sparse.csgraph import connected_components
 
-    inside = _in_core(scaled)
-    core, rest = np.flatnonzero(inside), np.flatnonzero(~inside)
-    if not 0 < len(core) <= DENSE:
+    degree = np.diff(scaled.indptr)
+    core = np.flatnonzero(degree > 2 * np.median(degree))
+    rest = np.flatnonzero(degree <= 2 * np.median(degree))
+    if not 0 < len(core) <= _WIDEST:
         return None
     N = scaled.tocsr()
     own, across = N[rest][:, rest], N[rest][:, core]
@@ -178,10 +173,7 @@ class Normal:
         self.scale = 1.0 / np.sqrt(np.maximum(N.diagonal(), 1e-300))
         self._scaled = N.copy()
         self._scaled.data *= self.scale[N.indices] * np.repeat(self.scale, np.diff(N.indptr))
-
-    @cached_property
-    def _arrow(self) -> Arrow | None:
-        return _arrow(self._scaled) if self.n > PLAIN else None
+        self._arrow = _arrow(self._scaled) if self.n > PLAIN else None
 
     @cached_property
     def _of_scaled(self) -> Solver:
@@ -207,8 +199,7 @@ class Normal:
     @cached_property
     def structured(self) -> Inverse | None:
         """The same as a sum, where many small sets of unknowns share few others: linear in n. None for others."""
-        shared = int(np.count_nonzero(_in_core(self._scaled)))
-        if shared > _WIDEST or shared * self.n > _ROOM or self._arrow is None:
+        if self._arrow is None or len(self._arrow.core) * self.n > _ROOM:
             return None
         return self._arrow.inverse(self.scale)
 

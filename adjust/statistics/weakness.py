@@ -68,15 +68,24 @@ def correlations(
         return _named(system, _of_structure(structure, np.maximum(system.sigmas, 1e-150), limit))
     if n <= PLAIN or (n <= DENSE and system.structured is not None):
         sigma = np.sqrt(np.maximum(np.diag(system.covariance), 1e-300))
-        whole = system.covariance / sigma / sigma[:, None]
-        largest = _largest(lambda first, part: whole[first:, part], n, limit, limit)
-        return _named(system, [(int(b), int(a), x) for a, b, x in largest.tolist()])
-    found = _exact(system, _likely(system, index, limit), limit)
-    if len(index) < n:
-        number = np.full(n, -1)
-        number[index] = 0
-        found += _within(system, number, limit)
-    return _named(system, found)
+        C = system.covariance / sigma / sigma[:, None]
+        pairs = _largest(lambda first, part: C[first:, part], n, limit)
+        return _named(system, _above(pairs, C[pairs[:, 0], pairs[:, 1]], limit))
+    pairs = _likely(system, index, limit)
+    columns = np.array(list(dict.fromkeys(pairs[:, 1].tolist()))[: max(_SOLVED // n, AT_ONCE)], dtype=np.int64)
+    number = np.full(n, -1)
+    number[columns] = np.arange(len(columns))
+    pairs = pairs[number[pairs[:, 1]] >= 0]
+    parts = [columns[i : i + AT_ONCE] for i in range(0, max(len(columns), 1), AT_ONCE)]
+    Q = np.hstack(side_by_side(lambda part: system.through_tree(_units(system, part)), parts))
+    found = _above(pairs, Q[pairs[:, 0], number[pairs[:, 1]]] / system.sigmas[pairs].prod(axis=1), limit)
+    return _named(system, found + (_within(system, index, limit) if len(index) < n else []))
+
+
+def _above(pairs: IntArray, C: FloatArray, limit: float) -> _Found:
+    """Of pairs (k, 2) with correlations (k,) those that are so large."""
+    high = np.abs(C) >= limit
+    return list(zip(*np.sort(pairs[high], axis=1).T.tolist(), C[high].tolist(), strict=True))
 
 
 def _likely(system: LinearSystem, index: IntArray, limit: float) -> IntArray:
@@ -88,56 +97,30 @@ def _likely(system: LinearSystem, index: IntArray, limit: float) -> IntArray:
     drawn /= np.maximum(np.linalg.norm(drawn, axis=1), 1e-150)[:, None]
     order = np.concatenate([index, np.delete(np.arange(len(drawn)), index)])
     u, z = drawn[order].astype(np.float32), np.arctanh(limit) - _SURE / np.sqrt(_DRAWS - 2.0)
-    found = _largest(lambda first, part: u[first:] @ u[part].T, len(index), limit, np.tanh(max(z, 1e-9)))
-    return np.asarray(order[found[:, :2].astype(np.int64)])
+    pairs = order[_largest(lambda first, part: u[first:] @ u[part].T, len(index), np.tanh(max(z, 1e-9)))]
+    often = np.bincount(pairs.ravel(), minlength=len(u))[pairs]
+    return np.where(often[:, :1] > often[:, 1:], pairs[:, ::-1], pairs)
 
 
-def _largest(block: Callable[[int, slice], FloatArray], n: int, limit: float, least: float) -> FloatArray:
-    """The largest of n columns with each other and with all others, at least of a size: (k, 3), row, column, value.
+def _largest(block: Callable[[int, slice], FloatArray], n: int, least: float) -> IntArray:
+    """Pairs (k, 2) of n columns with each other and with all others, those at least of a size, the largest first.
 
-    block: of the columns ``part`` the rows from ``first`` on, where these begin. limit: what is asked for in the end.
+    block: of the columns ``part`` the rows from ``first`` on, where these begin.
     """
 
     def above(first: int) -> FloatArray:
-        part = slice(first, min(first + _COMPARED, n))
-        C = block(first, part)
-        size = np.abs(C)
-        size[: size.shape[1]] = np.tril(size[: size.shape[1]], -1)  # each pair once, nothing with itself
-        high = size >= limit  # where these are enough no others are needed
-        high = high if np.count_nonzero(high) >= _KEPT else size >= least
-        a, b = np.divmod(np.flatnonzero(high), size.shape[1])
-        return _first(np.stack([first + a, first + b, C[a, b]], axis=1))
+        size = np.abs(block(first, slice(first, min(first + _COMPARED, n))))
+        k = size.shape[1]
+        size[:k] = np.tril(size[:k], -1)  # each pair once, nothing with itself
+        at = np.flatnonzero(size >= least)
+        values = size.ravel()[at]
+        if len(at) > _KEPT:
+            at = at[high := values >= np.partition(values, -_KEPT)[-_KEPT]]
+            values = values[high]
+        return np.stack([*(first + x for x in np.divmod(at, k)), values], axis=1)
 
-    return _first(np.concatenate(side_by_side(above, range(0, n, _COMPARED))))
-
-
-def _first(found: FloatArray) -> FloatArray:
-    """Rows (k, 3) by the size of the last number, the largest first; not more than are to be looked at."""
-    size = np.abs(found[:, 2])
-    kept = np.flatnonzero(size >= np.partition(size, -_KEPT)[-_KEPT]) if len(size) > _KEPT else slice(None)
-    return np.asarray(found[kept][np.argsort(-size[kept], kind="stable")])
-
-
-def _exact(system: LinearSystem, likely: IntArray, limit: float) -> _Found:
-    """Of pairs, the likeliest first, those that do correlate so; as many as ``_SOLVED`` numbers of columns tell of."""
-    n = len(system.columns)
-    often = np.bincount(likely.ravel(), minlength=n)
-    row, column = np.where((often[likely[:, 0]] > often[likely[:, 1]])[:, None], likely[:, ::-1], likely).T
-    columns = np.array(list(dict.fromkeys(column.tolist()))[: max(_SOLVED // n, AT_ONCE)], dtype=np.int64)
-    number = np.full(n, -1)
-    number[columns] = np.arange(len(columns))
-    at = number[column]
-
-    def of(first: int) -> _Found:
-        part = columns[first : first + AT_ONCE]
-        mine = np.flatnonzero((at >= first) & (at < first + len(part)))
-        i, j = row[mine], column[mine]
-        C = system.through_tree(_units(system, part))[i, at[mine] - first] / (system.sigmas[i] * system.sigmas[j])
-        high = np.abs(C) >= limit
-        ends = (f(i, j)[high].tolist() for f in (np.minimum, np.maximum))
-        return list(zip(*ends, C[high].tolist(), strict=True))
-
-    return [x for part in side_by_side(of, range(0, len(columns), AT_ONCE)) for x in part]
+    found = np.concatenate(side_by_side(above, range(0, n, _COMPARED)))
+    return found[np.argsort(-found[:, 2], kind="stable")[:_KEPT], :2].astype(np.int64)
 
 
 def _named(system: LinearSystem, found: _Found) -> tuple[Correlation, ...]:
@@ -186,10 +169,11 @@ def _of_structure(found: _Structure, sigma: FloatArray, limit: float) -> _Found:
     return out + [x for part in side_by_side(above, range(0, len(sharing), AT_ONCE)) for x in part]
 
 
-def _within(system: LinearSystem, number: IntArray, limit: float) -> list[tuple[int, int, float]]:
+def _within(system: LinearSystem, index: IntArray, limit: float) -> _Found:
     """Pairs of components of one unknown that is not compared with others."""
-    apart = [at for at in system.columns.at.values() if len(at) > 1 and (number[at] < 0).all()]
-    out = list[tuple[int, int, float]]()
+    others = {system.columns.names[i] for i in index.tolist()}
+    apart = [at for name, at in system.columns.at.items() if len(at) > 1 and name not in others]
+    out: _Found = []
     for k in sorted({len(at) for at in apart}):
         columns = np.array([at for at in apart if len(at) == k])
         C = system.own_covariances(columns)

@@ -182,17 +182,22 @@ def test_inner_datum_is_the_pseudo_inverse_and_relative_precision_does_not_depen
 
 
 def test_covariances_that_are_brought_together_are_those_of_the_whole_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
-    tree = solve_network(simulate(15, 4, extra=3).network).precision.tree
-    keys, rng = list(tree.places()), np.random.default_rng(0)
+    precision = solve_network(simulate(15, 4, extra=3).network).precision
+    tree, by_key, rng = precision.tree, precision.unknowns.by_key, np.random.default_rng(0)
+    keys = list(tree.places())
     pairs = [(keys[i], keys[j]) for i, j in rng.integers(0, len(keys), (60, 2)).tolist() if i != j]
-    each = [tree.joint(pair) for pair in pairs]
-    tree.bring_together(pairs)
-    monkeypatch.setattr(tree, "_apart", None)  # no way of its own is left to take
+    names = [(by_key[a].name, by_key[b].name) for a, b in pairs]
+    each, turned = ([precision.joint(pair[::way]) for pair in names] for way in (1, -1))
+    precision.bring_together(names)
+    monkeypatch.setattr(tree, "among", None)  # no way of its own is left to take
+    monkeypatch.setattr(tree, "full", None)
+    together = [precision.joint(pair) for pair in names]
+    monkeypatch.undo()
     whole = tree.full()
-    for pair, alone in zip(pairs, each, strict=True):
+    for pair, alone, back, found in zip(pairs, each, turned, together, strict=True):
         rows = np.concatenate([np.arange(len(whole))[tree.places()[key]] for key in pair])
-        for found in (alone, tree.joint(pair), tree.joint(pair[::-1])[np.ix_(*[np.roll(np.arange(12), 6)] * 2)]):
-            np.testing.assert_allclose(found, whole[np.ix_(rows, rows)], rtol=1e-9, atol=1e-12 * np.abs(whole).max())
+        for Q in (alone, found, back[np.ix_(*[np.roll(np.arange(12), 6)] * 2)]):
+            np.testing.assert_allclose(Q, whole[np.ix_(rows, rows)], rtol=1e-9, atol=1e-12 * np.abs(whole).max())
 
 
 def test_covariance_equals_the_scatter_of_repeated_networks() -> None:

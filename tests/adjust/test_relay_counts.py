@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from adjust.model.errors import SurveyError
+from adjust.relay import loops as loops_module
 from adjust.relay.counts import count
 from adjust.relay.loops import loop_basis
 from adjust.relay.network import topology
@@ -167,6 +168,21 @@ def test_search_that_runs_out_says_so():
     assert not basis.minimal
     assert "used up its budget" in basis.note
     assert len(basis) == 29 * 29
+
+
+def test_loops_that_are_too_many_for_the_shortest_are_short_and_independent(monkeypatch):
+    monkeypatch.setattr(loops_module, "MAX_SHORTEST_LOOPS", 10)
+    ladder = loop_basis(grid(2, 400))
+    assert (len(ladder), set(ladder.lengths.tolist())) == (399, {4})
+    assert "too many" in ladder.note
+    for top, seen in ((far_apart(60, 90, 1), 200), (far_apart(60, 90, 1), 8), (grid(12, 9), 200)):
+        monkeypatch.setattr(loops_module, "_SEEN", seen)
+        basis = loop_basis(top)
+        sets = [frozenset(basis.pair_idx[basis.ptr[k] : basis.ptr[k + 1]].tolist()) for k in range(len(basis))]
+        rank, shortest = rank_and_length(through_every_station(top))
+        assert len(sets) == rank == rank_and_length(sets)[0]
+        assert ("of a spanning tree" in basis.note) == (seen == 8)
+        assert seen == 8 or basis.lengths.sum() < 1.3 * shortest
 
 
 def test_text_names_parts_and_uncontrolled_pairs():

@@ -9,8 +9,8 @@ from gtsam import Pose3
 
 from adjust.graph.building import GraphBuilder
 from adjust.model.result import ParameterName
-from adjust.model.rewriting import Rewriting, Vector
-from adjust.model.survey import PointParameter, PoseParameter
+from adjust.model.rewriting import Rewriting, Vector, with_changed, with_rows
+from adjust.model.survey import Beam, PointParameter, PoseParameter, Surface, Survey, Table, VectorParameter
 from survey.simulate import full_lab
 from tests.adjust import helpers as h
 
@@ -46,7 +46,7 @@ def test_every_parameter_is_met_once_under_the_name_of_its_unknown() -> None:
     changed = names(survey)
     assert len(set(names.seen)) == len(names.seen)
     unknowns = GraphBuilder(survey, start.lenses).build(start).unknowns.by_name
-    of_owners = {n[:2] for n in unknowns if n[0] not in ("table_angles", "orientation", "instrument", "vertical")}
+    of_owners = {n[:2] for n in unknowns if n[0] not in ("table_angles", "orientation")}
     assert of_owners <= {n[:2] for n in names.seen}
     assert all("later" in s.epochs for s in changed.stations)
     free = [t.carrier_from_target for t in survey.targets if t.carrier_from_target.treatment == "free"]
@@ -56,3 +56,22 @@ def test_every_parameter_is_met_once_under_the_name_of_its_unknown() -> None:
     assert changed.image_blocks is survey.image_blocks
     assert all(a.lens is b.lens for a, b in zip(changed.cameras, survey.cameras, strict=True))
     assert all(a.x_in_world is b.x_in_world for a, b in zip(changed.points, survey.points, strict=True))
+
+
+def test_beams_and_surfaces_are_met_and_a_surface_without_parameters_stays() -> None:
+    known = Surface("s1", "plane", parameters=VectorParameter(("tilt_1",), np.zeros(1)))
+    names = Names()
+    changed = names(Survey(beams=(Beam("b", "station", "s"),), surfaces=(known, Surface("s2", "line"))))
+    assert names.seen == [("beam", "b"), ("surface", "s1"), ("vertical",)]
+    assert changed.surfaces[1].parameters is None
+
+
+def test_rows_and_things_are_changed_alone() -> None:
+    tables = (Table("a"), Table("b"), Table("c"))
+    survey = Survey(tables=tables)
+    changed = with_changed(survey, "tables", "b", axes=("z",)).tables
+    assert [t.axes for t in changed] == [tables[0].axes, ("z",), tables[2].axes]
+    assert changed[0] is tables[0]
+    assert changed[2] is tables[2]
+    rows = with_rows(survey, "tables", {2: tables[0]}).tables
+    assert all(a is b for a, b in zip(rows, (tables[0], tables[1], tables[0]), strict=True))

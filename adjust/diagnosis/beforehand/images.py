@@ -10,6 +10,7 @@ from adjust.diagnosis.hypothesis import Finding
 from adjust.diagnosis.time.forgotten_motion import forgotten_motion
 from adjust.frames.lens_times import LensTimes, whole_images
 from adjust.model.errors import listed
+from adjust.model.names import grouped
 from adjust.model.survey import Camera, FloatArray, IntArray, Survey
 
 _CELLS = (8, 6)
@@ -43,9 +44,8 @@ def coverage(survey: Survey) -> dict[str, dict[str, Any]]:
     for camera in survey.cameras:
         mine = [b for b in whole_images(survey).image_blocks if b.camera_id == camera.camera_id and len(b.uv)]
         uv = np.concatenate([np.zeros((0, 2)), *(b.uv for b in mine)])
-        images: dict[str, list[FloatArray]] = {}
-        for b in (b for b in survey.image_blocks if b.camera_id == camera.camera_id and len(b.uv)):
-            images.setdefault(b.epoch_id, []).append(b.uv)
+        given = (b for b in survey.image_blocks if b.camera_id == camera.camera_id and len(b.uv))
+        images = grouped((b.epoch_id, b.uv) for b in given)
         shares = {e: float(np.prod(np.ptp(np.concatenate(parts), axis=0) / times.size(camera, e)))
                   for e, parts in images.items()}  # fmt: skip
         out[camera.camera_id] = {"share": _share(camera, uv), "corners_empty": _empty_corners(camera, uv),

@@ -1,7 +1,7 @@
 """Names that appear once, points that nothing checks, epochs that join nothing."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 
 from adjust.diagnosis.hypothesis import Finding
 from adjust.model.errors import listed
@@ -22,29 +22,19 @@ def observed(survey: Survey, expected: Adjustment | None) -> Iterator[Finding]:
 def _usage(survey: Survey) -> Counter[str]:
     """How many observed components world points have, by id: two for an image point, three for coordinates."""
     out: Counter[str] = Counter()
-
-    def add(refs: Iterable[PositionRef | None], n: int = 1) -> None:
-        out.update({str(r.point_id): n for r in refs if r is not None and r.frame is None})
-
     for block in survey.image_blocks:
-        if block.target_id is None:
-            rows = block.point_idx[block.mask]
-            for i in rows.tolist():
-                out[survey.points[i].point_id] += 2
-    for r in (r for r in survey.readings if r.used):
-        for ref in {r.at, r.to, r.second}:
-            add([ref])
-    for d in (d for d in survey.distances if d.used):
-        add([d.a])
-        add([d.b])
-    for c in (c for c in survey.coordinates if c.used):
-        for ref in c.positions:
-            add([ref], 3)
-    for b in (b for b in survey.coordinate_differences if b.used):
-        for ref in (*b.at, *b.to):
-            add([ref], 3)
-    for o in (o for o in survey.on_surfaces if o.used):
-        add([o.position])
+        for i in block.point_idx[block.mask].tolist() if block.target_id is None else ():
+            out[survey.points[i].point_id] += 2
+    refs: list[tuple[PositionRef | None, int]] = [
+        *((ref, 1) for r in survey.readings if r.used for ref in {r.at, r.to, r.second}),
+        *((ref, 1) for d in survey.distances if d.used for ref in (d.a, d.b)),
+        *((ref, 3) for c in survey.coordinates if c.used for ref in c.positions),
+        *((ref, 3) for b in survey.coordinate_differences if b.used for ref in (*b.at, *b.to)),
+        *((o.position, 1) for o in survey.on_surfaces if o.used),
+    ]
+    for ref, n in refs:
+        if ref is not None and ref.frame is None:
+            out[str(ref.point_id)] += n
     return out
 
 

@@ -12,6 +12,7 @@ from adjust.diagnosis.units.conventions import ANGLES, LENGTH_RATIOS, LENGTHS, S
 from adjust.diagnosis.units.readings import misread_readings
 from adjust.diagnosis.weights.sigmas import id_of, odd_among
 from adjust.model.errors import listed
+from adjust.model.names import grouped
 from adjust.model.observations import Distance, PositionRef, Reading
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
@@ -88,11 +89,8 @@ def _slipped(what: str, value: float, predicted: float, factor: float, unit: str
 
 def _sigmas(survey: Survey) -> Iterator[Finding]:
     """Sigmas and values that look like another unit."""
-    by_kind: dict[str, list[Reading | Distance]] = {}
     every: tuple[Reading | Distance, ...] = (*survey.readings, *survey.distances)
-    for o in every:
-        by_kind.setdefault(o.kind if isinstance(o, Reading) else "distance", []).append(o)
-    for kind, found in by_kind.items():
+    for kind, found in grouped((str(getattr(o, "kind", "distance")), o) for o in every).items():
         if odd := [id_of(o) for o in odd_among(found)[1]]:
             yield Finding("problem", "suspicious sigma", tuple(odd), f"{kind} {listed(odd, 6)}: the sigma is more than "
                           "100 times off that of the others", "check its unit")  # fmt: skip
@@ -101,11 +99,8 @@ def _sigmas(survey: Survey) -> Iterator[Finding]:
 
 def _lengths(survey: Survey) -> Iterator[Finding]:
     """Distances that stand to the others of their set-up as a unit to another."""
-    by_setup: dict[str, list[tuple[str, float]]] = {}
-    for r in survey.readings:
-        if r.kind in ("slope_distance", "horizontal_distance"):
-            by_setup.setdefault(r.setup_id, []).append((r.reading_id, r.value))
-    typical = {s: float(np.median([v for _, v in found])) for s, found in by_setup.items() if len(found) >= 3}
+    lengths = [(r.setup_id, r.value) for r in survey.readings if r.kind in ("slope_distance", "horizontal_distance")]
+    typical = {s: float(np.median(found)) for s, found in grouped(lengths).items() if len(found) >= 3}
     if len(typical) < 2:
         return
     usual = float(np.median(list(typical.values())))

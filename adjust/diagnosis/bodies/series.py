@@ -7,6 +7,7 @@ import numpy as np
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.prediction import Altered, Prediction
 from adjust.diagnosis.table.views import view_covariance
+from adjust.model.names import grouped
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.spatial.rigid import adjoint, inverse, rotation_log
@@ -49,10 +50,7 @@ class Step:
 def series_of(case: Case, values: Altered) -> list[Series]:
     """For every pose of a camera or a target that is the same for several images: what each of them says about it."""
     prediction, blocks = Prediction(case.survey, values), case.survey.image_blocks
-    users: dict[ParameterName, list[int]] = {}
-    for i, block in enumerate(blocks):
-        for name, _ in prediction.links(block):
-            users.setdefault(name, []).append(i)
+    users = grouped((name, i) for i, block in enumerate(blocks) for name, _ in prediction.links(block))
     alone = {name for name, of in users.items() if name[0] != "table_motion" and len(of) < 2}
     out = []
     for name, of in users.items():

@@ -18,6 +18,7 @@ from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.late import Freed, as_unknowns, keyed, spoken
 from adjust.diagnosis.prediction import Linear
 from adjust.diagnosis.sequences import hand_poses
+from adjust.model.names import grouped
 from adjust.model.observations import ImageBlock, TableReading
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.rewriting import with_rows
@@ -48,11 +49,8 @@ def _motion(survey: Survey) -> dict[int, tuple[int, int, FloatArray, FloatArray]
 
     Of points that the whole course shows by splines, of others by the images before and after; zero where unknown.
     """
-    courses: dict[tuple[str, str | None], list[int]] = {}
-    for i, b in enumerate(survey.image_blocks):
-        courses.setdefault((b.camera_id, b.target_id), []).append(i)
     out = {}
-    for blocks in courses.values():
+    for blocks in grouped(((b.camera_id, b.target_id), i) for i, b in enumerate(survey.image_blocks)).values():
         if len(blocks) < _FEWEST:
             continue
         uv = np.full((len(blocks), 1 + max(int(survey.image_blocks[i].point_idx.max()) for i in blocks), 2), np.nan)

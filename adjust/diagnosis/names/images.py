@@ -12,6 +12,7 @@ import numpy as np
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, LeaveOut, Place, Rename
 from adjust.diagnosis.prediction import Prediction
+from adjust.model.names import grouped
 from adjust.model.observations import ImageBlock
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, Survey
@@ -72,15 +73,9 @@ def _better(now: Now, other: dict[int, ImageBlock]) -> tuple[list[int], float]:
 
 def _copies(survey: Survey) -> Iterator[Hypothesis]:
     """The same image points, to the last digit, in two images: either may be the copy."""
-    seen: dict[bytes, list[int]] = {}
-    for i, block in enumerate(survey.image_blocks):
-        if len(block.uv) > 1:
-            seen.setdefault(block.uv.tobytes(), []).append(i)
-    twice = [blocks for blocks in seen.values() if len(blocks) == 2]
-    ways: dict[tuple[str, str], list[tuple[int, int]]] = {}
-    for a, b in twice:
-        names = survey.image_blocks[a].camera_id, survey.image_blocks[b].camera_id
-        ways.setdefault(names, []).append((a, b))
+    seen = grouped((b.uv.tobytes(), i) for i, b in enumerate(survey.image_blocks) if len(b.uv) > 1)
+    camera_of = [b.camera_id for b in survey.image_blocks]
+    ways = grouped(((camera_of[i[0]], camera_of[i[1]]), i) for i in seen.values() if len(i) == 2)
     for (first, second), pairs in ways.items():
         for camera, other, which in ((second, first, 1), (first, second, 0)):
             gone = {p[which] for p in pairs}
@@ -172,9 +167,7 @@ def exchange(
 def _cameras(now: Now) -> Iterator[Hypothesis]:
     """All that a camera is said to show at an epoch, under the name of another one that shows nothing then."""
     survey = now.prediction.survey
-    images: dict[tuple[str, str], list[int]] = {}
-    for i, b in enumerate(survey.image_blocks):
-        images.setdefault((b.camera_id, b.epoch_id), []).append(i)
+    images = grouped(((b.camera_id, b.epoch_id), i) for i, b in enumerate(survey.image_blocks))
     bad = sorted(images, key=lambda k: -sum(float(now.squares[i].sum()) for i in images[k]))[:_BLOCKS]
     found: dict[tuple[str, str], tuple[float, list[str], dict[int, ImageBlock]]] = {}
     for camera, epoch in bad:

@@ -5,13 +5,14 @@ Evidence: the readings concerned against what the rest predicts at its robust st
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, compress
 
 import numpy as np
 
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, Rename
 from adjust.diagnosis.screen import Screen, at_best
+from adjust.model.names import grouped
 from adjust.model.observations import PositionRef, Reading
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import IntArray, Survey
@@ -57,10 +58,10 @@ def ends_exchanged(before: Screen, sets: Sequence[IntArray], names: Sequence[tup
 
 def _suspects(survey: Survey, before: Screen, setup_id: str | None) -> list[str]:
     """Points whose sights (of one set-up, of all) miss most, worst first; only such as do miss."""
-    misses: dict[str, list[float]] = {}
-    for r, square in zip(survey.readings, before.readings.tolist(), strict=True):
-        if r.to.frame is None and (setup_id is None or r.setup_id == setup_id):
-            misses.setdefault(str(r.to.point_id), []).append(min(square / before.scale, CAP))
+    squares = np.minimum(before.readings / before.scale, CAP).tolist()
+    mine = [setup_id is None or r.setup_id == setup_id for r in survey.readings]
+    sights = compress(zip(survey.readings, squares, strict=True), mine)
+    misses = grouped((str(r.to.point_id), square) for r, square in sights if r.to.frame is None)
     worst = {name: float(np.mean(v)) for name, v in misses.items()}
     return [n for n in sorted(worst, key=lambda n: -worst[n])[:_SUSPECTS] if worst[n] > _CLEARLY]
 

@@ -16,6 +16,7 @@ from gtsam import Pose3
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, Rename
 from adjust.diagnosis.screen import Screen, at_best, improvement, screen
+from adjust.model.names import grouped
 from adjust.model.observations import FrameRef, Pair, frame_text
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, Survey
@@ -61,10 +62,8 @@ def _misses(survey: Survey, found: Screen) -> FloatArray:
 
 def _suspects(survey: Survey, misses: FloatArray) -> list[FrameRef]:
     """Ends of several pairs, those first whose pairs miss most."""
-    of: dict[FrameRef, list[float]] = {}
-    for pair, square in zip(survey.pairs, misses.tolist(), strict=True):
-        for end in (pair.a, pair.b):
-            of.setdefault(end, []).append(square)
+    each = zip(survey.pairs, misses.tolist(), strict=True)
+    of = grouped((end, square) for pair, square in each for end in (pair.a, pair.b))
     several = {end: float(np.sum(squares)) for end, squares in of.items() if len(squares) > 1 and end.frame_id}
     return sorted(several, key=lambda end: -several[end])[:_SUSPECTS]
 

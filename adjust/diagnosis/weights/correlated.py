@@ -11,6 +11,7 @@ import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
+from adjust.model.names import grouped
 from adjust.model.observations import ReadingCovariance
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.testing.distributions import chi2
@@ -70,10 +71,8 @@ def _best_size(case: Case, found: Sequence[_Common]) -> tuple[float, float]:
 
 
 def _sets(survey: Survey, kind: str) -> list[IntArray]:
-    by_setup: dict[str, list[int]] = {}
-    for i, r in enumerate(survey.readings):
-        if r.kind == kind and r.setup_id and r.used:
-            by_setup.setdefault(r.setup_id, []).append(i)
+    mine = [(r.setup_id, i) for i, r in enumerate(survey.readings) if r.kind == kind and r.setup_id and r.used]
+    by_setup = grouped(mine)
     return [np.array(rows) for rows in by_setup.values() if len(rows) >= _FEWEST]
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, ScaleKey
 from adjust.model.errors import listed
+from adjust.model.names import grouped
 from adjust.model.observations import Distance, Level, OnSurface, Reading
 from adjust.model.result import Adjustment
 from adjust.model.rewriting import Fields
@@ -86,11 +87,8 @@ def _evenly(w: FloatArray) -> bool:
 def odd_sigmas(case: Case) -> Iterator[Hypothesis]:
     """Observations whose sigma is a hundred times another's of the same kind and group, or a hundredth."""
     for field in _KINDS:
-        observed = [o for o in getattr(case.survey, field) if o.used]
-        by_kind: dict[tuple[str, str], list[_One]] = {}
-        for o in observed:
-            by_kind.setdefault((getattr(o, "kind", field), o.group), []).append(o)
-        for (kind, group), members in by_kind.items():
+        observed: list[_One] = [o for o in getattr(case.survey, field) if o.used]
+        for (kind, group), members in grouped(((getattr(o, "kind", field), o.group), o) for o in observed).items():
             usual, odd = odd_among(members)
             if odd and len(members) > 2 * len(odd) + 1:
                 yield _with_usual(case, field, kind, group, odd, usual)

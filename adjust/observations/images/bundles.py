@@ -54,6 +54,8 @@ class BundleBatch(BundleLayout):
         """by_rows: of few image points, all on unknowns that others touch: no normal equations, which would round."""
         super().__init__(unknowns, state, blocks, chains, points, outside)
         self.by_rows = by_rows and not self.n_hidden and not self.reduced
+        n = self.n_keys - self.n_hidden + 1
+        self.n_rows = min(2 * len(self.point), n) if self.by_rows else n
         self.used: BoolArray = np.concatenate([b.mask for b in self.blocks])[self.sorted]
         self.W = self.W_all * self.used[:, None]
         k, p = len(self.point), len(self.reduced)
@@ -99,12 +101,6 @@ class BundleBatch(BundleLayout):
         kept, ptr = columns >= 0, np.zeros(len(columns) + 1, dtype=np.int64)
         np.cumsum(kept.sum(axis=1), out=ptr[1:])
         return sparse.csr_matrix((values[kept], columns[kept], ptr), (len(columns), self.n_local))
-
-    @property
-    def n_rows(self) -> int:
-        """Of the factor."""
-        n = self.n_keys - self.n_hidden + 1
-        return min(2 * len(self.point), n) if self.by_rows else n
 
     def _condense(self, values: gtsam.Values, damping: float) -> None:
         S, g = np.zeros((self.n_local, self.n_local)), np.zeros(self.n_local)

@@ -46,21 +46,20 @@ def helmert_blocks(owner: IntArray, seen: Sequence[IntArray], hidden: FloatArray
 
 
 def runs_of_epochs(blocks: Sequence[ImageBlock]) -> IntArray:
-    """Run (B,) of image blocks that hide nothing: few epochs each where their own rows are less work than one matrix.
-
-    What an epoch has of its own is then eliminated with those of its run, and not with all.
-    """
+    """Run (B,) of image blocks that hide nothing: some epochs each, where rows are less work than one matrix."""
     number: dict[str, int] = {}
     epoch = np.array([number.setdefault(b.epoch_id, len(number)) for b in blocks], dtype=np.int64)
-    run, points = epoch // _EPOCHS, [np.unique(b.point_idx) for b in blocks]
+    point = np.concatenate([np.zeros(0, dtype=np.int64), *(b.point_idx for b in blocks)])
+    of_point, work = np.repeat(epoch, [len(b.point_idx) for b in blocks]), 0.0
 
-    def columns(mine: IntArray) -> float:
-        seen = np.unique(np.concatenate([points[k] for k in mine]))
-        return 6.0 * len(np.unique(epoch[mine])) + 3.0 * len(seen)
+    def columns(mine: BoolArray) -> float:
+        return 6.0 * len(np.unique(of_point[mine])) + 3.0 * len(np.unique(point[mine]))
 
-    of_run = [np.flatnonzero(run == i) for i in range(int(run.max(initial=-1)) + 1)]
-    work = sum(4.0 * sum(len(points[k]) for k in mine) * columns(mine) ** 2 for mine in of_run)
-    return run if len(of_run) > 1 and work < _GAIN * _work(columns(np.arange(len(blocks))), 0.0) else np.zeros_like(run)
+    for i in range(len(number) // _EPOCHS + 1):
+        mine = of_point // _EPOCHS == i
+        work += 4.0 * np.count_nonzero(mine) * columns(mine) ** 2
+    less = work < _GAIN * float(_work(columns(of_point >= 0), 0.0))
+    return epoch // _EPOCHS if less else np.zeros_like(epoch)
 
 
 def _cut(incidence: sparse.csr_array, hidden: FloatArray) -> BoolArray | None:

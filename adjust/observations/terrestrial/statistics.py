@@ -4,14 +4,15 @@ Q_vv = Q_ll - A Q A'; r = diag(Q_vv P); the test of one reading is w^2 with w = 
 the standardized residual where readings are not correlated (Baarda 1968; Foerstner 1979).
 """
 
-from collections.abc import Iterator, Sequence
-from typing import overload
+from collections.abc import Sequence
+from dataclasses import fields
+from functools import partial
 
 import gtsam
 import numpy as np
 
 from adjust.model.observations import Reading, position_text
-from adjust.model.result import ObservationResidual, ReadingResiduals
+from adjust.model.result import Named, ObservationResidual, OtherArrays, ReadingResiduals, Residuals, arrays_of
 from adjust.model.survey import FloatArray, Survey
 from adjust.native.trees import KeyCovariances, row_influences
 from adjust.observations.terrestrial.batch import TerrestrialBatch
@@ -93,40 +94,20 @@ def reading_unit(kind: str) -> str:
     return "rad" if kind in _ANGLES else "m"
 
 
-class JoinedResiduals(Sequence[ObservationResidual]):
-    """Residuals of single observations, followed by those of all readings, each made when it is asked for."""
+def joined_residuals(
+    first: Sequence[ObservationResidual], survey: Survey, readings: ReadingResiduals
+) -> Sequence[ObservationResidual]:
+    """Residuals of single observations, followed by those of all readings."""
+    n, a, r = len(first), arrays_of(first), readings
+    components = "observed", "adjusted", "residual", "sigma", "redundancy", "standardized"
+    last = np.ones(len(r.used), dtype=np.int64), r.used, r.test, r.redundancy, *(getattr(r, x) for x in components)
+    arrays = OtherArrays(*(np.concatenate([getattr(a, f.name), x]) for f, x in zip(fields(a), last, strict=True)))
+    return Residuals(arrays, partial(_named, first, survey.readings), n)
 
-    def __init__(self, first: Sequence[ObservationResidual], survey: Survey, readings: ReadingResiduals) -> None:
-        self.first, self.survey, self.readings = first, survey, readings
 
-    def __len__(self) -> int:
-        return len(self.first) + len(self.survey.readings)
-
-    @overload
-    def __getitem__(self, index: int) -> ObservationResidual: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[ObservationResidual]: ...
-
-    def __getitem__(self, index: int | slice) -> ObservationResidual | Sequence[ObservationResidual]:
-        if isinstance(index, slice):
-            if index.indices(len(self)) == (0, len(self.first), 1):
-                return self.first
-            return tuple(self[i] for i in range(*index.indices(len(self))))
-        i = index + len(self) if index < 0 else index
-        if not 0 <= i < len(self):
-            raise IndexError(index)
-        return self.first[i] if i < len(self.first) else self._reading(i - len(self.first))
-
-    def __iter__(self) -> Iterator[ObservationResidual]:
-        yield from self.first
-        for i in range(len(self.survey.readings)):
-            yield self._reading(i)
-
-    def _reading(self, i: int) -> ObservationResidual:
-        reading, a, one = self.survey.readings[i], self.readings, slice(i, i + 1)
-        return ObservationResidual(
-            reading.kind, reading.group, reading_names(reading), (reading.kind,), (reading_unit(reading.kind),),
-            a.observed[one], a.adjusted[one], a.residual[one], a.sigma[one], a.redundancy[one], a.standardized[one],
-            float(a.test[i]), bool(a.used[i]),
-        )  # fmt: skip
+def _named(first: Sequence[ObservationResidual], readings: Sequence[Reading], i: int) -> Named:
+    if i < len(first):
+        o = first[i]
+        return o.kind, o.group, o.ids, o.components, o.units
+    x = readings[i - len(first)]
+    return x.kind, x.group, reading_names(x), (x.kind,), (reading_unit(x.kind),)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from adjust.model.names import grouped
 from adjust.observations.terrestrial.batch import circular_median
 from adjust.start.readings.places import positions
 from adjust.start.readings.sights import Node, Sights, best_of_places
@@ -43,17 +44,11 @@ class PlaneStart:
         self.around: dict[Node, dict[Node, None]] = {}  # in the order of the distances, as all that follows
         for a, b in self.distance:
             self.around.setdefault(a, {})[b] = None
-        self.sets_at: dict[Node, list[str]] = {}
-        self.sets_to: dict[Node, list[str]] = {}
-        self.azimuths_to: dict[Node, list[tuple[Node, float]]] = {}
-        for name, (a, targets) in self.sights.directions.items():
-            self.sets_at.setdefault(a, []).append(name)
-            for b in targets:
-                self.sets_to.setdefault(b, []).append(name)
-        for (a, b), values in self.sights.azimuths.items():
-            for value in values:
-                self.azimuths_to.setdefault(b, []).append((a, value))
-                self.azimuths_to.setdefault(a, []).append((b, value + np.pi))
+        sets = self.sights.directions
+        self.sets_at = grouped((a, name) for name, (a, _) in sets.items())
+        self.sets_to = grouped((b, name) for name, (_, targets) in sets.items() for b in targets)
+        read = [(a, b, value) for (a, b), values in self.sights.azimuths.items() for value in values]
+        self.azimuths_to = grouped(way for a, b, z in read for way in ((b, (a, z)), (a, (b, z + np.pi))))
         self.nodes = sorted({*self.sets_at, *self.sets_to, *self.around, *self.azimuths_to})
 
     def find(self, known: Mapping[Node, complex]) -> System:

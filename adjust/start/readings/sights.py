@@ -9,6 +9,7 @@ from typing import TypeVar, cast
 
 import numpy as np
 
+from adjust.model.names import grouped
 from adjust.model.observations import PositionRef, Reading, position_text
 from adjust.model.survey import FloatArray, Survey
 from adjust.observations.terrestrial.batch import circular_median
@@ -87,10 +88,7 @@ def spread(steps: Sequence[tuple[Node, Node, _Value]], known: Mapping[Node, _Val
 
     The median of all ways of the same length. Numbers or arrays.
     """
-    near: dict[Node, list[tuple[Node, _Value]]] = {}
-    for a, b, step in steps:
-        near.setdefault(a, []).append((b, step))
-        near.setdefault(b, []).append((a, -step))
+    near = grouped(way for a, b, step in steps for way in ((a, (b, step)), (b, (a, -step))))
     out = dict(known)
     front = list(out)
     while front:

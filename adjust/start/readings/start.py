@@ -6,6 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from adjust.model.names import grouped
 from adjust.model.observations import PositionRef, position_text
 from adjust.model.survey import FloatArray, Survey
 from adjust.start.readings.plane import PlaneStart
@@ -111,10 +112,7 @@ def explain(survey: Survey, lacking: list[str]) -> SurveyError:
     """Why these points have no approximate coordinates, by name."""
     sights = collect_sights(survey)
     lost = set(lacking)
-    tilted: dict[str, list[str]] = {}
-    for mine in tilted_sights(survey).values():
-        for s in mine:
-            tilted.setdefault(s.node, []).append(s.setup_id)
+    tilted = grouped((s.node, s.setup_id) for mine in tilted_sights(survey).values() for s in mine)
     lines = []
     for n in lacking[:12]:
         directions = sorted({a for a, targets in sights.directions.values() if n in targets})
