@@ -117,22 +117,23 @@ def _named(survey: Survey, hypothesis: Hypothesis, found: Difference) -> Hypothe
     other = [i for i, name in enumerate(found.names) if name not in FOCAL + CENTRE]
     focal, centre = ([i for i, name in enumerate(found.names) if name in of] for of in (FOCAL, CENTRE))
 
-    def named(name: str, parameters: int, keys: tuple[Edit, ...], what: str) -> Hypothesis:
-        return replace(hypothesis, name=name, parameters=parameters, cause=begin + what,
+    def named(name: str, parameters: int, keys: tuple[Edit, ...], cause: str) -> Hypothesis:
+        return replace(hypothesis, name=name, parameters=parameters, cause=cause,
                        edits=keys or hypothesis.edits, change=found_by(keys, hypothesis.change))  # fmt: skip
 
     if centre and found.vanishes([*focal, *other, *place]):
         shift = ", ".join(f"{found.d[i]:+.2f}" for i in centre)
         keys = crop_keys(survey, camera, first, 1.0, found.d[centre]) if len(centre) == 2 else ()
-        return named("images shifted", 3, keys, f"its images are shifted by ({shift}) px: another crop of the sensor")
+        cause = f"{begin}its images are shifted by ({shift}) px: another crop of the sensor"
+        return named("images shifted", 3, keys, cause)
     if focal:
         ratio = float(1.0 + found.d[focal[0]] / found.before[focal[0]])
         if found.vanishes([*focal[1:], *centre, *other, *place], _resized(found)):
             keys = crop_keys(survey, camera, first, ratio)
-            return named("images resized", 2, keys, f"its images have {ratio:.5g} times the size")
+            return named("images resized", 2, keys, f"{begin}its images have {ratio:.5g} times the size")
         if found.vanishes([*other, *place]):
             keys = block_keys(survey, camera, [found.names[i] for i in (*focal, *centre)], (first,))
-            said = f"its focal length is {ratio:.5f} times the former one: focus or zoom was touched"
+            said = f"{begin}its focal length is {ratio:.5f} times the former one: focus or zoom was touched"
             return named("focus touched", 5, keys, said)
     if found.vanishes([*focal, *centre, *other]):
         cause = f"camera {camera} was moved on its station before epoch {first} {motion_text(found.motion)}"

@@ -206,11 +206,11 @@ def _of_tables(case: Case, linear: Linear) -> Iterator[Effect]:
         def score(late: FloatArray, ids: Sequence[tuple[str, ...]] = ids, speed: FloatArray = speed) -> Score:
             return of_others(linear, "table", dict(zip(ids, (late[:, None] * speed)[:, :, None], strict=True)))
 
-        name = f"table {table.table_id}"
         yield from _modelled(
             case, Place("table", (table.table_id,), "clock"), ("table_clock", table.table_id), table.clock,
             "read the table while it stands still, and measure again",
-            (f"{name}: its readings are late", f"{name}: its clock drifts"), len(mine), score,
+            (f"table {table.table_id}: its readings are late", f"table {table.table_id}: its clock drifts"), len(mine),
+            score,
         )  # fmt: skip
         for k in range(angles.shape[1]):
             D = -np.eye(angles.shape[1])[k] * angles
@@ -244,12 +244,11 @@ def _of_hands(case: Case, linear: Linear) -> Iterator[Effect]:
         rows = [i for i, _ in poses.values()]
         if len(rows) < _FEWEST or station not in known:
             continue
-        name = f"the poses of {station} are"
         yield from _modelled(
             case, Place("station", (station,), "clock"), ("pose_clock", station), known[station],
             "stop the motion at every epoch, or read pose and image at the same time, and measure again",
-            (f"{name} late", f"{name} ever later against the images"), len(rows),
-            partial(_of_path, case.survey, linear, rows),
+            (f"the poses of {station} are late", f"the poses of {station} are ever later against the images"),
+            len(rows), partial(_of_path, case.survey, linear, rows),
         )  # fmt: skip
 
 

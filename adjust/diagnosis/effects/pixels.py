@@ -84,9 +84,9 @@ def _interlaced(case: Case, linear: Linear, camera: str) -> Effect:
         return np.cos(np.pi * b.uv[:, 1])[:, None, None] * np.eye(2) if b.camera_id == camera else None
 
     def said(theta: FloatArray, sigmas: FloatArray) -> str:
-        by = ", ".join(f"{t:+.2f} +- {s:.2f}" for t, s in zip(theta, sigmas, strict=True))
-        return (f"camera {camera}: image points at even rows are shifted against those at odd ones by twice ({by}) px: "
-                "as of two moments")  # fmt: skip
+        (u, v), (su, sv) = theta, sigmas
+        return (f"camera {camera}: image points at even rows are shifted against those at odd ones by twice "
+                f"({u:+.2f} +- {su:.2f}, {v:+.2f} +- {sv:.2f}) px: as of two moments")  # fmt: skip
 
     hypothesis = Hypothesis(
         "interlaced", "", "take every second row of its images, read apart, or whole images, and detect them again",

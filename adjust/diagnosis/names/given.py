@@ -72,7 +72,7 @@ def _exchanges(survey: Survey, given: list[str]) -> Iterator[Hypothesis]:
     x = _values(survey, given)
     for a, b in combinations(given, 2):
         cause = f"the given coordinates of points {a} and {b} are each other's"
-        yield _changed(survey, "given points exchanged", cause, f"exchange the coordinates of {a} and {b}",
+        yield _changed(survey, "given points exchanged", cause, f"exchange the coordinates of {a} and {b} in survey.toml",
                        "x_in_world", {a: x[b], b: x[a]})  # fmt: skip
 
 
@@ -84,8 +84,8 @@ def _slips(survey: Survey, given: list[str]) -> Iterator[Hypothesis]:
             if abs(new[axis] - x[axis]) > 1e-6:
                 yield _changed(
                     survey, "slipped decimal", f"point {name}: the decimal point of its given {what} has slipped: "
-                    f"{x[axis]:.10g} m for {new[axis]:.10g} m", f"write {new[axis]:.10g} m for {what} of point {name}",
-                    what, {name: new},
+                    f"{x[axis]:.10g} m for {new[axis]:.10g} m",
+                    f"write {new[axis]:.10g} m for {what} of point {name} in survey.toml", what, {name: new},
                 )  # fmt: skip
 
 
@@ -98,14 +98,14 @@ def _axes(survey: Survey, given: list[str]) -> Iterator[Hypothesis]:
         *((said, f"multiply all of them by {LENGTH_RATIOS[said]:g}", LENGTH_RATIOS[said] * np.eye(3))
           for said in ("are millimetres, read as metres", "are metres, read as millimetres")),
     ):  # fmt: skip
-        yield _changed(survey, "axes or unit of given coordinates", f"the given coordinates {said}", remedy,
-                       "x_in_world", {n: M @ v for n, v in x.items()})  # fmt: skip
+        yield _changed(survey, "axes or unit of given coordinates", f"the given coordinates {said}",
+                       f"{remedy} in survey.toml", "x_in_world", {n: M @ v for n, v in x.items()})  # fmt: skip
 
 
 def _changed(
     survey: Survey, name: str, cause: str, remedy: str, key: str, new: dict[str, FloatArray]
 ) -> Hypothesis:
-    return Hypothesis(name, cause, f"{remedy} in survey.toml", Place("point", tuple(new), key), with_given(survey, new),
+    return Hypothesis(name, cause, remedy, Place("point", tuple(new), key), with_given(survey, new),
                       _edits(new))  # fmt: skip
 
 

@@ -57,15 +57,16 @@ class Verdict:
 def hypotheses(n_axes: int) -> list[Misread]:
     """All mistakes, the simplest first."""
     names, one, own = [f"axis{i + 1}" for i in range(n_axes)], np.ones(n_axes), tuple(range(n_axes))
-    two, other, exchanged = n_axes == 2, own[::-1], "axis1 and axis2 are exchanged"
-    out = [Misread("", one, own)] + [Misread(exchanged, one, other)] * two
+    two, other = n_axes == 2, own[::-1]
+    out = [Misread("", one, own)] + [Misread("axis1 and axis2 are exchanged", one, other)] * two
     out += [Misread(f"the readings of {' and '.join(names)} {what}", factor * one, own) for factor, what in _UNITS]
     out += [Misread(f"the readings of {name} {what}", np.where(np.arange(2) == i, factor, 1.0), own)
             for i, name in enumerate(names if two else ()) for factor, what in _UNITS]  # fmt: skip
     out += [Misread(f"every epoch has the reading of the {which} one", one, own, partial(np.roll, shift=by, axis=0))
             for by, which in ((1, "following"), (-1, "preceding"))]  # fmt: skip
     out.append(Misread("the readings are in the opposite order of the epochs", one, own, np.flipud))
-    both = [Misread(f"{exchanged}, and the readings {what}", factor * one, other) for factor, what in _UNITS]
+    both = [Misread(f"axis1 and axis2 are exchanged, and the readings {what}", factor * one, other)
+            for factor, what in _UNITS]  # fmt: skip
     return out + both * two
 
 

@@ -53,8 +53,10 @@ def _scatter(views: Sequence[View]) -> float:
 
 
 def _moving(survey: Survey, kind: str, owner: str, evidence: float) -> Hypothesis:
+    cause = {"target": f"target {owner} moves between epochs, but is said to stand still",
+             "station": f"station {owner} moves between epochs, but is said to stand still"}[kind]  # fmt: skip
     return Hypothesis(
-        "motion forgotten", f"{kind} {owner} moves between epochs, but is said to stand still",
+        "motion forgotten", cause,
         f'write motion = "epoch" below [{kind}s.{owner}] in survey.toml', Place(kind, (owner,), "motion"),
         with_changed(survey, f"{kind}s", owner, motion="epoch"), (SetKey((f"{kind}s", owner, "motion"), "epoch"),),
         evidence, 6,

@@ -45,7 +45,8 @@ class Misreading:
 
     def text(self, whose: str) -> str:
         """What is wrong with which of them; whose: "their" or "its"."""
-        return f"{'its decimal point' if self.name == 'slipped decimal' else f'{whose} values'} {self.said}"
+        what = "its decimal point" if self.name == "slipped decimal" else f"{whose} values"
+        return f"{what} {self.said}"
 
     def may_be(self, widest: float) -> bool:
         """Whether values of which the largest is that (rad or m) can have been read so: a circle has one turn.

@@ -99,17 +99,17 @@ def _possible(
     up_to, up_at, along = A[:, 5], A[:, 2], np.ones(len(A))  # by the heights of the two ends' positions, and by lengths
     tilted = np.isin(kinds, ("zenith", "slope_distance", "height_difference"))
     lengths = np.isin(kinds, ("slope_distance", "horizontal_distance"))
-    rows = "of its rows in terrestrial.csv"
     for setup_id in dict.fromkeys(s for s in setups.tolist() if s):
         mine = setups == setup_id
         yield ("instrument height", f"the instrument's height at set-up {setup_id}",
                Place("setup", (setup_id,), "instrument_height_m"), mine & tilted, up_at,
-               f"change instrument_height {rows}")  # fmt: skip
+               "change instrument_height of its rows in terrestrial.csv")  # fmt: skip
         yield ("prism constant", f"the reflector's constant at set-up {setup_id}",
-               Place("setup", (setup_id,), "value"), mine & lengths, along, f"change the distances {rows}")  # fmt: skip
+               Place("setup", (setup_id,), "value"), mine & lengths, along,
+               "change the distances of its rows in terrestrial.csv")  # fmt: skip
     for target in dict.fromkeys(targets.tolist()):
         yield ("target height", f"the target's height on point {target}", Place("point", (target,), "target_height_m"),
-               (targets == target) & tilted, up_to, f"change target_height {rows}")  # fmt: skip
+               (targets == target) & tilted, up_to, "change target_height of its rows in terrestrial.csv")  # fmt: skip
     yield ("prism constant", "the reflector's constant of all distances", Place("instrument", (), ""), lengths, along,
            "give an instrument's distance_offset, or change all distances")  # fmt: skip
 
