@@ -72,8 +72,8 @@ def _exchanges(survey: Survey, given: list[str]) -> Iterator[Hypothesis]:
     x = _values(survey, given)
     for a, b in combinations(given, 2):
         cause = f"the given coordinates of points {a} and {b} are each other's"
-        yield _changed(survey, "given points exchanged", cause, f"exchange the coordinates of {a} and {b} in survey.toml",
-                       "x_in_world", {a: x[b], b: x[a]})  # fmt: skip
+        remedy = f"exchange the coordinates of {a} and {b} in survey.toml"
+        yield _changed(survey, "given points exchanged", cause, remedy, "x_in_world", {a: x[b], b: x[a]})
 
 
 def _slips(survey: Survey, given: list[str]) -> Iterator[Hypothesis]:
