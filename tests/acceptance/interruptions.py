@@ -150,6 +150,7 @@ def start(argv: list[str], home: Path, happens: Happens | None = None) -> int:
 
     def command() -> int:
         if happens is not None:
+            os.environ["LABSURVEY_THREADS"] = "1"  # in the copy alone: the same steps in the same order every time
             _tell(home, happens)
         return main([*argv, "--quiet"])
 
