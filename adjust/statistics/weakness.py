@@ -23,8 +23,8 @@ _WORK, _SOLVED = 1_000_000_000, 5_000_000
 """Correlations that are looked at in drawn solutions, and those in columns of the covariance matrix."""
 _DRAWS, _SURE = 64, 7.0
 """Drawn solutions, and by how many sigmas what they tell may be wrong."""
-_COMPARED = 256
-"""Components that are compared with all others in one go."""
+_COMPARED, _TOGETHER = 256, 8
+"""Components that are compared with all others in one go, and how often that is done side by side."""
 _KRYLOV, _RESTARTS = 40, 50
 _Found = list[tuple[int, int, float]]
 """Two components and their correlation."""
@@ -105,7 +105,8 @@ def _likely(system: LinearSystem, index: IntArray, limit: float) -> IntArray:
 def _largest(block: Callable[[slice, slice], FloatArray], total: int, n: int, least: float) -> IntArray:
     """Pairs (k, 2) of n columns with each other and with all others, those at least of a size, the largest first.
 
-    block: of some rows and columns. total: rows. Small blocks: what is not so large is never written to memory.
+    block: of some rows and columns. total: rows. Small blocks: what is not so large is never written to memory, and
+    what is smaller than enough others that were found before is not so large.
     """
 
     def above(first: int) -> FloatArray:
@@ -119,7 +120,11 @@ def _largest(block: Callable[[slice, slice], FloatArray], total: int, n: int, le
                 found.append(np.stack([row + i, first + j, size[i, j]], axis=1))
         return _first(np.concatenate(found))
 
-    return _first(np.concatenate(side_by_side(above, range(0, n, _COMPARED))))[:, :2].astype(np.int64)
+    out, firsts = np.zeros((0, 3)), range(0, n, _COMPARED)
+    for k in range(0, len(firsts), _TOGETHER):
+        out = _first(np.concatenate([out, *side_by_side(above, firsts[k : k + _TOGETHER])]))
+        least = max(least, float(out[-1, 2])) if len(out) == _KEPT else least
+    return out[:, :2].astype(np.int64)
 
 
 def _first(found: FloatArray) -> FloatArray:
