@@ -1,7 +1,6 @@
 """From a survey of stations and pairs to a pose network."""
 
-from dataclasses import dataclass, field, fields
-from functools import lru_cache
+from dataclasses import fields
 
 import numpy as np
 
@@ -61,23 +60,6 @@ def network_from_survey(survey: Survey, any_datum: bool = False) -> PoseNetwork:
     any_datum: a survey that gives none is solved as a free network. Raises SurveyError for pairs that join other frames
     than fixed stations, IndeterminateError where the survey gives no datum.
     """
-    parts = [id(getattr(survey, f.name)) for f in fields(survey) if f.name != "pairs"]
-    parts += [id(x) for p in survey.pairs for x in (p.pair_id, p.a, p.b, p.b_from_a, p.cov, p.group)]
-    network, used = _network(_AllUsed(tuple(parts), survey), any_datum), [p.used for p in survey.pairs]
-    return network if network.used.tolist() == used else network.with_used(np.array(used, dtype=np.bool_))
-
-
-@dataclass(frozen=True)
-class _AllUsed:
-    """A survey, equal to others of the same ``parts``: all but which pairs it uses."""
-
-    parts: tuple[int, ...]
-    survey: Survey = field(compare=False)
-
-
-@lru_cache(1)  # for all solutions of a search
-def _network(of: _AllUsed, any_datum: bool) -> PoseNetwork:
-    survey = of.survey
     stations = survey.stations_by_id
     if not survey.pairs_join_fixed_stations:
         for pair, ref in ((p, r) for p in survey.pairs for r in (p.a, p.b)):
