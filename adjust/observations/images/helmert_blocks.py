@@ -50,16 +50,18 @@ def runs_of_epochs(blocks: Sequence[ImageBlock]) -> IntArray:
     number: dict[str, int] = {}
     epoch = np.array([number.setdefault(b.epoch_id, len(number)) for b in blocks], dtype=np.int64)
     point = np.concatenate([np.zeros(0, dtype=np.int64), *(b.point_idx for b in blocks)])
-    of_point, work = np.repeat(epoch, [len(b.point_idx) for b in blocks]), 0.0
+    of_point, n_points = np.repeat(epoch, [len(b.point_idx) for b in blocks]), int(point.max(initial=-1)) + 1
 
-    def columns(mine: BoolArray) -> float:
-        return 6.0 * len(np.unique(of_point[mine])) + 3.0 * len(np.unique(point[mine]))
+    def columns(run: IntArray) -> FloatArray:
+        """Of the runs (n,) of all image points: unknowns of their epochs and points (r,)."""
+        epochs, points = np.unique(run * len(number) + of_point), np.unique(run * n_points + point)
+        n = int(run.max(initial=-1)) + 1
+        return np.asarray(6.0 * np.bincount(epochs // max(len(number), 1), minlength=n)
+                          + 3.0 * np.bincount(points // max(n_points, 1), minlength=n))  # fmt: skip
 
-    for i in range(len(number) // _EPOCHS + 1):
-        mine = of_point // _EPOCHS == i
-        work += 4.0 * np.count_nonzero(mine) * columns(mine) ** 2
-    less = work < _GAIN * float(_work(columns(of_point >= 0), 0.0))
-    return epoch // _EPOCHS if less else np.zeros_like(epoch)
+    run, together = of_point // _EPOCHS, columns(np.zeros_like(of_point)).sum()
+    work = (4.0 * np.bincount(run) * columns(run) ** 2).sum()
+    return epoch // _EPOCHS if work < _GAIN * float(_work(together, 0.0)) else np.zeros_like(epoch)
 
 
 def _cut(incidence: sparse.csr_array, hidden: FloatArray) -> BoolArray | None:
