@@ -191,7 +191,8 @@ class Residuals(Sequence[ObservationResidual]):
                 *self._named(i), a.observed[of], a.adjusted[of], a.residual[of], a.sigma[of], a.redundancies[of],
                 a.standardized[of], a.test[i].item(), a.used[i].item(),
             )  # fmt: skip
-            self._made[i : i + 1] = [found] if i < len(self._made) else []
+            if i < len(self._made):
+                self._made[i] = found
         return found
 
 

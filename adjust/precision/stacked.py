@@ -11,7 +11,7 @@ from adjust.frames.unknowns import Unknowns
 from adjust.model.survey import FloatArray, IntArray
 from adjust.observations.images.bundle_hidden import BundleHidden
 from adjust.precision.s_transformation import STransformation
-from adjust.precision.tree import TreeCovariance
+from adjust.precision.tree import TreeCovariance, unit_rows
 
 AT_ONCE = 64
 """Columns that the matrix is multiplied by in one go."""
@@ -76,8 +76,7 @@ class Stacked:
     def joint(self, keys: Sequence[int]) -> FloatArray:
         """Joint covariance of any unknowns, as solved, stacked in this order."""
         rows = np.concatenate([self.rows(k) for k in keys])
-        entries = np.ones(len(rows)), rows, np.arange(len(rows) + 1)
-        return self.among(sparse.csr_array(entries, (len(rows), self.n)))
+        return self.among(unit_rows(rows, self.n))
 
     def by_key(
         self, rows: Mapping[int, FloatArray], times: Callable[[FloatArray], FloatArray]

@@ -32,6 +32,11 @@ _MANY = 20
 """Keys that are looked up one by one, of a joint covariance."""
 
 
+def unit_rows(at: IntArray, n: int) -> sparse.csr_array:
+    """(k, n): in each row nothing but a one, in these columns (k,)."""
+    return sparse.csr_array((np.ones(len(at)), at, np.arange(len(at) + 1)), (len(at), n))
+
+
 class TreeCovariance:
     """Marginal and joint covariances. ``dims`` gives the dimension of every key; keys are also counted 0, 1, ..."""
 
@@ -91,7 +96,7 @@ class TreeCovariance:
         """Joint covariance of rows of a stacked vector; of most unknowns the whole matrix is less work."""
         if 2 * len(rows) > self.n:
             return np.asarray(self.full()[np.ix_(rows, rows)])
-        return self.among(sparse.csr_array((np.ones(len(rows)), rows, np.arange(len(rows) + 1)), (len(rows), self.n)))
+        return self.among(unit_rows(rows, self.n))
 
     def rows(self, keys: Sequence[int]) -> IntArray:
         """Rows of these keys in a stacked vector of all unknowns, as :meth:`times` takes it."""

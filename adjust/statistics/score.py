@@ -24,7 +24,6 @@ from adjust.testing.significance import LEVEL, Significance
 _SEEN = 1e-7
 """Share of a change's column that no unknown takes over, below which it does not show."""
 _CUTS = 40
-_ONE_SET: IntArray = np.array([0, -1])
 _SMALL = 1_000_000  # numbers of a matrix that is written out
 
 
@@ -182,19 +181,19 @@ class LinearScores:
         return scores(g, BB, taken[0][:, :, 0])[0]
 
     def _normals(
-        self, parts: Sequence[Part], group: IntArray, ptr: IntArray = _ONE_SET
+        self, parts: Sequence[Part], group: IntArray, ptr: IntArray | None = None
     ) -> tuple[FloatArray, FloatArray, list[FloatArray]]:
         """Of groups of parts, each a change of its own: B'e (S, k), B'B (S, k, k); of sets B'A Q A'B (s, k, s, k).
 
-        group: (p,) of every part, 0, 1, ... in this order. ptr: groups at which sets begin, and S, or -1 for it. No two
-        parts of a group have a row in common.
+        group: (p,) of every part, 0, 1, ... in this order. ptr: groups at which sets begin, and S; one set without. No
+        two parts of a group have a row in common.
         """
         rows, B = (np.concatenate(x) for x in zip(*parts, strict=True))
         of_row, k, n = np.repeat(group, [len(r) for r, _ in parts]), B.shape[1], int(group[-1]) + 1
         by_group = np.split(np.arange(len(rows)), np.searchsorted(of_row, np.arange(1, n)))
         g = np.array([B[mine].T @ self.e[rows[mine]] for mine in by_group])
         BB = np.array([B[mine].T @ B[mine] for mine in by_group])
-        ends = k * np.where(ptr < 0, n, ptr)
+        ends = k * (np.array([0, n]) if ptr is None else ptr)
         if self._dense is not None:
             dense = self._dense
             BA = np.concatenate([B[mine].T @ dense[rows[mine]] for mine in by_group])

@@ -10,7 +10,7 @@ from adjust.diagnosis.hypothesis import Finding, Hypothesis
 from adjust.diagnosis.names.given import wrong_given
 from adjust.diagnosis.units.conventions import ANGLES, LENGTH_RATIOS, LENGTHS, SLIPS
 from adjust.diagnosis.units.readings import misread_readings
-from adjust.diagnosis.weights.sigmas import id_of, odd_among
+from adjust.diagnosis.weights.sigmas import ODD, id_of, odd_among
 from adjust.model.errors import listed
 from adjust.model.names import grouped
 from adjust.model.observations import Distance, PositionRef, Reading
@@ -93,7 +93,7 @@ def _sigmas(survey: Survey) -> Iterator[Finding]:
     for kind, found in grouped((str(getattr(o, "kind", "distance")), o) for o in every).items():
         if odd := [id_of(o) for o in odd_among(found)[1]]:
             yield Finding("problem", "suspicious sigma", tuple(odd), f"{kind} {listed(odd, 6)}: the sigma is more than "
-                          "100 times off that of the others", "check its unit")  # fmt: skip
+                          f"{ODD:.0f} times off that of the others", "check its unit")  # fmt: skip
     yield from _lengths(survey)
 
 

@@ -23,7 +23,7 @@ from adjust.testing.distributions import chi2
 _ALPHA = 1e-4
 _FEWEST = 8.0
 """Redundancy from which a factor says anything."""
-_ODD = 100.0
+ODD = 100.0
 """Ratio of a sigma to the usual one of its kind that nobody means: a sigma of zero, or of a metre.
 
 No instrument is a hundred times as good as another in one survey; units of lengths and angles differ by that.
@@ -97,7 +97,7 @@ def odd_sigmas(case: Case) -> Iterator[Hypothesis]:
 def odd_among(members: Sequence[_One]) -> tuple[float, list[_One]]:
     """The usual sigma of observations of a kind, and those whose sigma is a hundred times that, or a hundredth."""
     usual = float(np.median([o.sigma for o in members]))
-    return usual, [o for o in members if not usual / _ODD < o.sigma < usual * _ODD]
+    return usual, [o for o in members if not usual / ODD < o.sigma < usual * ODD]
 
 
 def _with_usual(case: Case, field: str, kind: str, group: str, odd: list[_One], usual: float) -> Hypothesis:
