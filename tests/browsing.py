@@ -39,6 +39,14 @@ CONTRAST = """(() => {
   }
   return worst;
 })()"""
+# reading a page's own canvas twice makes Chromium complain of it: a copy that is there to be read is read
+INKED = """((c) => {
+  const copy = Object.assign(document.createElement("canvas"), { width: c.width, height: c.height });
+  const d = copy.getContext("2d", { willReadFrequently: true });
+  d.drawImage(c, 0, 0);
+  return d.getImageData(0, 0, c.width, c.height).data.filter((x, k) => k % 4 === 3 && x > 0).length;
+})"""
+"""How many pixels of a canvas something is drawn in; a function of the canvas."""
 BROWSER = next((path for name in printing.BROWSERS if (path := shutil.which(name))), None)
 
 

@@ -9,7 +9,7 @@ from capture.plan.plan import read_plan
 from capture.session.run import run_plan
 from capture.web.serve import PageServer
 from capture.web.state import SessionView
-from tests.browsing import CONTRAST, Page
+from tests.browsing import CONTRAST, INKED, Page
 from tests.capture.session_runs import write_plan
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -35,9 +35,7 @@ def test_images_overlay_and_coverage_are_shown(browser: Any, address: str, width
     assert p.inner_text("#state") == "finished"
     assert "6 of 6 epochs" in p.inner_text("#count")
     assert p.locator(".camera").first.inner_text().startswith("X · t06")
-    inked = """(() => { const c = document.querySelector('.stage canvas'), d = c.getContext('2d')
-        .getImageData(0, 0, c.width, c.height).data; return d.filter((x, k) => k % 4 === 3 && x > 0).length; })()"""
-    page.wait(f"{inked} > 1000")
+    page.wait(f"{INKED}(document.querySelector('.stage canvas')) > 1000")
     for k in range(p.locator("canvas").count()):
         assert p.locator("canvas").nth(k).get_attribute("aria-label")
     ratio, text = p.evaluate(CONTRAST)

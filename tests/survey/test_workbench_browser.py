@@ -26,7 +26,7 @@ from survey.workbench.pages.beginning import Beginning
 from survey.workbench.rows import columns
 from survey.workbench.server import WEB, Server
 from survey.workbench.session import Workbench
-from tests.browsing import CONTRAST, Page
+from tests.browsing import CONTRAST, INKED, Page
 from tests.survey.accessible import FAULTS
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -151,10 +151,7 @@ def test_every_view_is_drawn(desk: Page, view: str) -> None:
                   "document.querySelector('#right p.warn').textContent")  # fmt: skip
         assert p.inner_text("#right p.warn") == ""
     if view in ("scene", "plan", "south", "east", "network"):
-        inked = """(() => { const c = document.querySelector('#right canvas'), d = c.getContext('2d')
-            .getImageData(0, 0, c.width, c.height).data; let n = 0; for (let i = 3; i < d.length; i += 4) n += d[i] > 0;
-            return n > 300; })()"""
-        desk.wait(inked)
+        desk.wait(f"{INKED}(document.querySelector('#right canvas')) > 300")
     assert p.evaluate(FAULTS) == []
     assert desk.complaints == []
 
