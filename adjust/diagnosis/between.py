@@ -14,7 +14,7 @@ from gtsam import Pose3
 from adjust.diagnosis.units.conventions import LENGTH_RATIOS
 from adjust.epochs.congruence import Common, CongruenceOptions, common, compare
 from adjust.epochs.congruence_result import Congruence
-from adjust.epochs.states import EpochState, aligned, moved, origin
+from adjust.epochs.states import Epoch, aligned, moved, origin
 from adjust.model.errors import SurveyError, listed
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray
@@ -45,7 +45,7 @@ class Between:
     p: float = 1.0
 
 
-_Trial = tuple[Between, EpochState, FloatArray]
+_Trial = tuple[Between, Epoch, FloatArray]
 """A cause, the second epoch as it would be without it, and what moves freely between the two (7, k)."""
 
 
@@ -124,9 +124,7 @@ def _mirrored(both: Common, found: Congruence) -> Iterator[_Trial]:
     if any(isinstance(v, Pose3) for v in both.before.values) or len(both.names) < 4:
         return
     S = np.diag([1.0, 1.0, -1.0])
-    many = np.kron(np.eye(len(both.names)), S)
-    flipped = replace(both.after, values=tuple(S @ origin(v) for v in both.after.values),
-                      cov=many @ both.after.cov @ many.T)  # fmt: skip
+    flipped = both.after.mapped(tuple(S @ origin(v) for v in both.after.values), S, 1.0)
     x, y = _places(replace(both, after=flipped))
     epoch = found.epochs[1]
     cause = Between("mirrored", f"{epoch} is the mirror image of {found.epochs[0]}: one of the two is left-handed",
@@ -152,7 +150,7 @@ def _elsewhere(both: Common, found: Congruence) -> Iterator[_Trial]:
     yield cause, _moved_by(both.after, move), _with(both.directions, _RIGID)
 
 
-def _moved_by(state: EpochState, move: FloatArray) -> EpochState:
+def _moved_by(state: Epoch, move: FloatArray) -> Epoch:
     """By a rigid motion (4, 4)."""
     return moved(state, np.concatenate([move[:3, 3], rotation_log(move[:3, :3]), [0.0]]))
 

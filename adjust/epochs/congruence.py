@@ -11,17 +11,30 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from gtsam import Pose3
 
+from adjust.epochs.change import Change, Displaced, MatrixChange
 from adjust.epochs.congruence_result import Congruence, CongruenceStep, CongruenceTest, Motion
-from adjust.epochs.states import MOTIONS, EpochState, aligned, differences, epoch_state, gauge_rows
+from adjust.epochs.joined import JoinedChange
+from adjust.epochs.states import (
+    MOTIONS,
+    Epoch,
+    EpochNormals,
+    EpochState,
+    aligned,
+    epoch_normals,
+    epoch_state,
+    known,
+)
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
-from adjust.precision.s_transformation import transformed
 from adjust.statistics.relative_precision import ellipsoid
 from adjust.statistics.result import Ellipsoid
 from adjust.testing.criteria import LevelOptions, noncentrality, sidak
 from adjust.testing.distributions import chi2, fisher
-from adjust.testing.quadratic_forms import pseudo_precision, pseudo_square, pseudo_square_beside
+from adjust.testing.quadratic_forms import pseudo_square
+
+MOST_IN_MATRIX = 600
+"""Components up to which epochs are compared by one covariance matrix; more, by their normal equations."""
 
 
 @dataclass(frozen=True)
@@ -44,43 +57,6 @@ class CongruenceOptions:
 DEFAULT_CONGRUENCE = CongruenceOptions()
 
 
-@dataclass(frozen=True, eq=False)
-class _Change:
-    """Differences d (n,), their covariance Q (n, n), the motions G (n, k) that do not count, and whose rows are whose.
-
-    owner: (n,) number of the name. component: (n,) of rx ry rz x y z, 0 to 5. weight: (n,) in the datum. held: (n, k)
-    what the datum holds, held' d = 0. nowhere: names of which an epoch knows the rotation alone.
-    """
-
-    names: tuple[ParameterName, ...]
-    d: FloatArray
-    Q: FloatArray
-    G: FloatArray
-    owner: IntArray
-    component: IntArray
-    weight: FloatArray
-    held: FloatArray
-    nowhere: frozenset[ParameterName]
-
-    def rows(self, stable: Sequence[int]) -> IntArray:
-        """Components of these names."""
-        return np.flatnonzero(np.isin(self.owner, stable))
-
-    def transformed(self, stable: Sequence[int]) -> "_Change":
-        """In the datum of these names: S = I - G (G'EG)^-1 G'E."""
-        if not self.G.shape[1]:
-            return self
-        E = np.zeros(len(self.d))
-        E[self.rows(stable)] = self.weight[self.rows(stable)]
-        if np.linalg.matrix_rank(np.sqrt(E)[:, None] * self.G) < self.G.shape[1]:
-            raise SurveyError(
-                f"{len(stable)} stable points cannot carry the {self.G.shape[1]} motions that the epochs leave open; "
-                "name more, or hold something in both"
-            )
-        d, Q = transformed(self.d, self.Q, self.G, E)
-        return replace(self, d=d, Q=Q, held=E[:, None] * self.G)
-
-
 def congruence(
     first: Adjustment, second: Adjustment, options: CongruenceOptions = DEFAULT_CONGRUENCE
 ) -> Congruence:
@@ -98,15 +74,16 @@ class Common:
     """What two epochs have in common, not aligned; directions and pooled as :func:`compare` takes them."""
 
     names: tuple[ParameterName, ...]
-    before: EpochState
-    after: EpochState
+    before: Epoch
+    after: Epoch
     directions: FloatArray
     pooled: tuple[float, float, float]
 
 
 def common(first: Adjustment, second: Adjustment, options: CongruenceOptions = DEFAULT_CONGRUENCE) -> Common:
     """The points and fixed stations that both epochs have; raises SurveyError where there are none."""
-    before, after = epoch_state(first), epoch_state(second)
+    epoch = epoch_state if min(map(_size, (first, second))) <= MOST_IN_MATRIX else epoch_normals
+    before, after = epoch(first), epoch(second)
     names = tuple(n for n in before.names if n in after.index)
     if not names:
         raise SurveyError("the epochs have no point and no fixed station in common; use the same ids in both")
@@ -115,8 +92,13 @@ def common(first: Adjustment, second: Adjustment, options: CongruenceOptions = D
     return Common(names, before, after, directions, _pooled(first, second, options.scaled))
 
 
+def _size(adjustment: Adjustment) -> int:
+    """Components of its points and fixed stations."""
+    return sum(6 if isinstance(v, Pose3) else 3 for v in known(adjustment)[1])
+
+
 def compare(
-    names: tuple[ParameterName, ...], before: EpochState, after: EpochState, directions: FloatArray,
+    names: tuple[ParameterName, ...], before: Epoch, after: Epoch, directions: FloatArray,
     pooled: tuple[float, float, float], options: CongruenceOptions, cross: FloatArray | None = None,
 ) -> Congruence:  # fmt: skip
     """Of two states of the same names, aligned. directions (7, k): motions that do not count.
@@ -124,7 +106,7 @@ def compare(
     pooled: sigma0, its redundancy, p of the test of equal variances. cross: covariance (n, n) of the first with the
     second state where they are not independent.
     """
-    change = _change(names, before, after, directions, cross)
+    change = _change(before, after, directions, cross)
     begin = _numbers(names, options.reference)
     kept = [i for i in begin if (change.owner == i).any()]
     if not kept:
@@ -161,7 +143,7 @@ def _pooled(first: Adjustment, second: Adjustment, scaled: bool) -> tuple[float,
     return float(np.sqrt((first.omega + second.omega) / (f1 + f2))), float(f1 + f2), p
 
 
-def _open_motions(before: EpochState, after: EpochState) -> FloatArray:
+def _open_motions(before: Epoch, after: Epoch) -> FloatArray:
     """Motions (7, k) that either epoch leaves open, orthonormal in units of the extent."""
     both = np.hstack([before.directions, after.directions])
     if not both.shape[1]:
@@ -178,34 +160,12 @@ def _named(directions: FloatArray) -> tuple[str, ...]:
     return tuple(MOTIONS[i] for i in range(7) if size[i].max() > 1e-6 * size.max())
 
 
-def _change(
-    names: tuple[ParameterName, ...], before: EpochState, after: EpochState, directions: FloatArray,
-    cross: FloatArray | None,
-) -> _Change:  # fmt: skip
-    d, Q = differences(before, after), before.cov + after.cov
-    if cross is not None:
-        Q = Q - cross - cross.T
-    G = gauge_rows(before) @ directions
-    known = np.isfinite(d) & (np.diag(before.cov) + np.diag(after.cov) > 0.0)
-    owner = np.repeat(np.arange(len(names)), before.sizes)
-    component = np.concatenate([before.components(n) for n in names])
-    nowhere = frozenset(names[int(i)] for i in owner[~np.isfinite(d)])
-    Q_known = Q if known.all() else Q[np.ix_(known, known)]
-    change = _Change(names, d[known], Q_known, G[known], owner[known], component[known],
-                     np.ones(int(known.sum())), np.zeros((int(known.sum()), 0)), nowhere)  # fmt: skip
-    return replace(change, weight=_weights(change))
-
-
-def _weights(change: _Change) -> FloatArray:
-    """One weight for all positions, one for all rotations: the mean precision of a component if all others are known.
-
-    With points alone, or a datum that both epochs have, they do not matter; metres and radians need them.
-    """
-    position, G = change.component >= 3, change.G
-    if position.all() or not position.any() or not G.shape[1]:
-        return np.ones(len(position))
-    precision = pseudo_precision(transformed(change.d, change.Q, G, np.ones(len(G)))[1], G)
-    return np.asarray(np.where(position, precision[position].mean(), precision[~position].mean()))
+def _change(before: Epoch, after: Epoch, directions: FloatArray, cross: FloatArray | None) -> Change:
+    if isinstance(before, EpochState) and isinstance(after, EpochState):
+        return MatrixChange.of(before, after, directions, cross)
+    if isinstance(before, EpochNormals) and isinstance(after, EpochNormals) and cross is None:
+        return JoinedChange.of(before, after, directions)
+    raise TypeError("both epochs are known by their covariance matrices, or independent and by their normal equations")
 
 
 def _test(statistic: float, freedom: int, pooled: tuple[float, float, float], level: float) -> CongruenceTest:
@@ -217,19 +177,15 @@ def _test(statistic: float, freedom: int, pooled: tuple[float, float, float], le
     return CongruenceTest(F, freedom, f, p, p >= level)
 
 
-def _global(
-    change: _Change, stable: Sequence[int], pooled: tuple[float, float, float], alpha: float
-) -> CongruenceTest:
-    here = change.transformed(stable)
-    rows = here.rows(stable)
-    statistic, rank = pseudo_square_beside(here.d[rows], here.Q[np.ix_(rows, rows)], here.held[rows])
+def _global(change: Change, stable: Sequence[int], pooled: tuple[float, float, float], alpha: float) -> CongruenceTest:
+    statistic, rank = change.square(stable)
     # what the datum takes away is no information, whatever rounding leaves of it
-    rank = min(rank, max(0, len(rows) - change.G.shape[1]))
+    rank = min(rank, max(0, len(change.rows(stable)) - change.G.shape[1]))
     return _test(statistic, rank, pooled, alpha)
 
 
 def _search(
-    change: _Change, begin: list[int], test: CongruenceTest, pooled: tuple[float, float, float],
+    change: Change, begin: list[int], test: CongruenceTest, pooled: tuple[float, float, float],
     options: CongruenceOptions,
 ) -> tuple[list[CongruenceStep], list[int], CongruenceTest]:  # fmt: skip
     """Take out the worst until the rest is congruent, and back what then fits.
@@ -239,7 +195,7 @@ def _search(
     """
     stable, steps = list(begin), list[CongruenceStep]()
     while options.search and not test.passed:
-        shares = _shares(change, stable)
+        shares = change.shares(stable)
         worst = max(shares, key=lambda i: shares[i])
         rest = [i for i in stable if i != worst]
         try:
@@ -254,12 +210,12 @@ def _search(
 
 
 def _readmitted(
-    change: _Change, begin: list[int], stable: list[int], test: CongruenceTest, steps: list[CongruenceStep],
+    change: Change, begin: list[int], stable: list[int], test: CongruenceTest, steps: list[CongruenceStep],
     pooled: tuple[float, float, float], options: CongruenceOptions,
 ) -> tuple[list[CongruenceStep], list[int], CongruenceTest]:  # fmt: skip
     level = sidak(options.alpha, len(begin))
     for i in [i for i in begin if i not in stable] if test.passed else []:
-        single = _single(change.transformed(stable), i, pooled, level)
+        single = _single(change, change.displaced(stable), i, pooled, level)
         more = sorted([*stable, i])
         together = _global(change, more, pooled, options.alpha)
         if single.passed and together.passed:
@@ -268,56 +224,44 @@ def _readmitted(
     return steps, stable, test
 
 
-def _shares(change: _Change, stable: Sequence[int]) -> dict[int, float]:
-    """What each name adds to d' Q^+ d of the others alone: (P d)_j' P_jj^-1 (P d)_j (Niemeier 2008, 13.3)."""
-    here = change.transformed(stable)
-    rows = here.rows(stable)
-    d = here.d[rows]
-    _, _, P = pseudo_square(d, here.Q[np.ix_(rows, rows)])
-    gradient, owner, out = P @ d, here.owner[rows], {}
-    for i in stable:
-        mine = np.flatnonzero(owner == i)
-        if len(mine):
-            out[i] = float(gradient[mine] @ np.linalg.pinv(P[np.ix_(mine, mine)], hermitian=True) @ gradient[mine])
-    return out
-
-
-def _single(here: _Change, i: int, pooled: tuple[float, float, float], level: float) -> CongruenceTest:
-    rows = here.rows([i])
-    statistic, rank, _ = pseudo_square(here.d[rows], here.Q[np.ix_(rows, rows)])
+def _single(
+    change: Change, displaced: Displaced, i: int, pooled: tuple[float, float, float], level: float
+) -> CongruenceTest:
+    statistic, rank, _ = pseudo_square(*displaced(change.rows([i])))
     return _test(statistic, rank, pooled, level)
 
 
 def _motions(
-    change: _Change, before: EpochState, stable: list[int], pooled: tuple[float, float, float],
-    options: CongruenceOptions,
-) -> tuple[Motion, ...]:  # fmt: skip
-    here = change.transformed(stable)
-    present = [i for i in range(len(change.names)) if (change.owner == i).any()]
+    change: Change, before: Epoch, stable: list[int], pooled: tuple[float, float, float], options: CongruenceOptions
+) -> tuple[Motion, ...]:
+    displaced, inside = change.displaced(stable), set(stable)
+    present = np.unique(change.owner).tolist()
     level = sidak(options.alpha, len(present))
-    out = [_motion(here, before, i, i in stable, pooled, level, options) for i in present]
+    rows = np.split(np.arange(len(change.owner)), np.flatnonzero(np.diff(change.owner)) + 1)
+    out = [_motion(change, displaced, mine, before, i in inside, pooled, level, options)
+           for i, mine in zip(present, rows, strict=True)]  # fmt: skip
     return tuple(sorted(out, key=lambda m: (m.stable, m.test.p if np.isfinite(m.test.p) else 2.0)))
 
 
 def _motion(
-    here: _Change, before: EpochState, i: int, stable: bool, pooled: tuple[float, float, float], level: float,
-    options: CongruenceOptions,
+    change: Change, displaced: Displaced, rows: IntArray, before: Epoch, stable: bool,
+    pooled: tuple[float, float, float], level: float, options: CongruenceOptions,
 ) -> Motion:  # fmt: skip
-    name = here.names[i]
-    rows = here.rows([i])
-    d, Q = here.d[rows], here.Q[np.ix_(rows, rows)]
-    place, axes = here.component[rows], before.axes(name)
+    name = change.names[int(change.owner[rows[0]])]
+    d, Q = displaced(rows)
+    place, axes = change.component[rows], before.axes(name)
     full, cov = np.zeros(6), np.zeros((6, 6))
     full[place] = d
     cov[np.ix_(place, place)] = Q
     shift, cov_shift = axes @ full[3:], axes @ cov[3:, 3:] @ axes.T
-    test = _single(here, i, pooled, level)
+    statistic, rank, _ = pseudo_square(d, Q)
+    test = _test(statistic, rank, pooled, level)
     turn, rotation_test = np.zeros(3), None
     if isinstance(before.value(name), Pose3):
         turning = np.flatnonzero(place < 3)
         statistic, rank, _ = pseudo_square(d[turning], Q[np.ix_(turning, turning)])
         turn, rotation_test = full[:3], _test(statistic, rank, pooled, level)
-    if name in here.nowhere:
+    if name in change.nowhere:
         nan = np.full((3, 3), np.nan)
         region = Ellipsoid(np.zeros(0), np.zeros((3, 0)), 1.0 - options.alpha, np.isfinite(pooled[1]))
         return Motion(name, nan[0], nan, region, test, turn, cov[:3, :3], rotation_test, stable, bool(test.p < level),

@@ -1,35 +1,39 @@
-"""Points and fixed stations of an adjusted epoch with their joint covariance, and how they move with the whole."""
+"""Points and fixed stations of an adjusted epoch with what is known of them, and how they move with the whole."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Self, TypeVar
 
 import numpy as np
 from gtsam import Pose3, Rot3
+from scipy import sparse
 
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
-from adjust.precision.precision import Precision, rotations_only
+from adjust.precision.precision import Precision, precision_of, rotations_only
 from adjust.spatial.motions import point_motions
 from adjust.spatial.rigid import skew
+from adjust.statistics.condensed import condensed_system
+from adjust.statistics.system import LinearSystem
 
 MOTIONS = ("tx", "ty", "tz", "rx", "ry", "rz", "scale")
-_MOST = 20_000  # components: 3 GB a matrix, of which a few are held at once
 _POINT = np.array([3, 4, 5])
 _POSE = np.arange(6)
+_MIXED = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
-class EpochState:
-    """names with values (Pose3 or (3,) m) and joint covariance cov (n, n), three components a point, six a pose.
+class Epoch(ABC):
+    """names with values (Pose3 or (3,) m), n components in all: three a point, six a pose.
 
     directions: (7, k) motions of the whole that the epoch leaves open.
     """
 
     names: tuple[ParameterName, ...]
     values: tuple[Pose3 | FloatArray, ...]
-    cov: FloatArray
     directions: FloatArray
 
     @cached_property
@@ -63,14 +67,138 @@ class EpochState:
         value = self.value(name)
         return value.rotation().matrix() if isinstance(value, Pose3) else np.eye(3)
 
-    def part(self, names: Sequence[ParameterName]) -> "EpochState":
+    @property
+    def owner(self) -> IntArray:
+        """Number (n,) of the name of every component."""
+        return np.repeat(np.arange(len(self.names)), self.sizes)
+
+    def part(self, names: Sequence[ParameterName]) -> Self:
         """Only these, in this order."""
         if tuple(names) == self.names:
             return self
         starts = np.concatenate([[0], np.cumsum(self.sizes)])
         rows = np.concatenate([np.arange(starts[self.index[n]], starts[self.index[n] + 1]) for n in names])
-        values = tuple(self.value(n) for n in names)
-        return EpochState(tuple(names), values, self.cov[np.ix_(rows, rows)], self.directions)
+        return replace(self, names=tuple(names), values=tuple(self.value(n) for n in names))._of_rows(rows)
+
+    @abstractmethod
+    def _of_rows(self, rows: IntArray) -> Self:
+        """What is known of these components (n,) of all, where names and values are theirs already."""
+
+    @abstractmethod
+    def mapped(self, values: tuple[Pose3 | FloatArray, ...], L: FloatArray, scale: float) -> Self:
+        """With these values, to which L (3, 3) took the points; poses turned along, and their positions scaled."""
+
+
+@dataclass(frozen=True, eq=False)
+class EpochState(Epoch):
+    """By the joint covariance cov (n, n) of all components."""
+
+    cov: FloatArray
+
+    def _of_rows(self, rows: IntArray) -> Self:
+        return replace(self, cov=self.cov[np.ix_(rows, rows)])
+
+    def mapped(self, values: tuple[Pose3 | FloatArray, ...], L: FloatArray, scale: float) -> Self:
+        """See :class:`Epoch`."""
+        blocks, ends = _blocks(self.values, L, scale), np.cumsum(self.sizes)[:-1]
+
+        def rows(cov: FloatArray) -> FloatArray:
+            return np.concatenate([block @ part for block, part in zip(blocks, np.split(cov, ends), strict=True)])
+
+        return replace(self, values=values, cov=rows(rows(self.cov).T))
+
+
+@dataclass(frozen=True, eq=False)
+class EpochNormals(Epoch):
+    """By the normal equations N (u, u) of all unknowns of the epoch, which its datum has no part in.
+
+    column: (n,) of every component among the unknowns, -1 where it is held. L, scale: what the values were mapped by.
+    """
+
+    system: LinearSystem
+    N: sparse.csr_matrix
+    column: IntArray
+    L: FloatArray = field(default_factory=lambda: np.eye(3))
+    scale: float = 1.0
+
+    def _of_rows(self, rows: IntArray) -> Self:
+        return replace(self, column=self.column[rows])
+
+    def mapped(self, values: tuple[Pose3 | FloatArray, ...], L: FloatArray, scale: float) -> Self:
+        """See :class:`Epoch`."""
+        return replace(self, values=values, L=L @ self.L, scale=scale * self.scale)
+
+    @cached_property
+    def kinds(self) -> list[tuple[IntArray, IntArray, IntArray, FloatArray]]:
+        """Points, and poses: which names (p,), their components (p, k), columns (p, k), how they were mapped (k, k)."""
+        first, out = np.cumsum(self.sizes) - self.sizes, []
+        for k, block in ((3, self.L), (6, _of_pose(self.scale))):
+            which = np.flatnonzero(self.sizes == k)
+            if not len(which):
+                continue
+            at = first[which, None] + np.arange(k)
+            out.append((which, at, self.column[at], block))
+        return out
+
+    def normals(self) -> sparse.csr_matrix:
+        """N with the names' unknowns counted in the frame of the values.
+
+        Raises SurveyError where an epoch that holds but some directions of something was turned.
+        """
+        u = self.N.shape[0]
+        parts = [(np.arange(u), np.arange(u), np.ones(u))]
+        for which, _, columns, block in self.kinds:
+            free = columns >= 0
+            mixed = (~free @ (np.abs(block) > _MIXED) & free).any(axis=1)
+            if mixed.any():
+                name = " ".join(self.names[int(which[mixed][0])])
+                raise SurveyError(
+                    f"{name} is held in some directions alone, and the epochs are turned against each other; hold all "
+                    "of it or nothing"
+                )
+            inside = free[:, :, None] & free[:, None, :]
+            down, across = (np.broadcast_to(c, inside.shape)[inside] for c in (columns[:, :, None], columns[:, None]))
+            change = np.linalg.inv(block) - np.eye(len(block))
+            parts.append((down, across, np.broadcast_to(change, inside.shape)[inside]))
+        rows, columns, values = (np.concatenate(x) for x in zip(*parts, strict=True))
+        back = sparse.csr_matrix((values, (rows, columns)), (u, u))
+        return (back.T @ self.N @ back).tocsr()
+
+    def times(self, right: FloatArray) -> FloatArray:
+        """The joint covariance (n, n) in the epoch's own datum, times columns (n, k)."""
+        out, by_unknown = np.zeros(right.shape), np.zeros((self.N.shape[0], right.shape[1]))
+        for _, at, columns, block in self.kinds:
+            by_unknown[columns[columns >= 0]] = (block.T @ right[at])[columns >= 0]
+        found = self.system.times_covariance(by_unknown)
+        for _, at, columns, block in self.kinds:
+            out[at] = block @ np.where((columns >= 0)[:, :, None], found[columns], 0.0)
+        return out
+
+    def own(self) -> list[FloatArray]:
+        """Covariances (3, 3) or (6, 6) of all names in the epoch's own datum."""
+        precision, out = self.system.precision, [np.zeros((k, k)) for k in self.sizes.tolist()]
+        by_name = precision.unknowns.by_name
+        for which, _, _, block in self.kinds:
+            free = [i for i in which.tolist() if self.names[i] in by_name]
+            if not free:
+                continue
+            Q = precision.covs(np.array([by_name[self.names[i]].key for i in free], dtype=np.int64), len(block))
+            for i, cov in zip(free, block @ Q @ block.T, strict=True):
+                out[i] = cov
+        return out
+
+
+def _of_pose(scale: float) -> FloatArray:
+    """How the tangent of a pose changes when all is turned and scaled: on the right, it turns along."""
+    return np.diag([1.0] * 3 + [scale] * 3)
+
+
+def _blocks(values: Sequence[Pose3 | FloatArray], L: FloatArray, scale: float) -> list[FloatArray]:
+    pose = _of_pose(scale)
+    return [pose if isinstance(v, Pose3) else L for v in values]
+
+
+SomeEpoch = TypeVar("SomeEpoch", bound=Epoch)
 
 
 def origin(value: Pose3 | FloatArray) -> FloatArray:
@@ -79,22 +207,34 @@ def origin(value: Pose3 | FloatArray) -> FloatArray:
 
 
 def epoch_state(adjustment: Adjustment) -> EpochState:
-    """Points and fixed stations of an adjustment, a priori, in its datum; in rotation networks positions are nan.
+    """Points and fixed stations of an adjustment, a priori, in its datum; in rotation networks positions are nan."""
+    names, values, directions = known(adjustment)
+    return EpochState(names, values, directions, adjustment.joint(names))
 
-    Raises SurveyError where they are too many for one matrix.
-    """
+
+def epoch_normals(adjustment: Adjustment) -> EpochNormals:
+    """The same by its normal equations. Raises SurveyError for a solution that was moved to another datum."""
+    names, values, directions = known(adjustment)
+    system = condensed_system(precision_of(adjustment)).system
+    A, columns, parts = system.A[system.used[system.row_of]], system.columns, []
+    for name, value in zip(names, values, strict=True):
+        of_name = np.full(6 if isinstance(value, Pose3) else 3, -1)
+        if name in columns.at:
+            of_name[columns.free[name]] = columns.at[name]
+        parts.append(of_name)
+    column = np.concatenate([np.zeros(0, dtype=np.int64), *parts])
+    return EpochNormals(names, values, directions, system, (A.T @ A).tocsr(), column)
+
+
+def known(adjustment: Adjustment) -> tuple[tuple[ParameterName, ...], tuple[Pose3 | FloatArray, ...], FloatArray]:
+    """Points and fixed stations: names, values, and the motions (7, k) that are open."""
     names = [n for n in adjustment.estimates if n[0] == "point" or (n[0] == "world_from_station" and len(n) == 2)]
     values = tuple(
         e.value if isinstance(e.value, Pose3) else np.asarray(e.value) for e in (adjustment.estimates[n] for n in names)
     )
     if rotations_only(adjustment):
         values = tuple(Pose3(v.rotation(), np.full(3, np.nan)) for v in values if isinstance(v, Pose3))
-    if sum(6 if isinstance(v, Pose3) else 3 for v in values) > _MOST:
-        raise SurveyError(
-            f"{len(names)} points and stations are too many: what moved is told from one covariance matrix of at most "
-            f"{_MOST} components; compare parts of the survey, each with the stations that hold it"
-        )
-    return EpochState(tuple(names), values, adjustment.joint(names), open_directions(adjustment))
+    return tuple(names), values, open_directions(adjustment)
 
 
 def datum_carriers(adjustment: Adjustment) -> tuple[ParameterName, ...]:
@@ -115,7 +255,7 @@ def open_directions(adjustment: Adjustment) -> FloatArray:
     return np.zeros((7, 0))
 
 
-def gauge_rows(state: EpochState) -> FloatArray:
+def gauge_rows(state: Epoch) -> FloatArray:
     """How all components (n, 7) move with the whole."""
     return np.concatenate([value_motions(v) for v in state.values])
 
@@ -132,9 +272,9 @@ def value_motions(value: Pose3 | FloatArray) -> FloatArray:
     return out
 
 
-def differences(before: EpochState, after: EpochState) -> FloatArray:
+def differences(before: Sequence[Pose3 | FloatArray], after: Sequence[Pose3 | FloatArray]) -> FloatArray:
     """After minus before (n,), of poses in the tangent of the first; nan where only rotations are known."""
-    return np.concatenate([differences_of(a, b) for a, b in zip(before.values, after.values, strict=True)])
+    return np.concatenate([differences_of(a, b) for a, b in zip(before, after, strict=True)])
 
 
 def differences_of(a: Pose3 | FloatArray, b: Pose3 | FloatArray) -> FloatArray:
@@ -154,31 +294,26 @@ def moved_value(value: Pose3 | FloatArray, motion: FloatArray) -> Pose3 | FloatA
     return Pose3(Rot3(R @ value.rotation().matrix()), x) if isinstance(value, Pose3) else x
 
 
-def moved(state: EpochState, motion: FloatArray) -> EpochState:
-    """The whole moved by ``motion`` (7,), with its covariance."""
-    R, s = Rot3.Expmap(motion[3:6]).matrix(), float(np.exp(motion[6]))
-    # the tangent of a pose, on the right, turns along
-    blocks = [np.diag([1.0] * 3 + [s] * 3) if isinstance(v, Pose3) else s * R for v in state.values]
-    ends = np.cumsum(state.sizes)[:-1]
-
-    def rows(cov: FloatArray) -> FloatArray:
-        return np.concatenate([block @ part for block, part in zip(blocks, np.split(cov, ends), strict=True)])
-
-    return replace(state, values=tuple(moved_value(v, motion) for v in state.values), cov=rows(rows(state.cov).T))
+def moved(state: SomeEpoch, motion: FloatArray) -> SomeEpoch:
+    """The whole moved by ``motion`` (7,), with what is known of it."""
+    scale = float(np.exp(motion[6]))
+    L = scale * Rot3.Expmap(motion[3:6]).matrix()
+    return state.mapped(tuple(moved_value(v, motion) for v in state.values), L, scale)
 
 
-def aligned(before: EpochState, after: EpochState, directions: FloatArray, reference: Sequence[int]) -> EpochState:
+def aligned(before: Epoch, after: SomeEpoch, directions: FloatArray, reference: Sequence[int]) -> SomeEpoch:
     """The second epoch moved along ``directions`` (7, k) until the reference lies on the first as well as it can."""
     if not directions.shape[1]:
         return after
-    owner = np.repeat(np.arange(len(before.names)), before.sizes)
-    kept = np.isin(owner, list(reference))
+    kept = np.isin(before.owner, list(reference))
+    along, L, scale, values = gauge_rows(before) @ directions, np.eye(3), 1.0, after.values
     for _ in range(20):
-        d = differences(before, after)
+        d = differences(before.values, values)
         rows = kept & np.isfinite(d)
-        G = gauge_rows(before)[rows] @ directions
-        step = np.linalg.lstsq(G, -d[rows], rcond=1e-10)[0]
-        after = moved(after, directions @ step)
-        if np.abs(G @ step).max(initial=0.0) < 1e-12:
+        step = np.linalg.lstsq(along[rows], -d[rows], rcond=1e-10)[0]
+        motion = directions @ step
+        values, scale = tuple(moved_value(v, motion) for v in values), scale * float(np.exp(motion[6]))
+        L = float(np.exp(motion[6])) * Rot3.Expmap(motion[3:6]).matrix() @ L
+        if np.abs(along[rows] @ step).max(initial=0.0) < 1e-12:
             break
-    return after
+    return after.mapped(values, L, scale)

@@ -36,7 +36,7 @@ from adjust.observations.images.batch import whitened_squares
 from adjust.observations.images.bundle_hidden import BundleHidden
 from adjust.precision.s_transformation import STransformation, s_transformation
 from adjust.precision.stacked import Stacked
-from adjust.precision.tree import TreeCovariance
+from adjust.precision.tree import TreeCovariance, unit_rows
 from adjust.testing.distributions import chi2
 
 if TYPE_CHECKING:
@@ -175,7 +175,15 @@ class Precision(Covariances):
         """See :class:`Covariances`."""
         by_name = self.graph.unknowns.by_name
         keys = [(by_name[a].key, by_name[b].key) for a, b in pairs]
-        below = [(a, b) for a, b in keys if a in self.hidden or b in self.hidden or self.tree.shared(a, b) is None]
+        in_tree = [pair for pair in keys if not self.hidden.keys() & pair]
+        apart = [pair for pair in in_tree if self.tree.shared(*pair) is None]
+        if apart:
+            rows = [self.tree.rows(pair) for pair in apart]
+            ends = np.cumsum([0, *map(len, rows)])
+            self._together |= dict(zip(
+                apart, self.tree.each_among(unit_rows(np.concatenate(rows), self.tree.n), ends), strict=True
+            ))  # fmt: skip
+        below = [pair for pair in keys if self.hidden.keys() & pair]
         for k in range(0, len(below), _PAIRS):
             some = list(dict.fromkeys(key for pair in below[k : k + _PAIRS] for key in pair))
             ends = np.cumsum([0, *(self.unknowns.by_key[key].dim for key in some)])

@@ -9,8 +9,9 @@ from scipy.stats import binom
 
 from adjust.adjustment import adjust
 from adjust.epochs.congruence import CongruenceOptions, compare, congruence, joint_congruence
+from adjust.epochs.congruence_result import Congruence
 from adjust.epochs.joint import joint_survey
-from adjust.epochs.states import EpochState, aligned, epoch_state, moved
+from adjust.epochs.states import EpochState, aligned, epoch_normals, epoch_state, moved
 from adjust.graph.assembly import StartValues
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, Pair
@@ -146,11 +147,75 @@ def pair_network(seed: int, turned: float) -> tuple[Survey, StartValues]:
     return survey, StartValues({}, {("world_from_station", f"R{i}"): p for i, p in enumerate(poses)}, {})
 
 
-def test_epochs_too_large_for_one_matrix_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    result = adjust(*free_hall(1, noise=False))
-    monkeypatch.setattr("adjust.epochs.states._MOST", 35)
-    with pytest.raises(SurveyError, match="15 points and stations are too many"):
-        congruence(result, result)
+def held_hall(seed: int, shift: dict[str, FloatArray] | None = None) -> tuple[Survey, StartValues]:
+    """The same with three points held."""
+    survey, start = free_hall(seed, shift)
+    points = [replace(p, x_in_world=PointParameter(start.points[p.point_id], "held")) for p in survey.points[:3]]
+    return replace(survey, points=(*points, *survey.points[3:]), datum=Datum()), start
+
+
+MOVED = {"P3": np.array([0.004, 0.0, 0.0]), "P7": np.array([0.0, -0.003, 0.003])}
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "rel"),
+    [
+        (held_hall(1), held_hall(2, MOVED), 1e-9),
+        (free_hall(1), held_hall(2, MOVED), 1e-9),
+        # open in the second: each is linear at its own values
+        (held_hall(1), free_hall(2, MOVED), 1e-4),
+        (free_hall(1), free_hall(2, MOVED), 1e-4),
+        (free_hall(1), free_hall(3), 1e-4),
+    ],
+)
+def test_normal_equations_say_what_the_covariance_matrix_says(
+    first: tuple[Survey, StartValues], second: tuple[Survey, StartValues], rel: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    epochs = adjust(*first), adjust(*second)
+    expected = congruence(*epochs)
+    monkeypatch.setattr("adjust.epochs.congruence.MOST_IN_MATRIX", 0)
+    same_congruence(congruence(*epochs), expected, rel)
+
+
+def test_stations_are_compared_by_normal_equations_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    epochs = adjust(*pair_network(1, 0.0)), adjust(*pair_network(2, 4e-4))
+    expected = congruence(*epochs)
+    monkeypatch.setattr("adjust.epochs.congruence.MOST_IN_MATRIX", 0)
+    same_congruence(congruence(*epochs), expected, 1e-4)
+
+
+def same_congruence(found: Congruence, expected: Congruence, rel: float) -> None:
+    for now, then in ((found.before, expected.before), (found.after, expected.after)):
+        assert (now.statistic, now.freedom) == (pytest.approx(then.statistic, rel=rel), then.freedom)
+    assert (found.moved, found.stable) == (expected.moved, expected.stable)
+    assert [(s.name, s.share) for s in found.steps] == [
+        (s.name, pytest.approx(s.share, rel=rel)) for s in expected.steps
+    ]
+    motions = {m.name: m for m in expected.motions}
+    for m in found.motions:
+        then, sigma = motions[m.name], np.sqrt(np.trace(motions[m.name].cov))
+        np.testing.assert_allclose(m.displacement, then.displacement, atol=rel * sigma)
+        np.testing.assert_allclose(m.cov, then.cov, atol=rel * sigma**2)
+        assert m.test.statistic == pytest.approx(then.test.statistic, rel=10 * rel, abs=10 * rel)
+
+
+def test_a_share_is_what_the_statistic_falls_by() -> None:
+    """Where both epochs leave motions open too."""
+    first, second = adjust(*free_hall(1)), adjust(*free_hall(2, MOVED))
+    found = congruence(first, second)
+    rest = tuple(n for n in found.stable if n != found.steps[0].name) + tuple(s.name for s in found.steps[1:])
+    without = congruence(first, second, CongruenceOptions(reference=rest, search=False)).before
+    square = [t.statistic * t.freedom * found.sigma0**2 for t in (found.before, without)]
+    assert found.steps[0].share == pytest.approx(square[0] - square[1], rel=1e-5)
+
+
+def test_an_epoch_that_holds_heights_alone_is_not_turned_by_normal_equations() -> None:
+    state = epoch_normals(adjust(*free_hall(1)))
+    partly = replace(state, column=np.where(np.arange(len(state.column)) == 5, -1, state.column))
+    turned = moved(partly, np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0]))
+    with pytest.raises(SurveyError, match="held in some directions alone"):
+        turned.normals()
+    moved(partly, np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0])).normals()
 
 
 def test_a_station_that_turned() -> None:
