@@ -92,9 +92,9 @@ class AdjustmentGraph:
 
     ``graph`` has every observation as a factor on its unknowns and nothing else; ``system`` is a view of it for the
     solver, in which points and poses that nothing else touches are reduced.
-    bundles: image blocks of unknown points, in parts that are reduced each by itself. image_order: of every image block
-    its number in the survey and its part: 0 in ``images``, i in the bundle before the i-th. image_numbers: of every
-    block in ``images`` the number in the survey of that which it is, or a part of.
+    bundles: image blocks of unknown points, in parts that are reduced each by itself. image_numbers: of every block in
+    ``images`` the number in the survey of that which it is, or a part of. image_parts: of every image block of the
+    survey 0 where it is in ``images``, i in the bundle before the i-th.
     reduction: of the poses that only image points touch; None where it would not pay. pairs: those between two fixed
     stations, ``others[first_pair + pairs.rows[e]]`` the e-th; singles: the others that are in no batch.
     """
@@ -105,8 +105,8 @@ class AdjustmentGraph:
     start: gtsam.Values
     images: ImageBatch
     bundles: tuple[BundleBatch, ...]
-    image_order: list[tuple[int, int]]
-    image_numbers: list[int]
+    image_numbers: IntArray
+    image_parts: IntArray
     singles: list[ObservationFactor]
     singles_graph: gtsam.NonlinearFactorGraph
     terrestrial: TerrestrialBatch | None = None
@@ -298,12 +298,11 @@ class AdjustmentGraph:
     @cached_property
     def image_rows(self) -> IntArray:
         """Where the image points (N,), in the order of the survey's blocks, stand in those of all parts one by one."""
-        lengths, part = np.array([(len(self.survey.image_blocks[i].uv), p) for i, p in self.image_order] or [(0, 0)]).T
-        order = np.argsort(part, kind="stable")
-        first = np.empty(len(part), dtype=np.int64)
+        ptr = self.survey.image_points.ptr
+        lengths, order = np.diff(ptr), np.argsort(self.image_parts, kind="stable")
+        first = np.empty(len(order), dtype=np.int64)
         first[order] = np.cumsum(lengths[order]) - lengths[order]
-        ends = np.cumsum(lengths)
-        return np.asarray(np.arange(ends[-1]) + np.repeat(first - (ends - lengths), lengths))
+        return np.asarray(np.arange(ptr[-1]) + np.repeat(first - ptr[:-1], lengths))
 
     def joined(self, of_images: _Rows, of_bundles: Sequence[_Rows]) -> _Rows:
         """Rows (N, ...) of all image points in the order of ``Survey.image_blocks``, from those of every part."""
@@ -319,9 +318,10 @@ class AdjustmentGraph:
 
     def set_weights(self, weights: FloatArray) -> None:
         """Weights (N,) of the image points, on top of their covariance; zero leaves a point out."""
-        by_part = np.empty_like(weights)
-        by_part[self.image_rows] = weights
-        sizes = [self.images.n_points, *(len(b.uv) for b in self.bundles)]
+        sizes, by_part = [self.images.n_points, *(len(b.uv) for b in self.bundles)], weights
+        if self.bundles:
+            by_part = np.empty_like(weights)
+            by_part[self.image_rows] = weights
         known, *unknown = np.split(by_part, np.cumsum(sizes)[:-1])
         self.images.set_weights(known)
         for bundle, part in zip(self.bundles, unknown, strict=True):
@@ -334,7 +334,7 @@ class AdjustmentGraph:
 
     def behind_camera(self) -> list[ImageBlock]:
         """Blocks with a point behind their camera at the prepared values."""
-        found = [self.images.blocks[b] for b in np.flatnonzero(self.images.depth <= 0.0)]
+        found = [self.images.blocks[b] for b in np.flatnonzero(self.images.depth <= 0.0).tolist()]
         for bundle in self.bundles:
             found += [b for b, z in zip(bundle.blocks, bundle.depth, strict=True) if z <= 0.0]
         if not found:

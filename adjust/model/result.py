@@ -75,6 +75,11 @@ class ImageResiduals:
     test: FloatArray
     used: BoolArray
 
+    @cached_property
+    def n_used(self) -> IntArray:
+        """Points in use of every block (B,)."""
+        return np.diff(np.append(0, np.cumsum(self.used))[self.block_ptr])
+
 
 @dataclass(frozen=True, eq=False)
 class ReadingResiduals:

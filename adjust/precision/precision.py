@@ -30,9 +30,8 @@ from adjust.model.result import (
     arrays_of,
 )
 from adjust.model.survey import FloatArray, IntArray
-from adjust.native.point_tests import AdjustedPoints, residual_tests
+from adjust.native.point_tests import AdjustedPoints, residual_tests, sums_of_blocks
 from adjust.observations.factors import ObservationFactor
-from adjust.observations.images.batch import whitened_squares
 from adjust.observations.images.bundle_hidden import BundleHidden
 from adjust.precision.s_transformation import STransformation, s_transformation
 from adjust.precision.stacked import Stacked
@@ -211,6 +210,17 @@ class Precision(Covariances):
         return AdjustedPoints(*self._images, self.graph.square_roots(), self.graph.used())
 
     @cached_property
+    def image_residuals(self) -> ImageResiduals:
+        """Residuals and their statistics of all image points, in the order of ``Survey.image_blocks``."""
+        points = self.image_points
+        return ImageResiduals(self.graph.survey.image_points.ptr, points.v, *residual_tests(points), points.used)
+
+    @cached_property
+    def image_sums(self) -> FloatArray:
+        """Of every image block (B, 3): components in use, their redundancy, their weighted square sum."""
+        return sums_of_blocks(self.graph.survey.image_points.ptr, self.image_points)
+
+    @cached_property
     def pairs(self) -> "PairStatistics":
         """Statistics of the pairs between fixed stations. Raises ValueError where there are none."""
         if self.graph.pairs is None:
@@ -286,13 +296,6 @@ def residual_of(item: ObservationFactor, values: gtsam.Values) -> FloatArray:
     return np.asarray(item.factor.unwhitenedError(values))  # type: ignore[attr-defined]  # see above
 
 
-def image_residuals(precision: Precision) -> ImageResiduals:
-    """Residuals and their statistics of all image points, in the order of ``Survey.image_blocks``."""
-    points = precision.image_points
-    ptr = np.cumsum([0] + [len(b.uv) for b in precision.graph.survey.image_blocks])
-    return ImageResiduals(ptr, points.v, *residual_tests(points), points.used)
-
-
 def other_residuals(precision: Precision) -> Sequence[ObservationResidual]:
     """The same for every observation that is neither an image point nor a reading."""
     graph, out = precision.graph, dict[int, ObservationResidual]()
@@ -328,10 +331,7 @@ def adjusted_motion(observed: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def group_summaries(
-    precision: Precision,
-    images: ImageResiduals,
-    others: Sequence[ObservationResidual],
-    readings: ReadingResiduals | None = None,
+    precision: Precision, others: Sequence[ObservationResidual], readings: ReadingResiduals | None = None
 ) -> tuple[GroupSummary, ...]:
     """Observations, redundancy and weighted square sum of every group, in order of appearance."""
     graph, sums = precision.graph, dict[str, list[float]]()
@@ -340,9 +340,12 @@ def group_summaries(
         total = sums.setdefault(group, [0.0, 0.0, 0.0])
         total[0], total[1], total[2] = total[0] + n, total[1] + r, total[2] + omega
 
-    names = list(dict.fromkeys(block.group for block in graph.survey.image_blocks))
-    for group, *sums_of_group in zip(names, *_image_sums(graph, images, names), strict=True):
-        add(group, *sums_of_group)
+    number: dict[str, int] = {}
+    of_block = [number.setdefault(block.group, len(number)) for block in graph.survey.image_blocks]
+    sums_of_groups = np.zeros((len(number), 3))
+    np.add.at(sums_of_groups, of_block, precision.image_sums)
+    for group, i in number.items():
+        add(group, *sums_of_groups[i].tolist())
     arrays, squares = arrays_of(others), np.zeros(len(others))
     for i, item in zip(graph.single, graph.singles, strict=True):
         e = precision.rows(item).e
@@ -364,24 +367,6 @@ def group_summaries(
             square = float(readings.weighted_square[taken].sum())
             add(group, len(taken), float(readings.redundancy[taken].sum()), square)
     return tuple(GroupSummary(g, int(n), r, omega) for g, (n, r, omega) in sums.items())
-
-
-def _image_sums(
-    graph: AdjustmentGraph, images: ImageResiduals, names: Sequence[str]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Of each of these groups of image points: components used, redundancy, weighted square sum."""
-    blocks = graph.survey.image_blocks
-    if not blocks:
-        return np.zeros(0), np.zeros(0), np.zeros(0)
-    number = {name: i for i, name in enumerate(names)}
-    which = slice(None) if images.used.all() else images.used
-    of_point = np.repeat([number[block.group] for block in blocks], np.diff(images.block_ptr))[which]
-
-    def total(of_points: FloatArray) -> FloatArray:
-        return np.asarray(np.bincount(of_point, of_points[which], len(names)), dtype=np.float64)
-
-    squares = whitened_squares(images.residuals, graph.square_roots())
-    return total(np.full(len(squares), 2.0)), total(images.redundancy @ np.ones(2)), total(squares)
 
 
 def global_test(omega: float, redundancy: int, alpha: float) -> GlobalTest | None:

@@ -12,9 +12,10 @@ from adjust.frames.unknowns import Chain, Unknowns
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.bundles import BundleArrays
+from adjust.native.images import square_root_information
 from adjust.native.lenses import MAX_LENS
 from adjust.native.parallel import workers
-from adjust.observations.images.batch import Chains, square_root_information
+from adjust.observations.images.batch import Chains
 
 _Rows = TypeVar("_Rows", FloatArray, BoolArray)
 
