@@ -257,7 +257,7 @@ class GraphBuilder:
         for name, unknown in self.unknowns.by_name.items():
             if unknown.kind == "pose":
                 if name in start.poses:
-                    values.insert(unknown.key, start.poses[name])
+                    values.insert(j=unknown.key, pose3=start.poses[name])  # named: nothing else is tried
                 else:
                     missing.append(" ".join(name))
             elif unknown.kind == "point":

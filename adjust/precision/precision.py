@@ -230,7 +230,7 @@ class Precision(Covariances):
     def covs(self, keys: IntArray, dim: int) -> FloatArray:
         """Covariances (n, dim, dim) of many unknowns of the same dimension."""
         Q = np.empty((len(keys), dim, dim))
-        below = np.array([k in self.hidden for k in keys.tolist()], dtype=np.bool_)
+        below = np.isin(keys, list(self.hidden))
         Q[below] = np.array([self.hidden[k] for k in keys[below].tolist()]).reshape(-1, dim, dim)
         Q[~below] = self.tree.marginals(keys[~below], dim)
         t = self.transformation
@@ -238,9 +238,9 @@ class Precision(Covariances):
             G, W = (np.array([of[k] for k in keys.tolist()]) for of in (t.motions, t.spread))
             across = G @ np.swapaxes(W, 1, 2)
             Q += G @ t.core @ np.swapaxes(G, 1, 2) - across - np.swapaxes(across, 1, 2)
-        for i, key in enumerate(keys.tolist()):
-            if held := list(self.graph.unknowns.held.get(key, ())):
-                Q[i, held], Q[i, :, held] = 0.0, 0.0
+        for i in np.flatnonzero(np.isin(keys, list(self.unknowns.held))).tolist():
+            held = list(self.unknowns.held[int(keys[i])])
+            Q[i, held], Q[i, :, held] = 0.0, 0.0
         return Q
 
     def every_cov(self) -> dict[int, FloatArray]:
