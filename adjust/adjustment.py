@@ -185,9 +185,11 @@ def _without(survey: Survey, excluded: Sequence[int]) -> Survey:
     """Blocks that are not trusted: predicted and tested where the others determine their poses, else left out."""
     refused = set(excluded)
     builder = GraphBuilder(survey, {c.camera_id: np.zeros(len(MODELS[c.lens.model].names)) for c in survey.cameras})
-    chains = [builder.block_keys(block) for block in survey.image_blocks]
+    frames, unknowns = builder.frames, builder.unknowns
+    chains = [{key for link in frames.of_image(b) for key in unknowns.link_keys(link.slot)}
+              for b in survey.image_blocks]  # fmt: skip
     known = {key for i, keys in enumerate(chains) if i not in refused for key in keys}
-    known |= builder.table_keys()
+    known |= {u.key for name, u in unknowns.by_name.items() if name[0] == "table_angles"}  # they are always read
     blocks = []
     for i, block in enumerate(survey.image_blocks):
         if i not in refused:

@@ -15,9 +15,7 @@ from adjust.model.clocks import clocks_of
 from adjust.model.observations import ImageBlock, Pair
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey, VectorParameter
-from adjust.observations.factors import (
-    ObservationFactor,
-)
+from adjust.observations.factors import ObservationFactor
 from adjust.observations.images.batch import ImageBatch
 from adjust.observations.images.bundle_points import add_point_factors
 from adjust.observations.images.bundles import BundleBatch
@@ -90,8 +88,8 @@ class Evaluation:
 class AdjustmentGraph:
     """The graph, its start and the batches that serve it. Held together with the survey only by the solver.
 
-    ``graph`` has every observation as a factor on its unknowns and nothing else; ``system`` is a view of it for the
-    solver, in which points and poses that nothing else touches are reduced.
+    ``graph`` has every observation as a factor on its unknowns and nothing else; the solver
+    takes a ``view`` of it, in which points and poses that nothing else touches are reduced.
     bundles: image blocks of unknown points, in parts that are reduced each by itself. image_numbers: of every block in
     ``images`` the number in the survey of that which it is, or a part of. image_parts: of every image block of the
     survey 0 where it is in ``images``, i in the bundle before the i-th.
@@ -207,16 +205,11 @@ class AdjustmentGraph:
             bundle.add_factor(graph)
         return graph
 
-    @property
-    def system(self) -> gtsam.NonlinearFactorGraph:
-        """What the solver linearises, as long as :attr:`reduction` finds inverses: a view of ``graph``.
-
-        Of the same chi-square, with what :attr:`reduction` and :attr:`bundles` reduce eliminated already.
-        """
-        return self.view(self.reduction)
-
     def view(self, reduction: PoseReduction | None) -> gtsam.NonlinearFactorGraph:
-        """``system``, or where ``reduction`` is None what it is with all poses in sight."""
+        """What the solver linearises: of the chi-square of ``graph``, with what is reduced eliminated already.
+
+        reduction: :attr:`reduction`, or None for all poses in sight; :attr:`bundles` are reduced in any case.
+        """
         return self._unreduced if reduction is None else self._reduced
 
     @cached_property

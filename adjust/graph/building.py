@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import gtsam
@@ -188,14 +189,6 @@ class GraphBuilder:
                 unknown = self.unknowns.add(("point", point.point_id), "point", ("x", "y", "z"), ("m", "m", "m"))
                 self.unknowns.hold(unknown, parameter.held)
 
-    def block_keys(self, block: ImageBlock) -> set[int]:
-        """Keys of the pose and table unknowns that an image block depends on."""
-        return {key for link in self.frames.of_image(block) for key in self.unknowns.link_keys(link.slot)}
-
-    def table_keys(self) -> set[int]:
-        """Keys of the table angles, which are always read."""
-        return {u.key for name, u in self.unknowns.by_name.items() if name[0] == "table_angles"}
-
     def _world_points(self) -> FloatArray:
         """Held world points (P, 3) m; NaN for those that are not held."""
         held, unheld = self.unknowns.held_points, np.full(3, np.nan)
@@ -229,7 +222,7 @@ class GraphBuilder:
         from adjust.observations.pairs import PairBatch, pair_arrays  # here: as above
 
         rows, a_slot, b_slot = self.simple
-        measured = self.measured or pair_arrays([self.survey.pairs[i] for i in rows.tolist()])
+        measured = self.measured or pair_arrays(tuple(self.survey.pairs[i] for i in rows.tolist()))
         return PairBatch(measured, rows, a_slot, b_slot, self.unknowns, state)
 
     def _position(self, state: State, ref: PositionRef, chain: Chain | None) -> Position:
@@ -252,30 +245,27 @@ class GraphBuilder:
                         deformation(target.x_in_target, warp.names, warming)[i])  # fmt: skip
 
     def _values(self, start: StartValues) -> gtsam.Values:
-        values = gtsam.Values()
-        missing = []
+        values, missing = gtsam.Values(), []
         for name, unknown in self.unknowns.by_name.items():
-            if unknown.kind == "pose":
-                if name in start.poses:
-                    values.insert(j=unknown.key, pose3=start.poses[name])  # named: nothing else is tried
-                else:
-                    missing.append(" ".join(name))
-            elif unknown.kind == "point":
-                if name[1] in start.points:
-                    values.insert(unknown.key, np.asarray(start.points[name[1]], dtype=float))
-                else:
-                    missing.append(" ".join(name))
-            else:
+            if unknown.kind == "pose" and name in start.poses:
+                values.insert(j=unknown.key, pose3=start.poses[name])  # named: nothing else is tried
+            elif unknown.kind == "point" and name[1] in start.points:
+                values.insert(unknown.key, np.asarray(start.points[name[1]], dtype=float))
+            elif unknown.kind == "vector":
                 values.insert(unknown.key, self._start_vector(name, start))
+            else:
+                missing.append(" ".join(name))
         if missing:
             raise SurveyError("no start value for " + ", ".join(missing))
         return values
 
+    @cached_property
+    def _table_angles(self) -> dict[ParameterName, FloatArray]:
+        return {("table_angles", r.table_id, r.epoch_id): r.angles for r in reversed(self.survey.table_readings)}
+
     def _start_vector(self, name: ParameterName, start: StartValues) -> FloatArray:
-        if name[0] == "table_angles":
-            for reading in self.survey.table_readings:
-                if (reading.table_id, reading.epoch_id) == name[1:]:
-                    return np.array(start.vectors.get(name, reading.angles), dtype=float)
+        if name in self._table_angles:
+            return np.array(start.vectors.get(name, self._table_angles[name]), dtype=float)
         vector = self.unknowns.vectors[name]
         if name[0] == "lens":
             full = start.lenses[name[1]]

@@ -116,10 +116,7 @@ class ImagePoints:
         point_idx = np.concatenate([np.zeros(0, dtype=np.int64), *(b.point_idx for b in blocks)])
         uv = np.concatenate([np.zeros((0, 2)), *(b.uv for b in blocks)])
         cov = np.concatenate([np.zeros((0, 2, 2)), *(b.cov for b in blocks)])
-        used = np.ones(len(uv), dtype=np.bool_)
-        for b, block in enumerate(blocks):
-            if block.used is not None:
-                used[ptr[b] : ptr[b + 1]] = block.used
+        used = np.concatenate([np.zeros(0, dtype=np.bool_), *(b.mask for b in blocks)])
         return ImagePoints(ptr, point_idx, uv, cov, used)
 
 

@@ -8,6 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import compress
 from typing import TYPE_CHECKING
 
 import gtsam
@@ -334,39 +335,25 @@ def group_summaries(
     precision: Precision, others: Sequence[ObservationResidual], readings: ReadingResiduals | None = None
 ) -> tuple[GroupSummary, ...]:
     """Observations, redundancy and weighted square sum of every group, in order of appearance."""
-    graph, sums = precision.graph, dict[str, list[float]]()
-
-    def add(group: str, n: int, r: float, omega: float) -> None:
-        total = sums.setdefault(group, [0.0, 0.0, 0.0])
-        total[0], total[1], total[2] = total[0] + n, total[1] + r, total[2] + omega
-
-    number: dict[str, int] = {}
-    of_block = [number.setdefault(block.group, len(number)) for block in graph.survey.image_blocks]
-    sums_of_groups = np.zeros((len(number), 3))
-    np.add.at(sums_of_groups, of_block, precision.image_sums)
-    for group, i in number.items():
-        add(group, *sums_of_groups[i].tolist())
-    arrays, squares = arrays_of(others), np.zeros(len(others))
+    graph, arrays, squares = precision.graph, arrays_of(others), np.zeros(len(others))
     for i, item in zip(graph.single, graph.singles, strict=True):
         e = precision.rows(item).e
         squares[i] = e @ e
     if graph.pairs is not None:
         squares[graph.first_pair + graph.pairs.rows] = graph.pairs.squares(precision.pairs)
-    shares = np.bincount(arrays.observation, arrays.redundancies, len(others)).tolist()
-    every = zip(graph.of_others(lambda o: o.group, lambda p: p.group), arrays.n_components.tolist(), shares,
-                squares.tolist(), arrays.used.tolist(), strict=True)  # fmt: skip
-    for group, n, share, square, used in every:
-        if used:
-            add(group, n, share, square)
+    shares = np.bincount(arrays.observation, arrays.redundancies, len(others))
+    names = [block.group for block in graph.survey.image_blocks]
+    names += compress(graph.of_others(lambda o: o.group, lambda p: p.group), arrays.used.tolist())
+    rows = [precision.image_sums, np.stack([arrays.n_components, shares, squares], axis=1)[arrays.used]]
     if readings is not None:
-        of_group: dict[str, list[int]] = {}
-        for i, reading in enumerate(graph.survey.readings):
-            of_group.setdefault(reading.group, []).append(i)
-        for group, mine in of_group.items():
-            taken = np.array(mine)[readings.used[mine]]
-            square = float(readings.weighted_square[taken].sum())
-            add(group, len(taken), float(readings.redundancy[taken].sum()), square)
-    return tuple(GroupSummary(g, int(n), r, omega) for g, (n, r, omega) in sums.items())
+        names += [reading.group for reading in graph.survey.readings]
+        of_readings = np.ones(len(readings.used)), readings.redundancy, readings.weighted_square
+        rows.append(np.where(readings.used, of_readings, 0.0).T)
+    number: dict[str, int] = {}
+    group = [number.setdefault(name, len(number)) for name in names]
+    sums = np.zeros((len(number), 3))
+    np.add.at(sums, np.array(group, dtype=np.int64), np.concatenate(rows))
+    return tuple(GroupSummary(name, int(n), *of) for name, (n, *of) in zip(number, sums.tolist(), strict=True))
 
 
 def global_test(omega: float, redundancy: int, alpha: float) -> GlobalTest | None:
