@@ -11,9 +11,10 @@ from gtsam import Pose3
 
 from adjust.frames.state import State
 from adjust.frames.unknowns import Unknowns
-from adjust.model.clocks import clocks_of
+from adjust.model.clocks import CLOCKS
 from adjust.model.observations import ImageBlock, Pair
 from adjust.model.result import Adjustment, ParameterName
+from adjust.model.rewriting import vector_parameters
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey, VectorParameter
 from adjust.observations.factors import ObservationFactor
 from adjust.observations.images.batch import ImageBatch
@@ -56,13 +57,10 @@ def _by_component(adjustment: Adjustment, survey: Survey | None) -> dict[Paramet
     """Of tables, boards, clocks, in the order of their components in the survey: adjusted, else as given."""
     if survey is None:
         return {}
-    owners: dict[ParameterName, VectorParameter]
-    owners = {("table_geometry", t.table_id): t.geometry for t in survey.tables}
-    owners |= {("warp", t.target_id): t.warp for t in survey.targets if t.warp is not None}
-    owners |= {name: clock.parameters for name, clock in clocks_of(survey)}
     out: dict[ParameterName, FloatArray] = {}
-    for name, owner in owners.items():
-        if name in adjustment.estimates:
+    for name, owner in vector_parameters(survey).items():
+        listed = name in adjustment.estimates and name[0] in ("table_geometry", "warp", *CLOCKS)
+        if listed and isinstance(owner, VectorParameter):
             estimate = adjustment.estimates[name]
             known = dict(zip(estimate.components, np.asarray(estimate.value).tolist(), strict=True))
             given = zip(owner.names, owner.values.tolist(), strict=True)

@@ -13,11 +13,12 @@ from adjust.frames.unknowns import Chain, FrameTree, Unknowns
 from adjust.graph.assembly import AdjustmentGraph, StartValues
 from adjust.graph.singles import Singles
 from adjust.model.boards import deformation, warming_of
-from adjust.model.clocks import CLOCKS, EpochTimes, clocks_of
+from adjust.model.clocks import EpochTimes
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, ImageBlock, PositionRef
 from adjust.model.result import ParameterName
-from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.model.rewriting import vector_parameters
+from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey, VectorParameter
 from adjust.observations.clocks import Shifts, collect_clocks, shift
 from adjust.observations.factors import (
     ChainPose,
@@ -30,7 +31,7 @@ from adjust.observations.images.bundles import BundleBatch
 from adjust.observations.images.helmert_blocks import helmert_blocks, runs_of_epochs
 from adjust.observations.images.reduction import reduction
 from adjust.observations.terrestrial.building import build_batch, reading_refs
-from adjust.observations.terrestrial.parameters import collect_terrestrial, full_start
+from adjust.observations.terrestrial.parameters import collect_terrestrial
 
 if TYPE_CHECKING:
     from adjust.observations.pairs import PairArrays, PairBatch
@@ -260,30 +261,19 @@ class GraphBuilder:
         return values
 
     @cached_property
-    def _table_angles(self) -> dict[ParameterName, FloatArray]:
-        return {("table_angles", r.table_id, r.epoch_id): r.angles for r in reversed(self.survey.table_readings)}
+    def _given(self) -> dict[ParameterName, FloatArray]:
+        vectors = vector_parameters(self.survey).items()
+        return {name: p.values for name, p in vectors if isinstance(p, VectorParameter)} | {
+            ("table_angles", r.table_id, r.epoch_id): r.angles for r in reversed(self.survey.table_readings)
+        }
 
     def _start_vector(self, name: ParameterName, start: StartValues) -> FloatArray:
-        if name in self._table_angles:
-            return np.array(start.vectors.get(name, self._table_angles[name]), dtype=float)
+        if name[0] == "table_angles":
+            return np.array(start.vectors.get(name, self._given[name]), dtype=float)
         vector = self.unknowns.vectors[name]
         if name[0] == "lens":
             full = start.lenses[name[1]]
-        elif name in start.vectors:
-            full = start.vectors[name]
-        elif name in self.vector_starts:
-            full = self.vector_starts[name]
-        elif name[0] == "lens_drift":
-            full = np.zeros(len(vector.names))
-        elif name[0] == "lens_crop":
-            lens = self.survey.cameras_by_id[name[1]].lens
-            full = lens.crops[name[2]].parameters.values
-        elif name[0] in ("vertical", "instrument", "orientation", "centring"):
-            full = full_start(name, self.survey)
-        elif name[0] == "table_geometry":
-            full = self.survey.tables_by_id[name[1]].geometry.values
-        elif name[0] in CLOCKS:
-            full = next((c.parameters.values for owner, c in clocks_of(self.survey) if owner == name), np.zeros(1))
         else:
-            full = next(t.warp.values for t in self.survey.targets if t.target_id == name[1] and t.warp)
+            given = self._given.get(name, np.zeros(len(vector.names)))
+            full = start.vectors.get(name, self.vector_starts.get(name, given))
         return np.array([full[vector.names.index(x)] for x in vector.own], dtype=float)

@@ -8,10 +8,10 @@ from gtsam import Pose3, Rot3
 
 from adjust.frames.state import State
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Chain, Unknowns
-from adjust.model.clocks import clocks_of
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Coordinates, PositionRef, frame_text, position_text
 from adjust.model.result import ParameterName
+from adjust.model.rewriting import vector_parameters
 from adjust.model.survey import FloatArray, Survey, VectorPrior
 from adjust.observations.clocks import Shifts, reading_residual
 from adjust.observations.factors import (
@@ -114,17 +114,7 @@ class Singles:
 
     def _vector_priors(self, of_readings: Mapping[ParameterName, VectorPrior]) -> None:
         u = self.unknowns
-        owners: list[tuple[ParameterName, VectorPrior | None]]
-        owners = [(("lens", c.camera_id), c.lens.prior) for c in self.survey.cameras]
-        owners += [(("lens_crop", c.camera_id, e), x.parameters.prior) for c in self.survey.cameras
-                   for e, x in c.lens.crops.items()]  # fmt: skip
-        owners += [(("table_geometry", t.table_id), t.geometry.prior) for t in self.survey.tables]
-        owners += [(("warp", t.target_id), t.warp.prior) for t in self.survey.targets if t.warp]
-        owners += [(("beam", b.beam_id), b.parameters.prior) for b in self.survey.beams]
-        owners += [(("surface", s.surface_id), s.parameters.prior) for s in self.survey.surfaces if s.parameters]
-        owners += [(("vertical",), self.survey.vertical.tilt.prior)]
-        owners += [(name, clock.parameters.prior) for name, clock in clocks_of(self.survey)]
-        owners += of_readings.items()
+        of_owners = {name: p.prior for name, p in vector_parameters(self.survey).items() if name[0] != "instrument"}
         for name, sigma in ({} if self.shifts is None else self.shifts.jitters).items():
             factor = step_factor(u.vectors[name], None, np.array([sigma]))
             self._add(factor, "prior", "prior", name, ("jitter",), u.vectors[name].units, np.zeros(1))
@@ -132,7 +122,7 @@ class Singles:
             change = u.vectors[name]
             factor = step_factor(change, None if before is None else u.vectors[before], sigmas)
             self._add(factor, "prior", "prior", name, change.names, change.units, np.zeros(len(sigmas)))
-        for name, prior in owners:
+        for name, prior in (of_owners | dict(of_readings)).items():
             vector = u.vectors.get(name)
             if prior is not None and vector is not None and vector.key is not None:
                 units = tuple(vector.units[vector.names.index(x)] for x in prior.names)
