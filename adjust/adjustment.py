@@ -15,7 +15,7 @@ from adjust.graph.building import GraphBuilder
 from adjust.graph.solver import Solved, SolveOptions, settled, solve
 from adjust.lenses.models import MODELS, camera_constants, monotone_radius_px, principal_point_px
 from adjust.model.errors import NotConvergedError, listed
-from adjust.model.observations import ImageBlocks
+from adjust.model.observations import ImageBlock, ImageBlocks
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import BoolArray, Survey
 from adjust.native.parallel import Beside
@@ -130,27 +130,23 @@ def rejections(survey: Survey, given: Survey) -> tuple[str, ...]:
     before = _unused_before(given)
     points = tuple(p.point_id for p in survey.points)
     for block in survey.image_blocks:
-        if block.used is None or block.used.all() or not block.used.any():
+        if block.used is None or block.n_used in (0, len(block.uv)):
             continue
         ids = targets[block.target_id] if block.target_id else points
         old = before.get(block.place, frozenset())
         names = [ids[int(i)] for i in block.point_idx[~block.used] if int(i) not in old]
-        if not names:
-            continue
-        out.append(
-            f"camera {block.camera_id} at epoch {block.epoch_id}, target {block.target_id or 'points'}: left out as "
-            f"gross errors: {listed(names, 8)}"
-        )
+        if names:
+            out.append(f"{_said(block)}: left out as gross errors: {listed(names, 8)}")
     return tuple(out)
+
+
+def _said(block: ImageBlock) -> str:
+    return f"camera {block.camera_id} at epoch {block.epoch_id}, target {block.target_id or 'points'}"
 
 
 def _unused_before(given: Survey) -> dict[tuple[str, str, str | None, str], frozenset[int]]:
     """Positions of the points of each block that its owner does not use."""
-    return {
-        b.place: frozenset(b.point_idx[~b.used].tolist())
-        for b in given.image_blocks
-        if b.used is not None and not b.used.all()
-    }
+    return {b.place: frozenset(b.point_idx[~b.used].tolist()) for b in given.image_blocks if b.used is not None}
 
 
 def _trusted(survey: Survey, given: GivenStarts, options: AdjustOptions) -> Begun:
@@ -295,13 +291,10 @@ def _image_warnings(graph: AdjustmentGraph, result: Adjustment, given: Survey | 
     bad = np.bincount(np.searchsorted(ptr, failing, side="right") - 1, minlength=len(blocks))
     for i in np.flatnonzero((used == 0) | (bad > 0)).tolist():
         block = blocks[i]
-        what = f"camera {block.camera_id} at epoch {block.epoch_id}, target {block.target_id or 'points'}"
-        if used[i] == 0 and len(before.get(block.place, ())) == len(block.uv):
-            continue  # as its owner wants it
-        if used[i] == 0 and len(block.uv):
-            out.append(f"{what}: not used")
-        elif bad[i]:
-            out.append(f"{what}: {bad[i]} of {used[i]} image points do not fit (probable gross errors)")
+        if bad[i]:
+            out.append(f"{_said(block)}: {bad[i]} of {used[i]} image points do not fit (probable gross errors)")
+        elif len(before.get(block.place, ())) < len(block.uv):  # else as its owner wants it
+            out.append(f"{_said(block)}: not used")
     return out
 
 

@@ -138,27 +138,17 @@ class Singles:
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """The factors of those that take part, and what holds components. Raises SurveyError where one has no value."""
-        graph = gtsam.NonlinearFactorGraph()
+        graph, u = gtsam.NonlinearFactorGraph(), self.unknowns
         for item in self.items:
             if item.used:
                 graph.add(item.factor)
-        for factor in self._holds():
-            graph.add(factor)
-        return graph
-
-    def _holds(self) -> list[gtsam.NonlinearFactor]:
-        """What keeps single components of poses and points at their values. Raises SurveyError where there is none."""
-        u = self.unknowns
-        values = {name: parameter.value for name, parameter in u.parameters.items()}
-        points: dict[ParameterName, FloatArray | None] = {
-            ("point", p.point_id): p.x_in_world.value for p in self.survey.points
-        }
-        factors = []
+        points: dict[ParameterName, FloatArray | None]
+        points = {("point", p.point_id): p.x_in_world.value for p in self.survey.points if u.held}
         for key, held in u.held.items():
             unknown = u.by_key[key]
-            value = points[unknown.name] if unknown.kind == "point" else values[unknown.name]
+            value = points[unknown.name] if unknown.kind == "point" else u.parameters[unknown.name].value
             if value is None:
                 names = ", ".join(unknown.components[i] for i in held)
                 raise SurveyError(f"{' '.join(unknown.name)}: {names} held without a value; give it one")
-            factors.append(hold_factor(unknown, held, value))
-        return factors
+            graph.add(hold_factor(unknown, held, value))
+        return graph

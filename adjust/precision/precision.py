@@ -20,6 +20,7 @@ from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.datum import survey_motions
 from adjust.graph.solver import Solved
 from adjust.model.errors import SurveyError
+from adjust.model.names import grouped
 from adjust.model.result import (
     Adjustment,
     GlobalTest,
@@ -246,9 +247,7 @@ class Precision(Covariances):
 
     def every_cov(self) -> dict[int, FloatArray]:
         """Covariance (dim, dim) of every unknown."""
-        of_dim: dict[int, list[int]] = {}
-        for key, unknown in self.graph.unknowns.by_key.items():
-            of_dim.setdefault(unknown.dim, []).append(key)
+        of_dim = grouped((unknown.dim, key) for key, unknown in self.unknowns.by_key.items())
         return {k: Q for dim, keys in of_dim.items() for k, Q in zip(keys, self.covs(np.array(keys), dim), strict=True)}
 
     def pair_covariances(self) -> dict[str, FloatArray]:
