@@ -172,9 +172,8 @@ def _found(survey: Survey, given: GivenStarts) -> Start:
 
 def _misfit_px(found: Start) -> float:
     """Median misfit of the images that take part, px; zero where there are none."""
-    out = set(found.excluded_blocks)
-    rms = [v for i, v in enumerate(found.block_rms_px) if i not in out and not np.isnan(v)]
-    return float(np.median(rms)) if rms else 0.0
+    rms = np.delete(found.block_rms_px, found.excluded_blocks)
+    return float(np.median(rms[~np.isnan(rms)])) if not np.isnan(rms).all() else 0.0
 
 
 def _without(survey: Survey, excluded: Sequence[int]) -> Survey:
@@ -285,7 +284,7 @@ def _image_warnings(graph: AdjustmentGraph, result: Adjustment, given: Survey | 
     out, images, blocks = [], result.image_residuals, graph.survey.image_blocks
     bound = limit(len(images.test)) * max(1.0, result.sigma0**2)
     before = {} if given is None else _unused_before(given)
-    ptr, used = images.block_ptr, images.n_used
+    ptr, used = images.block_ptr, np.diff(np.append(0, np.cumsum(images.used))[images.block_ptr])
     with np.errstate(invalid="ignore"):
         failing = np.flatnonzero(images.used & (images.test > bound))
     bad = np.bincount(np.searchsorted(ptr, failing, side="right") - 1, minlength=len(blocks))

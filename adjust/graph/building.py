@@ -75,7 +75,8 @@ class GraphBuilder:
     def build(self, start: StartValues) -> AdjustmentGraph:
         """The whole graph. Raises SurveyError naming what is missing or contradictory."""
         self._register_points()
-        seen = self._images()
+        blocks = self.survey.image_blocks
+        seen = _Images(np.arange(len(blocks)), blocks, [self.frames.of_image(block) for block in blocks])
         positions, pair_chains = self._chains_of_others()
         geometry = GeometryFactors(self.survey, self.unknowns, self.frames)
         if self.times is not None:
@@ -113,13 +114,8 @@ class GraphBuilder:
             readings, reduced, pairs, first_pair,
         )  # fmt: skip
 
-    def _images(self) -> "_Images":
-        """All image blocks with their chains; makes the unknowns on the way."""
-        blocks = self.survey.image_blocks
-        return _Images(np.arange(len(blocks)), blocks, [self.frames.of_image(block) for block in blocks])
-
     def _image_batches(
-        self, state: State, seen: "_Images", outside: set[int]
+        self, state: State, seen: _Images, outside: set[int]
     ) -> tuple[IntArray, ImageBatch, IntArray, tuple[BundleBatch, ...]]:
         """Image blocks of known points in one batch, of unknown ones in bundles, with keys ``outside`` of both.
 
@@ -140,13 +136,13 @@ class GraphBuilder:
         return known.number, images, part_of, tuple(bundles)
 
     def _at_their_times(
-        self, times: EpochTimes, seen: "_Images", pairs: Mapping[int, Chain]
-    ) -> tuple["_Images", dict[int, Chain]]:
+        self, times: EpochTimes, seen: _Images, pairs: Mapping[int, Chain]
+    ) -> tuple[_Images, dict[int, Chain]]:
         """Image blocks, in parts of one moment each, and pairs, with their chains when the clocks say."""
         self.shifts = shifts = Shifts(self.survey, self.unknowns, times)
         of_blocks = [shifts.of_image(*whole) for whole in zip(seen.blocks, seen.chains, strict=True)]
         parts = [part for parts in of_blocks for part in parts]
-        number = np.repeat(seen.number, [len(parts) for parts in of_blocks])
+        number = np.repeat(seen.number, np.array([len(parts) for parts in of_blocks], dtype=np.int64))
         chains = {i: shifts.of_pair(self.survey.pairs[i], chain) for i, chain in pairs.items()}
         for reading in self.survey.table_readings:
             shifts.reading(reading)

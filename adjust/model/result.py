@@ -75,11 +75,6 @@ class ImageResiduals:
     test: FloatArray
     used: BoolArray
 
-    @cached_property
-    def n_used(self) -> IntArray:
-        """Points in use of every block (B,)."""
-        return np.diff(np.append(0, np.cumsum(self.used))[self.block_ptr])
-
 
 @dataclass(frozen=True, eq=False)
 class ReadingResiduals:
@@ -346,10 +341,10 @@ class Decision:
 
 
 class JointCovariances(Protocol):
-    """Covariances of the adjusted unknowns, a priori; see :class:`adjust.precision.precision.Covariances`."""
+    """Covariances of the adjusted unknowns, a priori (sigma0 = 1), in the survey's datum."""
 
     def joint(self, names: Sequence[ParameterName]) -> FloatArray:
-        """Of several unknowns, stacked in this order (of vectors their free components)."""
+        """Of several unknowns, stacked in this order (of vectors their free components); KeyError for what is none."""
         ...
 
     def whole(self, names: Sequence[ParameterName], sizes: Sequence[int]) -> FloatArray:

@@ -196,13 +196,6 @@ class PairStatistics:
     adjusted_cov: FloatArray
     residual_cov: FloatArray
 
-    def first(self, dim: int) -> "PairStatistics":
-        """Of the first ``dim`` components."""
-        return PairStatistics(
-            self.residual[:, :dim], self.whitened[:, :dim], self.redundancy[:, :dim], self.test, self.freedom,
-            self.p_value, self.adjusted_cov[:, :dim, :dim], self.residual_cov[:, :dim, :dim],
-        )  # fmt: skip
-
 
 @dataclass(eq=False)
 class PairBatch:
@@ -350,10 +343,6 @@ class PairBatch:
             p = np.where(freedom > 0, chi2.sf(test, np.maximum(freedom, 1)), np.nan)
         redundancy = np.where(used[:, None], np.diagonal(Qvv, axis1=1, axis2=2), 0.0)
         return PairStatistics(residual, white, redundancy, test, freedom, p, own, arrays.cov + sign * scatter)
-
-    def squares(self, stats: PairStatistics) -> FloatArray:
-        """Weighted squares (E,) of the residuals."""
-        return np.asarray(np.einsum("ni,ni->n", stats.whitened, stats.whitened))
 
     def residuals(self, stats: PairStatistics, pairs: Sequence[Pair]) -> Residuals:
         """As reports take them; ``pairs`` are those of the survey."""

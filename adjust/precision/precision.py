@@ -4,7 +4,6 @@ Redundancy numbers and residual covariances follow Baarda (1968) and Foerstner (
 Q_vv P. For an image point both components are tested together: v' Q_vv^-1 v, chi-square with two degrees of freedom.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,6 +25,7 @@ from adjust.model.result import (
     GlobalTest,
     GroupSummary,
     ImageResiduals,
+    JointCovariances,
     ObservationResidual,
     ParameterName,
     ReadingResiduals,
@@ -74,20 +74,13 @@ def _in_datum(datum: STransformation | None, keys: Sequence[int], Q: FloatArray)
     return Q if datum is None else datum.apply(keys, Q)
 
 
-class Covariances(ABC):
-    """Covariances of the adjusted ``unknowns``, a priori (sigma0 = 1), in the survey's datum."""
+class Covariances(JointCovariances):
+    """Those of the ``unknowns``; whoever has them says how :meth:`joint` is found, and what is prepared for it."""
 
     unknowns: Unknowns
 
-    @abstractmethod
-    def joint(self, names: Sequence[ParameterName]) -> FloatArray:
-        """Joint covariance of several unknowns, stacked in this order (of vectors their free components).
-
-        Raises KeyError for a name that is not an unknown.
-        """
-
-    def bring_together(self, pairs: Iterable[tuple[ParameterName, ParameterName]]) -> None:  # noqa: B027  # may do nothing
-        """Prepare :meth:`joint` of these pairs of unknowns, where that is cheaper for all at once."""
+    def bring_together(self, pairs: Iterable[tuple[ParameterName, ParameterName]]) -> None:
+        """Nothing, where it would not be cheaper for all at once."""
 
     def whole(self, names: Sequence[ParameterName], sizes: Sequence[int]) -> FloatArray:
         """The same of all components, so many of each of these parameters; zero where one is held."""
@@ -339,7 +332,7 @@ def group_summaries(
         e = precision.rows(item).e
         squares[i] = e @ e
     if graph.pairs is not None:
-        squares[graph.first_pair + graph.pairs.rows] = graph.pairs.squares(precision.pairs)
+        squares[graph.first_pair + graph.pairs.rows] = np.square(precision.pairs.whitened).sum(axis=1)
     shares = np.bincount(arrays.observation, arrays.redundancies, len(others))
     names = [block.group for block in graph.survey.image_blocks]
     names += compress(graph.of_others(lambda o: o.group, lambda p: p.group), arrays.used.tolist())

@@ -41,11 +41,6 @@ from adjust.observations.adapter import evaluated
 from adjust.observations.images.segments import block_keys
 
 
-def whitened_squares(v: FloatArray, W: FloatArray) -> FloatArray:
-    """|W v|^2 (n,) of residuals v (n, 2) with W (n, 3) upper triangular."""
-    return np.asarray((W[:, 0] * v[:, 0] + W[:, 1] * v[:, 1]) ** 2 + (W[:, 2] * v[:, 1]) ** 2)
-
-
 class Chains:
     """Pose chains of many blocks in flat arrays, evaluated together."""
 
@@ -207,7 +202,8 @@ class ImageBatch:
 
     def whitened_squares(self) -> FloatArray:
         """Weighted squares v' inv(Q_ll) v (N,) of all points where the chains were last evaluated."""
-        return whitened_squares(self.statistics(None)[0], self.W_all)
+        (u, v), (w00, w01, w11) = self.statistics(None)[0].T, self.W_all_columns
+        return np.asarray((w00 * u + w01 * v) ** 2 + (w11 * v) ** 2)
 
     def add_factors(self, graph: gtsam.NonlinearFactorGraph, which: IntArray | None = None) -> None:
         """One custom factor for each of these blocks, or of all, that has an unknown."""
