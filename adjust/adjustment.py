@@ -258,9 +258,8 @@ def estimates(precision: Precision) -> dict[ParameterName, Estimate]:
         out[name] = Estimate(name, x, ("x", "y", "z"), ("m",) * 3, cov, status)
     for name, unknown in u.by_name.items():
         if name[0] == "table_angles":
-            n = unknown.dim
-            out[name] = Estimate(name, np.asarray(values.atVector(unknown.key)), unknown.components, ("rad",) * n,
-                                 found[unknown.key], ("free",) * n)  # fmt: skip
+            x, free_all = np.asarray(values.atVector(unknown.key)), ("free",) * unknown.dim
+            out[name] = Estimate(name, x, unknown.components, unknown.units, found[unknown.key], free_all)
     return out
 
 

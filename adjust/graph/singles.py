@@ -12,7 +12,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import Coordinates, PositionRef, frame_text, position_text
 from adjust.model.result import ParameterName
 from adjust.model.rewriting import vector_parameters
-from adjust.model.survey import FloatArray, Survey, VectorPrior
+from adjust.model.survey import FloatArray, PointParameter, PoseParameter, Survey, VectorPrior
 from adjust.observations.clocks import Shifts, reading_residual
 from adjust.observations.factors import (
     ObservationFactor,
@@ -85,32 +85,26 @@ class Singles:
 
     def add_priors(self, of_readings: Mapping[ParameterName, VectorPrior]) -> None:
         """Of all unknowns; those that readings have are given."""
-        self._pose_priors()
-        self._point_priors()
+        for name, pose in self.unknowns.parameters.items():
+            if pose.treatment == "prior":
+                self._add_prior(name, pose)
+        for p in self.survey.points:
+            if p.x_in_world.treatment == "prior":
+                self._add_prior(("point", p.point_id), p.x_in_world)
         self._vector_priors(of_readings)
 
-    def _pose_priors(self) -> None:
-        for name, parameter in self.unknowns.parameters.items():
-            if parameter.treatment == "prior":
-                if parameter.value is None or parameter.prior_cov is None:
-                    raise SurveyError(f"{' '.join(name)} has a prior without value or covariance; give both")
-                factor = pose_prior_factor(parameter, self.unknowns.by_name[name].key)
-                known = np.isfinite(np.diag(parameter.prior_cov))
-                self._add(factor, "prior", "prior", name, tuple(np.array(POSE_COMPONENTS)[known]),
-                            tuple(np.array(POSE_UNITS)[known]), np.zeros(int(known.sum())))  # fmt: skip
-
-    def _point_priors(self) -> None:
-        for point in self.survey.points:
-            p = point.x_in_world
-            if p.treatment == "prior":
-                if p.value is None or p.prior_cov is None:
-                    raise SurveyError(f"point {point.point_id!r} has a prior without coordinates or sigma; give both")
-                name = ("point", point.point_id)
-                known = np.isfinite(np.diag(p.prior_cov))
-                mean = Coordinates((PositionRef(point.point_id),), np.asarray(p.value)[None], p.prior_cov)
-                factor = coordinates_factor(mean, [Position(None, np.zeros(3), self.unknowns.by_name[name].key)])
-                self._add(factor, "prior", "prior", name, tuple(np.array(["x", "y", "z"])[known]),
-                            ("m",) * int(known.sum()), np.asarray(p.value)[known])  # fmt: skip
+    def _add_prior(self, name: ParameterName, parameter: PoseParameter | PointParameter) -> None:
+        if parameter.value is None or parameter.prior_cov is None:
+            raise SurveyError(f"{' '.join(name)} has a prior without value or covariance; give both")
+        unknown, known = self.unknowns.by_name[name], np.isfinite(np.diag(parameter.prior_cov))
+        if isinstance(parameter, PoseParameter):
+            factor, observed = pose_prior_factor(parameter, unknown.key), np.zeros(6)
+        else:
+            mean = Coordinates((PositionRef(name[1]),), np.asarray(parameter.value)[None], parameter.prior_cov)
+            factor = coordinates_factor(mean, [Position(None, np.zeros(3), unknown.key)])
+            observed = np.asarray(parameter.value)
+        components, units = (tuple(np.array(x)[known].tolist()) for x in (unknown.components, unknown.units))
+        self._add(factor, "prior", "prior", name, components, units, observed[known])
 
     def _vector_priors(self, of_readings: Mapping[ParameterName, VectorPrior]) -> None:
         u = self.unknowns

@@ -356,8 +356,8 @@ class JointCovariances(Protocol):
         ...
 
     def bring_together(self, pairs: Iterable[tuple[ParameterName, ParameterName]]) -> None:
-        """Work out the covariances of many pairs of unknowns at once, before they are asked for one by one."""
-        ...
+        """Work out many pairs at once, before they are asked for one by one; nothing where that is no cheaper."""
+        return None
 
 
 @dataclass(frozen=True, eq=False, repr=False)

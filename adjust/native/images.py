@@ -34,8 +34,7 @@ _evaluate_chains = Function(
 )
 _square_roots = Function("square_roots", "first last cov[N,2,2] W[N,3]")
 _point_columns = Function(
-    "point_columns",
-    "which[*] ptr[B+1] start[B] n_points[B] x[P,3] shown[N] seen[N,2] weights[N,3] X[3,N] uv[2,N] W[3,N]",
+    "point_columns", "which[*] ptr[B+1] start[B] count[B] x[P,3] shown[N] seen[N,2] weights[N,3] X[3,N] uv[2,N] W[3,N]"
 )
 _normal_equations = Function("normal_equations", f"which[*] {_BATCH} H[B,m,m] chi[B] depth[B]")
 _errors = Function("errors", f"which[*] {_BATCH} chi[B] depth[B]")

@@ -75,12 +75,9 @@ def _in_datum(datum: STransformation | None, keys: Sequence[int], Q: FloatArray)
 
 
 class Covariances(JointCovariances):
-    """Those of the ``unknowns``; whoever has them says how :meth:`joint` is found, and what is prepared for it."""
+    """Those of the ``unknowns``; whoever has them says how :meth:`joint` is found, and may prepare it for many."""
 
     unknowns: Unknowns
-
-    def bring_together(self, pairs: Iterable[tuple[ParameterName, ParameterName]]) -> None:
-        """Nothing, where it would not be cheaper for all at once."""
 
     def whole(self, names: Sequence[ParameterName], sizes: Sequence[int]) -> FloatArray:
         """The same of all components, so many of each of these parameters; zero where one is held."""

@@ -83,8 +83,7 @@ class ImageBatch:
         x_in_world: FloatArray,
     ) -> None:  # fmt: skip
         """x_in_world: points (P, 3) m of the world, for blocks without a target."""
-        self.blocks, points = blocks, ImagePoints.of(blocks)
-        self.state = state
+        self.state, self.blocks, points = state, blocks, ImagePoints.of(blocks)
         self.chains = Chains(chains)
         self.ptr, self.used, self.n_points = points.ptr, points.used, len(points.uv)
         self._all = split_blocks(self.ptr)

@@ -69,8 +69,7 @@ def read_image_blocks(table: Table, names: Names, sigmas: Sigmas) -> tuple[tuple
         kept = None if whole else used[i:j]
         blocks.append(ImageBlock(camera, epoch, target_id or None, point_idx[i:j], uv[i:j], cov[i:j], kept, group_name))
         where.append(lines[i:j])
-    points = ImagePoints(ptr, point_idx, uv, cov, used)
-    return ImageBlocks(blocks, points), ImagePointsWhere(table.path, tuple(where))
+    return ImageBlocks(blocks, ImagePoints(ptr, point_idx, uv, cov, used)), ImagePointsWhere(table.path, tuple(where))
 
 
 def read_spots(table: Table, names: Names, sigmas: Sigmas) -> tuple[SpotBlock, ...]:
