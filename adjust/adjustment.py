@@ -2,11 +2,9 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from gtsam import Pose3
 
 from adjust.frames.lens_times import whole_images
 from adjust.frames.runs import within_motion
@@ -17,11 +15,13 @@ from adjust.graph.building import GraphBuilder
 from adjust.graph.solver import Solved, SolveOptions, settled, solve
 from adjust.lenses.models import MODELS, camera_constants, monotone_radius_px, principal_point_px
 from adjust.model.errors import NotConvergedError, listed
+from adjust.model.observations import ImageBlock, ImageBlocks
 from adjust.model.result import Adjustment, Estimate, ParameterName
-from adjust.model.survey import BoolArray, FloatArray, Survey
+from adjust.model.survey import BoolArray, Survey
 from adjust.native.parallel import Beside
+from adjust.native.point_tests import farthest_points
 from adjust.observations.terrestrial.statistics import joined_residuals, reading_residuals
-from adjust.precision.precision import Precision, global_test, group_summaries, image_residuals, other_residuals
+from adjust.precision.precision import Precision, global_test, group_summaries, other_residuals
 from adjust.start import Start, find_start
 from adjust.start.choice import Begun, adjusted_from_own_start
 from adjust.start.given import GivenStarts, given_starts, moved_onto
@@ -117,11 +117,11 @@ def _adjusted(
 
 def with_used(survey: Survey, used: BoolArray) -> Survey:
     """The survey with these image points (N,) in use."""
-    ptr = np.cumsum([0] + [len(b.uv) for b in survey.image_blocks]).tolist()
-    out = np.diff(np.concatenate([[0], np.cumsum(~used)])[ptr]).tolist()
-    parts = zip(survey.image_blocks, pairwise(ptr), out, strict=True)
-    blocks = (b if b.used is None and not n else replace(b, used=used[i:j]) for b, (i, j), n in parts)
-    return replace(survey, image_blocks=tuple(blocks))
+    points, blocks = survey.image_points, list(survey.image_blocks)
+    changed = np.flatnonzero(used != points.used)
+    for b in np.unique(np.searchsorted(points.ptr, changed, side="right") - 1).tolist():
+        blocks[b] = replace(blocks[b], used=used[points.ptr[b] : points.ptr[b + 1]])
+    return replace(survey, image_blocks=ImageBlocks(blocks, replace(points, used=used))) if len(changed) else survey
 
 
 def rejections(survey: Survey, given: Survey) -> tuple[str, ...]:
@@ -130,27 +130,23 @@ def rejections(survey: Survey, given: Survey) -> tuple[str, ...]:
     before = _unused_before(given)
     points = tuple(p.point_id for p in survey.points)
     for block in survey.image_blocks:
-        if block.used is None or block.used.all() or not block.used.any():
+        if block.used is None or block.n_used in (0, len(block.uv)):
             continue
         ids = targets[block.target_id] if block.target_id else points
         old = before.get(block.place, frozenset())
         names = [ids[int(i)] for i in block.point_idx[~block.used] if int(i) not in old]
-        if not names:
-            continue
-        out.append(
-            f"camera {block.camera_id} at epoch {block.epoch_id}, target {block.target_id or 'points'}: left out as "
-            f"gross errors: {listed(names, 8)}"
-        )
+        if names:
+            out.append(f"{_said(block)}: left out as gross errors: {listed(names, 8)}")
     return tuple(out)
+
+
+def _said(block: ImageBlock) -> str:
+    return f"camera {block.camera_id} at epoch {block.epoch_id}, target {block.target_id or 'points'}"
 
 
 def _unused_before(given: Survey) -> dict[tuple[str, str, str | None, str], frozenset[int]]:
     """Positions of the points of each block that its owner does not use."""
-    return {
-        b.place: frozenset(b.point_idx[~b.used].tolist())
-        for b in given.image_blocks
-        if b.used is not None and not b.used.all()
-    }
+    return {b.place: frozenset(b.point_idx[~b.used].tolist()) for b in given.image_blocks if b.used is not None}
 
 
 def _trusted(survey: Survey, given: GivenStarts, options: AdjustOptions) -> Begun:
@@ -176,18 +172,19 @@ def _found(survey: Survey, given: GivenStarts) -> Start:
 
 def _misfit_px(found: Start) -> float:
     """Median misfit of the images that take part, px; zero where there are none."""
-    out = set(found.excluded_blocks)
-    rms = [v for i, v in enumerate(found.block_rms_px) if i not in out and not np.isnan(v)]
-    return float(np.median(rms)) if rms else 0.0
+    rms = np.delete(found.block_rms_px, found.excluded_blocks)
+    return float(np.median(rms[~np.isnan(rms)])) if not np.isnan(rms).all() else 0.0
 
 
 def _without(survey: Survey, excluded: Sequence[int]) -> Survey:
     """Blocks that are not trusted: predicted and tested where the others determine their poses, else left out."""
     refused = set(excluded)
     builder = GraphBuilder(survey, {c.camera_id: np.zeros(len(MODELS[c.lens.model].names)) for c in survey.cameras})
-    chains = [builder.block_keys(block) for block in survey.image_blocks]
+    frames, unknowns = builder.frames, builder.unknowns
+    chains = [{key for link in frames.of_image(b) for key in unknowns.link_keys(link.slot)}
+              for b in survey.image_blocks]  # fmt: skip
     known = {key for i, keys in enumerate(chains) if i not in refused for key in keys}
-    known |= builder.table_keys()
+    known |= {u.key for name, u in unknowns.by_name.items() if name[0] == "table_angles"}  # they are always read
     blocks = []
     for i, block in enumerate(survey.image_blocks):
         if i not in refused:
@@ -210,14 +207,13 @@ def assemble(
     given: the survey of its owner; what that does not use needs no warning.
     """
     precision = precision or Precision(graph, solved)
-    images = image_residuals(precision)
     others = other_residuals(precision)
     readings = None
     if graph.terrestrial is not None:
         readings = reading_residuals(graph.terrestrial, precision.tree, solved.values)
     every = others if readings is None else joined_residuals(others, graph.survey, readings)
     with Beside() as made:
-        summed = made.of(lambda: group_summaries(precision, images, others, readings))
+        summed = made.of(lambda: group_summaries(precision, others, readings))
         unknowns, groups = estimates(precision), summed()
     n_observations = sum(g.n_observations for g in groups)
     n_unknowns = graph.unknowns.n_unknowns
@@ -226,9 +222,9 @@ def assemble(
     omega = sum(g.omega for g in groups)
     test = global_test(omega, redundancy, options.alpha)
     result = Adjustment(
-        graph.survey, unknowns, images, every, groups, n_observations, n_unknowns, defect, redundancy,
-        omega, float(np.sqrt(omega / redundancy)) if redundancy > 0 else float("nan"), test, solved.iterations,
-        solved.max_step, True, (), precision, readings,
+        graph.survey, unknowns, precision.image_residuals, every, groups, n_observations, n_unknowns, defect,
+        redundancy, omega, float(np.sqrt(omega / redundancy)) if redundancy > 0 else float("nan"), test,
+        solved.iterations, solved.max_step, True, (), precision, readings,
     )  # fmt: skip
     return replace(result, warnings=warnings(graph, result, given) + notes)
 
@@ -262,9 +258,8 @@ def estimates(precision: Precision) -> dict[ParameterName, Estimate]:
         out[name] = Estimate(name, x, ("x", "y", "z"), ("m",) * 3, cov, status)
     for name, unknown in u.by_name.items():
         if name[0] == "table_angles":
-            n = unknown.dim
-            out[name] = Estimate(name, np.asarray(values.atVector(unknown.key)), unknown.components, ("rad",) * n,
-                                 found[unknown.key], ("free",) * n)  # fmt: skip
+            x, free_all = np.asarray(values.atVector(unknown.key)), ("free",) * unknown.dim
+            out[name] = Estimate(name, x, unknown.components, unknown.units, found[unknown.key], free_all)
     return out
 
 
@@ -288,41 +283,33 @@ def _image_warnings(graph: AdjustmentGraph, result: Adjustment, given: Survey | 
     out, images, blocks = [], result.image_residuals, graph.survey.image_blocks
     bound = limit(len(images.test)) * max(1.0, result.sigma0**2)
     before = {} if given is None else _unused_before(given)
-    of_point = np.repeat(np.arange(len(blocks)), np.diff(images.block_ptr))
-    used = np.bincount(of_point[images.used], minlength=len(blocks))
+    ptr, used = images.block_ptr, np.diff(np.append(0, np.cumsum(images.used))[images.block_ptr])
     with np.errstate(invalid="ignore"):
-        bad = np.bincount(of_point[images.used & (images.test > bound)], minlength=len(blocks))
+        failing = np.flatnonzero(images.used & (images.test > bound))
+    bad = np.bincount(np.searchsorted(ptr, failing, side="right") - 1, minlength=len(blocks))
     for i in np.flatnonzero((used == 0) | (bad > 0)).tolist():
         block = blocks[i]
-        what = f"camera {block.camera_id} at epoch {block.epoch_id}, target {block.target_id or 'points'}"
-        if used[i] == 0 and len(before.get(block.place, ())) == len(block.uv):
-            continue  # as its owner wants it
-        if used[i] == 0 and len(block.uv):
-            out.append(f"{what}: not used")
-        elif bad[i]:
-            out.append(f"{what}: {bad[i]} of {used[i]} image points do not fit (probable gross errors)")
+        if bad[i]:
+            out.append(f"{_said(block)}: {bad[i]} of {used[i]} image points do not fit (probable gross errors)")
+        elif len(before.get(block.place, ())) < len(block.uv):  # else as its owner wants it
+            out.append(f"{_said(block)}: not used")
     return out
 
 
 def _lens_warnings(graph: AdjustmentGraph, result: Adjustment) -> list[str]:
-    out = []
-    for camera in graph.survey.cameras:
-        model = MODELS[camera.lens.model]
-        values = result.estimates[("lens", camera.camera_id)].value
-        if isinstance(values, Pose3):
-            continue
-        constants = camera_constants(camera)
-        radius = monotone_radius_px(model, values, constants)
-        seen = _largest_radius(graph, camera.camera_id, principal_point_px(model, values, constants))
+    out, survey = [], whole_images(graph.survey)
+    lenses = {c.camera_id: np.asarray(result.estimates["lens", c.camera_id].value) for c in survey.cameras}
+    centres = {c.camera_id: principal_point_px(MODELS[c.lens.model], lenses[c.camera_id], camera_constants(c))
+               for c in survey.cameras}  # fmt: skip
+    of_block = np.array([centres[b.camera_id] for b in survey.image_blocks]).reshape(-1, 2)
+    farthest = farthest_points(survey.image_points.ptr, survey.image_points.uv, of_block).tolist()
+    for camera in survey.cameras:
+        radius = monotone_radius_px(MODELS[camera.lens.model], lenses[camera.camera_id], camera_constants(camera))
+        seen = max((r for b, r in zip(survey.image_blocks, farthest, strict=True) if b.camera_id == camera.camera_id),
+                   default=0.0)  # fmt: skip
         if seen > radius:
             out.append(
                 f"camera {camera.camera_id}: its distortion folds back at {radius:.0f} px from the principal point, "
                 f"inside the observed {seen:.0f} px; free fewer coefficients or cover the image better"
             )
     return out
-
-
-def _largest_radius(graph: AdjustmentGraph, camera_id: str, centre: FloatArray) -> float:
-    blocks = whole_images(graph.survey).image_blocks
-    parts = [np.zeros((0, 2)), *(b.uv for b in blocks if b.camera_id == camera_id)]
-    return float(np.linalg.norm(np.concatenate(parts) - centre, axis=1).max(initial=0.0))

@@ -24,7 +24,7 @@ from adjust.model.survey import (
     Target,
     VectorParameter,
 )
-from adjust.observations.images.batch import square_root_information
+from adjust.native.images import square_root_information
 from survey.solution.quantities import Scale, pose_dict, pose_entry, sigmas_of
 from tests.adjust import helpers as h
 

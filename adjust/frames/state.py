@@ -41,8 +41,9 @@ class State:
         self.lenses = self._lens_arrays(survey)
         n = len(unknowns.slot_key)
         self.slot_R, self.slot_t = np.zeros((n, 3, 3)), np.zeros((n, 3))
-        for slot, pose in enumerate(unknowns.slot_pose):
-            self._set(slot, pose)
+        for slot, key in enumerate(unknowns.slot_key):
+            if key is None:  # the others are loaded
+                self._set(slot, unknowns.slot_pose[slot])
         derived: dict[int, TableSlot | ShiftedSlot] = {**unknowns.table_slots, **unknowns.shifted_slots}
         self.derived_index: IntArray = np.full(n, -1, dtype=np.int64)
         self.derived_index[list(derived)] = np.arange(len(derived))

@@ -164,7 +164,7 @@ class Unknowns:
     def status(self, key: int | None, treatment: str, dim: int) -> tuple[str, ...]:
         """Per component: the treatment of the whole, or "held"."""
         held = self.held.get(key, ()) if key is not None else ()
-        return tuple("held" if i in held else treatment for i in range(dim))
+        return tuple("held" if i in held else treatment for i in range(dim)) if held else (treatment,) * dim
 
     def add(self, name: ParameterName, kind: str, components: tuple[str, ...], units: tuple[str, ...]) -> Unknown:
         """Register a variable under the next key of its letter."""

@@ -11,13 +11,12 @@ from gtsam import Pose3
 
 from adjust.frames.state import State
 from adjust.frames.unknowns import Unknowns
-from adjust.model.clocks import clocks_of
+from adjust.model.clocks import CLOCKS
 from adjust.model.observations import ImageBlock, Pair
 from adjust.model.result import Adjustment, ParameterName
+from adjust.model.rewriting import vector_parameters
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey, VectorParameter
-from adjust.observations.factors import (
-    ObservationFactor,
-)
+from adjust.observations.factors import ObservationFactor
 from adjust.observations.images.batch import ImageBatch
 from adjust.observations.images.bundle_points import add_point_factors
 from adjust.observations.images.bundles import BundleBatch
@@ -58,13 +57,10 @@ def _by_component(adjustment: Adjustment, survey: Survey | None) -> dict[Paramet
     """Of tables, boards, clocks, in the order of their components in the survey: adjusted, else as given."""
     if survey is None:
         return {}
-    owners: dict[ParameterName, VectorParameter]
-    owners = {("table_geometry", t.table_id): t.geometry for t in survey.tables}
-    owners |= {("warp", t.target_id): t.warp for t in survey.targets if t.warp is not None}
-    owners |= {name: clock.parameters for name, clock in clocks_of(survey)}
     out: dict[ParameterName, FloatArray] = {}
-    for name, owner in owners.items():
-        if name in adjustment.estimates:
+    for name, owner in vector_parameters(survey).items():
+        listed = name in adjustment.estimates and name[0] in ("table_geometry", "warp", *CLOCKS)
+        if listed and isinstance(owner, VectorParameter):
             estimate = adjustment.estimates[name]
             known = dict(zip(estimate.components, np.asarray(estimate.value).tolist(), strict=True))
             given = zip(owner.names, owner.values.tolist(), strict=True)
@@ -90,11 +86,11 @@ class Evaluation:
 class AdjustmentGraph:
     """The graph, its start and the batches that serve it. Held together with the survey only by the solver.
 
-    ``graph`` has every observation as a factor on its unknowns and nothing else; ``system`` is a view of it for the
-    solver, in which points and poses that nothing else touches are reduced.
-    bundles: image blocks of unknown points, in parts that are reduced each by itself. image_order: of every image block
-    its number in the survey and its part: 0 in ``images``, i in the bundle before the i-th. image_numbers: of every
-    block in ``images`` the number in the survey of that which it is, or a part of.
+    ``graph`` has every observation as a factor on its unknowns and nothing else; the solver
+    takes a ``view`` of it, in which points and poses that nothing else touches are reduced.
+    bundles: image blocks of unknown points, in parts that are reduced each by itself. image_numbers: of every block in
+    ``images`` the number in the survey of that which it is, or a part of. image_parts: of every image block of the
+    survey 0 where it is in ``images``, i in the bundle before the i-th.
     reduction: of the poses that only image points touch; None where it would not pay. pairs: those between two fixed
     stations, ``others[first_pair + pairs.rows[e]]`` the e-th; singles: the others that are in no batch.
     """
@@ -105,8 +101,8 @@ class AdjustmentGraph:
     start: gtsam.Values
     images: ImageBatch
     bundles: tuple[BundleBatch, ...]
-    image_order: list[tuple[int, int]]
-    image_numbers: list[int]
+    image_numbers: IntArray
+    image_parts: IntArray
     singles: list[ObservationFactor]
     singles_graph: gtsam.NonlinearFactorGraph
     terrestrial: TerrestrialBatch | None = None
@@ -207,16 +203,11 @@ class AdjustmentGraph:
             bundle.add_factor(graph)
         return graph
 
-    @property
-    def system(self) -> gtsam.NonlinearFactorGraph:
-        """What the solver linearises, as long as :attr:`reduction` finds inverses: a view of ``graph``.
-
-        Of the same chi-square, with what :attr:`reduction` and :attr:`bundles` reduce eliminated already.
-        """
-        return self.view(self.reduction)
-
     def view(self, reduction: PoseReduction | None) -> gtsam.NonlinearFactorGraph:
-        """``system``, or where ``reduction`` is None what it is with all poses in sight."""
+        """What the solver linearises: of the chi-square of ``graph``, with what is reduced eliminated already.
+
+        reduction: :attr:`reduction`, or None for all poses in sight; :attr:`bundles` are reduced in any case.
+        """
         return self._unreduced if reduction is None else self._reduced
 
     @cached_property
@@ -298,12 +289,11 @@ class AdjustmentGraph:
     @cached_property
     def image_rows(self) -> IntArray:
         """Where the image points (N,), in the order of the survey's blocks, stand in those of all parts one by one."""
-        lengths, part = np.array([(len(self.survey.image_blocks[i].uv), p) for i, p in self.image_order] or [(0, 0)]).T
-        order = np.argsort(part, kind="stable")
-        first = np.empty(len(part), dtype=np.int64)
+        ptr = self.survey.image_points.ptr
+        lengths, order = np.diff(ptr), np.argsort(self.image_parts, kind="stable")
+        first = np.empty(len(order), dtype=np.int64)
         first[order] = np.cumsum(lengths[order]) - lengths[order]
-        ends = np.cumsum(lengths)
-        return np.asarray(np.arange(ends[-1]) + np.repeat(first - (ends - lengths), lengths))
+        return np.asarray(np.arange(ptr[-1]) + np.repeat(first - ptr[:-1], lengths))
 
     def joined(self, of_images: _Rows, of_bundles: Sequence[_Rows]) -> _Rows:
         """Rows (N, ...) of all image points in the order of ``Survey.image_blocks``, from those of every part."""
@@ -319,9 +309,10 @@ class AdjustmentGraph:
 
     def set_weights(self, weights: FloatArray) -> None:
         """Weights (N,) of the image points, on top of their covariance; zero leaves a point out."""
-        by_part = np.empty_like(weights)
-        by_part[self.image_rows] = weights
-        sizes = [self.images.n_points, *(len(b.uv) for b in self.bundles)]
+        sizes, by_part = [self.images.n_points, *(len(b.uv) for b in self.bundles)], weights
+        if self.bundles:
+            by_part = np.empty_like(weights)
+            by_part[self.image_rows] = weights
         known, *unknown = np.split(by_part, np.cumsum(sizes)[:-1])
         self.images.set_weights(known)
         for bundle, part in zip(self.bundles, unknown, strict=True):
@@ -334,7 +325,7 @@ class AdjustmentGraph:
 
     def behind_camera(self) -> list[ImageBlock]:
         """Blocks with a point behind their camera at the prepared values."""
-        found = [self.images.blocks[b] for b in np.flatnonzero(self.images.depth <= 0.0)]
+        found = [self.images.blocks[b] for b in np.flatnonzero(self.images.depth <= 0.0).tolist()]
         for bundle in self.bundles:
             found += [b for b, z in zip(bundle.blocks, bundle.depth, strict=True) if z <= 0.0]
         if not found:

@@ -1,6 +1,7 @@
 """What to say of an adjustment that did not arrive: what moved away, and which observations fit worst, by group."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -11,6 +12,7 @@ from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.datum import normal_diagonal, stacking, visible_keys
 from adjust.graph.rank import readable
 from adjust.model.errors import SurveyError
+from adjust.model.names import grouped
 from adjust.model.observations import position_text
 from adjust.model.stopped import GroupFit, Pull, Stopped, UnknownState
 from adjust.model.survey import FloatArray
@@ -62,11 +64,8 @@ def _gradient(graph: AdjustmentGraph, values: gtsam.Values) -> tuple[Pull, ...]:
         down, scale = linear.gradientAtZero(), np.sqrt(np.maximum(normal_diagonal(linear, stack), 1e-300))
     except (SurveyError, RuntimeError):  # the latter from GTSAM, of what is not finite
         return ()
-    pulls: dict[str, list[tuple[Unknown, FloatArray]]] = {}
-    for key, place in stack.at.items():
-        u = graph.unknowns.by_key[key]
-        pulls.setdefault(u.name[0], []).append((u, np.abs(down.at(key)) / scale[place]))
-    found = []
+    every_pull = ((graph.unknowns.by_key[key], np.abs(down.at(key)) / scale[at]) for key, at in stack.at.items())
+    pulls, found = grouped((u.name[0], (u, pull)) for u, pull in every_pull), []
     for kind, mine in pulls.items():
         every = np.concatenate([pull for _, pull in mine])
         u, most = max(mine, key=lambda item: float(np.max(item[1])))
@@ -79,10 +78,7 @@ def _rms(found: list[Misfit]) -> float:
 
 
 def _by_group(found: list[Misfit]) -> dict[str, list[Misfit]]:
-    groups: dict[str, list[Misfit]] = {}
-    for m in found:
-        groups.setdefault(m.group, []).append(m)
-    return groups
+    return grouped((m.group, m) for m in found)
 
 
 def describe_divergence(graph: AdjustmentGraph, start: gtsam.Values, values: gtsam.Values) -> list[str]:
@@ -137,9 +133,7 @@ def worst_by_group(found: list[Misfit]) -> list[str]:
 
 def _owners(found: list[Misfit]) -> list[tuple[str, float]]:
     """Owners with the mean of their squares, the largest first."""
-    squares: dict[str, list[float]] = {}
-    for m in found:
-        squares.setdefault(m.owner, []).append(m.square)
+    squares = grouped((m.owner, m.square) for m in found)
     mean = [(owner, float(np.mean(values))) for owner, values in squares.items()]
     return sorted(mean, key=lambda item: (-item[1], item[0]))
 
@@ -150,11 +144,9 @@ def misfits(graph: AdjustmentGraph, values: gtsam.Values) -> list[Misfit]:
         squares = graph.whitened_squares(values)
     except SurveyError:
         return []
-    out, used, at = [], graph.used(), 0
-    for block in graph.survey.image_blocks:
-        rows = slice(at, at + len(block.uv))
-        at = rows.stop
-        mine = squares[rows][used[rows]]
+    out, used = [], graph.used()
+    for block, (i, j) in zip(graph.survey.image_blocks, pairwise(graph.survey.image_points.ptr), strict=True):
+        mine = squares[i:j][used[i:j]]
         if len(mine):
             text = f"camera {block.camera_id} at epoch {block.epoch_id}, target {block.target_id or 'points'}"
             out.append(Misfit(block.group, f"camera {block.camera_id}", text, float(mine.mean()) / 2.0))

@@ -1,8 +1,9 @@
 """What was observed: values with their covariance and the group they belong to, as frozen values."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 from gtsam import Pose3, Rot3
@@ -91,6 +92,44 @@ class ImageBlock:
     def in_use(self) -> "ImageBlock":
         """Less what is predicted and tested only."""
         return self if self.used is None else replace(self.part(self.used), used=None)
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePoints:
+    """The image points (N,) of B blocks, block after block, as :class:`ImageBlock` has them.
+
+    ptr: (B + 1,) where each block begins.
+    """
+
+    ptr: IntArray
+    point_idx: IntArray
+    uv: FloatArray
+    cov: FloatArray
+    used: BoolArray
+
+    @staticmethod
+    def of(blocks: Sequence[ImageBlock]) -> "ImagePoints":
+        """Those of blocks; put together, but where they were cut out of one table."""
+        if isinstance(blocks, ImageBlocks):
+            return blocks.points
+        ptr = np.cumsum([0] + [len(b.uv) for b in blocks])
+        point_idx = np.concatenate([np.zeros(0, dtype=np.int64), *(b.point_idx for b in blocks)])
+        uv = np.concatenate([np.zeros((0, 2)), *(b.uv for b in blocks)])
+        cov = np.concatenate([np.zeros((0, 2, 2)), *(b.cov for b in blocks)])
+        used = np.concatenate([np.zeros(0, dtype=np.bool_), *(b.mask for b in blocks)])
+        return ImagePoints(ptr, point_idx, uv, cov, used)
+
+
+class ImageBlocks(tuple[ImageBlock, ...]):
+    """Image blocks that were cut out of one table of image points, which goes with them."""
+
+    points: ImagePoints
+
+    def __new__(cls, blocks: Iterable[ImageBlock], points: ImagePoints) -> Self:
+        """points: those of the blocks, in their order."""
+        made = super().__new__(cls, blocks)
+        made.points = points
+        return made
 
 
 @dataclass(frozen=True, eq=False)

@@ -341,10 +341,10 @@ class Decision:
 
 
 class JointCovariances(Protocol):
-    """Covariances of the adjusted unknowns, a priori; see :class:`adjust.precision.precision.Covariances`."""
+    """Covariances of the adjusted unknowns, a priori (sigma0 = 1), in the survey's datum."""
 
     def joint(self, names: Sequence[ParameterName]) -> FloatArray:
-        """Of several unknowns, stacked in this order (of vectors their free components)."""
+        """Of several unknowns, stacked in this order (of vectors their free components); KeyError for what is none."""
         ...
 
     def whole(self, names: Sequence[ParameterName], sizes: Sequence[int]) -> FloatArray:
@@ -356,8 +356,8 @@ class JointCovariances(Protocol):
         ...
 
     def bring_together(self, pairs: Iterable[tuple[ParameterName, ParameterName]]) -> None:
-        """Work out the covariances of many pairs of unknowns at once, before they are asked for one by one."""
-        ...
+        """Work out many pairs at once, before they are asked for one by one; nothing where that is no cheaper."""
+        return None
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, TypeVar
 
+from adjust.model.clocks import clocks_of
 from adjust.model.result import ParameterName
 from adjust.model.survey import (
     Camera,
@@ -90,6 +91,19 @@ class Rewriting:
         name = ("carrier_from_target", t.target_id)
         return replace(t, warp=warp, carrier_from_target=self.pose(name, t.carrier_from_target),
                        epochs=self.epochs(name, t.epochs, t.carrier_from_target))  # fmt: skip
+
+
+def vector_parameters(survey: Survey) -> dict[ParameterName, LensParameter | VectorParameter]:
+    """All that is named numbers, owner after owner; of a lens also its crops."""
+    out: dict[ParameterName, LensParameter | VectorParameter]
+    out = {("lens", c.camera_id): c.lens for c in survey.cameras}
+    out |= {("lens_crop", c.camera_id, e): x.parameters for c in survey.cameras for e, x in c.lens.crops.items()}
+    out |= {("table_geometry", t.table_id): t.geometry for t in survey.tables}
+    out |= {("warp", t.target_id): t.warp for t in survey.targets if t.warp}
+    out |= {("beam", b.beam_id): b.parameters for b in survey.beams}
+    out |= {("surface", s.surface_id): s.parameters for s in survey.surfaces if s.parameters}
+    out |= {("vertical",): survey.vertical.tilt} | {name: clock.parameters for name, clock in clocks_of(survey)}
+    return out | {("instrument", i.instrument_id): i.parameters for i in survey.instruments}
 
 
 def with_rows(survey: Survey, field: str, new: Mapping[int, object]) -> Survey:

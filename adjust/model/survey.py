@@ -24,6 +24,7 @@ from adjust.model.observations import (
     Distance,
     FrameRef,
     ImageBlock,
+    ImagePoints,
     LaserSpot,
     Level,
     Observation,
@@ -444,6 +445,11 @@ class Survey:
     def n_others_used(self) -> int:
         """How many of them are in use."""
         return sum(o.used for kind in self.others.values() for o in kind)
+
+    @cached_property
+    def image_points(self) -> ImagePoints:
+        """The image points of all blocks, one block after the other."""
+        return ImagePoints.of(self.image_blocks)
 
     @cached_property
     def cameras_by_id(self) -> Mapping[str, Camera]:

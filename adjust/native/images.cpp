@@ -9,7 +9,7 @@
 extern "C" __attribute__((visibility("default"))) const Entry *images() {
     static constexpr Entry table[] = {
         entry<evaluate_chains>("evaluate_chains"), entry<lens_rows>("lens_rows"), entry<tangents_of>("tangents_of"), entry<normal_equations>("normal_equations"), entry<errors>("errors"),
-        entry<block_rows>("block_rows"), entry<condensed_rows>("condensed_rows"), entry<serve>("serve"), entry<local_by_keys>("local_by_keys"),
+        entry<square_roots>("square_roots"), entry<point_columns>("point_columns"), entry<block_rows>("block_rows"), entry<condensed_rows>("condensed_rows"), entry<serve>("serve"), entry<local_by_keys>("local_by_keys"),
         entry<all_statistics>("all_statistics"), entry<reduce_poses>("reduce_poses"), entry<pose_steps>("pose_steps"),
         entry<leaf_rows>("leaf_rows"), entry<tree_block>("tree_block"), entry<invert_cliques>("invert_cliques"), entry<inversion_room>("inversion_room"),
         entry<covariance_room>("covariance_room"), entry<covariance_rows>("covariance_rows"), entry<clique_covariance>("clique_covariance"),
@@ -19,7 +19,7 @@ extern "C" __attribute__((visibility("default"))) const Entry *images() {
         entry<offsets_of_views>("offsets_of_views"), entry<homographies>("homographies"),
         entry<plane_poses>("plane_poses"), entry<fit_lens>("fit_lens"), entry<turns_by>("turns_by"),
         entry<turns_of>("turns_of"), entry<row_influences>("row_influences"), entry<residual_tests>("residual_tests"),
-        entry<controlled_directions>("controlled_directions"), entry<point_tests>("point_tests"),
-        entry<number_rows>("number_rows"), entry<record_rows>("record_rows"), {nullptr, nullptr, nullptr}};
+        entry<sums_of_blocks>("sums_of_blocks"), entry<farthest_points>("farthest_points"), entry<controlled_directions>("controlled_directions"),
+        entry<point_tests>("point_tests"), entry<number_rows>("number_rows"), entry<record_rows>("record_rows"), {nullptr, nullptr, nullptr}};
     return table;
 }

@@ -196,6 +196,33 @@ inline void clear_unused(const Batch &B, int64_t b, Room &room) {
     for (int j = 0; j < B.lenses.n_free[c]; ++j) std::memset(room.A[j], 0, sizeof room.A[j]);
 }
 
+// Square root information w00, w01, w11 of image points with covariances: upper triangular W with W'W = inv(cov).
+inline void square_roots(int64_t first, int64_t last, In<double, 3> cov, Out<double, 2> W) {
+    for (int64_t i = first; i < last; ++i) {
+        const double b = cov(i, 0, 1), c = cov(i, 1, 1), w00 = 1.0 / root(cov(i, 0, 0) - b * b / c);
+        W(i, 0) = w00, W(i, 1) = -w00 * b / c, W(i, 2) = 1.0 / root(c);
+    }
+}
+
+// The points of the listed blocks as columns: X of what they show, which is point ``shown`` of n_points[b] from x[start[b]]
+// on, uv, W. How many blocks show what is not there.
+inline int64_t point_columns(Ints which, Ints ptr, Ints start, Ints n_points, In<double, 2> x, Ints shown, In<double, 2> uv, In<double, 2> W,
+                             Out<double, 2> X_out, Out<double, 2> uv_out, Out<double, 2> W_out) {
+    int64_t wrong = 0;
+    for (int64_t k = 0; k < which.n[0]; ++k) {
+        const int64_t b = which[k];
+        for (int64_t i = ptr[b]; i < ptr[b + 1]; ++i) {
+            if (shown[i] < 0 || shown[i] >= n_points[b]) {
+                ++wrong;
+                break;
+            }
+            for (int j = 0; j < 3; ++j) X_out(j, i) = x(start[b] + shown[i], j), W_out(j, i) = W(i, j);
+            for (int j = 0; j < 2; ++j) uv_out(j, i) = uv(i, j);
+        }
+    }
+    return wrong;
+}
+
 // For each listed block: normal matrix H[b] (symmetric) of its local unknowns and, last, the residual, whose diagonal
 // element is chi-square, also in chi; depth: the least one.
 inline void normal_equations(Ints which, const Batch &B, Out<double, 3> H, Out<double, 1> chi, Out<double, 1> depth) {

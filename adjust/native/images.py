@@ -11,6 +11,7 @@ import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.library import Function
+from adjust.native.parallel import run_ranges
 from adjust.native.trees import TREE, TreeArrays
 
 SEGMENT_LENS, SEGMENT_POSE, SEGMENT_TABLE, SEGMENT_WARP = 0, 1, 2, 3
@@ -30,6 +31,10 @@ _BATCH = f"{BLOCKS} X[3,N] uv[2,N] W[3,N] {LENSES} R[B,3,3] t[B,3] {WARPS}"
 CHAINED = "C[*,6,6] D[*,6,*]"
 _evaluate_chains = Function(
     "evaluate_chains", "slot_R[S,3,3] slot_t[S,3] ptr[B+1] slot[L] inverse[L] R[B,3,3] t[B,3] C[L,6,6]"
+)
+_square_roots = Function("square_roots", "first last cov[N,2,2] W[N,3]")
+_point_columns = Function(
+    "point_columns", "which[*] ptr[B+1] start[B] count[B] x[P,3] shown[N] seen[N,2] weights[N,3] X[3,N] uv[2,N] W[3,N]"
 )
 _normal_equations = Function("normal_equations", f"which[*] {_BATCH} H[B,m,m] chi[B] depth[B]")
 _errors = Function("errors", f"which[*] {_BATCH} chi[B] depth[B]")
@@ -163,6 +168,26 @@ def evaluate_chains(
     R, t, C = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((len(link_slot), 6, 6))
     _evaluate_chains(slot_R, slot_t, link_ptr, link_slot, link_inverse, R, t, C)
     return R, t, C
+
+
+def square_root_information(cov: FloatArray) -> FloatArray:
+    """Upper triangular W (n, 3: w00, w01, w11) with W'W = inv(cov), for covariances (n, 2, 2)."""
+    W = np.empty((len(cov), 3))
+    run_ranges(_square_roots, len(cov), cov, W)
+    return W
+
+
+def point_columns(
+    which: IntArray, ptr: IntArray, targets: tuple[IntArray, IntArray, FloatArray], shown: IntArray,
+    seen: FloatArray, weights: FloatArray, out: PointArrays, W: FloatArray,
+) -> None:  # fmt: skip
+    """The image points (N,) of the listed blocks as columns, into ``out`` and W (3, N); seen (N, 2), weights (N, 3).
+
+    targets: where the points of each block's target begin (B,) in those of all targets, how many these are (B,), and
+    all (P, 3); shown (N,) is counted from there. Raises IndexError where a block shows what its target does not have.
+    """
+    if _point_columns(which, ptr, *targets, shown, seen, weights, *out, W):
+        raise IndexError("an image block shows points that its target does not have")
 
 
 def normal_equations(which: IntArray, at: BlocksAt, H: FloatArray, chi: FloatArray, depth: FloatArray) -> None:

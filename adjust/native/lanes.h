@@ -43,7 +43,7 @@ template <int H = W / 2> [[gnu::always_inline]] inline V sums(const V *v) {
 // x in every lane; a plain number has one.
 template <class S> inline S all(double x) {
     if constexpr (std::is_same_v<S, double>) return x;
-    else return S{} + x;
+    else return x - S{};  // of all that broadcasts a number only this is no work: 0 + x is another zero where x is -0
 }
 inline double root(double x) { return __builtin_sqrt(x); }
 inline V root(V v) {

@@ -65,6 +65,32 @@ inline void residual_tests(int64_t first, int64_t last, AdjustedPoints P, Out<do
     }
 }
 
+// Of the listed blocks (points ptr[b] .. ptr[b + 1] - 1): components in use, their redundancy, their weighted square sum.
+inline void sums_of_blocks(Ints which, Ints ptr, AdjustedPoints P, Out<double, 2> sums) {
+    for (int64_t k = 0; k < which.n[0]; ++k) {
+        double n = 0.0, redundancy = 0.0, squares = 0.0;
+        for (int64_t i = ptr[which[k]]; i < ptr[which[k] + 1]; ++i) {
+            if (!P.used[i]) continue;
+            const double e0 = P.W(i, 0) * P.v(i, 0) + P.W(i, 1) * P.v(i, 1), e1 = P.W(i, 2) * P.v(i, 1);
+            n += 2.0, redundancy += (1.0 - P.M(i, 0)) + (1.0 - P.M(i, 2)), squares += e0 * e0 + e1 * e1;
+        }
+        sums(which[k], 0) = n, sums(which[k], 1) = redundancy, sums(which[k], 2) = squares;
+    }
+}
+
+// Distance of the farthest point of each listed block from its centre; zero without points.
+inline void farthest_points(Ints which, Ints ptr, In<double, 2> uv, In<double, 2> centre, Out<double, 1> farthest) {
+    for (int64_t k = 0; k < which.n[0]; ++k) {
+        const int64_t b = which[k];
+        double most = 0.0;
+        for (int64_t i = ptr[b]; i < ptr[b + 1]; ++i) {
+            const double x = uv(i, 0) - centre(b, 0), y = uv(i, 1) - centre(b, 1);
+            most = larger(most, x * x + y * y);
+        }
+        farthest.data[b] = root(most);
+    }
+}
+
 // Controlled directions of every point.
 inline void controlled_directions(int64_t first, int64_t last, AdjustedPoints P, Out<int64_t, 1> freedom) {
     for (int64_t i = first; i < last; ++i) freedom.data[i] = Directions(P, i).freedom();

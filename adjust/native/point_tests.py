@@ -6,10 +6,13 @@ import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.library import Function
-from adjust.native.parallel import run_ranges
+from adjust.native.parallel import run_ranges, run_split, split_blocks
 
-_POINTS = "first last v[N,2] M[N,3] W[N,3] used[N]"
+_ADJUSTED = "v[N,2] M[N,3] W[N,3] used[N]"
+_POINTS = f"first last {_ADJUSTED}"
 _residual_tests = Function("residual_tests", f"{_POINTS} redundancy[N,2] standardized[N,2] test[N]")
+_sums_of_blocks = Function("sums_of_blocks", f"which[*] ptr[B+1] {_ADJUSTED} sums[B,3]")
+_farthest_points = Function("farthest_points", "which[*] ptr[B+1] uv[N,2] centre[B,2] farthest[B]")
 _controlled_directions = Function("controlled_directions", f"{_POINTS} freedom[N]")
 _point_tests = Function(
     "point_tests",
@@ -38,6 +41,20 @@ def residual_tests(points: AdjustedPoints) -> tuple[FloatArray, FloatArray, Floa
     n = len(points.v)
     out = np.empty((n, 2)), np.empty((n, 2)), np.empty(n)
     run_ranges(_residual_tests, n, *points, *out)
+    return out
+
+
+def sums_of_blocks(ptr: IntArray, points: AdjustedPoints) -> FloatArray:
+    """Of blocks of points, by ptr (B + 1,): components in use, their redundancy, their weighted square sum (B, 3)."""
+    out = np.empty((len(ptr) - 1, 3))
+    run_split(_sums_of_blocks, split_blocks(ptr), ptr, *points, out)
+    return out
+
+
+def farthest_points(ptr: IntArray, uv: FloatArray, centre: FloatArray) -> FloatArray:
+    """Of blocks of points, by ptr (B + 1,): largest distance (B,) of its uv (N, 2) from its centre (B, 2)."""
+    out = np.empty(len(ptr) - 1)
+    run_split(_farthest_points, split_blocks(ptr), ptr, uv, centre, out)
     return out
 
 

@@ -2,6 +2,7 @@
 //
 // A pose's columns are its own six, then those of the keys its blocks share with others, then the residual.
 #pragma once
+#include "dense.h"
 #include "images.h"
 
 namespace {
@@ -13,63 +14,36 @@ struct Reduction {
     Ints block_ptr, block, col_ptr, col, place;
 };
 
-// Room of a run of poses: upper triangles of their own normal matrices, derivatives, products, and where columns go.
+// Room of a run of poses, rows of ``size`` numbers in whole vectors: their own normal matrices, what the unknowns of a
+// block follow from, this the other way round, products; and where columns go.
 struct Scratch {
-    double *M, *G, *K, *N;
+    double *M, *G, *turned, *K, *N;
     int64_t *to, size;
 };
 
-// For the columns of a block's keys: where they stand among those of its pose, and the pose's derivative G (6, w).
-inline void by_own_columns(int64_t b, int64_t w, const Segments &S, Ints place, In<double, 3> C, In<double, 3> D, const Scratch &x) {
-    double E[6][MAX_KEY];
-    std::memset(x.G, 0, sizeof(double) * 6 * w);
-    for (int64_t s = S.ptr[b]; s < S.ptr[b + 1]; ++s) {
-        const int64_t o = S.place[s];
-        for (int64_t j = 0; j < S.n[s]; ++j) x.to[o + j] = place[s] + j;
-        if (S.kind[s] == LENS || S.kind[s] == WARP) continue;
-        pose_by_key(s, S, C, D, E);
-        for (int i = 0; i < 6; ++i)
-            for (int64_t j = 0; j < S.n[s]; ++j) x.G[i * w + o + j] += E[i][j];
-    }
-}
-
-// Add a block's normal matrix H (n, n), chained to the w columns of its keys, and its residual, to M's upper triangle.
-inline void add_block(int64_t b, int n, int64_t nl, int64_t w, const Segments &S, In<double, 2> H, const Scratch &x) {
+// Add a block's normal matrix H (n, n), chained to the w columns of its keys, and its residual, to M.
+inline void add_block(int64_t b, int n, int64_t nl, int64_t w, const Segments &S, Ints place, In<double, 3> C, In<double, 3> D, In<double, 2> H,
+                      const Scratch &x) {
     const int64_t v = w + 1;
-    for (int i = 0; i < n; ++i) {
-        double *K = x.K + i * v;
-        for (int64_t j = 0; j < w; ++j) {
-            double k = 0.0;
-            for (int a = 0; a < 6; ++a) k += H(i, nl + a) * x.G[a * w + j];
-            K[j] = k;
-        }
-        K[w] = H(i, n - 1);
+    block_by_keys(b, nl, S, C, D, Out<double, 2>(x.G, {n, x.size}));
+    x.G[(n - 1) * x.size + w] = 1.0;
+    for (int i = 0; i < n; ++i)
+        for (int64_t j = 0; j < v; ++j) x.turned[j * n + i] = x.G[i * x.size + j];
+    product(H.data, H.n[1], x.G, x.size, x.K, x.size, n, v, n);
+    product(x.turned, n, x.K, x.size, x.N, x.size, v, v, n);
+    for (int64_t s = S.ptr[b]; s < S.ptr[b + 1]; ++s)
+        for (int64_t j = 0; j < S.n[s]; ++j) x.to[S.place[s] + j] = place[s] + j;
+    const int64_t *to = x.to;
+    for (int64_t i = 0; i < v; ++i) {
+        double *row = x.M + to[i] * x.size;
+        const double *added = x.N + i * x.size;
+        for (int64_t j = 0; j < v; ++j) row[to[j]] += added[j];
     }
-    std::memset(x.N, 0, sizeof(double) * v * v);
-    const auto chained = [](int64_t) {};
-    each_segment(S, b, nl, [&](int64_t s, int64_t at) {
-        for (int64_t j = 0; j < S.n[s]; ++j)
-            for (int i = 0; i < n; ++i) x.K[i * v + S.place[s] + j] += S.factor[s] * H(i, at + j);
-    }, chained);
-    each_segment(S, b, nl, [&](int64_t s, int64_t at) {
-        for (int64_t i = 0; i < S.n[s]; ++i)
-            for (int64_t j = 0; j < v; ++j) x.N[(S.place[s] + i) * v + j] += S.factor[s] * x.K[(at + i) * v + j];
-    }, chained);
-    for (int64_t i = 0; i < w; ++i)
-        for (int a = 0; a < 6; ++a)
-            if (const double g = x.G[a * w + i]; g != 0.0)
-                for (int64_t j = 0; j < v; ++j) x.N[i * v + j] += g * x.K[(nl + a) * v + j];
-    x.N[w * v + w] = H(n - 1, n - 1);
-    for (int64_t i = 0; i < v; ++i)
-        for (int64_t j = i; j < v; ++j) {
-            const int64_t p = x.to[i], q = x.to[j];
-            x.M[smaller(p, q) * x.size + larger(p, q)] += x.N[i * v + j];
-        }
 }
 
 // First six rows of M (m, m) to [L' T] with L L' their own block; the rest loses T' T; upper triangles. False where the
-// block has no inverse to speak of.
-inline bool eliminate_pose(double *M, int64_t ld, int64_t m) {
+// block has no inverse to speak of. turned: room.
+inline bool eliminate_pose(double *M, int64_t ld, int64_t m, double *turned) {
     for (int i = 0; i < 6; ++i) {
         double *row = M + i * ld;
         double p = row[i];
@@ -80,41 +54,39 @@ inline bool eliminate_pose(double *M, int64_t ld, int64_t m) {
         row[i] = pivot;
         for (int k = 0; k < i; ++k) {
             const double a = M[k * ld + i];
-            for (int64_t j = i + 1; j < m; ++j) row[j] -= a * M[k * ld + j];
+            add_multiple(-a, M + k * ld + i + 1, row + i + 1, m - i - 1);
         }
-        for (int64_t j = i + 1; j < m; ++j) row[j] /= pivot;
+        const double f = 1.0 / pivot;
+        for (int64_t j = i + 1; j < m; ++j) row[j] *= f;
     }
     for (int64_t i = 6; i < m; ++i)
-        for (int k = 0; k < 6; ++k) {
-            const double a = M[k * ld + i];
-            if (a == 0.0) continue;
-            for (int64_t j = i; j < m; ++j) M[i * ld + j] -= a * M[k * ld + j];
-        }
+        for (int k = 0; k < 6; ++k) turned[6 * (i - 6) + k] = -M[k * ld + i];
+    product(turned, 6, M, ld, M + 6 * ld, ld, m - 6, m, 6, true);
     return true;
 }
 
 // Reduce the poses in run[1:]: L (J, 6, 6) upper and T stay for what follows; the sums are those of turn = run[0]. rest
 // (runs, n + 1, n + 1): upper triangle of the normal matrix of the interface and the residual, diagonal that before
 // anything was reduced. damping: share of its own diagonal that is added to a pose's. bad[turn]: a pose without an
-// inverse. work, to: scratch, v (2 v + 29) numbers and v places, v: columns of a pose or of a block + 1, at most.
+// inverse. work, to: scratch, v (2 v + 3 MAX_LOCAL) numbers and v places, v: columns of a pose or of a block + 1, at most,
+// in whole vectors.
 inline void reduce_poses(Ints run, const Reduction &a, const Blocks &blocks, const Lenses &lenses, const Segments &S, Ints width, In<double, 3> C,
                          In<double, 3> D, double damping, In<double, 3> H, Out<double, 3> L, Out<double, 1> T, Out<double, 2> diagonal,
                          Out<double, 3> rest, Out<int64_t, 1> bad, Out<double, 1> work, Out<int64_t, 1> to) {
     const int64_t turn = run[0], size = to.n[0], end = rest.n[1] - 1;
-    Scratch x{work.data, work.data + size * size, nullptr, nullptr, to.data, size};
-    x.K = x.G + 6 * size, x.N = x.K + MAX_LOCAL * size;
+    double *G = work.data + size * size;
+    const Scratch x{work.data, G, G + MAX_LOCAL * size, G + 2 * MAX_LOCAL * size, G + 3 * MAX_LOCAL * size, to.data, size};
     for (int64_t index = 1; index < run.n[0]; ++index) {
         const int64_t j = run[index], first = a.col_ptr[j], k = a.col_ptr[j + 1] - first, m = k + 7;
-        for (int64_t i = 0; i < m; ++i) std::memset(x.M + i * size, 0, sizeof(double) * m);
+        std::memset(x.M, 0, sizeof(double) * m * size);
         for (int64_t i = a.block_ptr[j]; i < a.block_ptr[j + 1]; ++i) {
             const int64_t b = a.block[i], nl = lenses.n_free[blocks.camera[b]], w = width[b];
             x.to[w] = m - 1;
-            by_own_columns(b, w, S, a.place, C, D, x);
-            add_block(b, int(nl + 7 + blocks.n_warp[b]), nl, w, S, H[b], x);
+            add_block(b, int(nl + 7 + blocks.n_warp[b]), nl, w, S, a.place, C, D, H[b], x);
         }
         for (int i = 0; i < 6; ++i) x.M[i * size + i] *= 1.0 + damping;
         for (int64_t i = 0; i < k; ++i) diagonal(turn, a.col[first + i]) += x.M[(6 + i) * size + 6 + i];
-        if (!eliminate_pose(x.M, size, m)) {
+        if (!eliminate_pose(x.M, size, m, x.turned)) {
             bad.data[turn] = j;
             return;
         }

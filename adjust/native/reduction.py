@@ -14,6 +14,8 @@ from adjust.native.library import Function
 
 WEAKEST_PIVOT = 2.0**-24
 """Share of a diagonal that must be left when the columns before it are eliminated: as GTSAM's Cholesky asks."""
+_WIDEST = 16
+"""Numbers in two of the widest vectors (``WIDEST`` in ``dense.h``)."""
 _REDUCTION = "block_ptr[J+1] block[*] col_ptr[J+1] col[*] own_place[*]"
 _reduce_poses = Function(
     "reduce_poses",
@@ -61,7 +63,8 @@ def reduce_poses(
     """
     segments, C, D, width = keys
     size = max(int(np.diff(a.col_ptr)[run[1:]].max(initial=0)) + 7, int(width.max(initial=0)) + 1)
-    work, to = np.empty(size * (2 * size + 6 + MAX_LOCAL)), np.empty(size, dtype=np.int64)
+    size = -(-size // _WIDEST) * _WIDEST
+    work, to = np.empty(size * (2 * size + 3 * MAX_LOCAL)), np.empty(size, dtype=np.int64)
     _reduce_poses(run, *a, *at.blocks, *at.lenses, *segments, width, C, D, damping, H, *out, work, to)
 
 

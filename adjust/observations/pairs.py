@@ -106,31 +106,9 @@ class PairArrays:
         return self.motions.log()
 
 
-def pair_arrays(pairs: Sequence[Pair]) -> PairArrays:
-    """Pairs as arrays, which are not to be changed: those of the same measurements are made once, used or not."""
-    found, used = _arrays(_Measured(tuple(pairs))), np.array([p.used for p in pairs], dtype=np.bool_)
-    return found if np.array_equal(found.used, used) else found.with_used(used)
-
-
-class _Measured:
-    """Pairs that are equal to others where these have the same measurements and covariances, by identity."""
-
-    def __init__(self, pairs: tuple[Pair, ...]) -> None:
-        self.pairs = pairs
-
-    def __hash__(self) -> int:
-        return len(self.pairs)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Measured) and len(self.pairs) == len(other.pairs) and all(
-            p is q or (p.b_from_a is q.b_from_a and p.cov is q.cov)
-            for p, q in zip(self.pairs, other.pairs, strict=True)
-        )  # fmt: skip
-
-
 @lru_cache(2)  # of a survey as it was given, and as it is solved
-def _arrays(of: _Measured) -> PairArrays:
-    pairs = of.pairs
+def pair_arrays(pairs: tuple[Pair, ...]) -> PairArrays:
+    """Pairs as arrays, which are not to be changed: those of the same pairs are made once."""
     cov, size = np.zeros((len(pairs), 6, 6)), np.array([len(p.cov) for p in pairs], dtype=np.int64)
     cov[size == 3, 3:, 3:] = np.diag([np.inf] * 3)
     for k in (3, 6):
@@ -152,7 +130,7 @@ def checked_arrays(pairs: Sequence[Pair]) -> PairArrays:
         n = 3 if isinstance(p.b_from_a, Rot3) else 6
         if np.shape(p.cov) != (n, n):
             raise SurveyError(f"{_said(p)}: its covariance has shape {np.shape(p.cov)}, expected ({n}, {n})")
-    found = pair_arrays(pairs)
+    found = pair_arrays(tuple(pairs))
     wrong = np.flatnonzero(found.doubtful | ~np.array([np.isfinite(p.cov).all() for p in pairs], dtype=np.bool_))
     if len(wrong):
         raise SurveyError(
@@ -217,13 +195,6 @@ class PairStatistics:
     p_value: FloatArray
     adjusted_cov: FloatArray
     residual_cov: FloatArray
-
-    def first(self, dim: int) -> "PairStatistics":
-        """Of the first ``dim`` components."""
-        return PairStatistics(
-            self.residual[:, :dim], self.whitened[:, :dim], self.redundancy[:, :dim], self.test, self.freedom,
-            self.p_value, self.adjusted_cov[:, :dim, :dim], self.residual_cov[:, :dim, :dim],
-        )  # fmt: skip
 
 
 @dataclass(eq=False)
@@ -372,10 +343,6 @@ class PairBatch:
             p = np.where(freedom > 0, chi2.sf(test, np.maximum(freedom, 1)), np.nan)
         redundancy = np.where(used[:, None], np.diagonal(Qvv, axis1=1, axis2=2), 0.0)
         return PairStatistics(residual, white, redundancy, test, freedom, p, own, arrays.cov + sign * scatter)
-
-    def squares(self, stats: PairStatistics) -> FloatArray:
-        """Weighted squares (E,) of the residuals."""
-        return np.asarray(np.einsum("ni,ni->n", stats.whitened, stats.whitened))
 
     def residuals(self, stats: PairStatistics, pairs: Sequence[Pair]) -> Residuals:
         """As reports take them; ``pairs`` are those of the survey."""

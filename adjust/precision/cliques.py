@@ -44,29 +44,28 @@ class Cliques:
     def of_tree(tree: gtsam.GaussianBayesTree, dims: Mapping[int, int], leaves: Leaves | None) -> "Cliques":
         """Of GTSAM's Bayes tree, with the cliques that were reduced before it below it."""
         blocks, clique_keys, parents = _collected(tree)
-        front, width = ([b.shape[i] for b in blocks] for i in (0, 1))
-        data = [b.ravel() for b in blocks]
+        rows, columns = (np.array([b.shape[i] for b in blocks], dtype=np.int64) for i in (0, 1))
+        sizes, data = np.array([len(keys) for keys in clique_keys], dtype=np.int64), [b.ravel() for b in blocks]
+        names = [k for keys in clique_keys for k in keys]
         if leaves is not None:
-            first_seen: dict[int, int] = {}
-            for c, keys in enumerate(clique_keys):  # parents first: a key is frontal where it first appears
-                for k in keys:
-                    first_seen.setdefault(k, c)
-            parents += [max(first_seen[k] for k in keys[1:]) for keys in leaves.keys]
-            front, width, data = front + leaves.front.tolist(), width + leaves.width.tolist(), [*data, leaves.data]
-            clique_keys = clique_keys + leaves.keys
-        number = {k: i for i, k in enumerate(dict.fromkeys(k for keys in clique_keys for k in keys))}
+            names, data = names + leaves.keys.tolist(), [*data, leaves.data]
+            sizes, columns = np.append(sizes, np.diff(leaves.key_ptr)), np.append(columns, leaves.width)
+            rows = np.append(rows, np.full(len(leaves.width), 6))
+        number = {k: i for i, k in enumerate(dict.fromkeys(names))}  # parents first: frontal where it first appears
         of_key = np.array([dims[k] for k in number], dtype=np.int64)
-        keys_of = np.array([number[k] for keys in clique_keys for k in keys], dtype=np.int64)
-        key_ptr = np.cumsum([0] + [len(keys) for keys in clique_keys]).astype(np.int64)
-        n_front = _frontal_keys(of_key[keys_of].tolist(), key_ptr.tolist(), front)
+        keys, clique = np.array([number[k] for k in names], dtype=np.int64), np.repeat(np.arange(len(rows)), sizes)
+        key_ptr = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+        ends = np.concatenate([[0], np.cumsum(of_key[keys])])
+        frontal = ends[1:] - ends[key_ptr[clique]] <= rows[clique]
         home = np.zeros(len(number), dtype=np.int64)
-        for c in range(len(front)):
-            home[keys_of[key_ptr[c] : key_ptr[c] + n_front[c]]] = c
-        rows, columns = np.array(front, dtype=np.int64), np.array(width, dtype=np.int64)
+        home[keys[frontal]] = clique[frontal]
+        n_front = np.bincount(clique[frontal], minlength=len(rows))
+        deepest = np.full(len(rows), -1, dtype=np.int64)
+        np.maximum.at(deepest, clique[~frontal], home[keys[~frontal]])
+        every_parent = np.append(np.array(parents, dtype=np.int64), deepest[len(parents) :])
         at = np.cumsum(np.append(0, rows * columns))[:-1].astype(np.int64)
         numbers = np.concatenate(data) if data else np.zeros(0)
-        return Cliques(number, of_key, home, key_ptr, keys_of, n_front, rows, columns, at,
-                       np.array(parents, dtype=np.int64), numbers)  # fmt: skip
+        return Cliques(number, of_key, home, key_ptr, keys, n_front, rows, columns, at, every_parent, numbers)
 
     def __len__(self) -> int:
         return len(self.front)
@@ -125,18 +124,6 @@ class Cliques:
         for numbers, parent in zip(own, self.parents.tolist(), strict=True):  # parents first
             way.append(numbers + (way[parent] if parent >= 0 else 0))
         return eliminations * float(self.front @ self.width.astype(float) ** 2) / max(way, default=1)
-
-
-def _frontal_keys(dims: list[int], ptr: list[int], fronts: list[int]) -> IntArray:
-    """Number of frontal keys of every clique, from the dimensions of all its keys and the number of its rows."""
-    out = np.empty(len(fronts), dtype=np.int64)
-    for c, rows in enumerate(fronts):
-        n, total = 0, 0
-        while total < rows:
-            total += dims[ptr[c] + n]
-            n += 1
-        out[c] = n
-    return out
 
 
 def _collected(tree: gtsam.GaussianBayesTree) -> tuple[list[FloatArray], list[list[int]], list[int]]:

@@ -4,10 +4,10 @@ Redundancy numbers and residual covariances follow Baarda (1968) and Foerstner (
 Q_vv P. For an image point both components are tested together: v' Q_vv^-1 v, chi-square with two degrees of freedom.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import compress
 from typing import TYPE_CHECKING
 
 import gtsam
@@ -19,20 +19,21 @@ from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.datum import survey_motions
 from adjust.graph.solver import Solved
 from adjust.model.errors import SurveyError
+from adjust.model.names import grouped
 from adjust.model.result import (
     Adjustment,
     GlobalTest,
     GroupSummary,
     ImageResiduals,
+    JointCovariances,
     ObservationResidual,
     ParameterName,
     ReadingResiduals,
     arrays_of,
 )
 from adjust.model.survey import FloatArray, IntArray
-from adjust.native.point_tests import AdjustedPoints, residual_tests
+from adjust.native.point_tests import AdjustedPoints, residual_tests, sums_of_blocks
 from adjust.observations.factors import ObservationFactor
-from adjust.observations.images.batch import whitened_squares
 from adjust.observations.images.bundle_hidden import BundleHidden
 from adjust.precision.s_transformation import STransformation, s_transformation
 from adjust.precision.stacked import Stacked
@@ -73,20 +74,10 @@ def _in_datum(datum: STransformation | None, keys: Sequence[int], Q: FloatArray)
     return Q if datum is None else datum.apply(keys, Q)
 
 
-class Covariances(ABC):
-    """Covariances of the adjusted ``unknowns``, a priori (sigma0 = 1), in the survey's datum."""
+class Covariances(JointCovariances):
+    """Those of the ``unknowns``; whoever has them says how :meth:`joint` is found, and may prepare it for many."""
 
     unknowns: Unknowns
-
-    @abstractmethod
-    def joint(self, names: Sequence[ParameterName]) -> FloatArray:
-        """Joint covariance of several unknowns, stacked in this order (of vectors their free components).
-
-        Raises KeyError for a name that is not an unknown.
-        """
-
-    def bring_together(self, pairs: Iterable[tuple[ParameterName, ParameterName]]) -> None:  # noqa: B027  # may do nothing
-        """Prepare :meth:`joint` of these pairs of unknowns, where that is cheaper for all at once."""
 
     def whole(self, names: Sequence[ParameterName], sizes: Sequence[int]) -> FloatArray:
         """The same of all components, so many of each of these parameters; zero where one is held."""
@@ -219,6 +210,17 @@ class Precision(Covariances):
         return AdjustedPoints(*self._images, self.graph.square_roots(), self.graph.used())
 
     @cached_property
+    def image_residuals(self) -> ImageResiduals:
+        """Residuals and their statistics of all image points, in the order of ``Survey.image_blocks``."""
+        points = self.image_points
+        return ImageResiduals(self.graph.survey.image_points.ptr, points.v, *residual_tests(points), points.used)
+
+    @cached_property
+    def image_sums(self) -> FloatArray:
+        """Of every image block (B, 3): components in use, their redundancy, their weighted square sum."""
+        return sums_of_blocks(self.graph.survey.image_points.ptr, self.image_points)
+
+    @cached_property
     def pairs(self) -> "PairStatistics":
         """Statistics of the pairs between fixed stations. Raises ValueError where there are none."""
         if self.graph.pairs is None:
@@ -228,7 +230,7 @@ class Precision(Covariances):
     def covs(self, keys: IntArray, dim: int) -> FloatArray:
         """Covariances (n, dim, dim) of many unknowns of the same dimension."""
         Q = np.empty((len(keys), dim, dim))
-        below = np.array([k in self.hidden for k in keys.tolist()], dtype=np.bool_)
+        below = np.isin(keys, list(self.hidden))
         Q[below] = np.array([self.hidden[k] for k in keys[below].tolist()]).reshape(-1, dim, dim)
         Q[~below] = self.tree.marginals(keys[~below], dim)
         t = self.transformation
@@ -236,16 +238,14 @@ class Precision(Covariances):
             G, W = (np.array([of[k] for k in keys.tolist()]) for of in (t.motions, t.spread))
             across = G @ np.swapaxes(W, 1, 2)
             Q += G @ t.core @ np.swapaxes(G, 1, 2) - across - np.swapaxes(across, 1, 2)
-        for i, key in enumerate(keys.tolist()):
-            if held := list(self.graph.unknowns.held.get(key, ())):
-                Q[i, held], Q[i, :, held] = 0.0, 0.0
+        for i in np.flatnonzero(np.isin(keys, list(self.unknowns.held))).tolist():
+            held = list(self.unknowns.held[int(keys[i])])
+            Q[i, held], Q[i, :, held] = 0.0, 0.0
         return Q
 
     def every_cov(self) -> dict[int, FloatArray]:
         """Covariance (dim, dim) of every unknown."""
-        of_dim: dict[int, list[int]] = {}
-        for key, unknown in self.graph.unknowns.by_key.items():
-            of_dim.setdefault(unknown.dim, []).append(key)
+        of_dim = grouped((unknown.dim, key) for key, unknown in self.unknowns.by_key.items())
         return {k: Q for dim, keys in of_dim.items() for k, Q in zip(keys, self.covs(np.array(keys), dim), strict=True)}
 
     def pair_covariances(self) -> dict[str, FloatArray]:
@@ -294,13 +294,6 @@ def residual_of(item: ObservationFactor, values: gtsam.Values) -> FloatArray:
     return np.asarray(item.factor.unwhitenedError(values))  # type: ignore[attr-defined]  # see above
 
 
-def image_residuals(precision: Precision) -> ImageResiduals:
-    """Residuals and their statistics of all image points, in the order of ``Survey.image_blocks``."""
-    points = precision.image_points
-    ptr = np.cumsum([0] + [len(b.uv) for b in precision.graph.survey.image_blocks])
-    return ImageResiduals(ptr, points.v, *residual_tests(points), points.used)
-
-
 def other_residuals(precision: Precision) -> Sequence[ObservationResidual]:
     """The same for every observation that is neither an image point nor a reading."""
     graph, out = precision.graph, dict[int, ObservationResidual]()
@@ -336,60 +329,28 @@ def adjusted_motion(observed: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def group_summaries(
-    precision: Precision,
-    images: ImageResiduals,
-    others: Sequence[ObservationResidual],
-    readings: ReadingResiduals | None = None,
+    precision: Precision, others: Sequence[ObservationResidual], readings: ReadingResiduals | None = None
 ) -> tuple[GroupSummary, ...]:
     """Observations, redundancy and weighted square sum of every group, in order of appearance."""
-    graph, sums = precision.graph, dict[str, list[float]]()
-
-    def add(group: str, n: int, r: float, omega: float) -> None:
-        total = sums.setdefault(group, [0.0, 0.0, 0.0])
-        total[0], total[1], total[2] = total[0] + n, total[1] + r, total[2] + omega
-
-    names = list(dict.fromkeys(block.group for block in graph.survey.image_blocks))
-    for group, *sums_of_group in zip(names, *_image_sums(graph, images, names), strict=True):
-        add(group, *sums_of_group)
-    arrays, squares = arrays_of(others), np.zeros(len(others))
+    graph, arrays, squares = precision.graph, arrays_of(others), np.zeros(len(others))
     for i, item in zip(graph.single, graph.singles, strict=True):
         e = precision.rows(item).e
         squares[i] = e @ e
     if graph.pairs is not None:
-        squares[graph.first_pair + graph.pairs.rows] = graph.pairs.squares(precision.pairs)
-    shares = np.bincount(arrays.observation, arrays.redundancies, len(others)).tolist()
-    every = zip(graph.of_others(lambda o: o.group, lambda p: p.group), arrays.n_components.tolist(), shares,
-                squares.tolist(), arrays.used.tolist(), strict=True)  # fmt: skip
-    for group, n, share, square, used in every:
-        if used:
-            add(group, n, share, square)
+        squares[graph.first_pair + graph.pairs.rows] = np.square(precision.pairs.whitened).sum(axis=1)
+    shares = np.bincount(arrays.observation, arrays.redundancies, len(others))
+    names = [block.group for block in graph.survey.image_blocks]
+    names += compress(graph.of_others(lambda o: o.group, lambda p: p.group), arrays.used.tolist())
+    rows = [precision.image_sums, np.stack([arrays.n_components, shares, squares], axis=1)[arrays.used]]
     if readings is not None:
-        of_group: dict[str, list[int]] = {}
-        for i, reading in enumerate(graph.survey.readings):
-            of_group.setdefault(reading.group, []).append(i)
-        for group, mine in of_group.items():
-            taken = np.array(mine)[readings.used[mine]]
-            square = float(readings.weighted_square[taken].sum())
-            add(group, len(taken), float(readings.redundancy[taken].sum()), square)
-    return tuple(GroupSummary(g, int(n), r, omega) for g, (n, r, omega) in sums.items())
-
-
-def _image_sums(
-    graph: AdjustmentGraph, images: ImageResiduals, names: Sequence[str]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Of each of these groups of image points: components used, redundancy, weighted square sum."""
-    blocks = graph.survey.image_blocks
-    if not blocks:
-        return np.zeros(0), np.zeros(0), np.zeros(0)
-    number = {name: i for i, name in enumerate(names)}
-    which = slice(None) if images.used.all() else images.used
-    of_point = np.repeat([number[block.group] for block in blocks], np.diff(images.block_ptr))[which]
-
-    def total(of_points: FloatArray) -> FloatArray:
-        return np.asarray(np.bincount(of_point, of_points[which], len(names)), dtype=np.float64)
-
-    squares = whitened_squares(images.residuals, graph.square_roots())
-    return total(np.full(len(squares), 2.0)), total(images.redundancy @ np.ones(2)), total(squares)
+        names += [reading.group for reading in graph.survey.readings]
+        of_readings = np.ones(len(readings.used)), readings.redundancy, readings.weighted_square
+        rows.append(np.where(readings.used, of_readings, 0.0).T)
+    number: dict[str, int] = {}
+    group = [number.setdefault(name, len(number)) for name in names]
+    sums = np.zeros((len(number), 3))
+    np.add.at(sums, np.array(group, dtype=np.int64), np.concatenate(rows))
+    return tuple(GroupSummary(name, int(n), *of) for name, (n, *of) in zip(number, sums.tolist(), strict=True))
 
 
 def global_test(omega: float, redundancy: int, alpha: float) -> GlobalTest | None:

@@ -13,7 +13,7 @@ import numpy as np
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.solver import Solved, SolveOptions, solve
 from adjust.model.survey import BoolArray, FloatArray
-from adjust.precision.precision import Precision, image_residuals
+from adjust.precision.precision import Precision
 from adjust.testing.criteria import cauchy_weights, limits, typical_factor
 from adjust.testing.gross_errors import Search, State, Verdicts, all_at_once, one_group
 
@@ -36,7 +36,7 @@ def limit(n: int) -> float:
 
 def scale(test: FloatArray) -> float:
     """Variance factor of most points, not below the a priori 1."""
-    return float(np.fmax(1.0, typical_factor(test, np.full(len(test), 2))))
+    return typical_factor(test, np.full(len(test), 2))
 
 
 def screen(graph: AdjustmentGraph, solved: Solved, options: SolveOptions) -> Screened:
@@ -46,7 +46,7 @@ def screen(graph: AdjustmentGraph, solved: Solved, options: SolveOptions) -> Scr
 
     def tested(solved: Solved, used: BoolArray) -> tuple[Screened, Verdicts]:
         precision = Precision(graph, solved)
-        return Screened(solved, precision, used), one_group(image_residuals(precision).test, freedom, used)
+        return Screened(solved, precision, used), one_group(precision.image_residuals.test, freedom, used)
 
     def solved_without(used: BoolArray, before: State[Screened] | None) -> tuple[Screened, Verdicts]:
         graph.set_weights(used.astype(np.float64))

@@ -98,7 +98,7 @@ def condensed_system(precision: Precision) -> CondensedSystem:
         columns.update(key_columns)
         parts = [_known(graph, n, key_columns, kept, blocks, numbers)]
         for part, bundle in enumerate(graph.bundles, 1):
-            number = np.array([i for i, p in graph.image_order if p == part], dtype=np.int64)
+            number = np.flatnonzero(graph.image_parts == part)
             parts.append(_unknown(bundle, number, n, key_columns, kept, blocks))
             numbers.append(number)
         A = stacked([p.A for p in parts])
@@ -121,7 +121,7 @@ def _known(
 ) -> ImageRows:  # fmt: skip
     """Blocks of known targets, those of the same size together."""
     images, entries = graph.images, Entries()
-    number = np.array(graph.image_numbers, dtype=np.int64)
+    number = graph.image_numbers
     shapes, columns, sets = _shapes(graph), columns_of_blocks(graph, key_columns), images.alike()
     at, lengths, e = 0, [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
     for mine, part in zip(sets, side_by_side(lambda mine: _condensed(graph, mine, shapes), sets), strict=True):

@@ -14,7 +14,6 @@ import numpy as np
 
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
-from adjust.observations.images.batch import whitened_squares
 from adjust.statistics.changes import ChangeSearch
 from adjust.statistics.condensed import CondensedSystem
 from adjust.statistics.result import Consistency, PartTest
@@ -115,15 +114,13 @@ def parts_of(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> 
 
 def contributions(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> Contributions:
     """What every observation of a condensed system contributes."""
-    images, graph = adjustment.image_residuals, system.precision.graph
+    graph = system.precision.graph
     k, M = len(blocks), len(system.used)
     n, r, omega = np.zeros(M), np.zeros(M), np.zeros(M)
     if k:
-        number = np.repeat(np.arange(len(images.block_ptr) - 1), np.diff(images.block_ptr))
-        squares = whitened_squares(images.residuals, graph.square_roots())
-        for out, values in ((n, np.full(len(squares), 2.0)), (r, images.redundancy @ np.ones(2)), (omega, squares)):
-            sums = np.bincount(number, np.where(images.used, values, 0.0), len(images.block_ptr) - 1)
-            out[:k] = (sums / np.maximum(np.bincount(blocks, minlength=len(sums)), 1))[blocks]  # each part its share
+        sums = system.precision.image_sums
+        shares = sums / np.maximum(np.bincount(blocks, minlength=len(sums)), 1)[:, None]  # each part its share
+        n[:k], r[:k], omega[:k] = shares[blocks].T
     np.add.at(omega, system.row_of, np.where(system.row_of >= k, system.e**2, 0.0))
     others = adjustment.other_residuals[: graph.n_others]
     first = k + len(others)

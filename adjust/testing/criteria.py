@@ -113,13 +113,22 @@ def explanation_cost(groups: Iterable[tuple[float, float]], left_out: float) -> 
 
 
 def typical_factor(statistics: FloatArray, freedom: IntArray) -> float:
-    """How much larger than chi-square's median the typical of tests (n,) is; nan without any."""
-    known = np.isfinite(statistics) & (freedom > 0)
-    if not known.any():
-        return float("nan")
-    few = freedom[known]
-    median = chi2.ppf(0.5, np.arange(1, int(few.max()) + 1))  # of a million tests there are few kinds
-    return float(np.median(statistics[known] / median[few - 1]))
+    """How much larger than chi-square's median the typical of tests (n,) is, at least 1; also without any.
+
+    freedom: (n,), 0 where nothing is tested.
+    """
+    ratio = statistics / _of_kinds(lambda kinds: chi2.ppf(0.5, kinds), freedom)
+    known = np.isfinite(ratio) & (freedom > 0)
+    n, n_larger = int(np.count_nonzero(known)), int(np.count_nonzero(known & (ratio > 1.0)))
+    if 2 * n_larger < max(1, n):  # neither is the middle one
+        return 1.0
+    return max(1.0, float(np.median(ratio[known])))
+
+
+def _of_kinds(quantile: Callable[[FloatArray], FloatArray], freedom: IntArray) -> FloatArray:
+    """A quantile for each of these degrees of freedom (n,), of 0 as of 1: of a million tests there are few kinds."""
+    kinds = np.arange(int(freedom.max(initial=1)) + 1)
+    return np.asarray(quantile(np.maximum(kinds, 1))[freedom])
 
 
 def cauchy_weights(squares: FloatArray) -> FloatArray:
@@ -134,9 +143,7 @@ def sidak(family_alpha: float, n_tests: int) -> float:
 
 def limits(family_alpha: float, freedom: IntArray, n_tests: int) -> FloatArray:
     """What one of ``n_tests`` chi-square tests of these degrees of freedom (n,) exceeds at Sidak's level."""
-    some = np.maximum(freedom, 1)
-    every = chi2.isf(sidak(family_alpha, n_tests), np.arange(1, int(some.max(initial=1)) + 1))  # there are few kinds
-    return np.asarray(every[some - 1])
+    return _of_kinds(lambda kinds: chi2.isf(sidak(family_alpha, n_tests), kinds), freedom)
 
 
 @lru_cache(maxsize=1024)

@@ -170,10 +170,11 @@ class Search(Generic[S]):
         mine = tests.used & tested
         factor = self.factor
         if np.count_nonzero(mine) >= self.many:
-            factor = np.maximum(factor, typical_factor(tests.statistic[mine], tests.freedom[mine]))
+            factor = np.maximum(factor, typical_factor(tests.statistic, np.where(mine, tests.freedom, 0)))
         n = int(tested.sum()) if self.n_tests is None else self.n_tests
-        limit = limits(self.family_alpha, tests.freedom, n) * factor[tests.group]
-        return State(solution, tests, limit, np.where(tested, np.nan_to_num(tests.statistic) / limit, 0.0), factor)
+        limit = limits(self.family_alpha, tests.freedom, n) * (factor if len(factor) == 1 else factor[tests.group])
+        over = np.where(tested & ~np.isnan(tests.statistic), tests.statistic / limit, 0.0)
+        return State(solution, tests, limit, over, factor)
 
     def settled(self, state: State[S], most: int | None = None) -> State[S]:
         """From this state on, until nothing goes and nothing comes back; each comes back only once.

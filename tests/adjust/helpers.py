@@ -30,7 +30,7 @@ from adjust.model.survey import (
     Target,
     VectorParameter,
 )
-from adjust.precision.precision import Precision, image_residuals, other_residuals
+from adjust.precision.precision import Precision, other_residuals
 from survey.simulate import resample
 from survey.simulate.scene import BROWN, Scene, Truth, rotation_about, transform
 
@@ -582,7 +582,7 @@ def check_minimum(full: Dense, done: Solved, Q: FloatArray) -> None:
 
 def check_statistics(precision: Precision, full: Dense, Q: FloatArray) -> None:
     """Residuals, redundancy numbers, standardized residuals and tests against Q_vv of the dense matrix."""
-    images, others = image_residuals(precision), other_residuals(precision)
+    images, others = precision.image_residuals, other_residuals(precision)
     n = full.n_image
     np.testing.assert_allclose(images.residuals.ravel(), full.v[: 2 * n], atol=1e-8)
     sums, at = 0.0, 0

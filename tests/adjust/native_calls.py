@@ -30,7 +30,7 @@ from adjust.native import (
 )
 from adjust.native.library import Function
 from adjust.navigation import navigate
-from adjust.precision.precision import Precision, image_residuals
+from adjust.precision.precision import Precision
 from adjust.relay.loops import loop_basis
 from adjust.relay.network import topology
 from adjust.start import find_start
@@ -114,9 +114,11 @@ def _images() -> None:
     survey, truth = warped_stereo()
     graph, done = h.solved(survey, near(truth))
     precision = Precision(graph, done)
-    image_residuals(precision)
     points, lambda0 = precision.image_points, np.array([17.0, 19.0])
-    n = len(points.v)
+    n, ptr = len(points.v), survey.image_points.ptr
+    point_tests.residual_tests(points)
+    point_tests.sums_of_blocks(ptr, points)
+    point_tests.farthest_points(ptr, points.v, np.zeros((len(ptr) - 1, 2)))
     point_tests.controlled_directions(points, np.zeros(n, dtype=np.int64))
     point_tests.point_tests(points, lambda0, tuple(np.zeros((n,) if i < 5 else (n, 2)) for i in range(9)))
     words = text.Words.of(["a", "bc", ""])
@@ -157,7 +159,7 @@ def _bundles() -> None:
             survey = replace(survey, cameras=(replace(camera, station_from_camera=PoseParameter(mount, "held")),))
         graph, done = h.solved(survey, h.shaken(h.start_at(truth), 1, 0.003, 0.003))
         precision = Precision(graph, done)
-        image_residuals(precision)
+        point_tests.residual_tests(precision.image_points)
         precision.datum_products({key: np.ones((1, u.dim)) for key, u in graph.unknowns.by_key.items()})
 
 

@@ -64,7 +64,9 @@ class Solved:
 
     @cached_property
     def pairs(self) -> PairStatistics:
-        return self.precision.pairs.first(self.network.dim)
+        p, k = self.precision.pairs, self.network.dim
+        return PairStatistics(p.residual[:, :k], p.whitened[:, :k], p.redundancy[:, :k], p.test, p.freedom, p.p_value,
+                              p.adjusted_cov[:, :k, :k], p.residual_cov[:, :k, :k])  # fmt: skip
 
     @property
     def world_from_station(self) -> Motions:

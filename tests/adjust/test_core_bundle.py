@@ -99,7 +99,8 @@ def test_intersection_goes_on_until_every_point_stands_still() -> None:
     far = h.start_at(truth)
     points = {k: np.asarray(best.values.atPoint3(graph.unknowns.by_name["point", k].key)) for k in far.points
               if ("point", k) in graph.unknowns.by_name}  # fmt: skip
-    seen_by_gtsam = {n for n, u in graph.unknowns.by_name.items() if u.key in set(graph.system.keyVector())}
+    visible = set(graph.view(graph.reduction).keyVector())
+    seen_by_gtsam = {n for n, u in graph.unknowns.by_name.items() if u.key in visible}
     hidden = next(k for k in points if ("point", k) not in seen_by_gtsam)
     points[hidden] = points[hidden] + (0.3, -0.2, 0.2)
     again = h.build(survey, replace(far, points={**far.points, **points}))
@@ -151,7 +152,7 @@ def test_back_substitution_gives_the_dense_step() -> None:
     start = near(truth)
     graph = h.build(survey, start)
     graph.prepare(graph.start, jacobians=True)
-    delta = graph.system.linearize(graph.start).optimize()
+    delta = graph.view(graph.reduction).linearize(graph.start).optimize()
     for bundle in graph.bundles:
         bundle.complete(delta)
     full = h.dense(graph, dict(start.lenses), graph.start)

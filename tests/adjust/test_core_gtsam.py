@@ -190,7 +190,7 @@ def test_the_solvers_view_is_of_the_same_chi_square_anywhere(kind: str) -> None:
     far = h.disturbed(graph.start, graph, 3, 0.1)
     for values in (far, graph.start, far):
         expected = graph.omega(gtsam.Values(values))
-        assert 2.0 * graph.system.error(values) == pytest.approx(expected, rel=1e-10)
+        assert 2.0 * graph.view(graph.reduction).error(values) == pytest.approx(expected, rel=1e-10)
         assert 2.0 * graph.graph.error(values) == pytest.approx(expected, rel=1e-10)
 
 
@@ -199,9 +199,9 @@ def test_the_solvers_view_has_the_step_of_the_graph(kind: str) -> None:
     """Also at values that nothing was prepared for."""
     graph = GRAPHS[kind]()
     far = h.disturbed(graph.start, graph, 3, 0.02)
-    whole, view = graph.graph.linearize(gtsam.Values(far)), graph.system.linearize(far)
+    whole, view = graph.graph.linearize(gtsam.Values(far)), graph.view(graph.reduction).linearize(far)
     expected, found = whole.optimize(), view.optimize()
-    for key in graph.system.keyVector():
+    for key in graph.view(graph.reduction).keyVector():
         scale = np.abs(expected.at(key)).max()
         np.testing.assert_allclose(found.at(key), expected.at(key), rtol=1e-5, atol=1e-6 * scale)
 
@@ -211,7 +211,7 @@ def test_served_rows_do_not_mix_values() -> None:
     for kind in ("reduced epochs", "lab"):
         graph = GRAPHS[kind]()
         far = h.disturbed(graph.start, graph, 3, 0.1)
-        plain = graph.system.linearize(graph.start)
+        plain = graph.view(graph.reduction).linearize(graph.start)
         prepared = graph.prepare(graph.start, jacobians=True)
         for i in range(graph.graph.size()):
             graph.graph.at(i).error(far)

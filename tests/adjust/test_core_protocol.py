@@ -70,7 +70,7 @@ def test_values_that_change_in_place_are_evaluated_anew(which: str) -> None:
     expected = graph.omega(moved)
     at = graph.prepare(values, jacobians=True)
     values.update(moved)
-    for factors in (graph.graph, graph.system):
+    for factors in (graph.graph, graph.view(graph.reduction)):
         assert 2.0 * factors.error(values) == pytest.approx(expected, rel=1e-9)
     assert graph.objective(graph.prepare(values, jacobians=True)) == pytest.approx(expected, rel=1e-9)
     assert graph.prepare(values, jacobians=True).number != at.number

@@ -14,7 +14,7 @@ from adjust.model.observations import Distance, PositionRef
 from adjust.model.survey import Datum, FloatArray, IntArray, Survey
 from adjust.observations.images import helmert_blocks as blocks
 from adjust.observations.images.helmert_blocks import helmert_blocks
-from adjust.precision.precision import Precision, image_residuals
+from adjust.precision.precision import Precision
 from survey.simulate.labs import LabSize, full_lab
 from tests.benchmarks import bundle
 from tests.benchmarks.building import Building, Plan, build
@@ -82,7 +82,7 @@ def test_cut_and_whole_give_the_same(monkeypatch: pytest.MonkeyPatch, inner: boo
     poses = [("world_from_station", "body", f"i{i}") for i in (3, 50, 90, 130)]  # of four rooms
     names = [*poses, ("point", str(building.bundle.names[0])), ("lens", "camera")]
     assert relative(before.joint(names), after.joint(names)) < 1e-6
-    a, b = image_residuals(before), image_residuals(after)
+    a, b = before.image_residuals, after.image_residuals
     for field in ("residuals", "redundancy", "standardized", "test"):
         np.testing.assert_allclose(getattr(b, field), getattr(a, field), rtol=1e-5, atol=1e-6)
     np.testing.assert_array_equal(a.used, b.used)
@@ -112,7 +112,7 @@ def test_runs_of_epochs_and_one_matrix_give_the_same(monkeypatch: pytest.MonkeyP
     difference = before.values.atVector(whole.unknowns.by_name["lens", "X"].key)
     difference = difference - after.values.atVector(cut.unknowns.by_name["lens", "X"].key)
     assert np.abs(difference / sigmas).max() < 1e-5
-    one, other = image_residuals(a), image_residuals(b)
+    one, other = a.image_residuals, b.image_residuals
     for field in ("residuals", "redundancy", "standardized", "test"):
         np.testing.assert_allclose(getattr(other, field), getattr(one, field), rtol=1e-5, atol=1e-6)
 

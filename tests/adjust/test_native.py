@@ -13,7 +13,7 @@ import pytest
 from adjust.native import parallel, vision
 from adjust.native.lenses import BROWN, N_LENS, lens_residuals, lens_rows
 from adjust.native.library import Function, instruction_set, instruction_sets, opened
-from adjust.precision.precision import Precision, image_residuals
+from adjust.precision.precision import Precision
 from survey.simulate import beacons, head_on_table
 from tests.adjust import helpers as h
 from tests.adjust.native_calls import FUNCTIONS, Call, calls
@@ -112,7 +112,7 @@ def _solution(monkeypatch: pytest.MonkeyPatch, threads: int) -> str:
             posed, key = unknown.kind == "pose", unknown.key
             value = done.values.atPose3(key).matrix() if posed else done.values.atVector(key)
             digest.update(value.tobytes() + h.covariance_of(precision, name).tobytes())
-        residuals = image_residuals(precision)
+        residuals = precision.image_residuals
         digest.update(residuals.residuals.tobytes() + residuals.redundancy.tobytes())
         digest.update(f"{done.omega.hex()} {done.iterations}".encode())
     return digest.hexdigest()

@@ -1,15 +1,20 @@
 """Tests of image points in the core against the same in NumPy, for points with little control and none."""
 
+from itertools import pairwise
+
 import numpy as np
 
 from adjust.native.point_tests import (
     AdjustedPoints,
     controlled_directions,
+    farthest_points,
     point_tests,
     residual_tests,
+    sums_of_blocks,
 )
 from adjust.testing.single_tests import component_tests, whitened
 
+PTR = np.array([0, 7, 7, 5000, 20_001])
 LAMBDA0 = np.array([17.1, 19.4])
 
 
@@ -99,6 +104,20 @@ def test_every_point_by_itself(monkeypatch) -> None:
     found = []
     for threads in ("1", "3"):
         monkeypatch.setenv("LABSURVEY_THREADS", threads)
-        found.append([*table(points), *residual_tests(points)])
+        sums = sums_of_blocks(PTR, points), farthest_points(PTR, points.v, np.zeros((len(PTR) - 1, 2)))
+        found.append([*table(points), *residual_tests(points), *sums])
     for a, b in zip(*found, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_sums_and_farthest_points_of_blocks() -> None:
+    points, centre = some_points(20_001), np.array([[0.1, -0.2], [3.0, 4.0], [0.0, 0.0], [-1.0, 0.5]])
+    W, _ = matrices(points)
+    squares = np.square(np.einsum("nij,nj->ni", W, points.v)).sum(axis=1)
+    sums, farthest = sums_of_blocks(PTR, points), farthest_points(PTR, points.v, centre)
+    for b, (i, j) in enumerate(pairwise(PTR.tolist())):
+        used = np.flatnonzero(points.used[i:j]) + i
+        expected = [2 * len(used), residual_tests(points)[0][used].sum(), squares[used].sum()]
+        np.testing.assert_allclose(sums[b], expected, rtol=1e-12)
+        distance = np.linalg.norm(points.v[i:j] - centre[b], axis=1).max(initial=0.0)
+        np.testing.assert_allclose(farthest[b], distance, rtol=1e-14)

@@ -16,6 +16,7 @@ from adjust.graph.solver import _Loop, solve
 from adjust.observations.images.reduction import PoseReduction
 from adjust.observations.pairs import PairBatch
 from adjust.pose_network import solve as pose_solve
+from adjust.precision import precision
 from adjust.precision.precision import Precision
 from adjust.precision.tree import TreeCovariance
 from adjust.start import find_start
@@ -37,7 +38,7 @@ PARTS: list[Part] = [
     ("retract", gtsam.Values, "retract"),
     ("precision: Bayes tree", Precision, "__init__"),
     ("covariances of the tree", TreeCovariance, "__init__"),
-    ("redundancy of image points", adjustment, "image_residuals"),
+    ("redundancy of image points", precision, "residual_tests"),
     ("redundancy of readings and others", adjustment, "other_residuals"),
     ("estimates", adjustment, "estimates"),
     ("groups", adjustment, "group_summaries"),

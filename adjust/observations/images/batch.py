@@ -14,7 +14,7 @@ import numpy as np
 from adjust.frames.state import State
 from adjust.frames.unknowns import Chain
 from adjust.model.boards import warming_of
-from adjust.model.observations import ImageBlock
+from adjust.model.observations import ImageBlock, ImagePoints
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.images import (
     N_SHAPE,
@@ -31,25 +31,14 @@ from adjust.native.images import (
     evaluate_chains,
     local_by_keys,
     normal_equations,
+    point_columns,
     serve,
+    square_root_information,
 )
 from adjust.native.parallel import run_split, split_blocks
 from adjust.native.trees import KeyCovariances, TreeArrays
 from adjust.observations.adapter import evaluated
 from adjust.observations.images.segments import block_keys
-
-
-def square_root_information(cov: FloatArray) -> FloatArray:
-    """Upper triangular W (n, 3: w00, w01, w11) with W'W = inv(cov), for covariances (n, 2, 2)."""
-    a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
-    w11 = 1.0 / np.sqrt(c)
-    w00 = 1.0 / np.sqrt(a - b * b / c)
-    return np.stack([w00, -w00 * b / c, w11], axis=1)
-
-
-def whitened_squares(v: FloatArray, W: FloatArray) -> FloatArray:
-    """|W v|^2 (n,) of residuals v (n, 2) with W (n, 3) upper triangular."""
-    return np.asarray((W[:, 0] * v[:, 0] + W[:, 1] * v[:, 1]) ** 2 + (W[:, 2] * v[:, 1]) ** 2)
 
 
 class Chains:
@@ -94,25 +83,31 @@ class ImageBatch:
         x_in_world: FloatArray,
     ) -> None:  # fmt: skip
         """x_in_world: points (P, 3) m of the world, for blocks without a target."""
-        self.blocks = tuple(blocks)
-        self.state = state
+        self.state, self.blocks, points = state, blocks, ImagePoints.of(blocks)
         self.chains = Chains(chains)
-        self.ptr: IntArray = np.cumsum([0] + [len(b.uv) for b in blocks])
-        self.camera = np.array([state.lens_states.of(b.camera_id, b.epoch_id) for b in blocks], dtype=np.int64)
-        warped: dict[str | None, int] = {t: i for t, i in state.targets.items() if state.warp_maps[i] is not None}
-        self.warp_id = np.array([warped.get(b.target_id, -1) for b in blocks], dtype=np.int64)
-        n_free = [0 if m is None else len(m.free) for m in state.warp_maps]
-        self.n_warp = np.array([n_free[i] if i >= 0 else 0 for i in self.warp_id.tolist()], dtype=np.int64)
-        warming = [warming_of(survey, survey.targets[i], b.epoch_id) if i >= 0 else 0.0
-                   for i, b in zip(self.warp_id.tolist(), blocks, strict=True)]  # fmt: skip
-        self.n_points = int(self.ptr[-1])
-        self.W_all = square_root_information(np.concatenate([np.zeros((0, 2, 2)), *(b.cov for b in blocks)]))
-        self.used: BoolArray = used_points(blocks)
-        self.W_all_columns = np.ascontiguousarray(self.W_all.T)
-        self.W = self.W_all_columns * self.used
+        self.ptr, self.used, self.n_points = points.ptr, points.used, len(points.uv)
+        self._all = split_blocks(self.ptr)
+        self.W_all = square_root_information(points.cov)
+        self.W_all_columns = np.empty((3, self.n_points))
+        self.points = PointArrays(np.empty((3, self.n_points)), np.empty((2, self.n_points)))
+        every = [*(t.x_in_target for t in survey.targets), x_in_world]
+        number: dict[str | None, int] = {None: len(state.targets)}
+        number.update(state.targets)
+        target = np.array([number[b.target_id] for b in blocks], dtype=np.int64)
+        ends = np.cumsum([0, *(len(x) for x in every)])
+        shown = ends[target], np.diff(ends)[target], np.concatenate(every)
+        run_split(point_columns, self._all, self.ptr, shown, points.point_idx, points.uv, self.W_all,
+                  self.points, self.W_all_columns)  # fmt: skip
         self._weighed: tuple[BoolArray, FloatArray] | None = None
-        self.arrays = BlockArrays(self.ptr, self.camera, self.warp_id, self.n_warp, np.array(warming, dtype=float))
-        self.points = _point_arrays(survey, blocks, x_in_world)
+        self.W = self._used_weights
+        self.camera = np.array([state.lens_states.of(b.camera_id, b.epoch_id) for b in blocks], dtype=np.int64)
+        warped = np.array([m is not None for m in state.warp_maps] + [False])[target]
+        self.warp_id = np.where(warped, target, -1)
+        self.n_warp = np.array([0 if m is None else len(m.free) for m in [*state.warp_maps, None]])[target]
+        warming = np.zeros(len(blocks))
+        for i in np.flatnonzero(warped).tolist():
+            warming[i] = warming_of(survey, survey.targets[target[i]], blocks[i].epoch_id)
+        self.arrays = BlockArrays(self.ptr, self.camera, self.warp_id, self.n_warp, warming)
         self._place_keys()
 
     def _place_keys(self) -> None:
@@ -123,7 +118,6 @@ class ImageBatch:
         self.H = np.zeros((len(self.blocks), most, most))
         self.chi, self.depth = np.zeros(len(self.blocks)), np.zeros(len(self.blocks))
         self._flat: FloatArray | None = None
-        self._all = split_blocks(self.ptr)
 
     @cached_property
     def keys(self) -> list[list[int]]:
@@ -207,7 +201,8 @@ class ImageBatch:
 
     def whitened_squares(self) -> FloatArray:
         """Weighted squares v' inv(Q_ll) v (N,) of all points where the chains were last evaluated."""
-        return whitened_squares(self.statistics(None)[0], self.W_all)
+        (u, v), (w00, w01, w11) = self.statistics(None)[0].T, self.W_all_columns
+        return np.asarray((w00 * u + w01 * v) ** 2 + (w11 * v) ** 2)
 
     def add_factors(self, graph: gtsam.NonlinearFactorGraph, which: IntArray | None = None) -> None:
         """One custom factor for each of these blocks, or of all, that has an unknown."""
@@ -251,7 +246,8 @@ class ImageBatch:
     def _used_weights(self) -> FloatArray:
         """Square root information (3, N) of the points that are used, their weights left aside; else zero."""
         if self._weighed is None or self._weighed[0] is not self.used:
-            self._weighed = self.used, self.W_all_columns * self.used
+            W = self.W_all_columns if self.used.all() else self.W_all_columns * self.used
+            self._weighed = self.used, W
         return self._weighed[1]
 
     def local_from_keys(self, which: IntArray) -> FloatArray:
@@ -278,29 +274,3 @@ class ImageBatch:
         if out.lost.any() and tree is not None:
             raise KeyError(f"unknowns of block {int(np.argmax(out.lost))} share no clique")
         return out.residual, out.influence
-
-
-def used_points(blocks: Sequence[ImageBlock]) -> BoolArray:
-    """Which image points (N,) of these blocks take part."""
-    ptr = np.cumsum([0] + [len(b.uv) for b in blocks]).tolist()
-    used = np.ones(ptr[-1], dtype=np.bool_)
-    for i, block in enumerate(blocks):
-        if block.used is not None:
-            used[ptr[i] : ptr[i + 1]] = block.used
-    return used
-
-
-def _point_arrays(survey: Survey, blocks: Sequence[ImageBlock], x_in_world: FloatArray) -> PointArrays:
-    """All image points with what they show: taken from the points of all targets seen, one after the other."""
-    targets: dict[str | None, FloatArray] = {t.target_id: t.x_in_target for t in survey.targets}
-    targets[None] = x_in_world
-    seen = dict.fromkeys(b.target_id for b in blocks)
-    x = [np.zeros((0, 3)), *(targets[t] for t in seen)]
-    starts = np.cumsum([len(part) for part in x]).tolist()
-    start, sizes = dict(zip(seen, starts, strict=False)), [len(b.uv) for b in blocks]
-    index = np.concatenate([np.zeros(0, dtype=np.int64), *(b.point_idx for b in blocks)])
-    if np.any((index < 0) | (index >= np.repeat([len(targets[b.target_id]) for b in blocks], sizes))):
-        raise IndexError("an image block shows points that its target does not have")
-    rows = index + np.repeat(np.array([start[b.target_id] for b in blocks], dtype=np.int64), sizes)
-    uv = np.ascontiguousarray(np.concatenate([np.zeros((0, 2)), *(b.uv for b in blocks)]).T)
-    return PointArrays(np.ascontiguousarray(np.concatenate(x)[rows].T), uv)

@@ -9,12 +9,13 @@ from scipy import sparse
 
 from adjust.frames.state import State
 from adjust.frames.unknowns import Chain, Unknowns
-from adjust.model.observations import ImageBlock
+from adjust.model.observations import ImageBlock, ImagePoints
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.bundles import BundleArrays
+from adjust.native.images import square_root_information
 from adjust.native.lenses import MAX_LENS
 from adjust.native.parallel import workers
-from adjust.observations.images.batch import Chains, square_root_information
+from adjust.observations.images.batch import Chains
 
 _Rows = TypeVar("_Rows", FloatArray, BoolArray)
 
@@ -40,13 +41,13 @@ class BundleLayout:
         self.unknowns, self.state = unknowns, state
         self.blocks = tuple(blocks)
         self.chains = Chains(chains)
-        idx = np.concatenate([b.point_idx for b in blocks])
-        present, self._point_of_rows = np.unique(idx, return_inverse=True)
+        all_seen = ImagePoints.of(blocks)
+        present, self._point_of_rows = np.unique(all_seen.point_idx, return_inverse=True)
         self.point_ids = tuple(points[i] for i in present.tolist())
         self.camera = np.array([state.lens_states.of(b.camera_id, b.epoch_id) for b in blocks], dtype=np.int64)
-        self.block_ptr: IntArray = np.cumsum([0] + [len(b.uv) for b in blocks])
+        self.block_ptr = all_seen.ptr
         self._choose_interface(outside)
-        self._sort_observations()
+        self._sort_observations(all_seen)
         self._place_local_unknowns()
         self._place_derivatives()
 
@@ -81,7 +82,7 @@ class BundleLayout:
         self.n_keys = int(starts[-1])
         self.n_hidden = int(sum(dims[: len(self.hidden_poses)]))
 
-    def _sort_observations(self) -> None:
+    def _sort_observations(self, all_seen: ImagePoints) -> None:
         block = np.repeat(np.arange(len(self.blocks)), np.diff(self.block_ptr))
         point = self._point_of_rows
         group = np.full(len(self.point_ids), 0)  # reduced points first, then those that stay, then the held
@@ -90,8 +91,8 @@ class BundleLayout:
         self.sorted: IntArray = np.lexsort((block, self.camera[block], point, group[point]))
         self.block, self.point = block[self.sorted].astype(np.int64), point[self.sorted].astype(np.int64)
         self.camera_of = self.camera[self.block]
-        self.uv = np.concatenate([b.uv for b in self.blocks])[self.sorted]
-        self.W_all = square_root_information(np.concatenate([b.cov for b in self.blocks]))[self.sorted]
+        self.uv, self.used = all_seen.uv[self.sorted], all_seen.used[self.sorted]
+        self.W_all = square_root_information(all_seen.cov[self.sorted])
         self.n_reduced = int(np.count_nonzero(group[self.point] == 0))
         seen = self.point[: self.n_reduced]
         self.reduced = [int(i) for i in dict.fromkeys(seen)]

@@ -16,7 +16,7 @@ from adjust.frames.state import State
 from adjust.frames.unknowns import Chain, Unknowns
 from adjust.model.errors import IndeterminateError
 from adjust.model.observations import ImageBlock
-from adjust.model.survey import BoolArray, FloatArray
+from adjust.model.survey import FloatArray
 from adjust.native.bundles import (
     ReducedArrays,
     SightArrays,
@@ -56,7 +56,6 @@ class BundleBatch(BundleLayout):
         self.by_rows = by_rows and not self.n_hidden and not self.reduced
         n = self.n_keys - self.n_hidden + 1
         self.n_rows = min(2 * len(self.point), n) if self.by_rows else n
-        self.used: BoolArray = np.concatenate([b.mask for b in self.blocks])[self.sorted]
         self.W = self.W_all * self.used[:, None]
         k, p = len(self.point), len(self.reduced)
         self.A = np.zeros((k, 2, MAX_LENS + 7))

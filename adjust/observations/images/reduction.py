@@ -33,13 +33,14 @@ _AT_EPOCHS = ("world_from_station", "carrier_from_target")
 
 @dataclass(frozen=True)
 class Leaves:
-    """Cliques of one frontal key each, eliminated before a tree: those of S, the others, lie in one of its cliques.
+    """Cliques of one frontal pose each, eliminated before a tree: those of S, the others, lie in one of its cliques.
 
-    width: columns of the blocks [R S], one after the other and row by row in ``data``.
+    keys[key_ptr[c]:key_ptr[c + 1]]: of clique c, the frontal one first. width: columns of the blocks [R S] of six rows,
+    one after the other and row by row in ``data``.
     """
 
-    keys: list[list[int]]
-    front: IntArray
+    keys: IntArray
+    key_ptr: IntArray
     width: IntArray
     data: FloatArray
 
@@ -179,10 +180,9 @@ class PoseReduction:
         width = 6 + np.diff(self.arrays.col_ptr)
         data = np.empty(6 * int(width.sum()))
         leaf_rows(self.arrays, self.L, self.T, data)
-        keys = [[key] for key in self.hidden]
-        for pose, number in zip(self._shared_pose.tolist(), self._shared.tolist(), strict=True):
-            keys[pose].append(self.interface.keys[number])
-        return Leaves(keys, np.full(len(keys), 6, dtype=np.int64), width, data)
+        first = np.searchsorted(self._shared_pose, np.arange(len(self.hidden)))
+        keys = np.insert(np.array(self.interface.keys, dtype=np.int64)[self._shared], first, self.hidden)
+        return Leaves(keys, np.append(first, len(self._shared)) + np.arange(len(first) + 1), width, data)
 
 
 def reduction(batch: ImageBatch, unknowns: Unknowns, outside: set[int]) -> PoseReduction | None:

@@ -12,7 +12,6 @@ from adjust.model.observations import PositionRef, Reading
 from adjust.model.result import ParameterName
 from adjust.model.survey import (
     INSTRUMENT,
-    FloatArray,
     Instrument,
     PoseParameter,
     Setup,
@@ -169,15 +168,6 @@ def _centring(setup: Setup, unknowns: Unknowns, out: TerrestrialParameters) -> N
     vector = vector_map(VectorParameter(CENTRING, np.zeros(3), free, prior), ("m",) * 3, unknowns, name)
     out.centrings[setup.setup_id] = unknowns.vectors[name] = vector
     out.priors[name] = prior
-
-
-def full_start(name: ParameterName, survey: Survey) -> FloatArray:
-    """The values (n,) that a vector has before anything is adjusted."""
-    if name[0] == "instrument":
-        return np.asarray(next(i for i in survey.instruments if i.instrument_id == name[1]).parameters.values)
-    if name[0] == "vertical":
-        return np.asarray(survey.vertical.tilt.values)
-    return np.zeros(3 if name[0] == "centring" else 1)
 
 
 def check_reading(reading: Reading, setup: Setup | None, flat: Mapping[PositionRef, int]) -> None:

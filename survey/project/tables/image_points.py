@@ -9,7 +9,7 @@ import numpy as np
 
 from adjust.lenses.crops import possible_sizes
 from adjust.model.names import natural_key
-from adjust.model.observations import ImageBlock
+from adjust.model.observations import ImageBlock, ImageBlocks, ImagePoints
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from survey.folder.text import suggestion
 from survey.project.project import ImagePointsWhere, Sigmas, SpotBlock
@@ -69,7 +69,7 @@ def read_image_blocks(table: Table, names: Names, sigmas: Sigmas) -> tuple[tuple
         kept = None if whole else used[i:j]
         blocks.append(ImageBlock(camera, epoch, target_id or None, point_idx[i:j], uv[i:j], cov[i:j], kept, group_name))
         where.append(lines[i:j])
-    return tuple(blocks), ImagePointsWhere(table.path, tuple(where))
+    return ImageBlocks(blocks, ImagePoints(ptr, point_idx, uv, cov, used)), ImagePointsWhere(table.path, tuple(where))
 
 
 def read_spots(table: Table, names: Names, sigmas: Sigmas) -> tuple[SpotBlock, ...]:

@@ -180,7 +180,7 @@ def pair_columns(pairs: Sequence[Pair]) -> Columns:
     """One row per pair: quaternion, translation of poses, sigmas where they are independent, else the covariance."""
     sigma_names = (*SIGMA_COLUMNS["rotation"][3], *SIGMA_COLUMNS["translation"][1])
     names = (*QUATERNION, *TRANSLATION, *sigma_names, *COVARIANCE_COLUMNS)
-    measured, rows = pair_arrays(pairs), np.full((len(pairs), len(names)), np.nan)
+    measured, rows = pair_arrays(tuple(pairs)), np.full((len(pairs), len(names)), np.nan)
     rotations = (p.b_from_a.rotation() if isinstance(p.b_from_a, Pose3) else p.b_from_a for p in pairs)
     rows[:, :4] = np.array([quaternion_wxyz(rotation) for rotation in rotations]).reshape(-1, 4)
     rows[:, 4:7] = from_si(measured.translations, "mm")
