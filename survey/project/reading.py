@@ -38,7 +38,6 @@ from survey.project.project import (
     IMAGES_FOLDER,
     OBSERVATIONS_FOLDER,
     Definition,
-    ImagePointsWhere,
     LeftOut,
     Project,
     Sigmas,
@@ -146,13 +145,13 @@ def _observed(definition: Definition, root: Node, tables: dict[str, Table]) -> P
     _check_datum_points(root, survey)
     names, sigmas = Names.of(survey), definition.sigmas
     points = tables.get("image_points")
-    blocks, where = read_image_blocks(points, names, sigmas) if points is not None else ((), ImagePointsWhere())
+    blocks = read_image_blocks(points, names, sigmas) if points is not None else ()
     survey = with_observations(dataclasses.replace(survey, image_blocks=blocks), tables, sigmas)
     fields = {field.name: getattr(definition, field.name) for field in dataclasses.fields(Definition)}
     hashes = {table.path.relative_to(definition.folder).as_posix(): table.digest for table in tables.values()}
     fields |= {"survey": survey, "inputs": dict(sorted(({**definition.inputs, **hashes}).items()))}
     spots = read_spots(tables["spots"], names, sigmas) if "spots" in tables else ()
-    return Project(**fields, spots=spots, image_points_where=where)
+    return Project(**fields, spots=spots)
 
 
 def _read_definition(folder: Path, text: str | None = None) -> tuple[Definition, Node]:

@@ -74,7 +74,7 @@ def _point_names(survey: Survey) -> tuple[tuple[str, ...], dict[str | None, int]
 
 
 def image_residuals_csv(adjustment: Adjustment, rows: ImageRows | None = None) -> Iterator[bytes]:
-    """``residuals.csv``, piece by piece; sigmas are those of the observations, a priori; no number is written where there is none.
+    """``residuals.csv``, piece by piece; sigmas are a priori; no number is written where there is none.
 
     rows: of the adjustment, where they are known already.
     """
