@@ -308,6 +308,24 @@ def test_blank_lines_and_quotes_go_the_other_way(good: Path) -> None:
     assert table_reading.read_table(path, IMAGE_POINTS).lines.tolist() == [2, 3, 5, 6, 7, 8]
 
 
+@pytest.mark.parametrize(("threads", "begun"), [("1", []), ("2", [True])])
+def test_large_tables_are_read_beside_the_rest(
+    good: Path, monkeypatch: pytest.MonkeyPatch, threads: str, begun: list[bool]
+) -> None:
+    before, path, called = files.read(good), good / "observations" / "image_points.csv", list[bool]()
+    monkeypatch.setenv("LABSURVEY_THREADS", threads)
+    for module in ("files", "arrow"):
+        monkeypatch.setattr(f"survey.project.tables.{module}.LARGE", 0)
+    after = files.read(good, called.append)
+    assert (called, differences(before.survey, after.survey), after.inputs) == (begun, [], before.inputs)
+    path.write_text(path.read_text().replace("e10,X", "e10,Z"))
+    with pytest.raises(SurveyError, match=r"image_points\.csv:4: camera_id: unknown camera 'Z'"):
+        files.read(good)
+    path.write_text(path.read_text() + "e10\n")
+    with pytest.raises(SurveyError, match=r"image_points\.csv:\d+: found 1 fields, expected"):
+        files.read(good)
+
+
 @pytest.mark.parametrize("quote", ["", '"'])
 @pytest.mark.parametrize("n", [1, 2, 3, 7])
 def test_chunks_of_a_table_join(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n: int, quote: str) -> None:
