@@ -65,13 +65,17 @@ def document(title: str, body: Markup, after: Markup | str = "") -> str:
     return unturned(page.render(values), TURNING) + "\n"
 
 
-def json_script(anchor: str, value: object) -> Markup:
-    """Plain values as a JSON block with an id, in a form that cannot end the script or become markup."""
+def json_script(anchor: str, text: str) -> Markup:
+    """JSON of :func:`json_of` as a block with an id."""
+    return part("data", anchor, Markup(text))
+
+
+def json_of(value: object) -> str:
+    """Plain values as JSON, in a form that cannot end a script or become markup."""
     text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     for sign in "<>&\u2028\u2029":
         text = text.replace(sign, f"\\u{ord(sign):04x}")
-    text = unturned(text, {sign: f"\\{shown}" for sign, shown in TURNING.items()})  # the script shows the escape
-    return part("data", anchor, Markup(text))
+    return unturned(text, {sign: f"\\{shown}" for sign, shown in TURNING.items()})  # the script shows the escape
 
 
 def fixed(value: float | None, decimals: int) -> str:
