@@ -47,7 +47,7 @@ class Context:
 
 def worst(values: FloatArray, most: int) -> IntArray:
     """Positions of the largest absolute values, largest first, equal ones in their order; NaN comes last."""
-    return largest(np.nan_to_num(np.abs(values), nan=-1.0), most)
+    return largest(np.fmax(np.abs(values), -1.0), most)
 
 
 def other_components(adjustment: Adjustment) -> tuple[IntArray, IntArray, FloatArray]:
