@@ -21,7 +21,7 @@ from survey.project.tables.reading import LARGEST_ROWS, Columns, Layout, TextCol
 
 LARGE = 2**20  # bytes of CSV, cells to write / 10: below, loading Arrow (30 ms) costs more than it saves
 _LARGEST_DECODED = 8 * 2**30  # bytes of the columns of a Parquet file
-_BLOCK, _ROWS = 4 * 2**20, 2**17  # bytes read, rows written at a time
+_BLOCK, _ROWS = 2**20, 2**17  # bytes read, rows written at a time
 _PLAIN = re.compile(r"[\w.:/+-]+").fullmatch  # names that need no quotes in CSV
 _ALIKE = (1e-4, 1e9)  # between these Arrow writes doubles as Python does, but for whole numbers
 
