@@ -110,8 +110,11 @@ def begun_results(
         **({PARQUET: lambda: image_residuals_parquet(adjustment)} if parquet else {}),
         "residuals_other.csv": lambda: other_residuals_csv(adjustment),
     })  # fmt: skip
-    solution = {**solution_dict(adjustment, run), **more}
-    return BegunResults(files, writing.of(lambda: begun_page(adjustment, run, solution, rows(), options.language)))
+
+    def page() -> BegunPage:
+        return begun_page(adjustment, run, {**solution_dict(adjustment, run), **more}, rows(), options.language)
+
+    return BegunResults(files, writing.of(page))
 
 
 def finished_results(
