@@ -21,12 +21,13 @@ from survey.report.language import ReportOptions
 from survey.report.results import write_results
 from survey.simulate import head_on_table
 from survey.solution.covariances import covariance_npz, read_covariances
-from survey.solution.dictionary import RunInfo, correlated, solution_dict
+from survey.solution.dictionary import RunInfo, solution_dict
 from survey.solution.frames import AdjustedFrames, table_from_mount
 from survey.solution.quantities import ellipsoid, key_of, pose_entry, scale_of, vector_entry
 from survey.solution.records import Form, Records, solution_json
 from survey.solution.residual_tables import image_residuals_csv, image_residuals_parquet, other_residuals_csv
 from survey.solution.statistics import statistics_of
+from survey.solution.unknowns import correlated
 from survey.solution.verdict import suspects, verdict
 from tests.survey.adjustments import POSE_COMPONENTS, POSE_UNITS, Lab, correlate, lab_adjustment
 
