@@ -80,12 +80,12 @@ class Beside:
     """
 
     def __init__(self) -> None:
-        self._alone = workers() == 1 or hasattr(_here, "step") or hasattr(_here, "busy")
+        self.alone = workers() == 1 or hasattr(_here, "step") or hasattr(_here, "busy")
         self._begun = list[Future[Any]]()
 
     def of(self, step: Callable[[], _Result]) -> Callable[[], _Result]:
         """What gives the result of a step, or raises what it raised."""
-        if self._alone:
+        if self.alone:
             result = step()
             return lambda: result
         begun = _stages(workers()).submit(step)
@@ -97,6 +97,7 @@ class Beside:
 
     def __exit__(self, *_: object) -> None:
         wait(self._begun)
+        self._begun.clear()
 
 
 def run_split(kernel: Callable[..., object], runs: list[IntArray], *arguments: object) -> None:

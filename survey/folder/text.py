@@ -30,19 +30,19 @@ _LONGEST_ID = 120  # bytes: an id with a prefix and an ending is still the name 
 _DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{i}" for port in ("COM", "LPT") for i in range(1, 10))}
 
 
-def atomic_write(path: Path, content: bytes | str, lasting: bool = False) -> None:
+def atomic_write(path: Path, content: bytes | str | Iterable[bytes], lasting: bool = False) -> None:
     """Write ``content`` (text as UTF-8) under a temporary name beside ``path``, then rename: all of it or nothing.
 
     What killed runs left of the same file goes. lasting: on return even a cut of the power leaves the new file.
     """
-    data = utf8(content) if isinstance(content, str) else content
+    whole = utf8(content) if isinstance(content, str) else content
     made = not path.parent.is_dir()
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_leftovers(path.parent, path.name)
     handle, temporary = _temporary(path)
     try:
         with os.fdopen(handle, "wb") as stream:
-            stream.write(data)
+            stream.writelines([whole] if isinstance(whole, bytes) else whole)
             stream.flush()
             os.fsync(handle)
         os.chmod(temporary, 0o666 & ~_umask())  # mkstemp makes files that only their owner can read

@@ -4,7 +4,6 @@ from survey.folder.text import atomic_write
 from survey.project.project import (
     AdjustmentOptions,
     Definition,
-    ImagePointsWhere,
     Project,
     Sigmas,
     SpotBlock,
@@ -16,7 +15,6 @@ from survey.project.writing import write_project
 __all__ = [
     "AdjustmentOptions",
     "Definition",
-    "ImagePointsWhere",
     "Project",
     "Sigmas",
     "SpotBlock",

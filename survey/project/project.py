@@ -11,7 +11,7 @@ import numpy as np
 from gtsam import Rot3
 
 from adjust.model.observations import Closure, FrameRef, ReadingKind
-from adjust.model.survey import FloatArray, IntArray, Survey
+from adjust.model.survey import FloatArray, Survey
 from survey.folder.locking import OBSERVATIONS_FOLDER as OBSERVATIONS_FOLDER
 from survey.folder.locking import RESULTS as RESULTS
 from survey.folder.plain import attributes
@@ -216,18 +216,6 @@ class Sigmas:
     instruments: Mapping[str, Accuracy] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, eq=False)
-class ImagePointsWhere:
-    """Where the image points of ``Survey.image_blocks`` stand: one array of lines (rows of Parquet) per block."""
-
-    file: Path | None = None
-    lines: tuple[IntArray, ...] = ()
-
-    def where(self, block: int, point: int) -> str:
-        """``file:line`` of a point of a block, for messages."""
-        return f"{self.file}:{self.lines[block][point]}"
-
-
 @dataclass(frozen=True)
 class LeftOut:
     """An exclusion in force, and how many images, image points, spots without a name and readings it meets."""
@@ -278,7 +266,6 @@ class Project(Definition):
     """
 
     spots: tuple[SpotBlock, ...] = ()
-    image_points_where: ImagePointsWhere = ImagePointsWhere()
     left_out: tuple[LeftOut, ...] = ()
     n_left_out: int = 0
     n_unused_in_files: int = 0

@@ -11,6 +11,7 @@ import numpy as np
 from adjust.model.errors import SurveyError
 from adjust.model.names import natural_key
 from adjust.model.survey import Datum, FloatArray, Point, PointParameter, Survey
+from adjust.native.parallel import Beside
 from survey.folder.locking import settled
 from survey.folder.text import id_problem, suggestion
 from survey.project.declared.clocks import are_timed, read_times
@@ -38,13 +39,12 @@ from survey.project.project import (
     IMAGES_FOLDER,
     OBSERVATIONS_FOLDER,
     Definition,
-    ImagePointsWhere,
     LeftOut,
     Project,
     Sigmas,
     SpotsRequest,
 )
-from survey.project.tables.files import read_table
+from survey.project.tables.files import Begun, begin_tables, read_table
 from survey.project.tables.image_points import read_image_blocks, read_spots, world_names
 from survey.project.tables.kinds import GROUPS, KINDS, LAYOUTS, with_observations
 from survey.project.tables.reading import Layout, Table
@@ -57,32 +57,35 @@ def read_definition(folder: Path) -> Definition:
         return _read_definition(Path(folder))[0]
 
 
-def read(folder: Path, then: Callable[[bool], object] = lambda _: None) -> Project:
+def read(folder: Path, meanwhile: Callable[[bool], object] = lambda _: None) -> Project:
     """Read a whole project folder; tables of observations that are not there yet are empty. Raises SurveyError.
 
     What ``exclusions.csv`` leaves out is not used. ``notes`` say which of its rows name nothing, ``image_notes``
-    which images are not those any more that the points come from. then: called when all files are read, with whether
-    there are image points.
+    which images are not those any more that the points come from. meanwhile: called while large tables are being read,
+    with whether that of image points is one of them.
     """
-    project = read_all(folder, then=then)
+    project = read_all(folder, meanwhile=meanwhile)
     return leaving_out(project, in_force(read_exclusions(project.folder / OBSERVATIONS_FOLDER)[0]).values())
 
 
 def read_all(
-    folder: Path, texts: Mapping[str, str] = MappingProxyType({}), then: Callable[[bool], object] = lambda _: None
+    folder: Path, texts: Mapping[str, str] = MappingProxyType({}), meanwhile: Callable[[bool], object] = lambda _: None
 ) -> Project:
     """:func:`read`, with what is excluded as if it were not.
 
     texts: what is to stand in files of the folder, not yet written, by their paths in it.
     """
-    with settled(Path(folder)):
+    place = Path(folder) / OBSERVATIONS_FOLDER
+    with settled(Path(folder)), Beside() as beside:
+        begun = begin_tables(place, LAYOUTS, beside) if not texts else {}
+        if begun:
+            meanwhile(any(path.stem == "image_points" for path in begun))
         definition, root = _read_definition(Path(folder), texts.get(DEFINITION_FILE))
-        place = definition.folder / OBSERVATIONS_FOLDER
-        tables = _read_tables(place, {definition.folder / name: text for name, text in texts.items()})
+        tables = _read_tables(place, {Path(folder) / name: text for name, text in texts.items()}, begun)
+        begun.clear()
         _, digest = read_exclusions(place)
         known = read_detected(place)
         images = _image_news(definition, tables, known)
-    then("image_points" in tables)
     project = _observed(definition, root, tables)
     hashes = dict(sorted({**project.inputs, f"{OBSERVATIONS_FOLDER}/{EXCLUSIONS_FILE}": digest}.items()))
     if digest:
@@ -146,13 +149,13 @@ def _observed(definition: Definition, root: Node, tables: dict[str, Table]) -> P
     _check_datum_points(root, survey)
     names, sigmas = Names.of(survey), definition.sigmas
     points = tables.get("image_points")
-    blocks, where = read_image_blocks(points, names, sigmas) if points is not None else ((), ImagePointsWhere())
+    blocks = read_image_blocks(points, names, sigmas) if points is not None else ()
     survey = with_observations(dataclasses.replace(survey, image_blocks=blocks), tables, sigmas)
     fields = {field.name: getattr(definition, field.name) for field in dataclasses.fields(Definition)}
     hashes = {table.path.relative_to(definition.folder).as_posix(): table.digest for table in tables.values()}
     fields |= {"survey": survey, "inputs": dict(sorted(({**definition.inputs, **hashes}).items()))}
     spots = read_spots(tables["spots"], names, sigmas) if "spots" in tables else ()
-    return Project(**fields, spots=spots, image_points_where=where)
+    return Project(**fields, spots=spots)
 
 
 def _read_definition(folder: Path, text: str | None = None) -> tuple[Definition, Node]:
@@ -252,10 +255,10 @@ def _check_scales(root: Node, sigmas: Sigmas, tables: dict[str, Table]) -> None:
             raise root.table("sigmas").table("scale").error(problem, group)
 
 
-def _read_tables(folder: Path, instead: Mapping[Path, str]) -> dict[str, Table]:
+def _read_tables(folder: Path, instead: Mapping[Path, str], begun: Mapping[Path, Begun]) -> dict[str, Table]:
     """All tables in the folder by name; raises where a file is no known table or one is there twice.
 
-    instead: what is to stand in some of them, not yet written.
+    instead: what is to stand in some of them, not yet written. begun: those of which the reading has begun.
     """
     tables: dict[str, Table] = {}
     paths = sorted(folder.iterdir()) if folder.is_dir() else []
@@ -270,7 +273,7 @@ def _read_tables(folder: Path, instead: Mapping[Path, str]) -> dict[str, Table]:
             raise SurveyError(f"{path}: unknown table {path.stem!r}; {near}")
         if path.stem in tables:
             raise SurveyError(f"{path}: {tables[path.stem].path.name} is there too; keep one of the two")
-        tables[path.stem] = read_table(path, layout, instead.get(path))
+        tables[path.stem] = read_table(path, layout, instead.get(path), begun.get(path))
     return tables
 
 

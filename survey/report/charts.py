@@ -62,10 +62,11 @@ def _bar(y: float, scale: float) -> str:
 def vector_field(c: CameraResiduals) -> Markup:
     """Residual vectors at the observed points; suspects red and all drawn, not used ones orange."""
     scale, height, parts = _frame(c.size, t("Residuals"))
-    rank = np.random.default_rng(0).permutation(len(c.uv))
-    ordinary = c.used & ~c.suspect
-    shown, n = np.sort(rank[ordinary[rank]][:_MOST_ARROWS]), int(np.count_nonzero(ordinary))
-    grow = _arrow_scale(np.hypot(*c.residuals[ordinary].T), 15.0)
+    ordinary = np.flatnonzero(c.used & ~c.suspect)
+    n = len(ordinary)
+    some = np.sort(np.random.default_rng(0).choice(n, _MOST_ARROWS, replace=False)) if n > _MOST_ARROWS else slice(None)
+    shown = ordinary[some]
+    grow = _arrow_scale(np.hypot(*c.residuals[shown].T), 15.0)
     origin = 0.5 * scale, _ABOVE + 0.5 * scale
     start = c.uv[shown] * scale + origin
     parts.append(d.arrows(start, start + grow * c.residuals[shown], d.ARROWS, 0.7))
@@ -88,8 +89,8 @@ def mean_field(c: CameraResiduals) -> Markup:
     ny = max(1, round(nx * c.size[1] / c.size[0]))
     cell = np.array([c.size[0] / nx, c.size[1] / ny])
     uv, residuals = c.uv[c.used], c.residuals[c.used]
-    ij = np.clip(((uv + 0.5) / cell).astype(int), 0, (nx - 1, ny - 1))
-    flat = ij[:, 1] * nx + ij[:, 0]
+    i, j = (np.clip(((uv[:, k] + 0.5) / cell[k]).astype(int), 0, most - 1) for k, most in ((0, nx), (1, ny)))
+    flat = j * nx + i
     n = np.bincount(flat, minlength=nx * ny)
     total = np.column_stack([np.bincount(flat, residuals[:, k], nx * ny) for k in (0, 1)])
     peak, size = max(int(n.max(initial=0)), 1), cell * scale

@@ -15,10 +15,24 @@ from survey.solution.statistics import Statistics
 
 
 @dataclass(frozen=True, eq=False)
+class Listed:
+    """The rows of the table of all observations, of ``total``, without what statistics say of them.
+
+    values: (12, n), as :mod:`survey.report.sections.observations` has them. columns: each as JSON, by its heading.
+    rest: JSON of what the table has beside its columns.
+    """
+
+    total: int
+    values: FloatArray
+    columns: dict[str, str]
+    rest: str
+
+
+@dataclass(frozen=True, eq=False)
 class Context:
     """The adjustment, its solution as plain values, and the image points row by row; ``suspect`` (N,).
 
-    statistics: None where only the adjustment itself is to be reported.
+    statistics: None where only the adjustment itself is to be reported. listed: once it is made.
     """
 
     adjustment: Adjustment
@@ -28,11 +42,12 @@ class Context:
     rows: ImageRows
     suspect: BoolArray
     statistics: Statistics | None = None
+    listed: Listed | None = None
 
 
 def worst(values: FloatArray, most: int) -> IntArray:
     """Positions of the largest absolute values, largest first, equal ones in their order; NaN comes last."""
-    return largest(np.nan_to_num(np.abs(values), nan=-1.0), most)
+    return largest(np.fmax(np.abs(values), -1.0), most)
 
 
 def other_components(adjustment: Adjustment) -> tuple[IntArray, IntArray, FloatArray]:

@@ -5,10 +5,12 @@ Every text that is not markup already is escaped on its way into a page; the HTM
 
 import json
 import math
+import re
 from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
@@ -21,6 +23,11 @@ MISSING = "–"
 _MOST_IN_FULL = 1e9  # a larger number of unknown size has a power of ten
 MINUS = "−"
 _HERE = Path(__file__).parent
+ANCHORED = ("image", "obs", "point", "reading", "param", "camera", "epoch", "target", "group", "station", "table")
+"""Kinds of things that have a place, as the page, the report and the terminal name it: ``#image=X/hX05``."""
+_IN_MESSAGE = re.compile(r"camera '?(?P<camera>[^\s',]+)'?(?: at|,) epoch '?(?P<epoch>[^\s',:]+)|"
+                         r"table (?P<table>\S+), epoch (?P<read>[^\s,:]+)|"
+                         r"images/(?P<image>[^\s/:]+/[^\s/:,.]+)")  # fmt: skip
 
 
 @cache
@@ -65,13 +72,17 @@ def document(title: str, body: Markup, after: Markup | str = "") -> str:
     return unturned(page.render(values), TURNING) + "\n"
 
 
-def json_script(anchor: str, value: object) -> Markup:
-    """Plain values as a JSON block with an id, in a form that cannot end the script or become markup."""
+def json_script(anchor: str, text: str) -> Markup:
+    """JSON of :func:`json_of` as a block with an id."""
+    return part("data", anchor, Markup(text))
+
+
+def json_of(value: object) -> str:
+    """Plain values as JSON, in a form that cannot end a script or become markup."""
     text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     for sign in "<>&\u2028\u2029":
         text = text.replace(sign, f"\\u{ord(sign):04x}")
-    text = unturned(text, {sign: f"\\{shown}" for sign, shown in TURNING.items()})  # the script shows the escape
-    return part("data", anchor, Markup(text))
+    return unturned(text, {sign: f"\\{shown}" for sign, shown in TURNING.items()})  # the script shows the escape
 
 
 def fixed(value: float | None, decimals: int) -> str:
@@ -181,3 +192,16 @@ def figures(drawn: Iterable[Markup], kind: str = "figures") -> Markup:
     """Pictures side by side; nothing where there is none."""
     drawn = list(drawn)
     return part("figures", drawn, kind) if drawn else Markup()
+
+
+def anchor(kind: str, text: str) -> str:
+    """The part of an address that names a thing: ``#image=X/hX05``."""
+    return f"#{kind}={quote(text, safe='/:@,.-_')}"
+
+
+def anchors_in(text: str) -> list[str]:
+    """The places that a message of an adjustment names."""
+    return [
+        anchor("reading", f"table_angles:{m['table']}/{m['read']}") if m["table"] else
+        anchor("image", m["image"] or f"{m['camera']}/{m['epoch']}") for m in _IN_MESSAGE.finditer(text)
+    ]  # fmt: skip

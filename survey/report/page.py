@@ -15,7 +15,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from survey.report.context import Context
 from survey.report.language import language, localised, speaking, t
-from survey.report.markup import document, element, joined, json_script, part
+from survey.report.markup import document, element, joined, json_of, json_script, part
 from survey.report.modules import WEB, bundled
 from survey.report.sections import diagnosis, loops, observations, overview, published, statistics, unknowns
 from survey.solution.dictionary import RunInfo, solution_dict
@@ -95,6 +95,7 @@ def begun_page(
         images.used & (images.test > limit),
     )  # fmt: skip
     with speaking(in_language):
+        c = replace(c, listed=observations.listed(c))
         made = {anchor: make(c) for _, anchor, make in _SECTIONS if anchor not in _OF_STATISTICS}
     return BegunPage(c, in_language, made)
 
@@ -107,7 +108,8 @@ def finished_page(begun: BegunPage, solution: dict[str, Any], found: Statistics 
         nav = part("nav", [(anchor, t(name)) for name, anchor, _ in _SECTIONS if made[anchor]])
         title = f"{c.solution['summary']['title'] or c.run.folder} – {t('Adjustment report')}"
         shown = overview.header(c) + nav + joined((made[anchor] for _, anchor, _ in _SECTIONS), "\n")
-        return document(title, shown, json_script("words", _words()) + element("script", Markup(bundled("report"))))
+        scripts = json_script("words", json_of(_words())) + element("script", Markup(bundled("report")))
+        return document(title, shown, scripts)
 
 
 def _words() -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """The results of a survey as files: ``solution.json``, ``covariance.npz``, residuals as CSV and ``report.html``."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -72,7 +72,7 @@ class ResultFiles:
         self.folder.mkdir(parents=True, exist_ok=True)
         self._begun: dict[str, Callable[[], None]] = {}
 
-    def begin(self, makers: Mapping[str, Callable[[], bytes]]) -> None:
+    def begin(self, makers: Mapping[str, Callable[[], bytes | Iterable[bytes]]]) -> None:
         """Files by name, by what makes them."""
         for name, make in makers.items():
             self._begun[name] = self._writing.of(partial(_write, self.folder / name, make))
@@ -110,8 +110,11 @@ def begun_results(
         **({PARQUET: lambda: image_residuals_parquet(adjustment)} if parquet else {}),
         "residuals_other.csv": lambda: other_residuals_csv(adjustment),
     })  # fmt: skip
-    solution = {**solution_dict(adjustment, run), **more}
-    return BegunResults(files, writing.of(lambda: begun_page(adjustment, run, solution, rows(), options.language)))
+
+    def page() -> BegunPage:
+        return begun_page(adjustment, run, {**solution_dict(adjustment, run), **more}, rows(), options.language)
+
+    return BegunResults(files, writing.of(page))
 
 
 def finished_results(
@@ -130,5 +133,5 @@ def finished_results(
     return solution, begun.files.paths
 
 
-def _write(path: Path, make: Callable[[], bytes]) -> None:
+def _write(path: Path, make: Callable[[], bytes | Iterable[bytes]]) -> None:
     atomic_write(path, make())

@@ -16,7 +16,7 @@ from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Target
 from survey.folder.plain import plain
 from survey.report import drawing as d
-from survey.report.markup import json_script, part
+from survey.report.markup import json_of, json_script, part
 from survey.solution.frames import AdjustedFrames
 from survey.solution.quantities import Scale
 
@@ -212,7 +212,7 @@ def space(adjustment: Adjustment, scale: Scale, scene: Scene) -> Markup:
     data = scene_values(adjustment, scale, replace(scene, spots=spots))
     data |= {"enlarged": enlargement(scene, scale.ellipsoid, extent)}
     short = {key: value if key == "spots" else _short(value) for key, value in data.items()}
-    return part("space", of="report.html") + json_script("space-data", short)
+    return part("space", of="report.html") + json_script("space-data", json_of(short))
 
 
 def _seven_digits(x: FloatArray) -> FloatArray:

@@ -8,8 +8,8 @@ import numpy as np
 
 from adjust.model.result import Adjustment
 from survey.project.observed import name_of_residual
+from survey.report.markup import anchor, anchors_in
 from survey.report.sections.published import head_rows, worst_pairs
-from survey.solution.anchors import anchor, anchors_in
 from survey.solution.dictionary import RunInfo, solution_dict
 from survey.solution.records import having
 
@@ -72,7 +72,8 @@ def _figures(solution: dict[str, Any]) -> Iterator[str]:
         )
     parts = solution.get("consistency")
     if parts and parts["n_tests"]:
-        failed = [f"{kind} {name}" for kind, x in parts["parts"].items() for name, p in x.items() if not p["fits"]]
+        failed = [f"{kind} {name}" for kind, x in parts["parts"].items()
+                  for name, fits in x.numbers("fits").items() if not fits]  # fmt: skip
         changed = [f"{x['kind']} {x['name']}" for x in parts["changes"]]
         listed = ", ".join(dict.fromkeys(changed + failed)) or "all fit"
         yield f"  parts and changes: {parts['n_tests']} tests: {_cut(listed, _WIDTH - 30)}"

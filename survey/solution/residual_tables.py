@@ -3,7 +3,7 @@
 Rows are made by the core: a million image points take a fraction of a second.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, groupby
 from math import isfinite
@@ -14,7 +14,7 @@ import numpy as np
 from adjust.model.observations import Reading
 from adjust.model.result import Adjustment, ImageResiduals, ObservationResidual
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
-from adjust.native.parallel import side_by_side
+from adjust.native.parallel import side_by_side, workers
 from adjust.native.text import NUMBERS, TEXT, WORD, Words, number_rows, record_rows
 from adjust.observations.terrestrial.statistics import reading_names, reading_unit
 from survey.folder.text import cell_text, csv_text
@@ -31,7 +31,7 @@ OTHER_COLUMNS = (
     "used"
 )
 _DECIMALS = (4, 4, 6, 6, 6, 6, 5, 5, 4, 4, 4, 0)
-_CHUNK = 50_000
+_CHUNK = 16_384
 _NEEDS_QUOTES = frozenset(',"\r\n')
 
 
@@ -73,8 +73,8 @@ def _point_names(survey: Survey) -> tuple[tuple[str, ...], dict[str | None, int]
     return tuple(names), start
 
 
-def image_residuals_csv(adjustment: Adjustment, rows: ImageRows | None = None) -> bytes:
-    """``residuals.csv``; sigmas are those of the observations, a priori; no number is written where there is none.
+def image_residuals_csv(adjustment: Adjustment, rows: ImageRows | None = None) -> Iterator[bytes]:
+    """``residuals.csv``, piece by piece; sigmas are a priori; no number is written where there is none.
 
     rows: of the adjustment, where they are known already.
     """
@@ -92,7 +92,10 @@ def image_residuals_csv(adjustment: Adjustment, rows: ImageRows | None = None) -
         made = number_rows(heads, rows.block[part], points, rows.point[part], values, _DECIMALS)
         return made if made is not None else _by_one(adjustment, rows, part, values)
 
-    return b"".join([IMAGE_COLUMNS.encode() + b"\n", *side_by_side(text, range(0, rows.block.size, _CHUNK))])
+    yield IMAGE_COLUMNS.encode() + b"\n"
+    step = _CHUNK * workers()  # memory is used again from one step to the next
+    for begin in range(0, rows.block.size, step):
+        yield from side_by_side(text, range(begin, min(begin + step, rows.block.size), _CHUNK))
 
 
 def _numbers(rows: ImageRows, found: ImageResiduals) -> tuple[FloatArray | BoolArray, ...]:

@@ -52,7 +52,10 @@ def first_calls(stations: list[str]) -> Iterator[list[str]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
-def test_what_is_measured_passes_the_stations_in_their_order(way: str, tmp_path: Path) -> None:
+def test_what_is_measured_passes_the_stations_in_their_order(
+    way: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LABSURVEY_THREADS", "1")  # nothing is done beside anything, unseen
     assert len(WAYS[way]) <= 10
     folder = tmp_path / "lab"
     assert main(["example", EXAMPLES[way], str(folder), "--quiet"]) == 0

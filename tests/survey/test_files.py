@@ -31,6 +31,7 @@ from survey.folder.units import from_si, to_si
 from survey.project.declared.toml_text import key_lines, read_tables
 from survey.project.tables import files as table_reading
 from survey.project.tables import reading as tables
+from survey.project.tables.image_points import IMAGE_POINTS
 from survey.project.tables.pairs import pair_columns
 from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList
 from survey.simulate import full_lab
@@ -133,8 +134,6 @@ def test_image_blocks(good: Path) -> None:
     assert blocks[0].point_idx.tolist() == [0, 1]
     np.testing.assert_allclose(blocks[0].cov[1], [[0.01, 0.01], [0.01, 0.04]], rtol=1e-15)
     np.testing.assert_allclose(blocks[2].cov[0], 0.01 * np.eye(2), rtol=1e-15)  # image_px
-    assert project.image_points_where.where(0, 1).endswith("observations/image_points.csv:3")
-    assert project.image_points_where.where(4, 0).endswith("observations/image_points.csv:6")
     assert project.spots[0].spot_ids == ("s1", "s2")
 
 
@@ -306,8 +305,25 @@ def test_blank_lines_and_quotes_go_the_other_way(good: Path) -> None:
     path.write_text(text)
     after = files.read(good)
     assert differences(before.survey, after.survey) == []
-    lines = [lines.tolist() for lines in after.image_points_where.lines]
-    assert lines == [[2, 3], [6], [5], [8], [7]]
+    assert table_reading.read_table(path, IMAGE_POINTS).lines.tolist() == [2, 3, 5, 6, 7, 8]
+
+
+@pytest.mark.parametrize(("threads", "begun"), [("1", []), ("2", [True])])
+def test_large_tables_are_read_beside_the_rest(
+    good: Path, monkeypatch: pytest.MonkeyPatch, threads: str, begun: list[bool]
+) -> None:
+    before, path, called = files.read(good), good / "observations" / "image_points.csv", list[bool]()
+    monkeypatch.setenv("LABSURVEY_THREADS", threads)
+    for module in ("files", "arrow"):
+        monkeypatch.setattr(f"survey.project.tables.{module}.LARGE", 0)
+    after = files.read(good, called.append)
+    assert (called, differences(before.survey, after.survey), after.inputs) == (begun, [], before.inputs)
+    path.write_text(path.read_text().replace("e10,X", "e10,Z"))
+    with pytest.raises(SurveyError, match=r"image_points\.csv:4: camera_id: unknown camera 'Z'"):
+        files.read(good)
+    path.write_text(path.read_text() + "e10\n")
+    with pytest.raises(SurveyError, match=r"image_points\.csv:\d+: found 1 fields, expected"):
+        files.read(good)
 
 
 @pytest.mark.parametrize("quote", ["", '"'])

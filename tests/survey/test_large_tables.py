@@ -17,7 +17,7 @@ from survey.project.tables import arrow as arrow_columns
 from survey.project.tables import files as table_reading
 from survey.project.tables.arrow import csv_columns, csv_rows
 from survey.project.tables.files import read_table, write_table
-from survey.project.tables.image_points import _distinct, ordered
+from survey.project.tables.image_points import _distinct, one_code
 from survey.project.tables.reading import Layout, Table, TextColumn
 
 LAYOUT = Layout("t", ("a_id",), ("x_mm",), ("group",), ("sigma_mm",))
@@ -162,7 +162,7 @@ def test_a_small_table_loads_no_arrow_and_a_large_one_no_pandas(tmp_path: Path) 
 import sys
 from pathlib import Path
 from survey.project.tables.files import read_table, write_table
-from survey.project.tables.image_points import _distinct, ordered
+from survey.project.tables.image_points import _distinct, one_code
 from survey.project.tables.reading import Layout
 layout = Layout("t", ("a_id",), ("x_mm",), ("group",), ("sigma_mm",))
 for name, seldom in (("small", "pyarrow"), ("large", "pandas")):
@@ -179,9 +179,10 @@ def test_rows_in_the_order_of_several_codes(largest: int) -> None:
     """Whether their product fits into a number or not; codes as the other way to number them has them."""
     rng = np.random.default_rng(1)
     codes = [rng.choice(np.array([0, 1, 2, largest]), 500) for _ in range(3)]
-    order, same = ordered(*codes)
+    code = one_code(*codes)
+    order = np.argsort(code, kind="stable")
     np.testing.assert_array_equal(order, np.lexsort(codes[::-1]))
-    rows = np.stack(codes, axis=1)[order]
+    rows, same = np.stack(codes, axis=1)[order], np.diff(code[order]) == 0
     np.testing.assert_array_equal(same, (rows[1:] == rows[:-1]).all(axis=1))
     assert same.any()
     for some in (codes[0], codes[0] % 7, np.zeros(0, dtype=np.int64)):

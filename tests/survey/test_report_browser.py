@@ -12,9 +12,9 @@ from adjust.model.errors import SurveyError
 from survey.project.observed import name_of_residual
 from survey.report import page as printing
 from survey.report.drawing import DARK
+from survey.report.markup import anchor
 from survey.report.page import report_html
 from survey.report.sections import observations
-from survey.solution.anchors import anchor
 from survey.solution.dictionary import RunInfo
 from tests.browsing import CONTRAST, INKED, Page, asked, need_browser
 from tests.survey.accessible import FAULTS

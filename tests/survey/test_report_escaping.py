@@ -26,7 +26,7 @@ from survey.planning.job import PlanRequest, planning_job
 from survey.planning.page import plan_page
 from survey.project import AdjustmentOptions, Project, Sigmas, read
 from survey.report.language import esc
-from survey.report.markup import json_script
+from survey.report.markup import json_of, json_script
 from survey.report.page import report_html
 from survey.simulate import beacons
 from survey.solution.dictionary import RunInfo
@@ -164,7 +164,7 @@ def test_notebooks() -> None:
 
 def test_data_in_a_page_is_read_back_as_it_was() -> None:
     """Embedded JSON: the script gets the same text, but for signs that would turn the line round."""
-    block = json_script("x", {p: [p] for p in PAYLOADS})
+    block = json_script("x", json_of({p: [p] for p in PAYLOADS}))
     assert faults_of(block) == []
     assert block.count("<") == 2
     data = json.loads(block.partition(">")[2].rpartition("<")[0])

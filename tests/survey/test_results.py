@@ -1,6 +1,7 @@
 import csv
 import io
 import json
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import reduce
 from pathlib import Path
@@ -20,12 +21,13 @@ from survey.report.language import ReportOptions
 from survey.report.results import write_results
 from survey.simulate import head_on_table
 from survey.solution.covariances import covariance_npz, read_covariances
-from survey.solution.dictionary import RunInfo, correlated, solution_dict
+from survey.solution.dictionary import RunInfo, solution_dict
 from survey.solution.frames import AdjustedFrames, table_from_mount
 from survey.solution.quantities import ellipsoid, key_of, pose_entry, scale_of, vector_entry
 from survey.solution.records import Form, Records, solution_json
 from survey.solution.residual_tables import image_residuals_csv, image_residuals_parquet, other_residuals_csv
 from survey.solution.statistics import statistics_of
+from survey.solution.unknowns import correlated
 from survey.solution.verdict import suspects, verdict
 from tests.survey.adjustments import POSE_COMPONENTS, POSE_UNITS, Lab, correlate, lab_adjustment
 
@@ -282,8 +284,8 @@ def test_covariances_come_back_as_they_were(adjustment: Adjustment, tmp_path: Pa
     assert covariance_npz(adjustment) == covariance_npz(adjustment)
 
 
-def rows_of(text: bytes) -> list[dict[str, str]]:
-    return list(csv.DictReader(io.StringIO(text.decode(), newline="")))
+def rows_of(pieces: Iterable[bytes]) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(b"".join(pieces).decode(), newline="")))
 
 
 def test_residuals_are_written_row_by_row(adjustment: Adjustment) -> None:
@@ -436,7 +438,7 @@ def test_numbers_too_large_for_fixed_decimals_are_written_in_full(adjustment: Ad
 
 
 def test_other_residuals_have_units_for_people(adjustment: Adjustment) -> None:
-    rows = rows_of(other_residuals_csv(adjustment))
+    rows = rows_of([other_residuals_csv(adjustment)])
     assert len(rows) == sum(len(o.components) for o in adjustment.other_residuals)
     table = next(o for o in adjustment.other_residuals if o.kind == "table")
     assert rows[0]["value_unit"] == "deg"

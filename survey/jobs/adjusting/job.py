@@ -1,4 +1,4 @@
-"""The main job: read, detect, adjust, write. What comes after reading is loaded while tables become observations."""
+"""The main job: read, detect, adjust, write. What comes after reading is loaded while large tables are being read."""
 
 from dataclasses import replace
 from importlib import import_module
@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from adjust.model.errors import SurveyError
-from adjust.native.parallel import Beside, workers
 from survey.folder.replacing import changing, replace_parts
 from survey.jobs.detecting import detect_in, detect_job, remember_images
 from survey.project import read
@@ -46,8 +45,8 @@ def adjust_job(
                 else:
                     detect_job(folder, progress=progress, everything=redetect)
 
-        with Beside() as loading, clock.step("read"):
-            project = read(folder, lambda images: loading.of(lambda: _load(images)) if workers() > 1 else None)
+        with clock.step("read"):
+            project = read(folder, _load)
         nothing_yet = bool(project.images) and not (project.survey.image_blocks or project.spots)
         if redetect or project.to_detect or (nothing_yet and not project.detected):
             detected()
@@ -73,7 +72,8 @@ def adjust_job(
 
 
 def _load(images: bool) -> None:
-    """What a project is adjusted and tested with; with one thread that is loaded when it is asked for."""
+    """What large tables are read with, and their project adjusted and tested."""
     algebra = ("scipy.linalg",) if images else ()
-    for name in ("scipy.special", *algebra, "survey.jobs.adjusting.outcome", "survey.jobs.adjusting.steps"):
+    jobs = ("survey.jobs.adjusting.outcome", "survey.jobs.adjusting.steps")
+    for name in ("pyarrow.csv", "scipy.special", *algebra, *jobs):
         import_module(name)

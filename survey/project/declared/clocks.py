@@ -6,7 +6,7 @@ from typing import Any
 from adjust.model.errors import SurveyError
 from adjust.model.survey import Clock, VectorParameter
 from survey.folder.units import from_si
-from survey.project.declared.declarations import CLOCK_UNITS
+from survey.project.declared.bodies import CLOCK_UNITS
 from survey.project.declared.node import Node
 from survey.project.declared.vectors import key_of, read_vector, vector_to_toml
 

@@ -69,6 +69,11 @@ class Declared:
         return self.by_name.get(name, self.free_keys)
 
 
+def declare(name: str, path: str, what: str, *keys: Key, free_keys: Key | None = None) -> Declared:
+    """A table of these keys."""
+    return Declared(name, path, what, keys, free_keys=free_keys)
+
+
 def vector_keys_declared(units: dict[str, str], said: dict[str, str], free: tuple[str, ...]) -> tuple[Key, ...]:
     """The keys of named scalars with units (``declared.vectors``): which are free, values, sigmas of priors."""
     names = tuple(units)

@@ -6,7 +6,7 @@ import numpy as np
 
 from adjust.lenses.models import MODELS
 from adjust.model.survey import FloatArray, ImageCrop, LensDrift, LensParameter, LensSharing, Tie, VectorPrior
-from survey.project.declared.declarations import CROP_UNITS
+from survey.project.declared.bodies import CROP_UNITS
 from survey.project.declared.node import Node
 from survey.project.declared.vectors import read_vector, vector_to_toml
 from survey.project.tables.covariance import covariance_problem

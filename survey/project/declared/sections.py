@@ -18,8 +18,8 @@ from adjust.model.survey import (
     Target,
 )
 from survey.folder.units import from_si
+from survey.project.declared.bodies import WARP_UNITS
 from survey.project.declared.clocks import clock_to_toml
-from survey.project.declared.declarations import WARP_UNITS
 from survey.project.declared.instruments import body_sections, instrument_sections, vertical_sections
 from survey.project.declared.lenses import lens_to_toml
 from survey.project.declared.options import closure_sections, tolerance_sections

@@ -10,7 +10,8 @@ from adjust.model.boards import BENT
 from adjust.model.survey import FloatArray, Target, VectorParameter, VectorPrior
 from survey.folder.text import suggestion
 from survey.folder.units import to_si
-from survey.project.declared.declarations import DECLARATIONS, WARP_UNITS
+from survey.project.declared.bodies import WARP_UNITS
+from survey.project.declared.declarations import DECLARATIONS
 from survey.project.declared.node import Node
 from survey.project.declared.owners import read_epochs
 from survey.project.declared.poses import read_pose

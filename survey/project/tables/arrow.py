@@ -21,7 +21,7 @@ from survey.project.tables.reading import LARGEST_ROWS, Columns, Layout, TextCol
 
 LARGE = 2**20  # bytes of CSV, cells to write / 10: below, loading Arrow (30 ms) costs more than it saves
 _LARGEST_DECODED = 8 * 2**30  # bytes of the columns of a Parquet file
-_BLOCK, _ROWS = 4 * 2**20, 2**17  # bytes read, rows written at a time
+_BLOCK, _ROWS = 2**20, 2**17  # bytes read, rows written at a time
 _PLAIN = re.compile(r"[\w.:/+-]+").fullmatch  # names that need no quotes in CSV
 _ALIKE = (1e-4, 1e9)  # between these Arrow writes doubles as Python does, but for whole numbers
 
@@ -29,9 +29,9 @@ _ALIKE = (1e-4, 1e9)  # between these Arrow writes doubles as Python does, but f
 def csv_columns(data: bytes, layout: Layout) -> dict[str, TextColumn | FloatArray] | None:
     """The columns of a plain, faultless CSV table of many rows; None for any other, which is to be read row by row.
 
-    Plain: no quotes, every line of the same ending, no blank line.
+    Plain: no quotes, no blank line.
     """
-    if len(data) < LARGE or b'"' in data or (b"\r" in data and not _before_line_feeds(data)):
+    if len(data) < LARGE or b'"' in data:
         return None
     header = data[: data.find(b"\n")].decode("utf-8-sig", "replace").rstrip("\r").split(",")
     if not set(layout.required) <= set(header) <= set(layout.columns) or not len(set(header)) == len(header) > 1:
@@ -58,13 +58,6 @@ def csv_columns(data: bytes, layout: Layout) -> dict[str, TextColumn | FloatArra
             return None
         out[name] = column
     return out
-
-
-def _before_line_feeds(data: bytes) -> bool:
-    """Whether a line feed follows every carriage return."""
-    signs = np.frombuffer(data, np.uint8)
-    at = np.flatnonzero(signs == ord("\r"))
-    return bool(at[-1] < len(signs) - 1 and (signs[at + 1] == ord("\n")).all())
 
 
 def _text(column: Any) -> TextColumn:

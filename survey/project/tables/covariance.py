@@ -83,7 +83,8 @@ def read_triples(table: Table, columns: tuple[str, ...]) -> tuple[FloatArray, Fl
 
 def table_correlations(table: Table, columns: tuple[str, ...]) -> FloatArray:
     """Correlations (n, k), zero where blank."""
-    rho = np.nan_to_num(np.stack([table.numbers(name) for name in columns], axis=1))
+    rho = np.stack([table.numbers(name) for name in columns], axis=1)
+    rho[np.isnan(rho)] = 0.0
     wrong = np.abs(rho) >= 1
     if wrong.any():
         row, i = (int(x[0]) for x in np.nonzero(wrong))

@@ -6,6 +6,7 @@ import io
 import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,31 +33,53 @@ _NUMBERS = re.compile(r"[-+.\deE ]+")  # the components of an axis in one cell
 Chunk = tuple[IntArray, Sequence[Sequence[str]]]
 
 
-def read_table(path: Path, layout: Layout, instead: str | None = None) -> Table:
+@dataclass(frozen=True, eq=False)
+class Begun:
+    """A table of CSV that is being read: its bytes, their sha256, and its columns as of :func:`csv_columns`."""
+
+    data: Callable[[], bytes]
+    digest: Callable[[], str]
+    columns: Callable[[], dict[str, TextColumn | FloatArray] | None]
+
+
+def begin_tables(folder: Path, layouts: Mapping[str, Layout], beside: Beside) -> dict[Path, Begun]:
+    """The large ones of these tables, read ``beside`` what comes next; none where nothing is done beside it."""
+    paths = [] if beside.alone else sorted(folder.glob("*.csv"))
+    return {path: begun_table(path, layouts[path.stem], beside) for path in paths
+            if path.stem in layouts and path.is_file() and path.stat().st_size >= LARGE}  # fmt: skip
+
+
+def begun_table(path: Path, layout: Layout, beside: Beside, instead: str | None = None) -> Begun:
+    """:func:`read_table`, begun."""
+    data = beside.of(lambda: content(path) if instead is None else instead.encode())
+    digest = beside.of(lambda: with_digest(data())[1])
+    return Begun(data, digest, beside.of(lambda: csv_columns(data(), layout) if path.suffix == ".csv" else None))
+
+
+def read_table(path: Path, layout: Layout, instead: str | None = None, begun: Begun | None = None) -> Table:
     """Read ``.csv`` or ``.parquet``; raises SurveyError with file and line for whatever does not fit the layout.
 
-    instead: what is to stand in it, not yet written.
+    instead: what is to stand in it, not yet written. begun: what was begun of it.
     """
-    data = content(path) if instead is None else instead.encode()
-    with Beside() as hashing:
-        digest = hashing.of(lambda: with_digest(data)[1])
-        return _read(path, layout, data, digest)
+    with Beside() as beside:
+        return _read(path, layout, begun or begun_table(path, layout, beside, instead))
 
 
-def _read(path: Path, layout: Layout, data: bytes, digest: Callable[[], str]) -> Table:
+def _read(path: Path, layout: Layout, begun: Begun) -> Table:
     if path.suffix == ".parquet":
-        columns = parquet_columns(path, data, layout)
-        return _table(path, layout, digest(), np.arange(1, len(next(iter(columns.values()))) + 1), columns)
-    plain = csv_columns(data, layout)
+        columns = parquet_columns(path, begun.data(), layout)
+        lines = np.arange(1, len(next(iter(columns.values()))) + 1)
+        return _table(path, layout, begun.digest(), lines, columns)
+    plain = begun.columns()
     if plain is not None:
-        return _table(path, layout, digest(), np.arange(2, len(next(iter(plain.values()))) + 2), plain)
-    text = decode(path, data)
+        return _table(path, layout, begun.digest(), np.arange(2, len(next(iter(plain.values()))) + 2), plain)
+    text = decode(path, begun.data())
     if not text.strip():
         raise SurveyError(f"{path}:1: the file is empty; the first line names the columns: {','.join(layout.required)}")
     check_rows(path, text.count("\n"))
     header, chunks = csv_chunks(path, text)
     check_header(path, header, layout)
-    return _assemble(path, layout, digest(), header, chunks)
+    return _assemble(path, layout, begun.digest(), header, chunks)
 
 
 def _assemble(path: Path, layout: Layout, digest: str, header: Sequence[str], chunks: Iterable[Chunk]) -> Table:

@@ -1,8 +1,6 @@
 """Tables of image points into one block per camera, epoch and target, without a step per row."""
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -10,13 +8,15 @@ import numpy as np
 from adjust.lenses.crops import possible_sizes
 from adjust.model.names import natural_key
 from adjust.model.observations import ImageBlock, ImageBlocks, ImagePoints
-from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.model.survey import FloatArray, IntArray, Survey
+from adjust.native.parallel import side_by_side
 from survey.folder.text import suggestion
-from survey.project.project import ImagePointsWhere, Sigmas, SpotBlock
+from survey.project.project import Sigmas, SpotBlock
 from survey.project.tables.covariance import covariance_from_sigmas, sigmas_and_correlations, table_correlations
 from survey.project.tables.reading import Columns, Layout, Table, TextColumn, checked_groups, first_row
 from survey.project.tables.references import Names
 
+_PART = 2**15  # rows at a time
 _SIGMAS = ("sigma_u_px", "sigma_v_px", "rho_uv")
 IMAGE_POINTS = Layout(
     "image_points",
@@ -28,16 +28,6 @@ IMAGE_POINTS = Layout(
 SPOTS = Layout("spots", ("epoch_id", "camera_id", "spot_id"), ("u_px", "v_px"), (), _SIGMAS)
 
 
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """The rows of a table as numbers: codes in natural order of names, positions of points, measured values."""
-
-    camera: IntArray
-    epoch: IntArray
-    uv: FloatArray
-    cov: FloatArray
-
-
 def world_names(table: Table) -> set[str]:
     """Ids of the points without target."""
     target, point = table.text("target_id"), table.text("point_id")
@@ -47,77 +37,71 @@ def world_names(table: Table) -> set[str]:
     return {point.names[code] for code in np.unique(point.codes[in_world]).tolist()}
 
 
-def read_image_blocks(table: Table, names: Names, sigmas: Sigmas) -> tuple[tuple[ImageBlock, ...], ImagePointsWhere]:
+def read_image_blocks(table: Table, names: Names, sigmas: Sigmas) -> tuple[ImageBlock, ...]:
     """Blocks by camera, epoch, target (the world's points last) and group; their points in the target's order."""
     cameras, epochs = table.ids("camera_id"), table.ids("epoch_id")
     targets, groups = table.text("target_id"), _groups(table)
-    rows = _measured(table, cameras, epochs, names, sigmas, groups)
+    uv, cov = _measured(table, cameras, names, sigmas, groups)
     point_idx = _point_positions(table, targets, names)
-    target, group = _ranks(targets, blank_last=True), _ranks(groups)
-    _refuse_duplicates(table, "point_id", rows.camera, rows.epoch, target, point_idx)
-    block = rows.camera, rows.epoch, target, group
-    order = ordered(*block, point_idx)[0]
-    ptr, used = _starts(order, block), table.flags("used")
-    first = order[ptr[:-1]]
+    seen = one_code(_ranks(cameras), _ranks(epochs), _ranks(targets, blank_last=True))
+    order, ptr = _arranged(table, "point_id", seen, point_idx, _ranks(groups))
+    first, used = order[ptr[:-1]], table.flags("used")
     texts = [TextColumn(c.names, c.codes[first]).values() for c in (cameras, epochs, targets, groups)]
-    place: IntArray | slice = slice(None) if (order == np.arange(len(order))).all() else order
-    point_idx, uv, cov, used, lines = point_idx[place], rows.uv[place], rows.cov[place], used[place], table.lines[place]
+    if (order != np.arange(len(order))).any():
+        point_idx, uv, cov, used = point_idx[order], uv[order], cov[order], used[order]
     all_used = np.logical_and.reduceat(used, ptr[:-1]).tolist() if len(first) else []
-    blocks, where = [], []
+    blocks = []
     ranges = pairwise(ptr.tolist())
     for (i, j), whole, camera, epoch, target_id, group_name in zip(ranges, all_used, *texts, strict=True):
         kept = None if whole else used[i:j]
         blocks.append(ImageBlock(camera, epoch, target_id or None, point_idx[i:j], uv[i:j], cov[i:j], kept, group_name))
-        where.append(lines[i:j])
-    return ImageBlocks(blocks, ImagePoints(ptr, point_idx, uv, cov, used)), ImagePointsWhere(table.path, tuple(where))
+    return ImageBlocks(blocks, ImagePoints(ptr, point_idx, uv, cov, used))
 
 
 def read_spots(table: Table, names: Names, sigmas: Sigmas) -> tuple[SpotBlock, ...]:
     """Unidentified spots in blocks by camera and epoch, sorted by id."""
     cameras, epochs, spots = table.ids("camera_id"), table.ids("epoch_id"), table.ids("spot_id")
     image = TextColumn(("image",), np.zeros(len(table), dtype=np.int64))
-    rows = _measured(table, cameras, epochs, names, sigmas, image)
-    spot = _ranks(spots)
-    _refuse_duplicates(table, "spot_id", rows.camera, rows.epoch, spot)
-    order, blocks = ordered(rows.camera, rows.epoch, spot)[0], []
-    for i, j in pairwise(_starts(order, (rows.camera, rows.epoch)).tolist()):
+    uv, cov = _measured(table, cameras, names, sigmas, image)
+    order, ptr = _arranged(table, "spot_id", one_code(_ranks(cameras), _ranks(epochs)), _ranks(spots), image.codes)
+    blocks = []
+    for i, j in pairwise(ptr.tolist()):
         part = order[i:j]
         camera_id, epoch_id = (column.names[column.codes[part[0]]] for column in (cameras, epochs))
         spot_ids = tuple(spots.names[code] for code in spots.codes[part].tolist())
-        blocks.append(SpotBlock(camera_id, epoch_id, spot_ids, rows.uv[part], rows.cov[part]))
+        blocks.append(SpotBlock(camera_id, epoch_id, spot_ids, uv[part], cov[part]))
     return tuple(blocks)
 
 
-def ordered(*codes: IntArray) -> tuple[IntArray, BoolArray]:
-    """Rows (n,) in the order of these codes, the first first; which of them (n - 1,) has the same as the one before.
+def one_code(*codes: IntArray) -> IntArray:
+    """One code (n,) of each row, that sorts as these do one after the other, the first first."""
+    key = codes[0]
+    for code in codes[1:]:
+        size = int(code.max(initial=0)) + 1
+        if (int(key.max(initial=0)) + 1) * size >= 2**62:
+            key = np.unique(key, return_inverse=True)[1].reshape(-1)
+        key = key * size + code
+    return key
 
-    Rows that are in order already, as this program writes them, cost next to nothing.
+
+def _arranged(table: Table, column: str, seen: IntArray, item: IntArray, group: IntArray) -> tuple[IntArray, IntArray]:
+    """The rows (n,) by what was ``seen`` where and when, group and item, and where (b + 1,) one of the first two ends.
+
+    Raises SurveyError where the same item of ``column`` was seen twice.
     """
-    sizes = [int(c.max(initial=0)) + 1 for c in codes]
-    if math.prod(sizes) < 2**62:
-        key = codes[0]
-        for code, size in zip(codes[1:], sizes[1:], strict=True):
-            key = key * size + code
-        order = np.argsort(key, kind="stable")
-        return order, np.diff(key[order]) == 0
-    order = np.lexsort(codes[::-1])
-    return order, ~_changes(order, codes)
-
-
-def _changes(order: IntArray, codes: Sequence[IntArray]) -> BoolArray:
-    """Where along ``order`` (n,) one of the codes changes (n - 1,)."""
-    out: BoolArray = np.zeros(max(len(order) - 1, 0), dtype=np.bool_)
-    for code in codes:
-        of_row = code[order]
-        out |= of_row[1:] != of_row[:-1]
-    return out
-
-
-def _starts(order: IntArray, codes: Sequence[IntArray]) -> IntArray:
-    """Ranges (b + 1,) of ``order`` (n,) over which the codes stay the same."""
-    if not len(order):
-        return np.zeros(1, dtype=np.int64)
-    return np.concatenate([[0], np.flatnonzero(_changes(order, codes)) + 1, [len(order)]])
+    every = one_code(seen, item)
+    order = np.argsort(every, kind="stable")  # of what is in order already, as this program writes it, next to nothing
+    same = np.flatnonzero(np.diff(every[order]) == 0)
+    if len(same):
+        i = same[np.argmin(order[same + 1])]
+        name = table.text(column).values()[order[i]]
+        line = table.lines[order[i]]
+        problem = f"{name!r} stands already in line {line} for this camera, epoch and target; remove one"
+        raise table.error(int(order[i + 1]), f"{column}: {problem}")
+    block = one_code(seen, group)
+    order = order[np.argsort(block[order], kind="stable")] if group.any() else order
+    ends = np.flatnonzero(np.diff(block[order], append=-1))
+    return order, np.concatenate([[0], ends + 1])
 
 
 def _groups(table: Table) -> TextColumn:
@@ -133,24 +117,33 @@ def _ranks(column: TextColumn, blank_last: bool = False) -> IntArray:
 
 
 def _measured(
-    table: Table, cameras: TextColumn, epochs: TextColumn, names: Names, sigmas: Sigmas, groups: TextColumn
-) -> _Rows:
+    table: Table, cameras: TextColumn, names: Names, sigmas: Sigmas, groups: TextColumn
+) -> tuple[FloatArray, FloatArray]:
+    """Image coordinates (n, 2) px and their covariances (n, 2, 2) px^2; part by part, as far as a core's own memory."""
     sizes = {camera.camera_id: np.max(possible_sizes(camera), axis=0) for camera in names.survey.cameras}
     for code, name in enumerate(cameras.names):
         if name not in sizes:
             row = first_row(cameras.codes == code)
             raise table.error(row, f"camera_id: unknown camera {name!r}; {suggestion(name, sizes)}")
-    uv = np.stack([table.numbers("u_px"), table.numbers("v_px")], axis=1)
     size = np.array([sizes[name] for name in cameras.names], dtype=float).reshape(-1, 2)
-    out_u, out_v = ((x < -0.5) | (x > most[cameras.codes]) for x, most in zip(uv.T, size.T - 0.5, strict=True))
-    outside = out_u | out_v
-    if outside.any():
-        row = first_row(outside)
-        width, height = size[cameras.codes[row]].astype(int)
-        problem = f"the point ({uv[row, 0]:g}, {uv[row, 1]:g}) px is outside the image of {width} x {height} px"
-        raise table.error(row, f"{problem}; correct the table or image_size_px")
-    scale = np.array([sigmas.scale.get(name, 1.0) for name in groups.names])[groups.codes]
-    return _Rows(_ranks(cameras), _ranks(epochs), uv, _covariances(table, sigmas.image_px, scale))
+    scale = np.array([sigmas.scale.get(name, 1.0) for name in groups.names])
+    ends = np.ascontiguousarray(size.T - 0.5)
+    uv, cov = np.empty((len(table), 2)), np.empty((len(table), 2, 2))
+
+    def measure(first: int) -> None:
+        rows = slice(first, first + _PART)
+        part, camera = table.part(rows), cameras.codes[rows]
+        uv[rows, 0], uv[rows, 1] = part.numbers("u_px"), part.numbers("v_px")
+        outside = np.logical_or(*((x < -0.5) | (x > most[camera]) for x, most in zip(uv[rows].T, ends, strict=True)))
+        if outside.any():
+            row = first_row(outside)
+            (u, v), (width, height) = uv[first + row], size[camera[row]].astype(int)
+            problem = f"the point ({u:g}, {v:g}) px is outside the image of {width} x {height} px"
+            raise part.error(row, f"{problem}; correct the table or image_size_px")
+        cov[rows] = _covariances(part, sigmas.image_px, scale[groups.codes[rows]])
+
+    side_by_side(measure, range(0, len(table), _PART))
+    return uv, cov
 
 
 def _covariances(table: Table, default_px: float | None, scale: FloatArray) -> FloatArray:
@@ -201,17 +194,6 @@ def _distinct(codes: IntArray) -> tuple[IntArray, IntArray, IntArray]:
     first = at[values]
     at[values] = np.arange(len(values))
     return values, first, at[codes]
-
-
-def _refuse_duplicates(table: Table, column: str, *codes: IntArray) -> None:
-    order, same_as_before = ordered(*codes)
-    same = np.flatnonzero(same_as_before)
-    if len(same):
-        i = same[np.argmin(order[same + 1])]
-        name = table.text(column).values()[order[i]]
-        line = table.lines[order[i]]
-        problem = f"{name!r} stands already in line {line} for this camera, epoch and target; remove one"
-        raise table.error(int(order[i + 1]), f"{column}: {problem}")
 
 
 def image_point_columns(blocks: Sequence[ImageBlock], survey: Survey) -> Columns:

@@ -16,8 +16,9 @@ from markupsafe import Markup
 
 from adjust.model.result import ObservationResidual
 from adjust.model.survey import FloatArray, IntArray
+from adjust.native.text import NUMBERS, TEXT, Words, record_rows
 from survey.project.observed import name_of_residual
-from survey.report.context import Context, other_components, worst
+from survey.report.context import Context, Listed, other_components, worst
 from survey.report.language import group_name, known, t
 from survey.report.markup import (
     MISSING,
@@ -27,6 +28,7 @@ from survey.report.markup import (
     fixed,
     general,
     joined,
+    json_of,
     json_script,
     part,
     pill,
@@ -173,13 +175,11 @@ def _excluded_row(e: dict[str, Any], limit: float) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def every_observation(c: Context) -> Markup:
-    """The section; nothing where there is no observation."""
+def listed(c: Context) -> Listed:
+    """What the table of all observations shows, as far as it needs no statistics."""
     n_image = c.adjustment.image_residuals.standardized.size
     observation, component, others_w = other_components(c.adjustment)
     w = np.concatenate([c.adjustment.image_residuals.standardized.ravel(), others_w])
-    if not len(w):
-        return Markup()
     chosen = worst(w, MOST)
     of_image = chosen < n_image
     parts = (
@@ -189,18 +189,23 @@ def every_observation(c: Context) -> Markup:
     texts, values = np.empty((len(_NAMES), len(chosen)), dtype=object), np.empty((_N_VALUES, len(chosen)))
     for mine, (part_texts, part_values) in parts:
         texts[:, mine], values[:, mine] = part_texts, part_values
-    names = dict(zip(_NAMES, texts.tolist(), strict=True))
-    numbers = _numbers(values) | _reliability(c, values)
-    made = [
-        {"key": x, "title": known(x)}
-        | (_coded(names[x]) if x in _NAMES else _numeric(x, numbers[x], _digits(x, numbers, values))) for x in COLUMNS
-    ]  # fmt: skip
+    columns = {name: _json_column(name, _coded(own)) for name, own in zip(_NAMES, texts.tolist(), strict=True)}
+    columns |= _numeric(_numbers(values), values)
     n_images = len(c.adjustment.image_residuals.test)
     seen, of = np.unique(values[10].astype(int), return_inverse=True)
     each = ["" if k < n_images else name_of_residual(c.adjustment.other_residuals[k - n_images]) for k in seen.tolist()]
-    readings = [each[i] for i in of.tolist()]
-    data = {"rows": len(chosen), "columns": made, "flags": values[9].astype(int).tolist(),
-            "places": _coded(readings), "at": [COLUMNS.index("Where"), COLUMNS.index("Point")]}  # fmt: skip
+    places = _coded([each[i] for i in of.tolist()])
+    rest = {"rows": len(chosen), "flags": values[9].astype(int).tolist(), "places": places,
+            "at": [COLUMNS.index("Where"), COLUMNS.index("Point")]}  # fmt: skip
+    return Listed(len(w), values, columns, json_of(rest))
+
+
+def every_observation(c: Context) -> Markup:
+    """The section; nothing where there is no observation."""
+    rows = c.listed or listed(c)
+    if not rows.total:
+        return Markup()
+    n, columns = rows.values.shape[1], rows.columns | _numeric(_reliability(c, rows.values), rows.values)
     said = t(
         "Every observation, one row per component, largest |w| first. w: Baarda's standardized residual. Gross error: "
         "estimated. MDB: the bias of this component alone that its test finds with the stated power; λ̄: how many of "
@@ -209,10 +214,11 @@ def every_observation(c: Context) -> Markup:
     if c.statistics is not None:
         power = c.statistics.reliability.criteria.options.power
         said += " " + t("Power {power} %.", power=fixed(100 * power, 0))
-    if len(w) > len(chosen):
-        shown = {"shown": count(len(chosen)), "n": count(len(w))}
+    if rows.total > n:
+        shown = {"shown": count(n), "n": count(rows.total)}
         said += " " + t("The worst {shown} of {n}; all in residuals.csv and residuals_other.csv.", **shown)
     table = part("all_observations", of="report.html")
+    data = f'{{"columns":[{",".join(columns[name] for name in COLUMNS)}],{rows.rest[1:]}'
     return section("all-observations", "All observations", table + json_script("all-data", data), said)
 
 
@@ -222,24 +228,27 @@ def _coded(values: Sequence[str]) -> dict[str, Any]:
     return {"names": names, "codes": [at[v] for v in values]}
 
 
-def _numeric(name: str, values: FloatArray, digits: IntArray) -> dict[str, Any]:
-    power = 10.0 ** np.maximum(digits, 0)
-    out: list[Any] = (np.rint(values * power) / power).tolist()
-    finite = np.isfinite(values)
-    for i in np.flatnonzero(finite & (digits <= 0)).tolist():
-        out[i] = int(out[i])
-    for i in np.flatnonzero(~finite).tolist():
-        out[i] = None
-    return {"values": out, "size": name in _BY_SIZE}
+def _json_column(name: str, said: dict[str, Any]) -> str:
+    return json_of({"key": name, "title": known(name)} | said)
 
 
-def _digits(name: str, numbers: dict[str, FloatArray], values: FloatArray) -> IntArray:
+def _numeric(numbers: dict[str, FloatArray], values: FloatArray) -> dict[str, str]:
+    """Columns of numbers as JSON, each with its decimals; null where there is none."""
+    words, none = Words.of(["null", ","]), np.empty((values.shape[1], 0), dtype=np.int64)
+    out = {}
+    for name, of in numbers.items():
+        power = 10.0 ** _digits(name, values)
+        rounded = (np.rint(of * power) / power)[:, None]
+        text = record_rows(words, none, rounded, ((NUMBERS, 1), (TEXT, 1)))[0].decode().removesuffix(",")
+        out[name] = f'{_json_column(name, {"size": name in _BY_SIZE})[:-1]},"values":[{text}]}}'
+    return out
+
+
+def _digits(name: str, values: FloatArray) -> IntArray:
     """Decimals: two digits of the sigma, three for its fractions; fixed ones for numbers without unit."""
-    sigma = numbers["σ"]
     if name in ("Redundancy", "w", "λ̄"):
-        return np.full(len(sigma), 2, dtype=np.int64)
-    if name in ("Observed", "Adjusted"):
-        sigma = sigma * values[7] / values[8]
+        return np.full(values.shape[1], 2, dtype=np.int64)
+    sigma = values[2] * values[7 if name in ("Observed", "Adjusted") else 8]
     with np.errstate(divide="ignore", invalid="ignore"):
         places = 2 - np.floor(np.log10(np.where(sigma > 0, sigma, np.nan)))
     return np.asarray(np.clip(np.nan_to_num(places, nan=4.0), 0, 9).astype(np.int64))
