@@ -11,7 +11,7 @@ from adjust.frames.unknowns import Unknowns
 from adjust.model.survey import FloatArray, IntArray
 from adjust.observations.images.bundle_hidden import BundleHidden
 from adjust.precision.s_transformation import STransformation
-from adjust.precision.tree import TreeCovariance, unit_rows
+from adjust.precision.tree import Half, TreeCovariance, squares, squares_of_sums, unit_rows
 
 AT_ONCE = 64
 """Columns that the matrix is multiplied by in one go."""
@@ -90,20 +90,29 @@ class Stacked:
 
     def among(self, A: sparse.csr_array) -> FloatArray:
         """A Q A' (m, m) of rows A (m, n): in any datum, where they are of observations."""
-        by_column = A.tocsc()
-        out, in_tree = np.zeros((A.shape[0],) * 2), by_column[:, : self.tree.n].tocsr()
+        return squares(self._half, A) if self.hidden else self.tree.among(A)
+
+    def among_sums(self, A: sparse.csr_array, q: int) -> FloatArray:
+        """The same (J, q, q) of the sums of the J sets of q rows from each on."""
+        return squares_of_sums(self._half, A, self.n, q)
+
+    def _half(self, A: sparse.csr_array) -> Half:
+        """Of some rows."""
+        if not self.hidden:
+            return self.tree.half(A)
+        by_column, rows, parts = A.tocsc(), list[IntArray](), list[FloatArray]()
+        in_tree = by_column[:, : self.tree.n].tocsr()
         for below, mine, interface in self._parts:
-            hidden = by_column[:, mine]
-            number = np.bincount(hidden.indices, minlength=len(out))
-            rows = np.flatnonzero(number)
-            if len(rows):
-                number[rows], right = np.arange(len(rows)), np.zeros((below.n, len(rows)))
-                right[np.repeat(np.arange(below.n), np.diff(hidden.indptr)), number[hidden.indices]] = hidden.data
-                own, over = below.among(right)
-                out[np.ix_(rows, rows)] += own
-                places = np.repeat(rows, len(interface)), np.tile(interface, len(rows))
-                in_tree = in_tree + sparse.csr_array((over.ravel(), places), in_tree.shape)
-        return out + self.tree.among(in_tree)
+            if by_column.indptr[mine.start] == by_column.indptr[mine.stop]:
+                continue
+            at, U, over = below.half(by_column[:, mine].T.toarray())
+            some = np.flatnonzero(over.any(axis=1))
+            places = np.repeat(some, len(interface)), np.tile(interface, len(some))
+            in_tree = in_tree + sparse.csr_array((over[some].ravel(), places), in_tree.shape)
+            parts.append(U)
+            rows.append(mine.start + at)
+        at, U = self.tree.half(in_tree)
+        return np.concatenate([at, *rows]), np.concatenate([U, *parts])
 
     def drawn(self, k: int) -> FloatArray:
         """Errors (n, k) of k solutions, drawn with the covariance in the survey's datum; always the same."""

@@ -29,10 +29,10 @@ from adjust.testing.quadratic_forms import pseudo_squares
 
 _SEEN = 1e-4
 """Share of a column that no unknown takes over, below which it is not told from rounding."""
-_MOST_RUNS = 256
-"""Of a system without structure, where every run is compared with every other."""
-_ROOM = 2e7
-"""Numbers that all possible changes may need."""
+_MOST_RUNS, _MOST_COLUMNS = 256, 12_000
+"""Of a system without structure, where every column of a run goes through the tree."""
+_ROOM = 20_000_000
+"""Numbers that all possible changes of others may need."""
 _MOST, _MOST_OF_ONE = 20, 2
 """Changes that are named: in all, and of the same kind of one camera, target or table, which may drift without end."""
 _SHAPES = {True: (("width", "1"), ("height", "1"), ("sag along x", "m"), ("sag along y", "m")),
@@ -101,14 +101,9 @@ class ChangeSearch:
         self.runs = _MOST_RUNS if shared is None else max(2, len(self.epochs), len(read))
         units = list(self._units(self.runs))
 
-        def numbers(runs: Sequence[int]) -> float:
-            """That M of every unit needs, or what it is made of."""
-            columns = [u.B.shape[1] * n for u, n in zip(units, runs, strict=True)]
-            return float(sum(k * (k if shared is None else shared) for k in columns))
-
-        if numbers([len(u.epochs) for u in units]) > _ROOM:
-            share = _ROOM / numbers([1] * len(units))
-            self.runs = int(np.clip(share if shared is not None else np.sqrt(share), 2, self.runs))
+        columns, most = sum(u.B.shape[1] * len(u.epochs) for u in units), _MOST_COLUMNS if shared is None else _ROOM // shared
+        if columns > most:
+            self.runs = int(np.clip(self.runs * most // columns, 2, self.runs))
             units = list(self._units(self.runs))
         self.candidates = side_by_side(lambda u: self._candidates(_by_runs(u)), units)
         self.n_tests = sum(len(c.g) for c in self.candidates)
@@ -249,11 +244,7 @@ def _taken(system: LinearSystem, X: sparse.csr_matrix, J: int) -> FloatArray:
     """XQX' of the runs from j on together (J, q, q); X (J q, n) of the runs by themselves."""
     q, sums = X.shape[0] // J, system.structured
     if sums is None:
-        M, out = system.among(X).reshape(J, q, J, q), np.empty((J, q, q))
-        for j in range(J):
-            later = M[j, :, j + 1 :].sum(axis=1)
-            out[j] = M[j, :, j] + later + later.T
-        return np.cumsum(out[::-1], axis=0)[::-1]
+        return system.among_sums(X, q)
     own = (X @ (sums.own @ X.T)).tocoo()
     (a, i), (b, k) = np.divmod(own.row, q), np.divmod(own.col, q)
     of_run = np.bincount((np.minimum(a, b) * q + i) * q + k, own.data, J * q * q).reshape(J, q, q)

@@ -131,15 +131,25 @@ class LinearSystem:
         """``R Q R'`` (c, c) of sparse rows R (c, n) of the normal equations, or of what is observed: in any datum."""
         if len(self.columns) <= PLAIN:
             return np.asarray(rows @ self.normal.solve(rows.T.toarray()))
-        stacked, entries = self.precision.stacked, (rows.data, self._stacked[rows.indices], rows.indptr)
-        return stacked.among(sparse.csr_array(entries, (rows.shape[0], stacked.n)))
+        return self.precision.stacked.among(self._in_stack(rows))
+
+    def among_sums(self, rows: sparse.csr_matrix, q: int) -> FloatArray:
+        """The same (J, q, q) of the sums of the J sets of q rows from each on, as of what changed since then."""
+        if len(self.columns) <= PLAIN:
+            sums = np.cumsum(rows.toarray().reshape(-1, q, rows.shape[1])[::-1], axis=0)[::-1]
+            return np.asarray(sums @ self.normal.solve(sums.reshape(rows.shape).T).T.reshape(sums.shape).transpose(0, 2, 1))
+        return self.precision.stacked.among_sums(self._in_stack(rows), q)
+
+    def _in_stack(self, rows: sparse.csr_matrix) -> sparse.csr_array:
+        """Rows (c, n) over a stacked vector of the precision's unknowns."""
+        entries = rows.data, self._stacked[rows.indices], rows.indptr
+        return sparse.csr_array(entries, (rows.shape[0], self.precision.stacked.n))
 
     def among_each(self, rows: sparse.csr_matrix, ptr: IntArray) -> list[FloatArray]:
         """The same of sets of rows, set i from ``ptr[i]`` on."""
         if len(self.columns) <= PLAIN or self.precision.hidden:
             return [self.among(rows[i:j]) for i, j in pairwise(ptr.tolist())]
-        entries = rows.data, self._stacked[rows.indices], rows.indptr
-        return self.precision.tree.each_among(sparse.csr_array(entries, (rows.shape[0], self.precision.tree.n)), ptr)
+        return self.precision.tree.each_among(self._in_stack(rows), ptr)
 
     def drawn(self, k: int) -> FloatArray:
         """Errors (n, k) of k solutions, drawn with the covariance in the survey's datum; always the same."""

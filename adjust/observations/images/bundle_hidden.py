@@ -3,7 +3,7 @@
 import numpy as np
 import scipy
 
-from adjust.model.survey import FloatArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.native.bundles import (
     PointCovariances,
     between_poses,
@@ -128,7 +128,10 @@ class BundleHidden:
         b = self.batch
         nh, k = b.n_hidden, right.shape[1]
         local = np.zeros((b.n_local, k))
-        of_points(b.arrays, b.of_reduced, b.Vi @ right[nh:].reshape(-1, 3, k), local)
+        points = right[nh:].reshape(-1, 3, k)
+        seen, own = np.flatnonzero(points.any(axis=(1, 2))), np.zeros(points.shape)
+        own[seen] = b.Vi[seen] @ points[seen]
+        of_points(b.arrays, b.of_reduced, own, local)
         out = np.asarray(b.G.T @ local)
         out[:nh] += right[:nh]
         return out
@@ -165,13 +168,17 @@ class BundleHidden:
         dX = b.points_following(np.asarray(b.G @ d), np.zeros_like(own)) + own
         return np.concatenate([d[:nh], dX.reshape(-1, k)])
 
-    def among(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Of rows over what is hidden, right (n, m): A Q A' (m, m) were the interface held; what they are over it."""
+    def half(self, right: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Of rows over what is hidden, right (n, m): U (k, m) with U'U = A Q A' were the interface held.
+
+        Before it which (k,) of all n rows of U these are, after it what they are over the interface (m, n_interface).
+        """
         b, m = self.batch, right.shape[1]
-        nh, u = b.n_hidden, self.on_poses(right)
-        half = (np.swapaxes(np.linalg.cholesky(b.Vi), 1, 2) @ right[nh:].reshape(-1, 3, m)).reshape(-1, m)
-        own = half.T @ half
+        nh, points = b.n_hidden, right[b.n_hidden :].reshape(-1, 3, m)
+        u, seen = self.on_poses(right), np.flatnonzero(points.any(axis=(1, 2)))
+        half = (np.swapaxes(np.linalg.cholesky(b.Vi[seen]), 1, 2) @ points[seen]).reshape(-1, m)
+        rows = (nh + 3 * seen[:, None] + np.arange(3)).ravel()
         if nh:
-            half = scipy.linalg.lapack.dtrtrs(b.C, u[:nh] / b.scale[:nh, None], lower=0, trans=1)[0]
-            own += half.T @ half
-        return own, self.on_interface(u).T
+            of_poses = scipy.linalg.lapack.dtrtrs(b.C, u[:nh] / b.scale[:nh, None], lower=0, trans=1)[0]
+            rows, half = np.concatenate([np.arange(nh), rows]), np.concatenate([of_poses, half])
+        return rows, half, self.on_interface(u).T
