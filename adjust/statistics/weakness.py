@@ -69,16 +69,19 @@ def correlations(
     if n <= PLAIN or (n <= DENSE and system.structured is not None):
         sigma = np.sqrt(np.maximum(np.diag(system.covariance), 1e-300))
         C = system.covariance / sigma / sigma[:, None]
-        pairs = _largest(lambda rows, part: C[rows, part], n, n, limit)
+        pairs = _largest(lambda rows, part: np.abs(C[rows, part]), n, n, limit)
         return _named(system, _above(pairs, C[pairs[:, 0], pairs[:, 1]], limit))
     pairs = _likely(system, index, limit)
     columns = np.array(list(dict.fromkeys(pairs[:, 1].tolist()))[: max(_SOLVED // n, AT_ONCE)], dtype=np.int64)
     number = np.full(n, -1)
     number[columns] = np.arange(len(columns))
-    pairs = pairs[number[pairs[:, 1]] >= 0]
-    parts = [columns[i : i + AT_ONCE] for i in range(0, max(len(columns), 1), AT_ONCE)]
-    Q = np.hstack(side_by_side(lambda part: system.through_tree(_units(system, part)), parts))
-    found = _above(pairs, Q[pairs[:, 0], number[pairs[:, 1]]] / system.sigmas[pairs].prod(axis=1), limit)
+
+    def of(first: int) -> _Found:
+        some = pairs[number[pairs[:, 1]] // AT_ONCE == first // AT_ONCE]
+        Q = system.through_tree(_units(system, columns[first : first + AT_ONCE]))
+        return _above(some, Q[some[:, 0], number[some[:, 1]] - first] / system.sigmas[some].prod(axis=1), limit)
+
+    found = [x for part in side_by_side(of, range(0, len(columns), AT_ONCE)) for x in part]
     return _named(system, found + (_within(system, index, limit) if len(index) < n else []))
 
 
@@ -97,32 +100,42 @@ def _likely(system: LinearSystem, index: IntArray, limit: float) -> IntArray:
     drawn /= np.maximum(np.linalg.norm(drawn, axis=1), 1e-150)[:, None]
     order = np.concatenate([index, np.delete(np.arange(len(drawn)), index)])
     u, z = drawn[order].astype(np.float32), np.arctanh(limit) - _SURE / np.sqrt(_DRAWS - 2.0)
-    pairs = order[_largest(lambda rows, part: u[rows] @ u[part].T, len(u), len(index), np.tanh(max(z, 1e-9)))]
+
+    def size(rows: slice, part: slice) -> FloatArray:
+        x = u[rows] @ u[part].T
+        return np.abs(x, out=x)
+
+    pairs = order[_largest(size, len(u), len(index), float(np.tanh(max(z, 1e-9))))]
     often = np.bincount(pairs.ravel(), minlength=len(u))[pairs]
     return np.where(often[:, :1] > often[:, 1:], pairs[:, ::-1], pairs)
 
 
-def _largest(block: Callable[[slice, slice], FloatArray], total: int, n: int, least: float) -> IntArray:
+def _largest(size: Callable[[slice, slice], FloatArray], total: int, n: int, least: float) -> IntArray:
     """Pairs (k, 2) of n columns with each other and with all others, those at least of a size, the largest first.
 
-    block: of some rows and columns. total: rows. Small blocks: what is not so large is never written to memory, and
-    what is smaller than enough others that were found before is not so large.
+    size: of some rows and columns. total: rows. Small blocks: what is not so large is never written to memory, and
+    what is smaller than enough others, of neighbours first, is not so large.
     """
+    parts = [slice(first, min(first + _COMPARED, n)) for first in range(0, n, _COMPARED)]
 
-    def above(first: int) -> FloatArray:
-        part, found = slice(first, min(first + _COMPARED, n)), [np.zeros((0, 3))]
-        for row in range(first, total, 4 * _COMPARED):
-            size = np.abs(block(slice(row, row + 4 * _COMPARED), part))
-            if row == first:
-                size[: size.shape[1]] = np.tril(size[: size.shape[1]], -1)  # each pair once, nothing with itself
-            if size.max() >= least:
-                i, j = np.nonzero(size >= least)
-                found.append(np.stack([row + i, first + j, size[i, j]], axis=1))
+    def above(part: slice) -> FloatArray:
+        found = [np.zeros((0, 3))]
+        for row in range(part.start, total, 4 * _COMPARED):
+            x = size(slice(row, row + 4 * _COMPARED), part)
+            if row == part.start:
+                x[: x.shape[1]] = np.tril(x[: x.shape[1]], -1)  # each pair once, nothing with itself
+            if x.max() >= least:
+                at = np.flatnonzero(x >= least)
+                i, j = np.divmod(at, x.shape[1])
+                found.append(np.stack([row + i, part.start + j, x.ravel()[at]], axis=1))
         return _first(np.concatenate(found))
 
-    out, firsts = np.zeros((0, 3)), range(0, n, _COMPARED)
-    for k in range(0, len(firsts), _TOGETHER):
-        out = _first(np.concatenate([out, *side_by_side(above, firsts[k : k + _TOGETHER])]))
+    near = np.concatenate([x[x >= least] for x in (np.tril(size(part, part), -1) for part in parts)]) if parts else ()
+    if len(near) > _KEPT:
+        least = float(np.partition(near, -_KEPT)[-_KEPT])
+    out = np.zeros((0, 3))
+    for k in range(0, len(parts), _TOGETHER):
+        out = _first(np.concatenate([out, *side_by_side(above, parts[k : k + _TOGETHER])]))
         least = max(least, float(out[-1, 2])) if len(out) == _KEPT else least
     return out[:, :2].astype(np.int64)
 
