@@ -23,15 +23,15 @@ class Stacked:
     def __init__(self, tree: TreeCovariance, hidden: Sequence[BundleHidden], unknowns: Unknowns) -> None:
         self.tree, self.hidden, self.unknowns = tree, tuple(hidden), unknowns
         self.n = tree.n + sum(below.n for below in hidden)
-        self._datum: tuple[FloatArray, FloatArray, FloatArray] | None = None
+        self._datum: tuple[FloatArray, FloatArray] | None = None
 
     def move_to(self, datum: STransformation, rows: Mapping[int, FloatArray]) -> None:
         """Let the survey's datum be this one, of these rows (d, dim per key)."""
         self._datum_rows = np.zeros((len(datum.core), self.n))
         for key, row in rows.items():
             self._datum_rows[:, self.places[key]] = row
-        G, W = (np.concatenate([of[key] for key in self.places]) for of in (datum.motions, datum.spread))
-        self._datum = G, W, datum.core
+        both = [np.concatenate([of[key] for key in self.places]) for of in (datum.motions, datum.spread)]
+        self._datum = np.concatenate(both, axis=1), datum.core
 
     @cached_property
     def places(self) -> dict[int, slice]:
@@ -53,24 +53,23 @@ class Stacked:
 
     def times(self, right: FloatArray) -> FloatArray:
         """Covariance, as solved, times columns (n, k)."""
-        tree = np.array(right[: self.tree.n])
-        on_poses = [below.on_poses(right[mine]) if right[mine].any() else None for below, mine, _ in self._parts]
+        out = np.array(right, order="C")
+        tree, on_poses = out[: self.tree.n], [below.on_poses(out[mine]) if out[mine].any() else None for below, mine, _ in self._parts]
         for (below, _, interface), some in zip(self._parts, on_poses, strict=True):
             if some is not None:
                 tree[interface] += below.on_interface(some)
-        found = self.tree.times(tree)
-        hidden = (below.products(found[interface], right[mine], some)
-                  for (below, mine, interface), some in zip(self._parts, on_poses, strict=True))  # fmt: skip
-        return np.concatenate([found, *hidden])
+        self.tree.multiply(tree)
+        for (below, mine, interface), some in zip(self._parts, on_poses, strict=True):
+            below.multiply(out[mine], tree[interface], some)
+        return out
 
     def times_in_datum(self, right: FloatArray) -> FloatArray:
         """The same of the covariance in the survey's datum: S Q S' times columns."""
         out = self.times(right)
         if self._datum is not None:
-            G, W, core = self._datum
-            moved = G.T @ right
-            out += G @ (core @ moved - W.T @ right)
-            out -= W @ moved
+            both, core = self._datum
+            by_motions, by_spread = np.split(both.T @ right, 2)
+            out += both @ np.concatenate([core @ by_motions - by_spread, -by_motions])
         return out
 
     def joint(self, keys: Sequence[int]) -> FloatArray:
@@ -121,6 +120,7 @@ class Stacked:
         hidden = (below.drawn(tree[interface], w[mine]) for below, mine, interface in self._parts)
         out = np.concatenate([tree, *hidden])
         if self._datum is not None:
-            G, R = self._datum[0], self._datum_rows
+            R = self._datum_rows
+            G = self._datum[0][:, : len(R)]
             out -= G @ np.linalg.solve(R @ G, R @ out)
         return out

@@ -146,14 +146,12 @@ class TreeCovariance:
         """Length of a stacked vector of all unknowns."""
         return int(self.cliques.first[-1])
 
-    def times(self, columns: FloatArray) -> FloatArray:
-        """The whole covariance matrix times columns (n, m), without forming it."""
-        x = np.array(columns, dtype=float, order="C")
+    def multiply(self, x: FloatArray) -> None:
+        """Multiply the whole covariance matrix by columns (n, m), in place, without forming it."""
         c, every = self.cliques, np.arange(len(self.cliques), dtype=np.int64)
         begun = set(c.home[c.key_of[x.any(axis=1)]].tolist())
         up = every if 2 * len(begun) > len(c) else c.ancestors(begun)
         solve_cliques(self.arrays, up, every, c.first, c.data, x)
-        return x
 
     def drawn(self, w: FloatArray) -> FloatArray:
         """R^-1 w (n, m): errors with the whole covariance matrix, where w are independent with unit variance."""

@@ -141,20 +141,21 @@ class BundleHidden:
         nh = self.batch.n_hidden
         return on_poses[nh:] + self._hidden_poses_given_interface()[0].T @ on_poses[:nh] if nh else on_poses
 
-    def products(self, interface: FloatArray, right: FloatArray, on_poses: FloatArray | None) -> FloatArray:
-        """Covariance times right-hand sides, of what is hidden (n, k), from that of the interface (n_interface, k).
+    def multiply(self, x: FloatArray, interface: FloatArray, on_poses: FloatArray | None) -> None:
+        """Covariance times right-hand sides x (n, k) of what is hidden, in place, and that of the interface (., k).
 
-        right: (n, k) on what is hidden, which they are :meth:`on_poses`; None where they are zero. The batch must be
-        prepared.
+        on_poses: what :meth:`on_poses` makes of x. The batch must be prepared.
         """
         b = self.batch
         nh, k = b.n_hidden, interface.shape[1]
-        d = np.vstack([np.zeros((nh, k)), interface])
+        d = np.concatenate([np.zeros((nh, k)), interface])
         if nh:
             T, P = self._hidden_poses_given_interface()
             d[:nh] = T @ interface if on_poses is None else T @ interface + P @ on_poses[:nh]
-        dX = b.points_following(np.asarray(b.G @ d), -right[nh:].reshape(-1, 3, k))
-        return np.concatenate([d[:nh], dX.reshape(-1, k)])
+        x[:nh] = d[:nh]
+        np.negative(x[nh:], out=x[nh:])
+        points = x[nh:].reshape(-1, 3, k)
+        b.points_following(np.asarray(b.G @ d), points)
 
     def drawn(self, interface: FloatArray, w: FloatArray) -> FloatArray:
         """Errors of what is hidden (n, k) with those of the interface (n_interface, k); w (n, k): independent, unit."""
