@@ -25,7 +25,8 @@ _DRAWS, _SURE = 64, 7.0
 """Drawn solutions, and by how many sigmas what they tell may be wrong."""
 _COMPARED, _TOGETHER = 256, 8
 """Components that are compared with all others in one go, and how often that is done side by side."""
-_KRYLOV, _RESTARTS = 40, 50
+_BLOCK, _STEPS, _EXACT = 8, 40, 1e-8
+"""Directions that are sought together, in at most so many steps; of an eigenvalue, what its vector leaves."""
 _Found = list[tuple[int, int, float]]
 """Two components and their correlation."""
 
@@ -221,7 +222,7 @@ def weak_directions(
     A, used = system.A, system.used[system.row_of]
     squares = A.data**2 * np.repeat(used, np.diff(A.indptr))
     alone = np.sqrt(np.maximum(np.bincount(A.indices, squares, A.shape[1]), 1e-300))
-    values, vectors = _eigen(system, np.arange(len(alone)), alone, most)
+    values, vectors = _eigen(system, alone, most)
     c, out = system.columns, []
     for inflation, shares, order in inflated(values, vectors, least_inflation, _SHARE):
         amount = inflation * shares / np.linalg.norm(shares) / alone * np.sign(shares[order[0]])
@@ -246,30 +247,42 @@ def inflated(
         yield float(np.sqrt(value)), shares, large[np.argsort(-np.abs(shares[large]), kind="stable")].tolist()
 
 
-def _eigen(system: LinearSystem, index: IntArray, scale: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
-    """Largest eigenvalues (k,), the first first, and vectors (n, k) of the covariance of these columns times scales.
+def _eigen(system: LinearSystem, scale: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
+    """Largest eigenvalues (k,), the first first, and vectors (n, k) of the covariance times the scales (n,) of columns.
 
-    In large surveys by Lanczos' method, every step of it one solution of the normal equations (Golub and Van Loan 2013,
-    chapter 10): the few directions that are asked for, and not all n.
+    In large surveys by Lanczos' method with a block of vectors (Golub and Van Loan 2013, 10.3.6), every step of it one
+    solution of the normal equations: it begins with drawn errors, in which the directions sought are large already.
     """
-    n = len(index)
+    n = len(scale)
     if n <= FEW:
-        Q = covariance_columns(system, index)[index] * np.outer(scale, scale)
+        Q = covariance_columns(system, np.arange(n)) * np.outer(scale, scale)
         values, vectors = np.linalg.eigh(0.5 * (Q + Q.T))
         return values[::-1][:most], vectors[:, ::-1][:, :most]
-    from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh  # here: they take long to load
+    kept, X, m = np.empty((_BLOCK * _STEPS, n)), system.drawn(_BLOCK) * scale[:, None], 0
+    X, left = _orthonormal(X, kept[:0])
+    H, values, moves, exact = np.zeros((len(kept),) * 2), np.zeros(0), np.empty((0, 0)), np.zeros(0, dtype=np.bool_)
+    for _ in range(_STEPS):
+        own = slice(m, m := m + X.shape[1])
+        kept[own] = X.T
+        X = system.times_covariance(X * scale[:, None]) * scale[:, None]
+        H[:m, own] = kept[:m] @ X
+        H[own, :m] = H[:m, own].T
+        X, left = _orthonormal(X, kept[:m])
+        values, moves = (x[..., : -most - 1 : -1] for x in np.linalg.eigh(H[:m, :m]))
+        exact = np.linalg.norm(left @ moves[own], axis=0) <= _EXACT * values
+        if exact.all():
+            break
+    return values[exact], kept[:m].T @ moves[:, exact]
 
-    inside = np.zeros(len(system.columns))
 
-    def times(x: FloatArray) -> FloatArray:
-        inside[index] = scale * x.ravel()
-        return np.asarray(scale * system.times_covariance(inside)[index])
-
-    operator = LinearOperator((n, n), matvec=times, dtype=np.float64)
-    first = 1.0 + 0.1 * np.cos(np.arange(n))  # the same every time, at right angles to nothing in particular
-    try:
-        values, vectors = eigsh(operator, most, which="LA", v0=first, ncv=_KRYLOV, tol=1e-6, maxiter=_RESTARTS)
-    except ArpackNoConvergence as found:  # those that came out are right
-        values, vectors = found.eigenvalues, found.eigenvectors
-    order = np.argsort(-values, kind="stable")
-    return np.asarray(values)[order], np.asarray(vectors)[:, order]
+def _orthonormal(X: FloatArray, kept: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Unit vectors U (n, j) at right angles with what X (n, k) spans besides kept (m, n), and R with X = U R there."""
+    R = np.eye(X.shape[1])
+    for _ in range(2):
+        X = X - kept.T @ (kept @ X)
+        G = X.T @ X
+        size = np.sqrt(np.diag(G)) + 1e-300
+        values, vectors = np.linalg.eigh(G / size[:, None] / size)
+        some, root = values > 1e-12, np.sqrt(np.abs(values))
+        X, R = X @ (vectors / root / size[:, None])[:, some], (vectors * root * size[:, None])[:, some].T @ R
+    return X, R
