@@ -25,7 +25,7 @@ _DRAWS, _SURE = 64, 7.0
 """Drawn solutions, and by how many sigmas what they tell may be wrong."""
 _COMPARED, _TOGETHER = 256, 8
 """Components that are compared with all others in one go, and how often that is done side by side."""
-_BLOCK, _STEPS, _EXACT = 8, 40, 1e-8
+_BLOCK, _STEPS, _EXACT = 8, 40, 1e-10
 """Directions that are sought together, in at most so many steps; of an eigenvalue, what its vector leaves."""
 _Found = list[tuple[int, int, float]]
 """Two components and their correlation."""
