@@ -54,7 +54,8 @@ class Stacked:
     def times(self, right: FloatArray) -> FloatArray:
         """Covariance, as solved, times columns (n, k)."""
         out = np.array(right, order="C")
-        tree, on_poses = out[: self.tree.n], [below.on_poses(out[mine]) if out[mine].any() else None for below, mine, _ in self._parts]
+        tree = out[: self.tree.n]
+        on_poses = [below.on_poses(out[mine]) if out[mine].any() else None for below, mine, _ in self._parts]
         for (below, _, interface), some in zip(self._parts, on_poses, strict=True):
             if some is not None:
                 tree[interface] += below.on_interface(some)

@@ -39,7 +39,7 @@ def unit_rows(at: IntArray, n: int) -> sparse.csr_array:
 
 
 Half: TypeAlias = tuple[IntArray, FloatArray]
-"""Of rows A (m, n): U (k, m) with U'U = A Q A', and which of all rows of U, sorted, these k are; the others are zero."""
+"""Of rows A (m, n): U (k, m) with U'U = A Q A', after which (k,) of all its rows these are; the others are zero."""
 
 
 def squares(half: Callable[[sparse.csr_array], Half], A: sparse.csr_array) -> FloatArray:
@@ -59,7 +59,8 @@ def squares(half: Callable[[sparse.csr_array], Half], A: sparse.csr_array) -> Fl
 
 def squares_of_sums(half: Callable[[sparse.csr_array], Half], A: sparse.csr_array, n: int, q: int) -> FloatArray:
     """A_j Q A_j' (J, q, q) with A_j the sum of the J sets of q rows of A from the j-th on; n: rows of all of U."""
-    out, total, later, some = np.empty((A.shape[0] // q, q, q)), np.zeros((q, q)), np.zeros((n, q)), max(_COLUMNS // q, 1)
+    out, total, later = np.empty((A.shape[0] // q, q, q)), np.zeros((q, q)), np.zeros((n, q))
+    some = max(_COLUMNS // q, 1)
     for end in range(len(out), 0, -some):
         first = max(end - some, 0)
         rows, U = half(A[first * q : end * q])

@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -137,7 +136,8 @@ class LinearSystem:
         """The same (J, q, q) of the sums of the J sets of q rows from each on, as of what changed since then."""
         if len(self.columns) <= PLAIN:
             sums = np.cumsum(rows.toarray().reshape(-1, q, rows.shape[1])[::-1], axis=0)[::-1]
-            return np.asarray(sums @ self.normal.solve(sums.reshape(rows.shape).T).T.reshape(sums.shape).transpose(0, 2, 1))
+            solved = self.normal.solve(sums.reshape(rows.shape).T).T.reshape(sums.shape)
+            return np.asarray(sums @ solved.transpose(0, 2, 1))
         return self.precision.stacked.among_sums(self._in_stack(rows), q)
 
     def _in_stack(self, rows: sparse.csr_matrix) -> sparse.csr_array:
@@ -354,31 +354,20 @@ def _all_columns(graph: AdjustmentGraph, columns: Columns, name: ParameterName) 
     return out
 
 
-_Numbers = npt.NDArray[np.integer[Any]]
-
-
 class Entries:
     """Dense blocks gathered into one sparse matrix; columns of -1 are left out."""
 
     def __init__(self) -> None:
-        self.parts: list[tuple[_Numbers, _Numbers, FloatArray]] = []
+        self.parts: list[tuple[IntArray, npt.NDArray[np.int32], FloatArray]] = []
 
     def add(self, rows: IntArray, columns: IntArray, values: FloatArray) -> None:
         """Values (r, c) at these rows and columns."""
-        kept = columns >= 0
-        c = columns[kept]
-        v = values[:, kept]
-        self.parts.append((np.repeat(rows, len(c)), np.tile(c, len(rows)), v.ravel()))
+        self.add_blocks(rows[None], columns[None], values[None])
 
     def add_blocks(self, rows: IntArray, columns: IntArray, values: FloatArray) -> None:
         """Values (b, r, c) at rows (b, r) and columns (b, c)."""
-        down = np.broadcast_to(rows[:, :, None].astype(np.int32), values.shape)
-        across = np.broadcast_to(columns[:, None, :].astype(np.int32), values.shape)
-        if (columns >= 0).all():
-            self.parts.append((down.ravel(), across.ravel(), values.ravel()))
-        else:
-            kept = across >= 0
-            self.parts.append((down[kept], across[kept], values[kept]))
+        across = np.repeat(columns.astype(np.int32), rows.shape[1], axis=0)
+        self.parts.append((rows.ravel(), across, values.ravel()))
 
     def add_many(self, points: IntArray, columns: IntArray, values: FloatArray) -> None:
         """Two rows each of many points: columns (k, c), values (k, 2, c)."""
@@ -388,13 +377,15 @@ class Entries:
         """All together."""
         if not self.parts:
             return sparse.csr_matrix(shape)
-        r, c, v = (np.concatenate(x) for x in zip(*self.parts, strict=True))
-        if (r[1:] >= r[:-1]).all():  # row by row already
-            ptr = np.cumsum(np.bincount(r + 1, minlength=shape[0] + 1))
+        rows = np.concatenate([r for r, _, _ in self.parts])
+        lengths = np.repeat([c.shape[1] for _, c, _ in self.parts], [len(r) for r, _, _ in self.parts])
+        c, v = np.concatenate([c.ravel() for _, c, _ in self.parts]), np.concatenate([v for _, _, v in self.parts])
+        if (kept := c >= 0).all() and (rows[1:] >= rows[:-1]).all():  # row by row already
+            ptr = np.concatenate([[0], np.cumsum(np.bincount(rows, lengths, shape[0]))]).astype(np.int32)
             out = sparse.csr_matrix((v, c, ptr), shape=shape)
             out.sum_duplicates()
             return out
-        return sparse.csr_matrix((v, (r, c)), shape=shape)
+        return sparse.csr_matrix((v[kept], (np.repeat(rows, lengths)[kept], c[kept])), shape=shape)
 
 
 Rows = tuple[sparse.csr_matrix, FloatArray]

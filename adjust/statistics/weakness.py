@@ -103,7 +103,7 @@ def _likely(system: LinearSystem, index: IntArray, limit: float) -> IntArray:
     u, z = drawn[order].astype(np.float32), np.arctanh(limit) - _SURE / np.sqrt(_DRAWS - 2.0)
 
     def size(rows: slice, part: slice) -> FloatArray:
-        x = u[rows] @ u[part].T
+        x: FloatArray = u[rows] @ u[part].T
         return np.abs(x, out=x)
 
     pairs = order[_largest(size, len(u), len(index), float(np.tanh(max(z, 1e-9))))]
