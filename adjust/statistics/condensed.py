@@ -63,11 +63,13 @@ class CondensedSystem:
         graph = self.system.precision.graph
         images, at = graph.images, int(graph.image_rows[row])
         if at >= images.n_points:  # its rows are among those of the system
-            i = int(np.searchsorted(self._first_points, row, side="right")) - 1
-            first = int(np.flatnonzero(self.block == i)[0]) + 2 * (row - int(self._first_points[i]))
-            A = self.system.A[first : first + 2]
-            columns = np.unique(A.indices)
-            return columns, A[:, columns].toarray()
+            A, i = self.system.A, int(np.searchsorted(self._first_points, row, side="right")) - 1
+            first = int(self._first_rows[i]) + 2 * (row - int(self._first_points[i]))
+            begin, middle, end = A.indptr[first : first + 3].tolist()
+            columns, place = np.unique(A.indices[begin:end], return_inverse=True)
+            out = np.zeros((2, len(columns)))
+            out[0, place[: middle - begin]], out[1, place[middle - begin :]] = A.data[begin:middle], A.data[middle:end]
+            return columns, out
         b = int(np.searchsorted(images.ptr, at, side="right")) - 1
         which, point = np.array([b]), at - int(images.ptr[b])
         local = images.rows(which)[0, 2 * point : 2 * point + 2, :-1]
@@ -79,6 +81,13 @@ class CondensedSystem:
     def n_points(self) -> int:
         """Image points."""
         return int(self._first_points[-1])
+
+    @cached_property
+    def _first_rows(self) -> IntArray:
+        """First row of every block."""
+        out = np.zeros(len(self._first_points), dtype=np.int64)
+        out[self.block[::-1]] = np.arange(len(self.block))[::-1]
+        return out
 
     @cached_property
     def _first_points(self) -> IntArray:

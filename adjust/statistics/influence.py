@@ -21,16 +21,17 @@ def shifts(condensed: CondensedSystem, rows: Sequence[int], bias: Mapping[int, F
 
     rows: image points first, then all others.
     """
-    system = condensed.system
-    n_points = condensed.n_points
-    right = np.zeros((len(system.columns), len(rows)))
-    for i, row in enumerate(rows):
-        if row < n_points:
+    system, parts = condensed.system, list[tuple[IntArray, FloatArray]]()
+    for row in rows:
+        if row < condensed.n_points:
             columns, A = condensed.point_rows(row)
-            right[columns, i] = A.T @ bias[row]
+            parts.append((columns, A.T @ bias[row]))
         else:
-            right[:, i] = system.bias_column(row - n_points + system.n_image, bias[row])
-    return system.times_covariance(right)
+            parts.append(system.bias_column(row - condensed.n_points + system.n_image, bias[row]))
+    places, values = (np.concatenate(x) for x in zip(*parts, strict=True))
+    ptr = np.cumsum([0, *(len(x) for x, _ in parts)])
+    right = sparse.csc_matrix((values, places, ptr), (len(system.columns), len(rows)))
+    return system.times_covariance(right.toarray() if system.structured is None or system.motions.shape[1] else right)
 
 
 def influences(
@@ -81,5 +82,6 @@ def _furthest(dx: FloatArray, coordinates: sparse.csr_matrix) -> tuple[FloatArra
 
 def _first_largest(values: FloatArray) -> IntArray:
     """Of every column (k,) the row of its largest value; ``argmax`` takes ten times as long along the first axis."""
-    rows, columns = np.nonzero(~(values < values.max(axis=0)))  # what is no number is the largest, as for argmax
-    return rows[np.unique(columns, return_index=True)[1]]
+    at = np.flatnonzero(~(values < values.max(axis=0)))  # what is no number is the largest, as for argmax
+    rows, columns = np.divmod(at, values.shape[1])
+    return np.asarray(rows[np.unique(columns, return_index=True)[1]])

@@ -21,6 +21,7 @@ from adjust.native.lenses import MAX_LENS
 from adjust.native.parallel import side_by_side
 from adjust.observations.factors import ObservationFactor
 from adjust.observations.images.bundles import BundleBatch
+from adjust.observations.images.segments import ranges
 from adjust.observations.terrestrial.layout import Chunk
 from adjust.precision.precision import Precision, precision_of
 from adjust.precision.s_transformation import without_datum_rows
@@ -84,17 +85,18 @@ class LinearSystem:
         """By observation: the readings it is whitened with, and its place among them."""
         return {int(self.row_of[r]): (j, i) for j in self.joint for i, r in enumerate(j.rows)}
 
-    def bias_column(self, observation: int, bias: FloatArray) -> FloatArray:
-        """Right-hand side (n,) of the normal equations for a bias of one observation.
+    def bias_column(self, observation: int, bias: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Right-hand side of the normal equations for a bias of one observation: summands and their places (k,).
 
         bias: (k,) whitened, or (1,) over the conditional sigma of a reading with a joint covariance.
         """
+        rows: IntArray = np.arange(self.ptr[observation], self.ptr[observation + 1])
         if observation in self.joint_of:
             joint, i = self.joint_of[observation]
-            column = joint.W[:, i]
-            return np.asarray(self.A[joint.rows].T @ (column * (bias[0] / np.linalg.norm(column))))
-        rows = slice(int(self.ptr[observation]), int(self.ptr[observation + 1]))
-        return np.asarray(self.A[rows].T @ bias)
+            rows, bias = joint.rows, joint.W[:, i] * (bias[0] / np.linalg.norm(joint.W[:, i]))
+        lengths = self.A.indptr[rows + 1] - self.A.indptr[rows]
+        places = ranges(self.A.indptr[rows], lengths)
+        return self.A.indices[places], self.A.data[places] * np.repeat(bias, lengths)
 
     @cached_property
     def row_of(self) -> IntArray:

@@ -155,7 +155,7 @@ def test_the_covariance_through_tree_and_bundles_is_that_of_the_normal_matrix(mo
             np.testing.assert_allclose(large.times_covariance(right[:, 0]), large.times_covariance(right)[:, 0])
             np.testing.assert_allclose(large.among(rows), of_rows, atol=1e-7)
             few = len(of_rows) // 3
-            sums = np.cumsum(of_rows[: 3 * few, : 3 * few].reshape(few, 3, few, 3)[::-1, :, ::-1], axis=0).cumsum(axis=2)
+            sums = of_rows[: 3 * few, : 3 * few].reshape(few, 3, few, 3)[::-1, :, ::-1].cumsum(axis=0).cumsum(axis=2)
             expected = np.einsum("jajb->jab", sums)[::-1]
             for one in (large, system):
                 found = one.among_sums(rows[: 3 * few], 3)
