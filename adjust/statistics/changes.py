@@ -26,7 +26,7 @@ from adjust.statistics.condensed import CondensedSystem
 from adjust.statistics.result import Change, ChangeShift
 from adjust.statistics.system import LinearSystem
 from adjust.testing.distributions import chi2, fisher, norm
-from adjust.testing.quadratic_forms import pseudo_squares
+from adjust.testing.quadratic_forms import many_pseudo_squares
 
 _SEEN = 1e-4
 """Share of a column that no unknown takes over, below which it is not told from rounding."""
@@ -298,7 +298,7 @@ def _clearest(candidates: Sequence[_Candidates]) -> tuple[_Candidates, int, floa
     """Whose change is the least likely, which of its changes, its statistic and degrees of freedom."""
     best, most = None, -np.inf
     for c in candidates:
-        T, q = pseudo_squares(c.g, c.M, _SEEN)
+        T, q = many_pseudo_squares(c.g, c.M, _SEEN)
         z = np.where(q > 0, _normal_score(T, np.maximum(q, 1)), -np.inf)
         j = int(z.argmax()) if len(z) else -1
         if j >= 0 and z[j] > most:

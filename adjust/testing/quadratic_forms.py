@@ -33,6 +33,24 @@ def pseudo_squares(g: FloatArray, M: FloatArray, least: float, share: float = 0.
     return np.asarray((np.einsum("...qk,...q->...k", half, g) ** 2).sum(axis=-1)), rank
 
 
+def many_pseudo_squares(g: FloatArray, M: FloatArray, least: float) -> tuple[FloatArray, IntArray]:
+    """The same of many g (k, n) and M (k, n, n) without negative eigenvalues: by inverses, where these tell of no open one.
+
+    No eigenvalue of the inverse is larger than the root of its squares; a quarter of the work of all eigenvalues.
+    """
+    T, rank = np.zeros(len(M)), np.zeros(len(M), dtype=np.int64)
+    some = np.flatnonzero(np.einsum("kii->k", M) > least)
+    try:
+        inverse = np.linalg.inv(M[some])
+        full = np.einsum("kij,kij->k", inverse, inverse) < least**-2
+    except np.linalg.LinAlgError:
+        inverse, full = M[some], np.zeros(len(some), dtype=np.bool_)
+    at, rest = some[full], some[~full]
+    T[at], rank[at] = np.einsum("ki,kij,kj->k", g[at], inverse[full], g[at]), M.shape[2]
+    T[rest], rank[rest] = pseudo_squares(g[rest], M[rest], least)
+    return T, rank
+
+
 def pseudo_square(d: FloatArray, Q: FloatArray) -> tuple[float, int, FloatArray]:
     """``d' Q^+ d``, the rank of Q, and ``Q^+`` (n, n), of d (n,) with covariance Q; in sigmas, as units do not mix."""
     s = np.sqrt(np.maximum(np.diag(Q), 1e-300))
