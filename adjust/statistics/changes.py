@@ -25,8 +25,8 @@ from adjust.precision.precision import noise_of
 from adjust.statistics.condensed import CondensedSystem
 from adjust.statistics.result import Change, ChangeShift
 from adjust.statistics.system import LinearSystem
-from adjust.testing.distributions import chi2, fisher, norm
-from adjust.testing.quadratic_forms import many_pseudo_squares
+from adjust.testing.distributions import chi2, fisher
+from adjust.testing.quadratic_forms import explaining, many_pseudo_squares, normal_score
 
 _SEEN = 1e-4
 """Share of a column that no unknown takes over, below which it is not told from rounding."""
@@ -288,18 +288,12 @@ def _given(c: _Candidates, known: _Chosen) -> _Candidates:
     return replace(c, M=0.5 * (M + M.transpose(0, 2, 1)), g=c.g - K @ known.amounts)
 
 
-def _normal_score(T: FloatArray, q: IntArray) -> FloatArray:
-    """As a standard normal quantity, also where p is too small for a number (Wilson and Hilferty 1931)."""
-    c = 2.0 / (9.0 * q)
-    return np.asarray(((T / q) ** (1.0 / 3.0) - 1.0 + c) / np.sqrt(c))
-
-
 def _clearest(candidates: Sequence[_Candidates]) -> tuple[_Candidates, int, float, int] | None:
     """Whose change is the least likely, which of its changes, its statistic and degrees of freedom."""
     best, most = None, -np.inf
     for c in candidates:
         T, q = many_pseudo_squares(c.g, c.M, _SEEN)
-        z = np.where(q > 0, _normal_score(T, np.maximum(q, 1)), -np.inf)
+        z = np.where(q > 0, normal_score(T, np.maximum(q, 1)), -np.inf)
         j = int(z.argmax()) if len(z) else -1
         if j >= 0 and z[j] > most:
             best, most = (c, j, float(T[j]), int(q[j])), float(z[j])
@@ -309,30 +303,9 @@ def _clearest(candidates: Sequence[_Candidates]) -> tuple[_Candidates, int, floa
 def _shifts(c: _Candidates, j: int, T: float, spread: float) -> tuple[ChangeShift, ...]:
     """The components that explain it, with variances ``spread`` times the a priori ones."""
     M, g = c.M[j], c.g[j]
-    index = _explaining(M, g, T, spread)
+    index = explaining(M, g, T, spread, _SEEN)
     inverse = np.linalg.pinv(M[np.ix_(index, index)], rcond=1e-9, hermitian=True)
     amount, sigma = -inverse @ g[index] * c.scale[j, index], np.sqrt(spread * np.diag(inverse)) * c.scale[j, index]
     order = np.argsort(-np.abs(amount) / np.maximum(sigma, 1e-300), kind="stable")
     said = [c.unit.components[i] for i in index]
     return tuple(ChangeShift(said[i][0], said[i][1], float(amount[i]), float(sigma[i])) for i in order)
-
-
-def _explaining(M: FloatArray, g: FloatArray, T: float, spread: float) -> list[int]:
-    """The fewest components whose own change leaves nothing significant of T, one added after the other."""
-    index: list[int] = []
-    possible = [i for i in range(len(g)) if M[i, i] > _SEEN]
-    limit = spread * float(norm.isf(0.005)) ** 2
-    while possible:
-        taken = [_part(M, g, [*index, i]) for i in possible]
-        # of those that say the same, such as width and height of a board, the first
-        best = next(i for i, x in enumerate(taken) if x >= max(taken) - 1e-6 * abs(T))
-        if index and taken[best] - _part(M, g, index) < limit:
-            break
-        index.append(possible.pop(best))
-        if T - taken[best] < limit:
-            break
-    return index
-
-
-def _part(M: FloatArray, g: FloatArray, index: list[int]) -> float:
-    return float(g[index] @ np.linalg.pinv(M[np.ix_(index, index)], rcond=_SEEN, hermitian=True) @ g[index])

@@ -22,17 +22,16 @@ from adjust.native.lenses import MAX_LENS
 from adjust.native.parallel import side_by_side
 from adjust.observations.images.bundles import BundleBatch
 from adjust.precision.precision import Precision
-from adjust.statistics.system import (
+from adjust.statistics.rows import (
     Entries,
     ImageRows,
     KeyColumns,
-    LinearSystem,
-    assembled,
     bundle_order,
     bundle_rows,
     columns_of_blocks,
     stacked,
 )
+from adjust.statistics.system import LinearSystem, assembled
 
 _FLAT = 1e-9
 

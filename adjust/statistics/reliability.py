@@ -11,9 +11,9 @@ from adjust.model.survey import FloatArray, IntArray
 from adjust.native.point_tests import AdjustedPoints, controlled_directions, point_tests
 from adjust.precision.precision import Precision, precision_of
 from adjust.statistics.condensed import CondensedSystem, condensed_system
-from adjust.statistics.influence import influences
+from adjust.statistics.effects import influences
 from adjust.statistics.result import Influence, ObservationTests, Reliability
-from adjust.statistics.system import groups_of_others
+from adjust.statistics.rows import groups_of_others
 from adjust.testing.criteria import Criteria, LevelOptions, criteria
 from adjust.testing.single_tests import Whitened, component_tests, whitened
 

@@ -11,9 +11,9 @@ from adjust.model.result import Adjustment, Decision, Estimate, ParameterName, V
 from adjust.model.survey import FloatArray
 from adjust.native.parallel import Beside
 from adjust.precision.precision import precision_of
-from adjust.statistics.budget import uncertainty_budget
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.consistency import consistency
+from adjust.statistics.effects import uncertainty_budget
 from adjust.statistics.relative_precision import relative_precision
 from adjust.statistics.reliability import LARGEST_NETWORK, reliability
 from adjust.statistics.result import (

@@ -15,8 +15,8 @@ from adjust.precision.precision import precision_of
 from adjust.statistics import changes, weakness
 from adjust.statistics import normal as normal_module
 from adjust.statistics import system as system_module
-from adjust.statistics.budget import uncertainty_budget
 from adjust.statistics.condensed import condensed_system
+from adjust.statistics.effects import uncertainty_budget
 from adjust.statistics.reliability import reliability
 from adjust.statistics.system import linear_system
 from adjust.statistics.weakness import correlations, weak_directions
