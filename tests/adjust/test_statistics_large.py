@@ -47,20 +47,22 @@ def test_few_unknowns_that_many_touch_and_many_small_sets() -> None:
         at += k
     order = rng.permutation(n)
     N = N[np.ix_(order, order)]
-    found = normal_module._arrow(sparse.csc_matrix(N))
+    found = normal_module.structured_inverse(sparse.csc_matrix(N), np.ones(n))
     assert found is not None
-    assert 2 * n * len(found.core) < n**2
+    assert 2 * n * len(found.U) < n**2
     for b in (rng.normal(size=n), rng.normal(size=(n, 3))):
-        x = found.solve(b)
+        x = found.times(b)
         assert x.shape == b.shape
         np.testing.assert_allclose(x, np.linalg.solve(N, b), rtol=1e-8, atol=1e-10)
+        np.testing.assert_allclose(found.times(sparse.csc_matrix(b.reshape(n, -1))), x.reshape(n, -1), atol=1e-12)
     scale = rng.uniform(0.5, 2.0, n)
-    Q = found.inverse(scale)
+    Q = normal_module.structured_inverse(sparse.csc_matrix(N), scale)
+    assert Q is not None
     assert np.count_nonzero(Q.member < 0) == len(Q.U)
     inverse = np.linalg.inv(N) * np.outer(scale, scale)
     np.testing.assert_allclose(Q.own.toarray() + Q.U.T @ Q.U, inverse, rtol=1e-8, atol=1e-9 * np.abs(inverse).max())
     full = rng.normal(size=(n, n))
-    assert normal_module._arrow(sparse.csc_matrix(full @ full.T)) is None
+    assert normal_module.structured_inverse(sparse.csc_matrix(full @ full.T), np.ones(n)) is None
 
 
 def test_lanczos_finds_the_directions_of_the_whole_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -221,7 +223,6 @@ def test_threads_and_portions_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> 
         return [*tests, *rows, shifts, np.array([x.coefficient for x in listed])]
 
     monkeypatch.setattr(parallel, "_WORTHWHILE", 300)
-    monkeypatch.setattr(normal_module, "_AT_ONCE", 7)
     monkeypatch.setattr(batch_module, "_AT_ONCE", 200)
     found = []
     for threads in ("1", "3"):
