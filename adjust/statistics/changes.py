@@ -98,7 +98,8 @@ class ChangeSearch:
         units = list(self._units(self.runs))
         columns = sum(u.B.shape[1] * len(u.epochs) for u in units)
         if s.structured is not None:
-            self.rows, self.own = _sparse(self.A), _sparse(s.structured.own)
+            self.rows, self.own = (SparseRows(x.indptr.astype(np.int64), x.indices.astype(np.int64), x.data)
+                                   for x in (self.A, s.structured.own))  # fmt: skip
             self.shared = np.ascontiguousarray(s.structured.U.T)
         elif columns > _MOST_COLUMNS:
             self.runs = max(self.runs * _MOST_COLUMNS // columns, 2)
@@ -237,10 +238,6 @@ class ChangeSearch:
         V = vectors[:, values > _SEEN]
         inverse = np.linalg.pinv(V.T @ c.M[j] @ V, rcond=1e-12, hermitian=True)
         return _Chosen(B @ V, left @ V, inverse, inverse @ (V.T @ c.g[j]))
-
-
-def _sparse(A: sparse.csr_matrix) -> SparseRows:
-    return SparseRows(A.indptr.astype(np.int64), A.indices.astype(np.int64), A.data)
 
 
 def _by_runs(u: Unit) -> Unit:

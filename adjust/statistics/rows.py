@@ -162,10 +162,6 @@ class Entries:
         across = np.repeat(columns.astype(np.int32), rows.shape[1], axis=0)
         self.parts.append((rows.ravel(), across, values.ravel()))
 
-    def add_many(self, points: IntArray, columns: IntArray, values: FloatArray) -> None:
-        """Two rows each of many points: columns (k, c), values (k, 2, c)."""
-        self.add_blocks(2 * points[:, None] + np.arange(2), columns, values)
-
     def matrix(self, shape: tuple[int, int]) -> sparse.csr_matrix:
         """All together."""
         if not self.parts:
@@ -221,8 +217,8 @@ def bundle_rows(bundle: BundleBatch, n: int, key_columns: KeyColumns) -> Rows:
     of_point = np.full((len(bundle.point_ids), 3), -1, dtype=np.int64)
     for i in bundle.reduced:
         of_point[i] = key_columns[bundle.point_key[i]]
-    points.add_many(np.arange(k), np.where(bundle.point_at[:, None] >= 0, -1, of_point[bundle.point]),
-                    bundle.A[:, :, MAX_LENS + 3 : MAX_LENS + 6])  # fmt: skip
+    by_point, reduced = bundle.A[:, :, MAX_LENS + 3 : MAX_LENS + 6], bundle.point_at[:, None] < 0
+    points.add_blocks(np.arange(2 * k).reshape(k, 2), np.where(reduced, of_point[bundle.point], -1), by_point)
     columns = np.concatenate([key_columns[key] for key in bundle.order])
     kept = columns >= 0
     select = sparse.csr_matrix((np.ones(int(kept.sum())), (np.flatnonzero(kept), columns[kept])), (len(columns), n))

@@ -28,11 +28,6 @@ class BundleHidden:
         self._given_interface: tuple[FloatArray, FloatArray] | None = None
         self.keys = [*batch.hidden_poses, *(batch.point_key[i] for i in batch.reduced)]
         """What is hidden, in the order of stacked vectors of it: poses, then points."""
-        self._keys = set(self.keys)
-
-    def hides(self, key: int) -> bool:
-        """Whether an unknown is one of those hidden here."""
-        return key in self._keys
 
     @property
     def n(self) -> int:
