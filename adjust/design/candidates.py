@@ -30,7 +30,7 @@ from adjust.model.rewriting import Fields
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Point, Survey
 from adjust.observations.factors import ObservationFactor
 from adjust.statistics.outliers.candidates import FIELDS
-from adjust.statistics.system import Columns, ItemRows, points_apart, survey_rows
+from adjust.statistics.rows import Columns, ItemRows, points_apart, survey_rows
 
 _RANK = 1e-10
 

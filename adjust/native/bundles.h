@@ -314,6 +314,7 @@ inline void of_points(const Bundle &b, In<double, 3> weights, In<double, 3> WL, 
         by_columns(out.n[1], [&](int64_t c, auto none) {
             using S = decltype(none);
             const S x[3] = {loaded<S>(&v(j, 0, c)), loaded<S>(&v(j, 1, c)), loaded<S>(&v(j, 2, c))};
+            if (!any((x[0] != 0.0) | (x[1] != 0.0) | (x[2] != 0.0))) return;  // of most, where few points have something
             through_point(b, j, weights, WL, [&](const double *w, int64_t ld, int64_t at, int64_t n) {
                 for (int64_t q = 0; q < n; ++q)
                     store(&out(at + q, c), loaded<S>(&out(at + q, c)) - (w[q] * x[0] + w[ld + q] * x[1] + w[2 * ld + q] * x[2]));

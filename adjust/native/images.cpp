@@ -1,6 +1,7 @@
 // What Python calls of lenses, image points, views, planes, trees, reduced poses and simulated networks.
 #include "calibration.h"
 #include "chains.h"
+#include "changes.h"
 #include "planes.h"
 #include "point_tests.h"
 #include "text.h"
@@ -19,7 +20,8 @@ extern "C" __attribute__((visibility("default"))) const Entry *images() {
         entry<offsets_of_views>("offsets_of_views"), entry<homographies>("homographies"),
         entry<plane_poses>("plane_poses"), entry<fit_lens>("fit_lens"), entry<turns_by>("turns_by"),
         entry<turns_of>("turns_of"), entry<row_influences>("row_influences"), entry<residual_tests>("residual_tests"),
-        entry<sums_of_blocks>("sums_of_blocks"), entry<farthest_points>("farthest_points"), entry<controlled_directions>("controlled_directions"),
-        entry<point_tests>("point_tests"), entry<number_rows>("number_rows"), entry<record_rows>("record_rows"), {nullptr, nullptr, nullptr}};
+        entry<sums_of_blocks>("sums_of_blocks"), entry<farthest_points>("farthest_points"),
+        entry<controlled_directions>("controlled_directions"), entry<point_tests>("point_tests"), entry<change_squares>("change_squares"),
+        entry<number_rows>("number_rows"), entry<record_rows>("record_rows"), {nullptr, nullptr, nullptr}};
     return table;
 }

@@ -1,4 +1,7 @@
-"""Tests and reliability of all image points in the core, in threads: every point by itself (``point_tests.h``)."""
+"""Tests and reliability of all image points in the core, in threads: every point by itself (``point_tests.h``).
+
+And of what may have changed from one epoch on (``changes.h``).
+"""
 
 from typing import NamedTuple
 
@@ -18,6 +21,11 @@ _point_tests = Function(
     "point_tests",
     f"{_POINTS} lambda0[2] redundancy[N] least[N] statistic[N] detectable[N] external[N] w[N,2] error[N,2] "
     "detectable_component[N,2] bias[N,2]",
+)
+_change_squares = Function(
+    "change_squares",
+    "first[J+1] rows[k] B[k,w] A_ptr[m+1] A_column[a] A_entry[a] e[m] own_ptr[n+1] own_column[o] own_entry[o] U[n,c] "
+    "x[n,w] s[n,w] mark[n] touched[n] left[w,w] shared[w,c] columns[2,w] squares[J,w] M[J,w,w] g[J,w]",
 )
 
 
@@ -69,3 +77,28 @@ def point_tests(points: AdjustedPoints, lambda0: FloatArray, out: tuple[FloatArr
     The latter (N, 2); all as ``ObservationTests`` has them. lambda0: (2,) of tests with one and two components.
     """
     run_ranges(_point_tests, len(points.v), *points, lambda0, *out)
+
+
+class SparseRows(NamedTuple):
+    """A sparse matrix: the columns and entries of row i are those from ``ptr[i]`` to ``ptr[i + 1]``."""
+
+    ptr: IntArray
+    column: IntArray
+    entry: FloatArray
+
+
+def change_squares(
+    first: IntArray, rows: IntArray, B: FloatArray, A: SparseRows, e: FloatArray, own: SparseRows, U: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Of columns B (k, q) in these rows (k,) of a system, run j from ``first[j]`` on: the sums over all runs from j on.
+
+    The diagonal (J, q) of B'B, ``B' (I - A Q A') B`` (J, q, q) and B'e (J, q), with Q = own + U U', U (n, c).
+    """
+    (k, q), (n, c), J, w = B.shape, U.shape, len(first) - 1, -(-B.shape[1] // 8) * 8
+    padded = np.zeros((k, w))
+    padded[:, :q] = B
+    later = np.zeros((n, w)), np.zeros((n, w)), np.full(n, -1), np.empty(n, dtype=np.int64)
+    sums = np.zeros((w, w)), np.zeros((w, c)), np.zeros((2, w))
+    out = np.empty((J, w)), np.empty((J, w, w)), np.empty((J, w))
+    _change_squares(first, rows, padded, *A, e, *own, U, *later, *sums, *out)
+    return out[0][:, :q], out[1][:, :q, :q], out[2][:, :q]

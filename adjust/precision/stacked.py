@@ -11,7 +11,7 @@ from adjust.frames.unknowns import Unknowns
 from adjust.model.survey import FloatArray, IntArray
 from adjust.observations.images.bundle_hidden import BundleHidden
 from adjust.precision.s_transformation import STransformation
-from adjust.precision.tree import TreeCovariance, unit_rows
+from adjust.precision.tree import Half, TreeCovariance, squares, squares_of_sums, unit_rows
 
 AT_ONCE = 64
 """Columns that the matrix is multiplied by in one go."""
@@ -23,15 +23,15 @@ class Stacked:
     def __init__(self, tree: TreeCovariance, hidden: Sequence[BundleHidden], unknowns: Unknowns) -> None:
         self.tree, self.hidden, self.unknowns = tree, tuple(hidden), unknowns
         self.n = tree.n + sum(below.n for below in hidden)
-        self._datum: tuple[FloatArray, FloatArray, FloatArray] | None = None
+        self._datum: tuple[FloatArray, FloatArray] | None = None
 
     def move_to(self, datum: STransformation, rows: Mapping[int, FloatArray]) -> None:
         """Let the survey's datum be this one, of these rows (d, dim per key)."""
         self._datum_rows = np.zeros((len(datum.core), self.n))
         for key, row in rows.items():
             self._datum_rows[:, self.places[key]] = row
-        G, W = (np.concatenate([of[key] for key in self.places]) for of in (datum.motions, datum.spread))
-        self._datum = G, W, datum.core
+        both = [np.concatenate([of[key] for key in self.places]) for of in (datum.motions, datum.spread)]
+        self._datum = np.concatenate(both, axis=1), datum.core
 
     @cached_property
     def places(self) -> dict[int, slice]:
@@ -53,24 +53,24 @@ class Stacked:
 
     def times(self, right: FloatArray) -> FloatArray:
         """Covariance, as solved, times columns (n, k)."""
-        tree = np.array(right[: self.tree.n])
-        on_poses = [below.on_poses(right[mine]) if right[mine].any() else None for below, mine, _ in self._parts]
+        out = np.array(right, order="C")
+        tree = out[: self.tree.n]
+        on_poses = [below.on_poses(out[mine]) if out[mine].any() else None for below, mine, _ in self._parts]
         for (below, _, interface), some in zip(self._parts, on_poses, strict=True):
             if some is not None:
                 tree[interface] += below.on_interface(some)
-        found = self.tree.times(tree)
-        hidden = (below.products(found[interface], right[mine], some)
-                  for (below, mine, interface), some in zip(self._parts, on_poses, strict=True))  # fmt: skip
-        return np.concatenate([found, *hidden])
+        self.tree.multiply(tree)
+        for (below, mine, interface), some in zip(self._parts, on_poses, strict=True):
+            below.multiply(out[mine], tree[interface], some)
+        return out
 
     def times_in_datum(self, right: FloatArray) -> FloatArray:
         """The same of the covariance in the survey's datum: S Q S' times columns."""
         out = self.times(right)
         if self._datum is not None:
-            G, W, core = self._datum
-            moved = G.T @ right
-            out += G @ (core @ moved - W.T @ right)
-            out -= W @ moved
+            both, core = self._datum
+            by_motions, by_spread = np.split(both.T @ right, 2)
+            out += both @ np.concatenate([core @ by_motions - by_spread, -by_motions])
         return out
 
     def joint(self, keys: Sequence[int]) -> FloatArray:
@@ -90,20 +90,29 @@ class Stacked:
 
     def among(self, A: sparse.csr_array) -> FloatArray:
         """A Q A' (m, m) of rows A (m, n): in any datum, where they are of observations."""
-        by_column = A.tocsc()
-        out, in_tree = np.zeros((A.shape[0],) * 2), by_column[:, : self.tree.n].tocsr()
+        return squares(self._half, A) if self.hidden else self.tree.among(A)
+
+    def among_sums(self, A: sparse.csr_array, q: int) -> FloatArray:
+        """The same (J, q, q) of the sums of the J sets of q rows from each on."""
+        return squares_of_sums(self._half, A, self.n, q)
+
+    def _half(self, A: sparse.csr_array) -> Half:
+        """Of some rows."""
+        if not self.hidden:
+            return self.tree.half(A)
+        by_column, rows, parts = A.tocsc(), list[IntArray](), list[FloatArray]()
+        in_tree = by_column[:, : self.tree.n].tocsr()
         for below, mine, interface in self._parts:
-            hidden = by_column[:, mine]
-            number = np.bincount(hidden.indices, minlength=len(out))
-            rows = np.flatnonzero(number)
-            if len(rows):
-                number[rows], right = np.arange(len(rows)), np.zeros((below.n, len(rows)))
-                right[np.repeat(np.arange(below.n), np.diff(hidden.indptr)), number[hidden.indices]] = hidden.data
-                own, over = below.among(right)
-                out[np.ix_(rows, rows)] += own
-                places = np.repeat(rows, len(interface)), np.tile(interface, len(rows))
-                in_tree = in_tree + sparse.csr_array((over.ravel(), places), in_tree.shape)
-        return out + self.tree.among(in_tree)
+            if by_column.indptr[mine.start] == by_column.indptr[mine.stop]:
+                continue
+            at, U, over = below.half(by_column[:, mine].T.toarray())
+            some = np.flatnonzero(over.any(axis=1))
+            places = np.repeat(some, len(interface)), np.tile(interface, len(some))
+            in_tree = in_tree + sparse.csr_array((over[some].ravel(), places), in_tree.shape)
+            parts.append(U)
+            rows.append(mine.start + at)
+        at, U = self.tree.half(in_tree)
+        return np.concatenate([at, *rows]), np.concatenate([U, *parts])
 
     def drawn(self, k: int) -> FloatArray:
         """Errors (n, k) of k solutions, drawn with the covariance in the survey's datum; always the same."""
@@ -112,6 +121,7 @@ class Stacked:
         hidden = (below.drawn(tree[interface], w[mine]) for below, mine, interface in self._parts)
         out = np.concatenate([tree, *hidden])
         if self._datum is not None:
-            G, R = self._datum[0], self._datum_rows
+            R = self._datum_rows
+            G = self._datum[0][:, : len(R)]
             out -= G @ np.linalg.solve(R @ G, R @ out)
         return out

@@ -5,7 +5,8 @@ subset of Takahashi, Fagan and Chen 1973; Golub and Plemmons 1980 for geodetic n
 lie together in one clique, so all redundancy numbers follow from it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeAlias
 
 import gtsam
 import numpy as np
@@ -27,7 +28,7 @@ from adjust.observations.images.reduction import Leaves
 from adjust.precision.cliques import Cliques
 
 _COLUMNS = 96
-"""Columns that go through the tree at once."""
+"""Columns that go up the tree at once."""
 _MANY = 20
 """Keys that are looked up one by one, of a joint covariance."""
 
@@ -35,6 +36,40 @@ _MANY = 20
 def unit_rows(at: IntArray, n: int) -> sparse.csr_array:
     """(k, n): in each row nothing but a one, in these columns (k,)."""
     return sparse.csr_array((np.ones(len(at)), at, np.arange(len(at) + 1)), (len(at), n))
+
+
+Half: TypeAlias = tuple[IntArray, FloatArray]
+"""Of rows A (m, n): U (k, m) with U'U = A Q A', after which (k,) of all its rows these are; the others are zero."""
+
+
+def squares(half: Callable[[sparse.csr_array], Half], A: sparse.csr_array) -> FloatArray:
+    """A Q A' (m, m) by halves of some rows at once."""
+    out, done = np.zeros((A.shape[0],) * 2), list[Half]()
+    for i in range(0, A.shape[0], _COLUMNS):
+        rows, U = half(A[i : i + _COLUMNS])
+        for k, (before, V) in enumerate(done):
+            _, here, there = np.intersect1d(rows, before, assume_unique=True, return_indices=True)
+            across = U[here].T @ V[there]
+            out[i : i + _COLUMNS, k * _COLUMNS : (k + 1) * _COLUMNS] = across
+            out[k * _COLUMNS : (k + 1) * _COLUMNS, i : i + _COLUMNS] = across.T
+        done.append((rows, U))
+        out[i : i + _COLUMNS, i : i + _COLUMNS] = U.T @ U
+    return out
+
+
+def squares_of_sums(half: Callable[[sparse.csr_array], Half], A: sparse.csr_array, n: int, q: int) -> FloatArray:
+    """A_j Q A_j' (J, q, q) with A_j the sum of the J sets of q rows of A from the j-th on; n: rows of all of U."""
+    out, total, later = np.empty((A.shape[0] // q, q, q)), np.zeros((q, q)), np.zeros((n, q))
+    some = max(_COLUMNS // q, 1)
+    for end in range(len(out), 0, -some):
+        first = max(end - some, 0)
+        rows, U = half(A[first * q : end * q])
+        own = (U.T @ U).reshape(end - first, q, end - first, q)[::-1, :, ::-1].cumsum(axis=0).cumsum(axis=2)
+        across = (U.T @ later[rows]).reshape(-1, q, q)[::-1].cumsum(axis=0)
+        out[first:end] = (np.einsum("jajb->jab", own) + across + across.transpose(0, 2, 1) + total)[::-1]
+        later[rows] += U.reshape(len(rows), -1, q).sum(axis=1)
+        total = out[first]
+    return out
 
 
 class TreeCovariance:
@@ -112,14 +147,12 @@ class TreeCovariance:
         """Length of a stacked vector of all unknowns."""
         return int(self.cliques.first[-1])
 
-    def times(self, columns: FloatArray) -> FloatArray:
-        """The whole covariance matrix times columns (n, m), without forming it."""
-        x = np.array(columns, dtype=float, order="C")
+    def multiply(self, x: FloatArray) -> None:
+        """Multiply the whole covariance matrix by columns (n, m), in place, without forming it."""
         c, every = self.cliques, np.arange(len(self.cliques), dtype=np.int64)
         begun = set(c.home[c.key_of[x.any(axis=1)]].tolist())
         up = every if 2 * len(begun) > len(c) else c.ancestors(begun)
         solve_cliques(self.arrays, up, every, c.first, c.data, x)
-        return x
 
     def drawn(self, w: FloatArray) -> FloatArray:
         """R^-1 w (n, m): errors with the whole covariance matrix, where w are independent with unit variance."""
@@ -140,33 +173,25 @@ class TreeCovariance:
 
     def among(self, A: sparse.csr_array) -> FloatArray:
         """The same of all rows of A (m, n): of many some at once, on their ways to the roots."""
-        c, m = self.cliques, A.shape[0]
-        if m <= _COLUMNS:
-            return self.each_among(A, np.array([0, m]))[0]
-        home = c.home[c.key_of]
-        of_row = np.maximum.reduceat(np.append(home[A.indices], 0), A.indptr[:-1])
+        c = self.cliques
+        if A.shape[0] <= _COLUMNS:
+            return self.each_among(A, np.array([0, A.shape[0]]))[0]
+        of_row = np.maximum.reduceat(np.append(c.home[c.key_of[A.indices]], 0), A.indptr[:-1])
         order = np.argsort(of_row, kind="stable")  # neighbours in the tree side by side
-        A, out = A[order], np.zeros((m, m))
-        none, done = np.zeros(0, dtype=np.int64), list[tuple[IntArray, FloatArray]]()
-        for i in range(0, m, _COLUMNS):
-            mine = A[i : i + _COLUMNS]
-            up = c.ancestors(set(home[mine.indices].tolist()))
-            first, n = c.gathered(up)
-            entries = mine.data, (first - c.first[:-1])[c.key_of[mine.indices]] + mine.indices, mine.indptr
-            U = np.ascontiguousarray(sparse.csr_array(entries, (mine.shape[0], n)).toarray().T)
-            solve_cliques(self.arrays, up, none, first, c.data, U)
-            way = np.zeros(len(c), dtype=np.bool_)
-            way[up] = True
-            rows = np.flatnonzero(way[home])
-            for k, (before, V) in enumerate(done):
-                _, here, there = np.intersect1d(rows, before, assume_unique=True, return_indices=True)
-                across = U[here].T @ V[there]
-                out[i : i + _COLUMNS, k * _COLUMNS : (k + 1) * _COLUMNS] = across
-                out[k * _COLUMNS : (k + 1) * _COLUMNS, i : i + _COLUMNS] = across.T
-            done.append((rows, U))
-            out[i : i + _COLUMNS, i : i + _COLUMNS] = U.T @ U
         back = np.argsort(order)
-        return np.asarray(out[np.ix_(back, back)])
+        return np.asarray(squares(self.half, A[order])[np.ix_(back, back)])
+
+    def half(self, A: sparse.csr_array) -> Half:
+        """R^-T A' of some rows A (m, n): on the ways to the roots."""
+        c = self.cliques
+        up = c.ancestors(set(c.home[c.key_of[A.indices]].tolist()))
+        first, n = c.gathered(up)
+        entries = A.data, (first - c.first[:-1])[c.key_of[A.indices]] + A.indices, A.indptr
+        U = np.ascontiguousarray(sparse.csr_array(entries, (A.shape[0], n)).toarray().T)
+        solve_cliques(self.arrays, up, np.zeros(0, dtype=np.int64), first, c.data, U)
+        way = np.zeros(len(c), dtype=np.bool_)
+        way[up] = True
+        return np.flatnonzero(way[c.home[c.key_of]]), U
 
     def full(self) -> FloatArray:
         """The whole covariance matrix (n, n) of all unknowns, rows as :meth:`places` says, parents before children.

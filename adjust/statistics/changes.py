@@ -20,19 +20,18 @@ from adjust.model.names import natural_key
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import side_by_side
+from adjust.native.point_tests import SparseRows, change_squares
 from adjust.precision.precision import noise_of
 from adjust.statistics.condensed import CondensedSystem
 from adjust.statistics.result import Change, ChangeShift
 from adjust.statistics.system import LinearSystem
-from adjust.testing.distributions import chi2, fisher, norm
-from adjust.testing.quadratic_forms import pseudo_squares
+from adjust.testing.distributions import chi2, fisher
+from adjust.testing.quadratic_forms import explaining, many_pseudo_squares, normal_score
 
 _SEEN = 1e-4
 """Share of a column that no unknown takes over, below which it is not told from rounding."""
-_MOST_RUNS = 256
-"""Of a system without structure, where every run is compared with every other."""
-_ROOM = 2e7
-"""Numbers that all possible changes may need."""
+_MOST_RUNS, _MOST_COLUMNS = 256, 12_000
+"""Of a system without structure, where every column of a run goes through the tree."""
 _MOST, _MOST_OF_ONE = 20, 2
 """Changes that are named: in all, and of the same kind of one camera, target or table, which may drift without end."""
 _SHAPES = {True: (("width", "1"), ("height", "1"), ("sag along x", "m"), ("sag along y", "m")),
@@ -60,26 +59,24 @@ class Unit:
 class _Candidates:
     """A unit's possible changes (J, ...), scaled so that B'B has a unit diagonal: M (J, q, q), g (J, q), scale (J, q).
 
-    X: (j q, n) B'A of the j runs by themselves, one after the other; a change has the sum of those from its run on.
+    A change has what its run and all later ones have.
     """
 
     unit: Unit
     M: FloatArray
     g: FloatArray
     scale: FloatArray
-    X: sparse.csr_matrix
 
 
 @dataclass(frozen=True, eq=False)
 class _Chosen:
-    """What was found, less what was found before it: B (m, q) over all rows, X = A'B and Y = QX (n, q).
+    """What was found, less what was found before it: B (m, q) over all rows, and left = (I - A Q A') B.
 
     inverse: (q, q) of its M; amounts: (q,) that times its g.
     """
 
     B: FloatArray
-    X: FloatArray
-    Y: FloatArray
+    left: FloatArray
     inverse: FloatArray
     amounts: FloatArray
 
@@ -96,19 +93,16 @@ class ChangeSearch:
         self.A, self.e = s.A, s.e - s.A @ step
         self.epoch, self.epochs = _coded([b.epoch_id for b in adjustment.survey.image_blocks])
         self.owners = list(self._owners())
-        shared = None if s.structured is None else len(s.structured.U)
         read = {r.epoch_id for r in adjustment.survey.table_readings}
-        self.runs = _MOST_RUNS if shared is None else max(2, len(self.epochs), len(read))
+        self.runs = _MOST_RUNS if s.structured is None else max(2, len(self.epochs), len(read))
         units = list(self._units(self.runs))
-
-        def numbers(runs: Sequence[int]) -> float:
-            """That M of every unit needs, or what it is made of."""
-            columns = [u.B.shape[1] * n for u, n in zip(units, runs, strict=True)]
-            return float(sum(k * (k if shared is None else shared) for k in columns))
-
-        if numbers([len(u.epochs) for u in units]) > _ROOM:
-            share = _ROOM / numbers([1] * len(units))
-            self.runs = int(np.clip(share if shared is not None else np.sqrt(share), 2, self.runs))
+        columns = sum(u.B.shape[1] * len(u.epochs) for u in units)
+        if s.structured is not None:
+            self.rows, self.own = (SparseRows(x.indptr.astype(np.int64), x.indices.astype(np.int64), x.data)
+                                   for x in (self.A, s.structured.own))  # fmt: skip
+            self.shared = np.ascontiguousarray(s.structured.U.T)
+        elif columns > _MOST_COLUMNS:
+            self.runs = max(self.runs * _MOST_COLUMNS // columns, 2)
             units = list(self._units(self.runs))
         self.candidates = side_by_side(lambda u: self._candidates(_by_runs(u)), units)
         self.n_tests = sum(len(c.g) for c in self.candidates)
@@ -212,54 +206,38 @@ class ChangeSearch:
 
     def _candidates(self, u: Unit) -> _Candidates:
         """Of the runs from j on, j = 1, 2, ..., or of the only one."""
+        which = slice(1 if len(u.epochs) > 1 else 0, None)
+        squares, M, g = (x[which] for x in (self._whole if self.system.structured is None else self._structured)(u))
+        scale = np.divide(1.0, np.sqrt(squares), out=np.zeros_like(squares), where=squares > 0.0)
+        M = M * scale[:, :, None] * scale[:, None, :]
+        return _Candidates(u, 0.5 * (M + M.transpose(0, 2, 1)), g * scale, scale)
+
+    def _structured(self, u: Unit) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Of every run and all later ones the diagonal of B'B (J, q), M (J, q, q) and g (J, q)."""
+        return change_squares(_first(u), u.rows, np.ascontiguousarray(u.B), self.rows, self.e, self.own, self.shared)
+
+    def _whole(self, u: Unit) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The same of a system without structure."""
         J, q = len(u.epochs), u.B.shape[1]
-        of_run = np.bincount(u.run, minlength=J)
-        ptr, before = np.cumsum([0, *np.repeat(of_run, q)]), np.cumsum(of_run) - of_run
-        place = (ptr[u.run * q] + np.arange(len(u.run)) - before[u.run])[:, None] + of_run[u.run, None] * np.arange(q)
-        values, rows = np.empty(u.B.size), np.empty(u.B.size, dtype=np.int64)
-        values[place], rows[place] = u.B, u.rows[:, None]
-        by_run = sparse.csr_matrix((values, rows, ptr), (J * q, len(self.e)))
-        by_run.eliminate_zeros()
-        X = (by_run @ self.A).tocsr()
-        both = _from_runs_on(_by_run(u, np.column_stack([u.B, self.e[u.rows]])))
-        P, g = both[:, :, :q], both[:, :, q]
-        taken = _taken(self.system, X, J)[1 if J > 1 else 0 :]
-        size = np.sqrt(np.einsum("jqq->jq", P))
-        scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
-        M = (P - taken) * scale[:, :, None] * scale[:, None, :]
-        return _Candidates(u, 0.5 * (M + M.transpose(0, 2, 1)), g * scale, scale, X)
+        columns = (u.run * q)[:, None] + np.arange(q)
+        B = sparse.csr_matrix((u.B.ravel(), columns.ravel(), np.arange(0, u.B.size + 1, q)), (len(u.rows), J * q))
+        both = np.cumsum(_by_run(u, np.column_stack([u.B, self.e[u.rows]]))[::-1], axis=0)[::-1]
+        taken = self.system.among_sums((B.T @ self.A[u.rows]).tocsr(), q)
+        return np.einsum("jqq->jq", both[:, :, :q]), both[:, :, :q] - taken, both[:, :, q]
 
     def _chosen(self, c: _Candidates, j: int, before: Sequence[_Chosen]) -> _Chosen:
         """Its directions that show, less what they have in common with those before."""
         u, B = c.unit, np.zeros((len(self.e), c.unit.B.shape[1]))
         mine = u.run >= (j + 1 if len(u.epochs) > 1 else 0)
         B[u.rows[mine]] = u.B[mine] * c.scale[j]
-        X = np.asarray(self.A.T @ B)
-        Y = self.system.times_covariance(X)
-        shares = [x.inverse @ (x.B.T @ B - x.X.T @ Y) for x in before]
+        left = B - self.A @ self.system.times_covariance(np.asarray(self.A.T @ B))
+        shares = [x.inverse @ (x.B.T @ left) for x in before]
         for x, share in zip(before, shares, strict=True):
-            B, X, Y = B - x.B @ share, X - x.X @ share, Y - x.Y @ share
+            B, left = B - x.B @ share, left - x.left @ share
         values, vectors = np.linalg.eigh(next(x.M[j] for x in self.candidates if x.unit is u))
         V = vectors[:, values > _SEEN]
         inverse = np.linalg.pinv(V.T @ c.M[j] @ V, rcond=1e-12, hermitian=True)
-        return _Chosen(B @ V, X @ V, Y @ V, inverse, inverse @ (V.T @ c.g[j]))
-
-
-def _taken(system: LinearSystem, X: sparse.csr_matrix, J: int) -> FloatArray:
-    """XQX' of the runs from j on together (J, q, q); X (J q, n) of the runs by themselves."""
-    q, sums = X.shape[0] // J, system.structured
-    if sums is None:
-        M, out = system.among(X).reshape(J, q, J, q), np.empty((J, q, q))
-        for j in range(J):
-            later = M[j, :, j + 1 :].sum(axis=1)
-            out[j] = M[j, :, j] + later + later.T
-        return np.cumsum(out[::-1], axis=0)[::-1]
-    own = (X @ (sums.own @ X.T)).tocoo()
-    (a, i), (b, k) = np.divmod(own.row, q), np.divmod(own.col, q)
-    of_run = np.bincount((np.minimum(a, b) * q + i) * q + k, own.data, J * q * q).reshape(J, q, q)
-    shared = np.asarray(X @ sums.U.T).reshape(J, q, -1)
-    own_on, shared_on = (np.cumsum(x[::-1], axis=0)[::-1] for x in (of_run, shared))
-    return np.asarray(own_on + shared_on @ shared_on.transpose(0, 2, 1))
+        return _Chosen(B @ V, left @ V, inverse, inverse @ (V.T @ c.g[j]))
 
 
 def _by_runs(u: Unit) -> Unit:
@@ -285,10 +263,14 @@ def _runs(epochs: IntArray, names: Sequence[str], most: int) -> tuple[IntArray, 
     return number[place.reshape(-1)], tuple(names[i] for i in first.tolist())
 
 
+def _first(u: Unit) -> IntArray:
+    """First of the rows of every run (J + 1,)."""
+    return np.searchsorted(u.run, np.arange(len(u.epochs) + 1))
+
+
 def _by_run(u: Unit, other: FloatArray) -> FloatArray:
     """B' times other columns (k, r), of every run apart: (J, q, r)."""
-    first = np.searchsorted(u.run, np.arange(len(u.epochs) + 1))
-    return np.array([u.B[i:j].T @ other[i:j] for i, j in pairwise(first.tolist())])
+    return np.array([u.B[i:j].T @ other[i:j] for i, j in pairwise(_first(u).tolist())])
 
 
 def _from_runs_on(of_runs: FloatArray) -> FloatArray:
@@ -298,25 +280,17 @@ def _from_runs_on(of_runs: FloatArray) -> FloatArray:
 
 def _given(c: _Candidates, known: _Chosen) -> _Candidates:
     """Candidates with M and g where one more change is part of the model."""
-    u = c.unit
-    across = _by_run(u, known.B[u.rows]) - np.asarray(c.X @ known.Y).reshape(len(u.epochs), u.B.shape[1], -1)
-    K = _from_runs_on(across) * c.scale[:, :, None]
+    K = _from_runs_on(_by_run(c.unit, known.left[c.unit.rows])) * c.scale[:, :, None]
     M = c.M - K @ known.inverse @ K.transpose(0, 2, 1)
     return replace(c, M=0.5 * (M + M.transpose(0, 2, 1)), g=c.g - K @ known.amounts)
-
-
-def _normal_score(T: FloatArray, q: IntArray) -> FloatArray:
-    """As a standard normal quantity, also where p is too small for a number (Wilson and Hilferty 1931)."""
-    c = 2.0 / (9.0 * q)
-    return np.asarray(((T / q) ** (1.0 / 3.0) - 1.0 + c) / np.sqrt(c))
 
 
 def _clearest(candidates: Sequence[_Candidates]) -> tuple[_Candidates, int, float, int] | None:
     """Whose change is the least likely, which of its changes, its statistic and degrees of freedom."""
     best, most = None, -np.inf
     for c in candidates:
-        T, q = pseudo_squares(c.g, c.M, _SEEN)
-        z = np.where(q > 0, _normal_score(T, np.maximum(q, 1)), -np.inf)
+        T, q = many_pseudo_squares(c.g, c.M, _SEEN)
+        z = np.where(q > 0, normal_score(T, np.maximum(q, 1)), -np.inf)
         j = int(z.argmax()) if len(z) else -1
         if j >= 0 and z[j] > most:
             best, most = (c, j, float(T[j]), int(q[j])), float(z[j])
@@ -326,30 +300,9 @@ def _clearest(candidates: Sequence[_Candidates]) -> tuple[_Candidates, int, floa
 def _shifts(c: _Candidates, j: int, T: float, spread: float) -> tuple[ChangeShift, ...]:
     """The components that explain it, with variances ``spread`` times the a priori ones."""
     M, g = c.M[j], c.g[j]
-    index = _explaining(M, g, T, spread)
+    index = explaining(M, g, T, spread, _SEEN)
     inverse = np.linalg.pinv(M[np.ix_(index, index)], rcond=1e-9, hermitian=True)
     amount, sigma = -inverse @ g[index] * c.scale[j, index], np.sqrt(spread * np.diag(inverse)) * c.scale[j, index]
     order = np.argsort(-np.abs(amount) / np.maximum(sigma, 1e-300), kind="stable")
     said = [c.unit.components[i] for i in index]
     return tuple(ChangeShift(said[i][0], said[i][1], float(amount[i]), float(sigma[i])) for i in order)
-
-
-def _explaining(M: FloatArray, g: FloatArray, T: float, spread: float) -> list[int]:
-    """The fewest components whose own change leaves nothing significant of T, one added after the other."""
-    index: list[int] = []
-    possible = [i for i in range(len(g)) if M[i, i] > _SEEN]
-    limit = spread * float(norm.isf(0.005)) ** 2
-    while possible:
-        taken = [_part(M, g, [*index, i]) for i in possible]
-        # of those that say the same, such as width and height of a board, the first
-        best = next(i for i, x in enumerate(taken) if x >= max(taken) - 1e-6 * abs(T))
-        if index and taken[best] - _part(M, g, index) < limit:
-            break
-        index.append(possible.pop(best))
-        if T - taken[best] < limit:
-            break
-    return index
-
-
-def _part(M: FloatArray, g: FloatArray, index: list[int]) -> float:
-    return float(g[index] @ np.linalg.pinv(M[np.ix_(index, index)], rcond=_SEEN, hermitian=True) @ g[index])

@@ -22,19 +22,20 @@ from adjust.native.lenses import MAX_LENS
 from adjust.native.parallel import side_by_side
 from adjust.observations.images.bundles import BundleBatch
 from adjust.precision.precision import Precision
-from adjust.statistics.system import (
+from adjust.statistics.rows import (
     Entries,
     ImageRows,
     KeyColumns,
-    LinearSystem,
-    assembled,
     bundle_order,
     bundle_rows,
     columns_of_blocks,
     stacked,
 )
+from adjust.statistics.system import LinearSystem, assembled
 
 _FLAT = 1e-9
+_OWN = (MAX_LENS, MAX_LENS + 6, MAX_LENS + 12, MAX_LENS + 12 + N_SHAPE)
+"""Where lens, camera, target and shape end among the columns that a block could have besides."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +64,13 @@ class CondensedSystem:
         graph = self.system.precision.graph
         images, at = graph.images, int(graph.image_rows[row])
         if at >= images.n_points:  # its rows are among those of the system
-            i = int(np.searchsorted(self._first_points, row, side="right")) - 1
-            first = int(np.flatnonzero(self.block == i)[0]) + 2 * (row - int(self._first_points[i]))
-            A = self.system.A[first : first + 2]
-            columns = np.unique(A.indices)
-            return columns, A[:, columns].toarray()
+            A, i = self.system.A, int(np.searchsorted(self._first_points, row, side="right")) - 1
+            first = int(self._first_rows[i]) + 2 * (row - int(self._first_points[i]))
+            begin, middle, end = A.indptr[first : first + 3].tolist()
+            columns, place = np.unique(A.indices[begin:end], return_inverse=True)
+            out = np.zeros((2, len(columns)))
+            out[0, place[: middle - begin]], out[1, place[middle - begin :]] = A.data[begin:middle], A.data[middle:end]
+            return columns, out
         b = int(np.searchsorted(images.ptr, at, side="right")) - 1
         which, point = np.array([b]), at - int(images.ptr[b])
         local = images.rows(which)[0, 2 * point : 2 * point + 2, :-1]
@@ -81,77 +84,69 @@ class CondensedSystem:
         return int(self._first_points[-1])
 
     @cached_property
+    def _first_rows(self) -> IntArray:
+        """First row of every block."""
+        out = np.zeros(len(self._first_points), dtype=np.int64)
+        out[self.block[::-1]] = np.arange(len(self.block))[::-1]
+        return out
+
+    @cached_property
     def _first_points(self) -> IntArray:
         """First image point of every block, and the number of all."""
         blocks = self.system.precision.graph.survey.image_blocks
         return np.cumsum([0] + [len(b.uv) for b in blocks])
 
 
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Some blocks by their numbers: rows of the system, block (m,) of each and what it could have besides (m, 30)."""
+
+    rows: ImageRows
+    numbers: IntArray
+    block: IntArray
+    own: FloatArray
+
+
 def condensed_system(precision: Precision) -> CondensedSystem:
     """The system of a solved survey, of any size."""
-    kept: dict[str, list[FloatArray]] = {k: [] for k in ("lens", "camera", "target", "shape")}
-    blocks: list[IntArray] = []
-    numbers: list[IntArray] = []
-    columns: KeyColumns = {}
+    parts, columns = list[_Part](), KeyColumns()
 
     def image_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> ImageRows:
         columns.update(key_columns)
-        parts = [_known(graph, n, key_columns, kept, blocks, numbers)]
+        parts.append(_known(graph, n, key_columns))
         for part, bundle in enumerate(graph.bundles, 1):
             number = np.flatnonzero(graph.image_parts == part)
-            parts.append(_unknown(bundle, number, n, key_columns, kept, blocks))
-            numbers.append(number)
-        A = stacked([p.A for p in parts])
-        e, lengths, used = (np.concatenate([getattr(p, x) for p in parts]) for x in ("e", "lengths", "used"))
-        return ImageRows(A, e, lengths, used, [g for p in parts for g in p.groups])
+            parts.append(_unknown(bundle, number, n, key_columns))
+        rows = [p.rows for p in parts]
+        e, lengths, used = (np.concatenate([getattr(p, x) for p in rows]) for x in ("e", "lengths", "used"))
+        return ImageRows(stacked([p.A for p in rows]), e, lengths, used, [g for p in rows for g in p.groups])
 
     system = assembled(precision, image_rows)
-    block = np.concatenate([np.zeros(0, dtype=np.int64), *blocks])
-    lens, camera, target, shape = (
-        np.concatenate([np.zeros((0, w)), *kept[k]])
-        for k, w in (("lens", MAX_LENS), ("camera", 6), ("target", 6), ("shape", N_SHAPE))
-    )
-    return CondensedSystem(system, block, lens, camera, target, shape, system.e[: len(block)],
-                           np.concatenate([np.zeros(0, dtype=np.int64), *numbers]), columns)  # fmt: skip
+    numbers, block, own = (np.concatenate([getattr(p, x) for p in parts]) for x in ("numbers", "block", "own"))
+    lens, camera, target, shape = np.split(own, _OWN[:-1], axis=1)
+    return CondensedSystem(system, block, lens, camera, target, shape, system.e[: len(block)], numbers, columns)
 
 
-def _known(
-    graph: AdjustmentGraph, n: int, key_columns: KeyColumns, kept: dict[str, list[FloatArray]], blocks: list[IntArray],
-    numbers: list[IntArray],
-) -> ImageRows:  # fmt: skip
+def _known(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> _Part:
     """Blocks of known targets, those of the same size together."""
     images, entries = graph.images, Entries()
     number = graph.image_numbers
     shapes, columns, sets = _shapes(graph), columns_of_blocks(graph, key_columns), images.alike()
-    at, lengths, e = 0, [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
-    for mine, part in zip(sets, side_by_side(lambda mine: _condensed(graph, mine, shapes), sets), strict=True):
-        g, k = part.e.shape
-        entries.add_blocks(at + np.arange(g * k).reshape(g, k), columns(mine), part.by_key)
-        for name, values in kept.items():
-            values.append(getattr(part, name).reshape(g * k, -1))
-        blocks.append(np.repeat(number[mine], k))
-        e.append(part.e.ravel())
+    at, lengths, e, own = 0, [np.zeros(0, dtype=np.int64)], [np.zeros(0)], [np.zeros((0, _OWN[-1]))]
+    made = side_by_side(lambda mine: _condensed(graph, mine, shapes), sets)
+    for mine, (by_key, by_own, residual) in zip(sets, made, strict=True):
+        g, k = residual.shape
+        entries.add_blocks(at + np.arange(g * k).reshape(g, k), columns(mine), by_key)
+        own.append(by_own.reshape(g * k, -1))
+        e.append(residual.ravel())
         lengths.append(np.full(g, k))
         at += g * k
     order = np.concatenate([np.zeros(0, dtype=np.int64), *sets])
-    numbers.append(number[order])
     groups = [images.blocks[b].group for b in order.tolist()]
-    used = np.ones(len(groups), dtype=np.bool_)
-    A = entries.matrix((at, n))
+    A, of_blocks = entries.matrix((at, n)), np.concatenate(lengths)
     A.eliminate_zeros()  # rows that are triangular leave half of it empty
-    return ImageRows(A, np.concatenate(e), np.concatenate(lengths), used, groups)
-
-
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Rows of g alike blocks, k each: by the columns of their keys (g, k, w), the rest as in ``CondensedSystem``."""
-
-    by_key: FloatArray
-    lens: FloatArray
-    camera: FloatArray
-    target: FloatArray
-    shape: FloatArray
-    e: FloatArray
+    rows = ImageRows(A, np.concatenate(e), of_blocks, np.ones(len(groups), dtype=np.bool_), groups)
+    return _Part(rows, number[order], np.repeat(number[order], of_blocks), np.concatenate(own))
 
 
 def _shapes(graph: AdjustmentGraph) -> Callable[[IntArray], FloatArray]:
@@ -167,21 +162,23 @@ def _shapes(graph: AdjustmentGraph) -> Callable[[IntArray], FloatArray]:
     return lambda points: table[at[points]]
 
 
-def _condensed(graph: AdjustmentGraph, mine: IntArray, shapes: Callable[[IntArray], FloatArray]) -> _Rows:
-    """Of blocks that are alike."""
+def _condensed(
+    graph: AdjustmentGraph, mine: IntArray, shapes: Callable[[IntArray], FloatArray]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Of g blocks that are alike, k rows each, by the columns of their keys (g, k, w), own (g, k, 30) and e (g, k)."""
     images, width = graph.images, int(graph.images.n_rows[mine[0]]) - 1
     points = images.ptr[mine][:, None] + np.arange(len(images.blocks[mine[0]].uv))
     rows = images.condensed_rows(mine, shapes(points))
     nl = images.state.lenses.n_free[images.camera[mine]]
-    lens = np.zeros((*rows.shape[:2], MAX_LENS))
-    pose = np.empty((*rows.shape[:2], 6))
+    own = np.zeros((*rows.shape[:2], _OWN[-1]))
+    lens, camera, pose, shape = np.split(own, _OWN[:-1], axis=2)
     for count in np.unique(nl):  # warps make up for lens parameters in the number of columns
         those = nl == count
         lens[those, :, :count] = rows[those][:, :, :count]
         pose[those] = rows[those][:, :, count : count + 6]
-    by_camera = pose @ adjoint_of_inverse(images.chains.R[mine], images.chains.t[mine])
-    by_key = rows[:, :, :width] @ images.local_from_keys(mine)
-    return _Rows(by_key, lens, by_camera, pose, rows[:, :, width:-1].copy(), rows[:, :, -1].copy())
+    camera[:] = pose @ adjoint_of_inverse(images.chains.R[mine], images.chains.t[mine])
+    shape[:] = rows[:, :, width:-1]
+    return rows[:, :, :width] @ images.local_from_keys(mine), own, rows[:, :, -1].copy()
 
 
 def _shape_factors(x: FloatArray) -> FloatArray:
@@ -193,25 +190,17 @@ def _shape_factors(x: FloatArray) -> FloatArray:
     return out
 
 
-def _unknown(
-    bundle: BundleBatch, number: IntArray, n: int, key_columns: KeyColumns, kept: dict[str, list[FloatArray]],
-    blocks: list[IntArray],
-) -> ImageRows:  # fmt: skip
+def _unknown(bundle: BundleBatch, number: IntArray, n: int, key_columns: KeyColumns) -> _Part:
     """Blocks of unknown points, whose rows differ in the columns of their points: as they are, two per point."""
     A, e = bundle_rows(bundle, n, key_columns)
-    order = bundle_order(bundle)
-    used = np.repeat(bundle.unsorted(bundle.used), 2).astype(float)
-    local = bundle.A.reshape(-1, MAX_LENS + 7)[order] * used[:, None]
-    lengths = 2 * np.diff(bundle.block_ptr)
+    used, lengths = np.repeat(bundle.unsorted(bundle.used), 2).astype(float), 2 * np.diff(bundle.block_ptr)
     of_row = np.repeat(np.arange(len(lengths)), lengths)
-    pose = local[:, MAX_LENS : MAX_LENS + 6]
-    c = bundle.chains
-    by_camera = adjoint_of_inverse(c.R, c.t)
-    kept["lens"].append(local[:, :MAX_LENS])
-    kept["target"].append(np.zeros_like(pose))
-    kept["camera"].append(np.einsum("ni,nij->nj", pose, by_camera[of_row]))
-    kept["shape"].append(np.zeros((len(local), N_SHAPE)))
-    blocks.append(number[of_row])
+    local = bundle.A.reshape(-1, MAX_LENS + 7)[bundle_order(bundle)] * used[:, None]
+    own, pose = np.zeros((len(local), _OWN[-1])), local[:, MAX_LENS : MAX_LENS + 6]
+    own[:, :MAX_LENS] = local[:, :MAX_LENS]
+    by_camera = adjoint_of_inverse(bundle.chains.R, bundle.chains.t)
+    own[:, _OWN[0] : _OWN[1]] = np.einsum("ni,nij->nj", pose, by_camera[of_row])
     groups = [b.group for b in bundle.blocks]
     A = A if used.all() else (sparse.diags(used) @ A).tocsr()
-    return ImageRows(A, e * used, lengths.astype(np.int64), np.ones(len(groups), dtype=np.bool_), groups)
+    rows = ImageRows(A, e * used, lengths.astype(np.int64), np.ones(len(groups), dtype=np.bool_), groups)
+    return _Part(rows, number, number[of_row], own)

@@ -17,7 +17,8 @@ from adjust.model.survey import FloatArray, IntArray
 from adjust.statistics.changes import ChangeSearch
 from adjust.statistics.condensed import CondensedSystem
 from adjust.statistics.result import Consistency, PartTest
-from adjust.statistics.system import LinearSystem, groups_of_others
+from adjust.statistics.rows import groups_of_others
+from adjust.statistics.system import LinearSystem
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2, fisher
 from adjust.testing.quadratic_forms import upper_tail, upper_tail_bound

@@ -1,4 +1,4 @@
-"""What every group contributes to the normal equations, for any variance factors.
+"""What every group contributes to the normal equations, for any variance factors; a survey that has such factors.
 
 Observations are ``e + A dx`` with covariance V(theta). Most blocks belong to one group: V = theta_g V_0. A block whose
 components belong to several groups has V = D V_0 D, D = diag(sqrt(theta_g)): its correlations stay. The score and the
@@ -11,20 +11,25 @@ which follow from normal matrices of the groups alone: E[q_g] = sum_h S_gh (thet
 equations; the covariance of the estimated factors, relative to themselves, is 2 inv(S).
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TypeAlias
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
 
 import numpy as np
 import scipy
 from scipy import sparse
 
-from adjust.model.survey import FloatArray, IntArray
+from adjust.model.rewriting import Fields
+from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.statistics.normal import Normal, inverse_of_factor
 from adjust.statistics.system import LinearSystem
 
 _SMALL = 500
 """Unknowns up to which the normal matrices of the groups are full ones."""
+_WITH_COVARIANCE = (
+    "image_blocks", "table_readings", "pairs", "coordinates", "coordinate_differences", "alignments", "laser_spots",
+)  # fmt: skip
+_WITH_SIGMA = ("distances", "levels", "on_surfaces")
 Matrix: TypeAlias = FloatArray | sparse.csr_matrix
 
 
@@ -173,3 +178,39 @@ def _add_mixed(
     np.add.at(r, m.group, 1.0)  # the rest of its redundancy is in the normal matrices
     local = np.eye(len(v)) - 2.0 * np.diag(np.diag(B @ P)) + V * P - V * (P @ B @ P) - B * P
     np.add.at(S, (m.group[:, None], m.group[None, :]), 0.5 * local)
+
+
+def scaled_survey(survey: Survey, factors: Mapping[str, float]) -> Survey:
+    """The survey with every covariance of group g multiplied by ``factors[g]`` (1 where there is none).
+
+    Readings of several groups that share a covariance get the root of the product of their factors.
+    """
+
+    def root(group: str) -> float:
+        return float(np.sqrt(factors.get(group, 1.0)))
+
+    def with_cov(item: Any) -> Any:  # of every kind, by the name of its field
+        factor = root(item.group) ** 2
+        return item if factor == 1.0 else replace(item, cov=factor * item.cov)
+
+    def with_sigma(item: Any) -> Any:  # as above
+        factor = root(item.group)
+        return item if factor == 1.0 else replace(item, sigma=factor * item.sigma)
+
+    changed: Fields = {f: tuple(with_cov(x) for x in getattr(survey, f)) for f in _WITH_COVARIANCE}
+    changed |= {f: tuple(with_sigma(x) for x in getattr(survey, f)) for f in _WITH_SIGMA}
+    readings = tuple(
+        r if root(r.group) == 1.0 else replace(r, sigma=root(r.group) * r.sigma,
+                                               target_centring_sigma=root(r.group) * r.target_centring_sigma)
+        for r in survey.readings
+    )  # fmt: skip
+    group_of = {r.reading_id: r.group for r in survey.readings}
+    joint = tuple(
+        replace(c, cov=_scaled(c.cov, np.array([root(group_of.get(i, "")) for i in c.reading_ids])))
+        for c in survey.reading_covariances
+    )
+    return replace(survey, readings=readings, reading_covariances=joint, **changed)
+
+
+def _scaled(cov: FloatArray, roots: FloatArray) -> FloatArray:
+    return np.asarray(cov * np.outer(roots, roots))

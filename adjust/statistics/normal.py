@@ -9,7 +9,6 @@ import scipy
 from scipy import sparse
 
 from adjust.model.survey import FloatArray, IntArray
-from adjust.native.parallel import side_by_side
 from adjust.precision.s_transformation import without_datum_rows
 
 DENSE = 3000
@@ -20,8 +19,6 @@ PLAIN = 600
 """Unknowns up to which nothing is gained by their structure."""
 _SMALL_SET = 100
 """Unknowns of one epoch, or one point, up to which they are eliminated by themselves."""
-_AT_ONCE = 64
-"""Right-hand sides that are solved in one go."""
 _PIECE = 4096
 """Unknowns of small sets that are solved in one go: what stays in a core's own memory."""
 _ROOM, _WIDEST = 20_000_000, 500
@@ -40,94 +37,52 @@ class Inverse:
     U: FloatArray
     member: IntArray
 
-
-@dataclass(frozen=True, eq=False)
-class _Piece:
-    """Small sets of k unknowns: where they are (p k,), their inverses (p, k, k), their rows over the core (p k, c)."""
-
-    rows: IntArray
-    inverse: FloatArray
-    across: FloatArray
-
-    @cached_property
-    def at(self) -> IntArray | slice:
-        """The rows, as a slice where they follow each other: then nothing is copied."""
-        first, n = int(self.rows[0]), len(self.rows)
-        return slice(first, first + n) if np.array_equal(self.rows, np.arange(first, first + n)) else self.rows
-
-    def own(self, b: FloatArray) -> FloatArray:
-        """Inverses times (p k, r)."""
-        return np.asarray(np.matmul(self.inverse, b.reshape(*self.inverse.shape[:2], -1)).reshape(b.shape))
+    def times(self, right: FloatArray) -> FloatArray:
+        """The same times (n, k) or (n,), which may be sparse."""
+        return np.asarray(self.own @ right + self.U.T @ (self.U @ right))
 
 
-class Arrow:
-    """A matrix (n, n) of few unknowns that most others touch, the core, and small sets that touch nothing but these.
+def structured_inverse(N: sparse.csc_matrix, scale: FloatArray) -> Inverse | None:
+    """The inverse of a matrix (n, n), its unknowns counted in these scales (n,), where it is an arrow; None of others.
 
-    That is a survey of many epochs, or of many points seen from a few places.
+    An arrow has few unknowns that most others touch, the core, and small sets that touch nothing but these: a survey of
+    many epochs, or of many points seen from a few places. Linear in n.
     """
-
-    def __init__(self, core: IntArray, head: FloatArray, pieces: list[_Piece]) -> None:
-        self.core, self.pieces, self.n = core, pieces, len(core) + sum(len(p.rows) for p in pieces)
-        for p in pieces:
-            head -= p.across.T @ p.own(p.across)
-        self.lower = np.linalg.cholesky(head)
-
-    def solve(self, b: FloatArray) -> FloatArray:
-        """The solution (n, k) or (n,), some columns in one go."""
-        columns = b.reshape(len(b), -1)
-        parts = [columns[:, i : i + _AT_ONCE] for i in range(0, columns.shape[1], _AT_ONCE)]
-        solved = side_by_side(self._solve, parts)
-        return (solved[0] if len(solved) == 1 else np.concatenate(solved, axis=1)).reshape(b.shape)
-
-    def _solve(self, b: FloatArray) -> FloatArray:
-        x, y = np.empty_like(b), b[self.core]
-        for p in self.pieces:
-            x[p.at] = own = p.own(b[p.at])
-            y -= p.across.T @ own
-        x[self.core] = y = scipy.linalg.cho_solve((self.lower, True), y)
-        for p in self.pieces:
-            x[p.at] -= p.own(p.across @ y)
-        return x
-
-    def inverse(self, scale: FloatArray) -> Inverse:
-        """Of the matrix whose unknowns are counted in these (n,) scales."""
-        U, member = np.empty((len(self.core), self.n)), np.full(self.n, -1)
-        U[:, self.core] = scipy.linalg.solve_triangular(self.lower, np.diag(scale[self.core]), lower=True)
-        entries, first = [(np.zeros(0, dtype=np.int64),) * 2 + (np.zeros(0),)], 0
-        for p in self.pieces:
-            T, (n, k, _) = p.own(p.across), p.inverse.shape
-            U[:, p.rows] = -scipy.linalg.solve_triangular(self.lower, T.T, lower=True) * scale[p.rows]
-            member[p.rows] = first + np.repeat(np.arange(n), k)
-            rows, first = p.rows.reshape(n, k), first + n
-            values = p.inverse * scale[rows][:, :, None] * scale[rows][:, None, :]
-            entries.append((np.repeat(rows, k), np.tile(rows, k).ravel(), values.ravel()))
-        i, j, values = (np.concatenate(x) for x in zip(*entries, strict=True))
-        return Inverse(sparse.csr_matrix((values, (i, j)), (self.n, self.n)), U, member)
-
-
-def _arrow(scaled: sparse.csc_matrix) -> Arrow | None:
-    """The matrix as an arrow, where it is one."""
     from scipy.sparse.csgraph import connected_components
 
-    degree = np.diff(scaled.indptr)
+    degree, n = np.diff(N.indptr), N.shape[0]
     core = np.flatnonzero(degree > 2 * np.median(degree))
     rest = np.flatnonzero(degree <= 2 * np.median(degree))
-    if not 0 < len(core) <= _WIDEST:
+    if not 0 < len(core) <= min(_WIDEST, _ROOM // n):
         return None
-    N = scaled.tocsr()
+    N = N.tocsr()
     own, across = N[rest][:, rest], N[rest][:, core]
     _, label = connected_components(own, directed=False)
     sizes = np.bincount(label)
     if sizes.max() > _SMALL_SET:
         return None
-    pieces = list[_Piece]()
+    head, pieces = N[core][:, core].toarray(), list[tuple[IntArray, FloatArray, FloatArray]]()
     for k in np.unique(sizes).tolist():
         sets = np.argsort(label, kind="stable")[np.repeat(sizes, sizes) == k].reshape(-1, k)
         for mine in np.array_split(sets, -(-sets.size // _PIECE)):
-            rows = mine.ravel()
+            B: FloatArray = across[mine.ravel()].toarray()
             inverse: FloatArray = np.linalg.inv(_blocks(own, mine)).astype(np.float64, copy=False)
-            pieces.append(_Piece(rest[rows], inverse, across[rows].toarray()))
-    return Arrow(core, N[core][:, core].toarray(), pieces)
+            T = np.matmul(inverse, B.reshape(*mine.shape, -1)).reshape(B.shape)
+            head -= B.T @ T
+            pieces.append((rest[mine], inverse, T))
+    lower = np.linalg.cholesky(head)
+    U, member, first = np.empty((len(core), n)), np.full(n, -1), 0
+    U[:, core] = scipy.linalg.solve_triangular(lower, np.diag(scale[core]), lower=True)
+    entries = [(np.zeros(0, dtype=np.int64),) * 2 + (np.zeros(0),)]
+    for rows, inverse, T in pieces:
+        at, k = rows.ravel(), rows.shape[1]
+        U[:, at] = -scipy.linalg.solve_triangular(lower, T.T, lower=True) * scale[at]
+        member[rows] = first + np.arange(len(rows))[:, None]
+        first += len(rows)
+        values = inverse * scale[rows][:, :, None] * scale[rows][:, None, :]
+        entries.append((np.repeat(at, k), np.tile(rows, k).ravel(), values.ravel()))
+    i, j, values = (np.concatenate(x) for x in zip(*entries, strict=True))
+    return Inverse(sparse.csr_matrix((values, (i, j)), (n, n)), U, member)
 
 
 def _blocks(N: sparse.csr_matrix, sets: IntArray) -> FloatArray:
@@ -173,16 +128,17 @@ class Normal:
         self.scale = 1.0 / np.sqrt(np.maximum(N.diagonal(), 1e-300))
         self._scaled = N.copy()
         self._scaled.data *= self.scale[N.indices] * np.repeat(self.scale, np.diff(N.indptr))
-        self._arrow = _arrow(self._scaled) if self.n > PLAIN else None
+        self.structured = structured_inverse(self._scaled, self.scale) if self.n > PLAIN else None
+        """The inverse as a sum, where many small sets of unknowns share few others; None for others."""
 
     @cached_property
     def _of_scaled(self) -> Solver:
-        return _solver(self._scaled) if self._arrow is None else (self._arrow.solve, None)
+        return _solver(self._scaled)
 
     def solve(self, right: FloatArray) -> FloatArray:
         """The solution (n, k) or (n,) of N x = right, with the datum's rows fulfilled where ``right`` is seen."""
-        if (sums := self.structured) is not None:
-            return np.asarray(sums.own @ right + sums.U.T @ (sums.U @ right))
+        if self.structured is not None:
+            return self.structured.times(right)
         scale = self.scale if right.ndim == 1 else self.scale[:, None]
         out = self._of_scaled[0](scale * right)
         out *= scale
@@ -191,17 +147,10 @@ class Normal:
     @cached_property
     def inverse(self) -> FloatArray:
         """Inverse (n, n) of the matrix with its datum rows."""
-        inverse = self._of_scaled[1]
+        inverse = self._of_scaled[1] if self.structured is None else None
         if inverse is None:
             return self.solve(np.eye(self.n))
         return np.asarray(inverse() * self.scale * self.scale[:, None])
-
-    @cached_property
-    def structured(self) -> Inverse | None:
-        """The same as a sum, where many small sets of unknowns share few others: linear in n. None for others."""
-        if self._arrow is None or len(self._arrow.core) * self.n > _ROOM:
-            return None
-        return self._arrow.inverse(self.scale)
 
     def covariance(self, datum: sparse.csr_matrix) -> FloatArray:
         """Covariance (n, n) of the unknowns: the inverse less what the datum's own rows add (S-transformation)."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -11,9 +12,9 @@ from adjust.model.survey import FloatArray, IntArray
 from adjust.native.point_tests import AdjustedPoints, controlled_directions, point_tests
 from adjust.precision.precision import Precision, precision_of
 from adjust.statistics.condensed import CondensedSystem, condensed_system
-from adjust.statistics.influence import influences
+from adjust.statistics.effects import influences
 from adjust.statistics.result import Influence, ObservationTests, Reliability
-from adjust.statistics.system import groups_of_others
+from adjust.statistics.rows import groups_of_others
 from adjust.testing.criteria import Criteria, LevelOptions, criteria
 from adjust.testing.single_tests import Whitened, component_tests, whitened
 
@@ -27,20 +28,17 @@ _OF_COMPONENTS = ("w", "error", "detectable_component", "bias")
 
 @dataclass(frozen=True, eq=False)
 class _Batch:
-    """Observations of the same number of components: their rows in the table, what they are whitened with.
-
-    weakest: their weakest controlled directions, as :meth:`Whitened.weakest` has them.
-    """
+    """Observations of the same number of components: their rows in the table, what they are whitened with."""
 
     rows: IntArray
     x: Whitened
     W: FloatArray
     back: FloatArray
-    weakest: tuple[FloatArray, FloatArray]
 
-
-def _batch(rows: IntArray, x: Whitened, W: FloatArray, back: FloatArray) -> _Batch:
-    return _Batch(rows, x, W, back, x.weakest())
+    @cached_property
+    def weakest(self) -> tuple[FloatArray, FloatArray]:
+        """Their weakest controlled directions."""
+        return self.x.weakest()
 
 
 def reliability(
@@ -96,7 +94,7 @@ def _others(precision: Precision) -> list[_Batch]:
     for same in found.values():
         rows, e, M, W, back = (np.array([x[i] for x in same]) for i in range(5))
         used = np.array([x[5] for x in same], dtype=np.bool_)
-        out.append(_batch(rows, whitened(e, M, used), W, back))
+        out.append(_Batch(rows, whitened(e, M, used), W, back))
     return out + _pairs(precision, n_image)
 
 
@@ -113,7 +111,7 @@ def _pairs(precision: Precision, n_image: int) -> list[_Batch]:
             M = W @ stats.adjusted_cov[chosen, :k, :k] @ W.transpose(0, 2, 1)
             x = whitened(stats.whitened[chosen, :k], M, np.asarray(arrays.used[chosen], dtype=np.bool_))
             rows = n_image + precision.graph.first_pair + batch.rows[chosen]
-            out.append(_batch(rows, x, W, np.asarray(np.linalg.inv(W))))
+            out.append(_Batch(rows, x, W, np.asarray(np.linalg.inv(W))))
     return out
 
 
@@ -137,7 +135,7 @@ def _readings(precision: Precision, known: ReadingResiduals | None) -> list[_Bat
         g[rows] = whitener.T @ (e[rows] if used else Q @ e[rows]) / W[rows]
     n, first = len(e), sum(len(b.uv) for b in precision.graph.survey.image_blocks) + precision.graph.n_others
     x = Whitened(g[:, None], K[:, None, None], K[:, None], np.ones((n, 1, 1)), batch.used)
-    return [_batch(first + np.arange(n), x, W[:, None, None], 1.0 / W[:, None, None])]
+    return [_Batch(first + np.arange(n), x, W[:, None, None], 1.0 / W[:, None, None])]
 
 
 def _table(
@@ -219,23 +217,12 @@ def _influences(
     rows = rows[worth[rows] > 0.0].tolist()
     if not rows:
         return ()
-    W_of = {int(k): W for batch in batches for k, W in zip(*_among(batch, rows), strict=True)}
+    W_of = {int(b.rows[i]): b.W[i] for b in batches for i in np.flatnonzero(np.isin(b.rows, rows))}
     bias = {}
     for row in rows:
         own = tests.bias[tests.ptr[row] : tests.ptr[row + 1]]
-        W = _upper(points.W[row]) if row < tests.n_image else W_of[row]
-        bias[row] = W @ own
+        bias[row] = (np.insert(points.W[row], 2, 0.0).reshape(2, 2) if row < tests.n_image else W_of[row]) @ own
     return influences(system or condensed_system(precision_of(adjustment)), rows, bias)
-
-
-def _among(batch: _Batch, rows: Sequence[int]) -> tuple[IntArray, FloatArray]:
-    """Of a batch those of these rows (k,), and their W (k, n, n)."""
-    chosen = np.isin(batch.rows, rows)
-    return batch.rows[chosen], batch.W[chosen]
-
-
-def _upper(w: FloatArray) -> FloatArray:
-    return np.array([[w[0], w[1]], [0.0, w[2]]])
 
 
 def _uncontrolled(adjustment: Adjustment, tests: ObservationTests) -> tuple[str, ...]:

@@ -10,10 +10,10 @@ from adjust.graph.assembly import StartValues, values_of
 from adjust.model.errors import NotConvergedError, SurveyError, listed
 from adjust.model.result import Adjustment, Component, VarianceComponents
 from adjust.model.survey import Survey
+from adjust.statistics.group_sums import scaled_survey
 from adjust.statistics.outliers.outcome import OutlierSearch, SearchOptions
 from adjust.statistics.outliers.search import disagreeing_pairs, search_outliers
 from adjust.statistics.outliers.watched import watchable
-from adjust.statistics.scaling import scaled_survey
 from adjust.statistics.variance_components import ComponentOptions, Scaled, estimate_variance_components
 from adjust.testing.criteria import limits
 

@@ -4,50 +4,24 @@ The solver condenses image points and hides unknowns; what compares observations
 influences, the search for outliers) needs them apart. Rows are linearised at the solution: ``e(x + dx) = e + A dx``.
 """
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
 
-import gtsam
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
 from adjust.graph.assembly import AdjustmentGraph
-from adjust.model.result import Adjustment, ParameterName
+from adjust.model.result import Adjustment
 from adjust.model.survey import BoolArray, FloatArray, IntArray
-from adjust.native.lenses import MAX_LENS
 from adjust.native.parallel import side_by_side
 from adjust.observations.factors import ObservationFactor
-from adjust.observations.images.bundles import BundleBatch
-from adjust.observations.terrestrial.layout import Chunk
+from adjust.observations.images.segments import ranges
 from adjust.precision.precision import Precision, precision_of
 from adjust.precision.s_transformation import without_datum_rows
 from adjust.precision.stacked import AT_ONCE
 from adjust.statistics.normal import PLAIN, Inverse, Normal
-
-
-@dataclass(frozen=True, eq=False)
-class Columns:
-    """The free components of all unknowns, n in all, in the order of the graph's unknowns.
-
-    names, components, units: (n,). at: columns of an unknown's free components. free: which components these are.
-    """
-
-    names: tuple[ParameterName, ...]
-    components: tuple[str, ...]
-    units: tuple[str, ...]
-    at: dict[ParameterName, IntArray]
-    free: dict[ParameterName, IntArray]
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def of(self, names: Sequence[ParameterName]) -> IntArray:
-        """Columns of these unknowns, one after the other."""
-        return np.concatenate([self.at[n] for n in names] or [np.zeros(0, dtype=np.int64)])
+from adjust.statistics.rows import Columns, Entries, ItemRows, KeyColumns, MakeImageRows, points_apart, survey_rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,17 +59,18 @@ class LinearSystem:
         """By observation: the readings it is whitened with, and its place among them."""
         return {int(self.row_of[r]): (j, i) for j in self.joint for i, r in enumerate(j.rows)}
 
-    def bias_column(self, observation: int, bias: FloatArray) -> FloatArray:
-        """Right-hand side (n,) of the normal equations for a bias of one observation.
+    def bias_column(self, observation: int, bias: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Right-hand side of the normal equations for a bias of one observation: summands and their places (k,).
 
         bias: (k,) whitened, or (1,) over the conditional sigma of a reading with a joint covariance.
         """
+        rows: IntArray = np.arange(self.ptr[observation], self.ptr[observation + 1])
         if observation in self.joint_of:
             joint, i = self.joint_of[observation]
-            column = joint.W[:, i]
-            return np.asarray(self.A[joint.rows].T @ (column * (bias[0] / np.linalg.norm(column))))
-        rows = slice(int(self.ptr[observation]), int(self.ptr[observation + 1]))
-        return np.asarray(self.A[rows].T @ bias)
+            rows, bias = joint.rows, joint.W[:, i] * (bias[0] / np.linalg.norm(joint.W[:, i]))
+        lengths = self.A.indptr[rows + 1] - self.A.indptr[rows]
+        places = ranges(self.A.indptr[rows], lengths)
+        return self.A.indices[places], self.A.data[places] * np.repeat(bias, lengths)
 
     @cached_property
     def row_of(self) -> IntArray:
@@ -131,15 +106,26 @@ class LinearSystem:
         """``R Q R'`` (c, c) of sparse rows R (c, n) of the normal equations, or of what is observed: in any datum."""
         if len(self.columns) <= PLAIN:
             return np.asarray(rows @ self.normal.solve(rows.T.toarray()))
-        stacked, entries = self.precision.stacked, (rows.data, self._stacked[rows.indices], rows.indptr)
-        return stacked.among(sparse.csr_array(entries, (rows.shape[0], stacked.n)))
+        return self.precision.stacked.among(self._in_stack(rows))
+
+    def among_sums(self, rows: sparse.csr_matrix, q: int) -> FloatArray:
+        """The same (J, q, q) of the sums of the J sets of q rows from each on, as of what changed since then."""
+        if len(self.columns) <= PLAIN:
+            sums = np.cumsum(rows.toarray().reshape(-1, q, rows.shape[1])[::-1], axis=0)[::-1]
+            solved = self.normal.solve(sums.reshape(rows.shape).T).T.reshape(sums.shape)
+            return np.asarray(sums @ solved.transpose(0, 2, 1))
+        return self.precision.stacked.among_sums(self._in_stack(rows), q)
+
+    def _in_stack(self, rows: sparse.csr_matrix) -> sparse.csr_array:
+        """Rows (c, n) over a stacked vector of the precision's unknowns."""
+        entries = rows.data, self._stacked[rows.indices], rows.indptr
+        return sparse.csr_array(entries, (rows.shape[0], self.precision.stacked.n))
 
     def among_each(self, rows: sparse.csr_matrix, ptr: IntArray) -> list[FloatArray]:
         """The same of sets of rows, set i from ``ptr[i]`` on."""
         if len(self.columns) <= PLAIN or self.precision.hidden:
             return [self.among(rows[i:j]) for i, j in pairwise(ptr.tolist())]
-        entries = rows.data, self._stacked[rows.indices], rows.indptr
-        return self.precision.tree.each_among(sparse.csr_array(entries, (rows.shape[0], self.precision.tree.n)), ptr)
+        return self.precision.tree.each_among(self._in_stack(rows), ptr)
 
     def drawn(self, k: int) -> FloatArray:
         """Errors (n, k) of k solutions, drawn with the covariance in the survey's datum; always the same."""
@@ -195,76 +181,9 @@ class LinearSystem:
         return out
 
 
-@dataclass(frozen=True, eq=False)
-class ImageRows:
-    """Whitened rows of the image points, as some observations: A (m, n), e (m,), how many rows each has, used, groups.
-
-    An observation is one image point here, or a whole block of them (see :mod:`adjust.statistics.condensed`).
-    """
-
-    A: sparse.csr_matrix
-    e: FloatArray
-    lengths: IntArray
-    used: BoolArray
-    groups: list[str]
-
-
-KeyColumns = dict[int, IntArray]
-"""By key: column of every component, -1 for held ones."""
-
-
 def linear_system(adjustment: Adjustment) -> LinearSystem:
     """The system of an adjustment. Raises SurveyError for one without covariances."""
     return assembled(precision_of(adjustment), points_apart)
-
-
-MakeImageRows = Callable[[AdjustmentGraph, int, KeyColumns], ImageRows]
-ItemRows = tuple[Sequence[int], FloatArray, FloatArray]
-"""Keys of an observation, its whitened rows over them, and its whitened residuals."""
-
-
-@dataclass(frozen=True, eq=False)
-class SurveyRows:
-    """All observations at some values: ``A``, ``e``, ``ptr``, ``used`` as in ``LinearSystem``; groups (M,).
-
-    n_image: the first of them, which are image points; n_before: rows before those of the readings.
-    """
-
-    columns: Columns
-    key_columns: KeyColumns
-    A: sparse.csr_matrix
-    e: FloatArray
-    ptr: IntArray
-    used: BoolArray
-    groups: list[str]
-    n_image: int
-    n_before: int
-
-
-def survey_rows(
-    graph: AdjustmentGraph, values: gtsam.Values, image_rows: MakeImageRows,
-    of_item: Callable[[ObservationFactor], ItemRows],
-) -> SurveyRows:  # fmt: skip
-    """Rows of a graph that was prepared at these values."""
-    columns = _columns(graph)
-    key_columns = {graph.unknowns.by_name[name].key: _all_columns(graph, columns, name) for name in columns.at}
-    n = len(columns)
-    images = image_rows(graph, n, key_columns)
-    others = _other_rows(graph, values, of_item, n, key_columns)
-    readings = _reading_rows(graph, values, n, key_columns)
-    lengths = np.concatenate([images.lengths, others[2], np.ones(len(readings[1]))])
-    return SurveyRows(
-        columns, key_columns, stacked([images.A, others[0], readings[0]]),
-        np.concatenate([images.e, others[1], readings[1]]), np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
-        np.concatenate([images.used, _used_others(graph)]), images.groups + groups_of_others(graph),
-        len(images.lengths), images.A.shape[0] + others[0].shape[0],
-    )  # fmt: skip
-
-
-def stacked(parts: Sequence[sparse.csr_matrix]) -> sparse.csr_matrix:
-    """One below the other; not copied where all others are empty."""
-    some = [A for A in parts if A.shape[0]] or parts[:1]
-    return some[0] if len(some) == 1 else sparse.vstack(some).tocsr()
 
 
 def assembled(precision: Precision, image_rows: MakeImageRows) -> LinearSystem:
@@ -286,23 +205,6 @@ def assembled(precision: Precision, image_rows: MakeImageRows) -> LinearSystem:
                         rows.n_image, joint)  # fmt: skip
 
 
-def points_apart(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> ImageRows:
-    """Every image point an observation of its own."""
-    A, e = _image_rows(graph, n, key_columns)
-    groups = [b.group for b in graph.survey.image_blocks for _ in range(len(b.uv))]
-    return ImageRows(A, e, np.full(len(groups), 2), graph.used(), groups)
-
-
-def groups_of_others(graph: AdjustmentGraph) -> list[str]:
-    """Of all observations that are no image points, the readings last."""
-    return graph.of_others(lambda o: o.group, lambda p: p.group) + [r.group for r in graph.survey.readings]
-
-
-def _used_others(graph: AdjustmentGraph) -> BoolArray:
-    readings = graph.terrestrial.used if graph.terrestrial is not None else np.zeros(0, dtype=np.bool_)
-    return np.concatenate([np.array(graph.of_others(lambda o: o.used, lambda p: p.used), dtype=np.bool_), readings])
-
-
 def joint_readings(graph: AdjustmentGraph) -> list[tuple[IntArray, FloatArray]]:
     """Readings that share a covariance, by their place in ``Survey.readings``, and what whitens them."""
     chunks = graph.terrestrial.layout.chunks if graph.terrestrial is not None else ()
@@ -317,177 +219,6 @@ def mixed_blocks(system: LinearSystem) -> list[tuple[IntArray, tuple[str, ...], 
         if len(set(groups)) > 1:
             out.append((joint.rows, groups, np.asarray(np.linalg.inv(joint.W))))
     return out
-
-
-def _columns(graph: AdjustmentGraph) -> Columns:
-    names: list[ParameterName] = []
-    components: list[str] = []
-    units: list[str] = []
-    at, free, whole = {}, {}, {n: np.arange(n) for n in {u.dim for u in graph.unknowns.by_name.values()}}
-    for name, unknown in graph.unknowns.by_name.items():
-        held = graph.unknowns.held.get(unknown.key, ())
-        free[name] = kept = np.delete(whole[unknown.dim], held) if held else whole[unknown.dim]
-        at[name] = np.arange(len(names), len(names) + len(kept))
-        names += [name] * len(kept)
-        components += [unknown.components[i] for i in kept.tolist()] if held else unknown.components
-        units += [unknown.units[i] for i in kept.tolist()] if held else unknown.units
-    return Columns(tuple(names), tuple(components), tuple(units), at, free)
-
-
-def _all_columns(graph: AdjustmentGraph, columns: Columns, name: ParameterName) -> IntArray:
-    """Column (dim,) of every component of an unknown, -1 for held ones."""
-    free, dim = columns.free[name], graph.unknowns.by_name[name].dim
-    if len(free) == dim:
-        return columns.at[name]
-    out = np.full(dim, -1, dtype=np.int64)
-    out[free] = columns.at[name]
-    return out
-
-
-_Numbers = npt.NDArray[np.integer[Any]]
-
-
-class Entries:
-    """Dense blocks gathered into one sparse matrix; columns of -1 are left out."""
-
-    def __init__(self) -> None:
-        self.parts: list[tuple[_Numbers, _Numbers, FloatArray]] = []
-
-    def add(self, rows: IntArray, columns: IntArray, values: FloatArray) -> None:
-        """Values (r, c) at these rows and columns."""
-        kept = columns >= 0
-        c = columns[kept]
-        v = values[:, kept]
-        self.parts.append((np.repeat(rows, len(c)), np.tile(c, len(rows)), v.ravel()))
-
-    def add_blocks(self, rows: IntArray, columns: IntArray, values: FloatArray) -> None:
-        """Values (b, r, c) at rows (b, r) and columns (b, c)."""
-        down = np.broadcast_to(rows[:, :, None].astype(np.int32), values.shape)
-        across = np.broadcast_to(columns[:, None, :].astype(np.int32), values.shape)
-        if (columns >= 0).all():
-            self.parts.append((down.ravel(), across.ravel(), values.ravel()))
-        else:
-            kept = across >= 0
-            self.parts.append((down[kept], across[kept], values[kept]))
-
-    def add_many(self, points: IntArray, columns: IntArray, values: FloatArray) -> None:
-        """Two rows each of many points: columns (k, c), values (k, 2, c)."""
-        self.add_blocks(2 * points[:, None] + np.arange(2), columns, values)
-
-    def matrix(self, shape: tuple[int, int]) -> sparse.csr_matrix:
-        """All together."""
-        if not self.parts:
-            return sparse.csr_matrix(shape)
-        r, c, v = (np.concatenate(x) for x in zip(*self.parts, strict=True))
-        if (r[1:] >= r[:-1]).all():  # row by row already
-            ptr = np.cumsum(np.bincount(r + 1, minlength=shape[0] + 1))
-            out = sparse.csr_matrix((v, c, ptr), shape=shape)
-            out.sum_duplicates()
-            return out
-        return sparse.csr_matrix((v, (r, c)), shape=shape)
-
-
-Rows = tuple[sparse.csr_matrix, FloatArray]
-
-
-def _image_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> Rows:
-    """Rows of all image points in the order of ``Survey.image_blocks``."""
-    parts = [_known_rows(graph, n, key_columns)] + [bundle_rows(b, n, key_columns) for b in graph.bundles]
-    if len(parts) == 1:
-        return parts[0]
-    A, e = sparse.vstack([p[0] for p in parts]).tocsr(), np.concatenate([p[1] for p in parts])
-    order = (2 * graph.image_rows[:, None] + np.arange(2)).ravel()
-    return A[order], e[order]
-
-
-def columns_of_blocks(graph: AdjustmentGraph, key_columns: KeyColumns) -> Callable[[IntArray], IntArray]:
-    """Columns (g, w) of g image blocks of known targets with equally many: those of their keys, one after the other."""
-    k = graph.images.of_blocks
-    every = np.concatenate([np.zeros(0, dtype=np.int64), *(key_columns[key] for key in k.key.tolist())])
-    first = np.cumsum(k.columns) - k.columns
-    return lambda mine: every[first[mine][:, None] + np.arange(int(k.columns[mine[0]]))]
-
-
-def _known_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> Rows:
-    images, entries = graph.images, Entries()
-    e = np.zeros(2 * images.n_points)
-    columns = columns_of_blocks(graph, key_columns)
-    for mine in images.alike():
-        local = images.rows(mine)
-        rows = 2 * images.ptr[mine][:, None] + np.arange(local.shape[1])
-        e[rows] = local[:, :, -1]
-        entries.add_blocks(rows, columns(mine), local[:, :, :-1] @ images.local_from_keys(mine))
-    return entries.matrix((len(e), n)), e
-
-
-def bundle_rows(bundle: BundleBatch, n: int, key_columns: KeyColumns) -> Rows:
-    """Whitened rows of the image points of unknown points, used or not, in the order of the bundle's blocks."""
-    bundle.whitened_squares()  # leaves the rows of all points, used or not, with their own weights
-    k, points = len(bundle.point), Entries()
-    of_point = np.full((len(bundle.point_ids), 3), -1, dtype=np.int64)
-    for i in bundle.reduced:
-        of_point[i] = key_columns[bundle.point_key[i]]
-    points.add_many(np.arange(k), np.where(bundle.point_at[:, None] >= 0, -1, of_point[bundle.point]),
-                    bundle.A[:, :, MAX_LENS + 3 : MAX_LENS + 6])  # fmt: skip
-    columns = np.concatenate([key_columns[key] for key in bundle.order])
-    kept = columns >= 0
-    select = sparse.csr_matrix((np.ones(int(kept.sum())), (np.flatnonzero(kept), columns[kept])), (len(columns), n))
-    A_keys = bundle.local_rows() @ (bundle.local_from_keys() @ select) + points.matrix((2 * k, n))
-    order = bundle_order(bundle)
-    return A_keys.tocsr()[order], bundle.A[:, :, MAX_LENS + 6].ravel()[order]
-
-
-def bundle_order(bundle: BundleBatch) -> IntArray:
-    """Rows (2 K,) of a bundle's image points as its blocks have them."""
-    back = np.empty(len(bundle.sorted), dtype=np.int64)
-    back[bundle.sorted] = np.arange(len(back))
-    return np.asarray((2 * back[:, None] + np.arange(2)).ravel())
-
-
-def _other_rows(
-    graph: AdjustmentGraph, values: gtsam.Values, of_item: Callable[[ObservationFactor], ItemRows], n: int,
-    key_columns: KeyColumns,
-) -> tuple[sparse.csr_matrix, FloatArray, IntArray]:  # fmt: skip
-    """Rows, residuals and lengths of what is neither an image point nor a reading, in the order of the survey."""
-    alone, batch, entries = [of_item(item) for item in graph.singles], graph.pairs, Entries()
-    rows = iter([len(e) for _, _, e in alone])
-    lengths = np.array(graph.of_others(lambda _: next(rows), lambda p: len(p.cov)), dtype=np.int64)
-    ptr = np.concatenate([[0], np.cumsum(lengths)])
-    residuals = np.empty(int(ptr[-1]))
-    for (keys, A, e), at in zip(alone, ptr[graph.single].tolist(), strict=True):
-        columns = np.concatenate([np.zeros(0, dtype=np.int64), *(key_columns[k] for k in keys)])
-        residuals[at : at + len(e)] = e
-        entries.add(np.arange(at, at + len(e)), columns, A)
-    if batch is not None:
-        first = ptr[graph.first_pair + batch.rows]
-        r, *by = batch.whitened_rows(values)
-        places = {k: np.flatnonzero(np.equal(batch.arrays.is_pose, k == 6)) for k in (6, 3)}
-        none = np.full(6, -1)
-        ends = [np.array([key_columns.get(k, none) for k in keys.tolist()]) for keys in (batch.b_key, batch.a_key)]
-        for k, mine in places.items():
-            at = first[mine, None] + np.arange(k)
-            residuals[at] = r[mine, :k]
-            across = np.concatenate([c[mine] for c in ends], axis=1)
-            entries.add_blocks(at, across, np.concatenate([J[mine, :k] for J in by], axis=2))
-    return entries.matrix((int(ptr[-1]), n)), residuals, lengths
-
-
-def _reading_rows(graph: AdjustmentGraph, values: gtsam.Values, n: int, key_columns: KeyColumns) -> Rows:
-    batch = graph.terrestrial
-    if batch is None:
-        return sparse.csr_matrix((0, n)), np.zeros(0)
-    e, entries = batch.unweighted(values).copy(), Entries()
-    alike: dict[tuple[int, ...], list[Chunk]] = {}
-    for chunk in batch.layout.chunks:
-        if chunk.keys:  # those between held positions have none
-            alike.setdefault((len(chunk.rows), *chunk.dims), []).append(chunk)
-    for (k, *dims), chunks in alike.items():
-        rows, at = np.array([c.rows for c in chunks]), np.array([c.start for c in chunks])
-        for i, dim in enumerate(dims):
-            blocks = batch.J[at[:, None] + np.arange(k * dim)].reshape(len(at), k, dim)
-            entries.add_blocks(rows, np.array([key_columns[c.keys[i]] for c in chunks]), blocks)
-            at += k * dim
-    return entries.matrix((len(e), n)), e
 
 
 def _datum(precision: Precision, n: int, key_columns: KeyColumns) -> tuple[sparse.csr_matrix, FloatArray]:

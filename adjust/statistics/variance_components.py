@@ -16,9 +16,8 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Component, VarianceComponents
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.precision.precision import precision_of
-from adjust.statistics.group_sums import GroupSums, Moments, group_sums, moments
+from adjust.statistics.group_sums import GroupSums, Moments, group_sums, moments, scaled_survey
 from adjust.statistics.normal import DENSE
-from adjust.statistics.scaling import scaled_survey
 from adjust.statistics.system import LinearSystem, linear_system, mixed_blocks
 from adjust.testing.distributions import chi2
 

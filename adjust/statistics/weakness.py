@@ -25,7 +25,8 @@ _DRAWS, _SURE = 64, 7.0
 """Drawn solutions, and by how many sigmas what they tell may be wrong."""
 _COMPARED, _TOGETHER = 256, 8
 """Components that are compared with all others in one go, and how often that is done side by side."""
-_KRYLOV, _RESTARTS = 40, 50
+_BLOCK, _STEPS, _EXACT = 8, 40, 1e-10
+"""Directions that are sought together, in at most so many steps; of an eigenvalue, what its vector leaves."""
 _Found = list[tuple[int, int, float]]
 """Two components and their correlation."""
 
@@ -69,16 +70,19 @@ def correlations(
     if n <= PLAIN or (n <= DENSE and system.structured is not None):
         sigma = np.sqrt(np.maximum(np.diag(system.covariance), 1e-300))
         C = system.covariance / sigma / sigma[:, None]
-        pairs = _largest(lambda rows, part: C[rows, part], n, n, limit)
+        pairs = _largest(lambda rows, part: np.abs(C[rows, part]), n, n, limit)
         return _named(system, _above(pairs, C[pairs[:, 0], pairs[:, 1]], limit))
     pairs = _likely(system, index, limit)
     columns = np.array(list(dict.fromkeys(pairs[:, 1].tolist()))[: max(_SOLVED // n, AT_ONCE)], dtype=np.int64)
     number = np.full(n, -1)
     number[columns] = np.arange(len(columns))
-    pairs = pairs[number[pairs[:, 1]] >= 0]
-    parts = [columns[i : i + AT_ONCE] for i in range(0, max(len(columns), 1), AT_ONCE)]
-    Q = np.hstack(side_by_side(lambda part: system.through_tree(_units(system, part)), parts))
-    found = _above(pairs, Q[pairs[:, 0], number[pairs[:, 1]]] / system.sigmas[pairs].prod(axis=1), limit)
+
+    def of(first: int) -> _Found:
+        some = pairs[number[pairs[:, 1]] // AT_ONCE == first // AT_ONCE]
+        Q = system.through_tree(_units(system, columns[first : first + AT_ONCE]))
+        return _above(some, Q[some[:, 0], number[some[:, 1]] - first] / system.sigmas[some].prod(axis=1), limit)
+
+    found = [x for part in side_by_side(of, range(0, len(columns), AT_ONCE)) for x in part]
     return _named(system, found + (_within(system, index, limit) if len(index) < n else []))
 
 
@@ -97,32 +101,42 @@ def _likely(system: LinearSystem, index: IntArray, limit: float) -> IntArray:
     drawn /= np.maximum(np.linalg.norm(drawn, axis=1), 1e-150)[:, None]
     order = np.concatenate([index, np.delete(np.arange(len(drawn)), index)])
     u, z = drawn[order].astype(np.float32), np.arctanh(limit) - _SURE / np.sqrt(_DRAWS - 2.0)
-    pairs = order[_largest(lambda rows, part: u[rows] @ u[part].T, len(u), len(index), np.tanh(max(z, 1e-9)))]
+
+    def size(rows: slice, part: slice) -> FloatArray:
+        x: FloatArray = u[rows] @ u[part].T
+        return np.abs(x, out=x)
+
+    pairs = order[_largest(size, len(u), len(index), float(np.tanh(max(z, 1e-9))))]
     often = np.bincount(pairs.ravel(), minlength=len(u))[pairs]
     return np.where(often[:, :1] > often[:, 1:], pairs[:, ::-1], pairs)
 
 
-def _largest(block: Callable[[slice, slice], FloatArray], total: int, n: int, least: float) -> IntArray:
+def _largest(size: Callable[[slice, slice], FloatArray], total: int, n: int, least: float) -> IntArray:
     """Pairs (k, 2) of n columns with each other and with all others, those at least of a size, the largest first.
 
-    block: of some rows and columns. total: rows. Small blocks: what is not so large is never written to memory, and
-    what is smaller than enough others that were found before is not so large.
+    size: of some rows and columns. total: rows. Small blocks: what is not so large is never written to memory, and
+    what is smaller than enough others, of neighbours first, is not so large.
     """
+    parts = [slice(first, min(first + _COMPARED, n)) for first in range(0, n, _COMPARED)]
 
-    def above(first: int) -> FloatArray:
-        part, found = slice(first, min(first + _COMPARED, n)), [np.zeros((0, 3))]
-        for row in range(first, total, 4 * _COMPARED):
-            size = np.abs(block(slice(row, row + 4 * _COMPARED), part))
-            if row == first:
-                size[: size.shape[1]] = np.tril(size[: size.shape[1]], -1)  # each pair once, nothing with itself
-            if size.max() >= least:
-                i, j = np.nonzero(size >= least)
-                found.append(np.stack([row + i, first + j, size[i, j]], axis=1))
+    def above(part: slice) -> FloatArray:
+        found = [np.zeros((0, 3))]
+        for row in range(part.start, total, 4 * _COMPARED):
+            x = size(slice(row, row + 4 * _COMPARED), part)
+            if row == part.start:
+                x[: x.shape[1]] = np.tril(x[: x.shape[1]], -1)  # each pair once, nothing with itself
+            if x.max() >= least:
+                at = np.flatnonzero(x >= least)
+                i, j = np.divmod(at, x.shape[1])
+                found.append(np.stack([row + i, part.start + j, x.ravel()[at]], axis=1))
         return _first(np.concatenate(found))
 
-    out, firsts = np.zeros((0, 3)), range(0, n, _COMPARED)
-    for k in range(0, len(firsts), _TOGETHER):
-        out = _first(np.concatenate([out, *side_by_side(above, firsts[k : k + _TOGETHER])]))
+    near = np.concatenate([x[x >= least] for x in (np.tril(size(part, part), -1) for part in parts)]) if parts else ()
+    if len(near) > _KEPT:
+        least = float(np.partition(near, -_KEPT)[-_KEPT])
+    out = np.zeros((0, 3))
+    for k in range(0, len(parts), _TOGETHER):
+        out = _first(np.concatenate([out, *side_by_side(above, parts[k : k + _TOGETHER])]))
         least = max(least, float(out[-1, 2])) if len(out) == _KEPT else least
     return out[:, :2].astype(np.int64)
 
@@ -208,7 +222,7 @@ def weak_directions(
     A, used = system.A, system.used[system.row_of]
     squares = A.data**2 * np.repeat(used, np.diff(A.indptr))
     alone = np.sqrt(np.maximum(np.bincount(A.indices, squares, A.shape[1]), 1e-300))
-    values, vectors = _eigen(system, np.arange(len(alone)), alone, most)
+    values, vectors = _eigen(system, alone, most)
     c, out = system.columns, []
     for inflation, shares, order in inflated(values, vectors, least_inflation, _SHARE):
         amount = inflation * shares / np.linalg.norm(shares) / alone * np.sign(shares[order[0]])
@@ -233,30 +247,42 @@ def inflated(
         yield float(np.sqrt(value)), shares, large[np.argsort(-np.abs(shares[large]), kind="stable")].tolist()
 
 
-def _eigen(system: LinearSystem, index: IntArray, scale: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
-    """Largest eigenvalues (k,), the first first, and vectors (n, k) of the covariance of these columns times scales.
+def _eigen(system: LinearSystem, scale: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
+    """Largest eigenvalues (k,), the first first, and vectors (n, k) of the covariance times the scales (n,) of columns.
 
-    In large surveys by Lanczos' method, every step of it one solution of the normal equations (Golub and Van Loan 2013,
-    chapter 10): the few directions that are asked for, and not all n.
+    In large surveys by Lanczos' method with a block of vectors (Golub and Van Loan 2013, 10.3.6), every step of it one
+    solution of the normal equations: it begins with drawn errors, in which the directions sought are large already.
     """
-    n = len(index)
+    n = len(scale)
     if n <= FEW:
-        Q = covariance_columns(system, index)[index] * np.outer(scale, scale)
+        Q = covariance_columns(system, np.arange(n)) * np.outer(scale, scale)
         values, vectors = np.linalg.eigh(0.5 * (Q + Q.T))
         return values[::-1][:most], vectors[:, ::-1][:, :most]
-    from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh  # here: they take long to load
+    kept, X, m = np.empty((_BLOCK * _STEPS, n)), system.drawn(_BLOCK) * scale[:, None], 0
+    X, left = _orthonormal(X, kept[:0])
+    H, values, moves, exact = np.zeros((len(kept),) * 2), np.zeros(0), np.empty((0, 0)), np.zeros(0, dtype=np.bool_)
+    for _ in range(_STEPS):
+        own = slice(m, m := m + X.shape[1])
+        kept[own] = X.T
+        X = system.times_covariance(X * scale[:, None]) * scale[:, None]
+        H[:m, own] = kept[:m] @ X
+        H[own, :m] = H[:m, own].T
+        X, left = _orthonormal(X, kept[:m])
+        values, moves = (x[..., : -most - 1 : -1] for x in np.linalg.eigh(H[:m, :m]))
+        exact = np.linalg.norm(left @ moves[own], axis=0) <= _EXACT * values
+        if exact.all():
+            break
+    return values[exact], kept[:m].T @ moves[:, exact]
 
-    inside = np.zeros(len(system.columns))
 
-    def times(x: FloatArray) -> FloatArray:
-        inside[index] = scale * x.ravel()
-        return np.asarray(scale * system.times_covariance(inside)[index])
-
-    operator = LinearOperator((n, n), matvec=times, dtype=np.float64)
-    first = 1.0 + 0.1 * np.cos(np.arange(n))  # the same every time, at right angles to nothing in particular
-    try:
-        values, vectors = eigsh(operator, most, which="LA", v0=first, ncv=_KRYLOV, tol=1e-6, maxiter=_RESTARTS)
-    except ArpackNoConvergence as found:  # those that came out are right
-        values, vectors = found.eigenvalues, found.eigenvectors
-    order = np.argsort(-values, kind="stable")
-    return np.asarray(values)[order], np.asarray(vectors)[:, order]
+def _orthonormal(X: FloatArray, kept: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Unit vectors U (n, j) at right angles with what X (n, k) spans besides kept (m, n), and R with X = U R there."""
+    R = np.eye(X.shape[1])
+    for _ in range(2):
+        X = X - kept.T @ (kept @ X)
+        G = X.T @ X
+        size = np.sqrt(np.diag(G)) + 1e-300
+        values, vectors = np.linalg.eigh(G / size[:, None] / size)
+        some, root = values > 1e-12, np.sqrt(np.abs(values))
+        X, R = X @ (vectors / root / size[:, None])[:, some], (vectors * root * size[:, None])[:, some].T @ R
+    return X, R

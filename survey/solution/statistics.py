@@ -11,9 +11,9 @@ from adjust.model.result import Adjustment, Decision, Estimate, ParameterName, V
 from adjust.model.survey import FloatArray
 from adjust.native.parallel import Beside
 from adjust.precision.precision import precision_of
-from adjust.statistics.budget import uncertainty_budget
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.consistency import consistency
+from adjust.statistics.effects import uncertainty_budget
 from adjust.statistics.relative_precision import relative_precision
 from adjust.statistics.reliability import LARGEST_NETWORK, reliability
 from adjust.statistics.result import (
@@ -76,7 +76,7 @@ def statistics_of(adjustment: Adjustment, tolerances: tuple[Tolerance, ...], sca
     judged = verdicts(adjustment, tolerances, scale)
     alpha = adjustment.global_test.alpha if adjustment.global_test is not None else 0.05
     drawn, near = correlation_matrix(adjustment), neighbours(adjustment, scale)
-    if _is_large_network(adjustment):
+    if adjustment.survey.is_pose_network and len(adjustment.other_residuals) > LARGEST_NETWORK:
         tested = consistency(adjustment, None, alpha)
         return Statistics(reliability(adjustment), adjustment.variance_components, (), (), near, (), drawn,
                           adjustment.decisions, judged, tested, (*tested.left_out, _LARGE_NETWORK))  # fmt: skip
@@ -100,10 +100,6 @@ _LARGE_NETWORK = (
     f"correlations, weak directions, uncertainty budgets and influences: not computed for a network of more than "
     f"{LARGEST_NETWORK} pairs; the covariance of any stations is there (Solution.covariance)"
 )
-
-
-def _is_large_network(adjustment: Adjustment) -> bool:
-    return adjustment.survey.is_pose_network and len(adjustment.other_residuals) > LARGEST_NETWORK
 
 
 def _left_out(adjustment: Adjustment, system: LinearSystem, n_budgets: int) -> tuple[str, ...]:
@@ -163,7 +159,8 @@ def neighbours(adjustment: Adjustment, scale: Scale) -> tuple[RelativePrecision,
                 places.append(x)
     if len(names) < 2:
         return ()
-    x, free, found = np.array(places), [_is_free(adjustment, name) for name in names], dict[tuple[int, int], None]()
+    x, found = np.array(places), dict[tuple[int, int], None]()
+    free = [bool(_unknown_components(adjustment.estimates[name])) for name in names]
     for i in range(len(x)):
         near = _nearest(x, i, min(3, len(x)))
         found |= {(min(i, k), max(i, k)): None for k in near[1:] if free[i] or free[k]}
@@ -178,10 +175,6 @@ def neighbours(adjustment: Adjustment, scale: Scale) -> tuple[RelativePrecision,
         for r in relative_precision(adjustment, pairs, PROBABILITY, posterior)
         if r.ellipsoid.dimension  # rotations alone say nothing of positions
     )  # fmt: skip
-
-
-def _is_free(adjustment: Adjustment, name: ParameterName) -> bool:
-    return bool(_unknown_components(adjustment.estimates[name]))
 
 
 def correlation_matrix(adjustment: Adjustment) -> CorrelationMatrix | None:

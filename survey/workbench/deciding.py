@@ -23,7 +23,7 @@ from survey.workbench.resident import Resident, Watch
 from survey.workbench.situation import CancelledError, ChangedError, Situation, Step, signature_of
 
 if TYPE_CHECKING:
-    from adjust.diagnosis.ranking import Candidate
+    from adjust.diagnosis.diagnosis import Candidate
 
 _NONE: Mapping[str, str] = MappingProxyType({})
 

@@ -8,7 +8,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.model.observations import FrameRef, PositionRef, Reading
 from adjust.model.survey import FloatArray, Survey
-from adjust.statistics.scaling import scaled_survey
+from adjust.statistics.group_sums import scaled_survey
 from survey.simulate.scene import Truth
 from tests.acceptance.planted_images import Mistake, Plant, anything, of
 

@@ -121,6 +121,8 @@ def _images() -> None:
     point_tests.farthest_points(ptr, points.v, np.zeros((len(ptr) - 1, 2)))
     point_tests.controlled_directions(points, np.zeros(n, dtype=np.int64))
     point_tests.point_tests(points, lambda0, tuple(np.zeros((n,) if i < 5 else (n, 2)) for i in range(9)))
+    eye, ones = point_tests.SparseRows(np.arange(4), np.arange(3), np.ones(3)), np.ones((3, 2))
+    point_tests.change_squares(np.array([0, 1, 3]), np.arange(3), ones, eye, ones[:, 0].copy(), eye, ones)
     words = text.Words.of(["a", "bc", ""])
     text.number_rows(words, np.array([0, 1, 2]), words, np.array([1, 1, 0]), points.v[:3], [3, 0])
     parts = [(text.WORD, 0), (text.NUMBERS, 2), (text.TEXT, 1)]

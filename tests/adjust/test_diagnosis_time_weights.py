@@ -13,7 +13,7 @@ from adjust.diagnosis.time.forgotten_motion import forgotten_motion
 from adjust.diagnosis.time.synchronisation import time_offset, unsynchronised
 from adjust.diagnosis.weights import correlated
 from adjust.diagnosis.weights.sigmas import odd_sigmas, wrong_factors
-from adjust.statistics.scaling import scaled_survey
+from adjust.statistics.group_sums import scaled_survey
 from survey.project import read
 from survey.simulate import head_on_table, stereo
 from tests.adjust.planted import case_of, hall

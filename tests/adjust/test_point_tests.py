@@ -1,11 +1,14 @@
-"""Tests of image points in the core against the same in NumPy, for points with little control and none."""
+"""Tests of image points and of changes in the core against the same in NumPy, with little control and none."""
 
 from itertools import pairwise
 
 import numpy as np
+from scipy import sparse
 
 from adjust.native.point_tests import (
     AdjustedPoints,
+    SparseRows,
+    change_squares,
     controlled_directions,
     farthest_points,
     point_tests,
@@ -121,3 +124,23 @@ def test_sums_and_farthest_points_of_blocks() -> None:
         np.testing.assert_allclose(sums[b], expected, rtol=1e-12)
         distance = np.linalg.norm(points.v[i:j] - centre[b], axis=1).max(initial=0.0)
         np.testing.assert_allclose(farthest[b], distance, rtol=1e-14)
+
+
+def test_changes_from_every_run_on_are_those_of_the_dense_matrices() -> None:
+    """Runs of several rows, of none, and with unknowns that other runs have too."""
+    rng = np.random.default_rng(3)
+    first, m, n = np.array([0, 4, 4, 9, 15, 16]), 30, 20
+    rows, e = rng.permutation(m)[:16], rng.standard_normal(m)
+    A = sparse.random_array((m, n), density=0.2, rng=rng, format="csr")
+    half = sparse.block_diag([rng.standard_normal((k, k)) for k in (3, 5, 1, 7, 4)])
+    own, U = (half @ half.T).tocsr(), rng.standard_normal((n, 6))
+    for q in (1, 6, 8, 14):
+        B = rng.standard_normal((16, q))
+        A_rows, own_rows = (SparseRows(x.indptr.astype(int), x.indices.astype(int), x.data) for x in (A, own))
+        squares, M, g = change_squares(first, rows, B, A_rows, e, own_rows, U)
+        for j, start in enumerate(first[:-1]):
+            C, X = B[start:], A.toarray()[rows[start:]].T @ B[start:]
+            expected = C.T @ C - X.T @ (own.toarray() + U @ U.T) @ X
+            np.testing.assert_allclose(M[j], expected, rtol=0.0, atol=1e-12 * np.abs(expected).max(initial=1.0))
+            np.testing.assert_allclose(squares[j], (C**2).sum(axis=0))
+            np.testing.assert_allclose(g[j], C.T @ e[rows[start:]])

@@ -16,7 +16,7 @@ from adjust.model.observations import FrameRef, Pair
 from adjust.model.result import Adjustment
 from adjust.model.survey import Datum, FloatArray, PointParameter, PoseParameter, Station, Survey
 from adjust.statistics.condensed import condensed_system
-from adjust.statistics.influence import shifts
+from adjust.statistics.effects import shifts
 from adjust.statistics.relative_precision import relative_precision
 from adjust.statistics.reliability import observation_name, reliability
 from adjust.statistics.screened_adjustment import adjust_cleaned

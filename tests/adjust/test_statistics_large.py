@@ -15,8 +15,8 @@ from adjust.precision.precision import precision_of
 from adjust.statistics import changes, weakness
 from adjust.statistics import normal as normal_module
 from adjust.statistics import system as system_module
-from adjust.statistics.budget import uncertainty_budget
 from adjust.statistics.condensed import condensed_system
+from adjust.statistics.effects import uncertainty_budget
 from adjust.statistics.reliability import reliability
 from adjust.statistics.system import linear_system
 from adjust.statistics.weakness import correlations, weak_directions
@@ -47,20 +47,22 @@ def test_few_unknowns_that_many_touch_and_many_small_sets() -> None:
         at += k
     order = rng.permutation(n)
     N = N[np.ix_(order, order)]
-    found = normal_module._arrow(sparse.csc_matrix(N))
+    found = normal_module.structured_inverse(sparse.csc_matrix(N), np.ones(n))
     assert found is not None
-    assert 2 * n * len(found.core) < n**2
+    assert 2 * n * len(found.U) < n**2
     for b in (rng.normal(size=n), rng.normal(size=(n, 3))):
-        x = found.solve(b)
+        x = found.times(b)
         assert x.shape == b.shape
         np.testing.assert_allclose(x, np.linalg.solve(N, b), rtol=1e-8, atol=1e-10)
+        np.testing.assert_allclose(found.times(sparse.csc_matrix(b.reshape(n, -1))), x.reshape(n, -1), atol=1e-12)
     scale = rng.uniform(0.5, 2.0, n)
-    Q = found.inverse(scale)
+    Q = normal_module.structured_inverse(sparse.csc_matrix(N), scale)
+    assert Q is not None
     assert np.count_nonzero(Q.member < 0) == len(Q.U)
     inverse = np.linalg.inv(N) * np.outer(scale, scale)
     np.testing.assert_allclose(Q.own.toarray() + Q.U.T @ Q.U, inverse, rtol=1e-8, atol=1e-9 * np.abs(inverse).max())
     full = rng.normal(size=(n, n))
-    assert normal_module._arrow(sparse.csc_matrix(full @ full.T)) is None
+    assert normal_module.structured_inverse(sparse.csc_matrix(full @ full.T), np.ones(n)) is None
 
 
 def test_lanczos_finds_the_directions_of_the_whole_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,6 +156,12 @@ def test_the_covariance_through_tree_and_bundles_is_that_of_the_normal_matrix(mo
             np.testing.assert_allclose(large.times_covariance(right) / scale, expected / scale, atol=1e-7)
             np.testing.assert_allclose(large.times_covariance(right[:, 0]), large.times_covariance(right)[:, 0])
             np.testing.assert_allclose(large.among(rows), of_rows, atol=1e-7)
+            few = len(of_rows) // 3
+            sums = of_rows[: 3 * few, : 3 * few].reshape(few, 3, few, 3)[::-1, :, ::-1].cumsum(axis=0).cumsum(axis=2)
+            expected = np.einsum("jajb->jab", sums)[::-1]
+            for one in (large, system):
+                found = one.among_sums(rows[: 3 * few], 3)
+                np.testing.assert_allclose(found, expected, atol=1e-7 * np.abs(expected).max())
     assert hidden == {"point", "world_from_station"}
 
 
@@ -215,7 +223,6 @@ def test_threads_and_portions_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> 
         return [*tests, *rows, shifts, np.array([x.coefficient for x in listed])]
 
     monkeypatch.setattr(parallel, "_WORTHWHILE", 300)
-    monkeypatch.setattr(normal_module, "_AT_ONCE", 7)
     monkeypatch.setattr(batch_module, "_AT_ONCE", 200)
     found = []
     for threads in ("1", "3"):

@@ -14,9 +14,9 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, PointParameter
-from adjust.statistics.budget import uncertainty_budget
+from adjust.statistics.effects import uncertainty_budget
+from adjust.statistics.group_sums import scaled_survey
 from adjust.statistics.relative_precision import ellipsoid, relative_precision
-from adjust.statistics.scaling import scaled_survey
 from adjust.statistics.system import linear_system
 from adjust.statistics.variance_components import estimate_variance_components
 from adjust.statistics.weakness import correlations, weak_directions

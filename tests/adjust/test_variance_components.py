@@ -11,8 +11,7 @@ from scipy.optimize import minimize
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ReadingCovariance
 from adjust.model.survey import FloatArray, IntArray, Survey
-from adjust.statistics.group_sums import GroupSums, MixedBlock, moments
-from adjust.statistics.scaling import scaled_survey
+from adjust.statistics.group_sums import GroupSums, MixedBlock, moments, scaled_survey
 from adjust.statistics.system import linear_system
 from adjust.statistics.variance_components import (
     ComponentOptions,

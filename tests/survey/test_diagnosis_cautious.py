@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from adjust.statistics.scaling import scaled_survey
+from adjust.statistics.group_sums import scaled_survey
 from survey.cli import main
 from survey.jobs.adjusting.job import adjust_job
 from survey.project.writing import write_project

@@ -10,9 +10,8 @@ import pytest
 from gtsam import Pose3
 
 import survey
-from adjust.diagnosis.diagnosis import Diagnosis
+from adjust.diagnosis.diagnosis import Candidate, Diagnosis
 from adjust.diagnosis.hypothesis import Hypothesis, LeaveOut, Place
-from adjust.diagnosis.ranking import Candidate
 from adjust.diagnosis.trial import Misfit
 from adjust.model.errors import DiagnosedError, SurveyError
 from survey.cli import main

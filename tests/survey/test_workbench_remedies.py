@@ -7,6 +7,7 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 
+from adjust.diagnosis.diagnosis import Candidate
 from adjust.diagnosis.hypothesis import (
     ChangeColumns,
     ChangeReadings,
@@ -19,7 +20,6 @@ from adjust.diagnosis.hypothesis import (
     ScaleKey,
     SetKey,
 )
-from adjust.diagnosis.ranking import Candidate
 from survey.project import write_project
 from survey.project.exclusions import in_force, read_exclusions
 from survey.simulate import stereo

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from adjust.diagnosis.diagnosis import Candidate
 from adjust.diagnosis.hypothesis import ChangeReadings, Edit, Hypothesis, Place
-from adjust.diagnosis.ranking import Candidate
 from adjust.diagnosis.units.conventions import MISREADINGS, Misreading, slips
 from adjust.diagnosis.units.motions import CONVENTIONS, edits_of, mended, miss
 from adjust.model.observations import Distance, Reading

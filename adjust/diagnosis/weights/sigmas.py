@@ -17,7 +17,7 @@ from adjust.model.observations import Distance, Level, OnSurface, Reading
 from adjust.model.result import Adjustment
 from adjust.model.rewriting import Fields
 from adjust.model.survey import FloatArray
-from adjust.statistics.scaling import scaled_survey
+from adjust.statistics.group_sums import scaled_survey
 from adjust.testing.distributions import chi2
 
 _ALPHA = 1e-4

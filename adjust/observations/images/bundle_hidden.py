@@ -3,7 +3,7 @@
 import numpy as np
 import scipy
 
-from adjust.model.survey import FloatArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.native.bundles import (
     PointCovariances,
     between_poses,
@@ -123,7 +123,10 @@ class BundleHidden:
         b = self.batch
         nh, k = b.n_hidden, right.shape[1]
         local = np.zeros((b.n_local, k))
-        of_points(b.arrays, b.of_reduced, b.Vi @ right[nh:].reshape(-1, 3, k), local)
+        points = right[nh:].reshape(-1, 3, k)
+        seen, own = np.flatnonzero(points.any(axis=(1, 2))), np.zeros(points.shape)
+        own[seen] = b.Vi[seen] @ points[seen]
+        of_points(b.arrays, b.of_reduced, own, local)
         out = np.asarray(b.G.T @ local)
         out[:nh] += right[:nh]
         return out
@@ -133,20 +136,21 @@ class BundleHidden:
         nh = self.batch.n_hidden
         return on_poses[nh:] + self._hidden_poses_given_interface()[0].T @ on_poses[:nh] if nh else on_poses
 
-    def products(self, interface: FloatArray, right: FloatArray, on_poses: FloatArray | None) -> FloatArray:
-        """Covariance times right-hand sides, of what is hidden (n, k), from that of the interface (n_interface, k).
+    def multiply(self, x: FloatArray, interface: FloatArray, on_poses: FloatArray | None) -> None:
+        """Covariance times right-hand sides x (n, k) of what is hidden, in place, and that of the interface (., k).
 
-        right: (n, k) on what is hidden, which they are :meth:`on_poses`; None where they are zero. The batch must be
-        prepared.
+        on_poses: what :meth:`on_poses` makes of x. The batch must be prepared.
         """
         b = self.batch
         nh, k = b.n_hidden, interface.shape[1]
-        d = np.vstack([np.zeros((nh, k)), interface])
+        d = np.concatenate([np.zeros((nh, k)), interface])
         if nh:
             T, P = self._hidden_poses_given_interface()
             d[:nh] = T @ interface if on_poses is None else T @ interface + P @ on_poses[:nh]
-        dX = b.points_following(np.asarray(b.G @ d), -right[nh:].reshape(-1, 3, k))
-        return np.concatenate([d[:nh], dX.reshape(-1, k)])
+        x[:nh] = d[:nh]
+        np.negative(x[nh:], out=x[nh:])
+        points = x[nh:].reshape(-1, 3, k)
+        b.points_following(np.asarray(b.G @ d), points)
 
     def drawn(self, interface: FloatArray, w: FloatArray) -> FloatArray:
         """Errors of what is hidden (n, k) with those of the interface (n_interface, k); w (n, k): independent, unit."""
@@ -160,13 +164,17 @@ class BundleHidden:
         dX = b.points_following(np.asarray(b.G @ d), np.zeros_like(own)) + own
         return np.concatenate([d[:nh], dX.reshape(-1, k)])
 
-    def among(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Of rows over what is hidden, right (n, m): A Q A' (m, m) were the interface held; what they are over it."""
+    def half(self, right: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Of rows over what is hidden, right (n, m): U (k, m) with U'U = A Q A' were the interface held.
+
+        Before it which (k,) of all n rows of U these are, after it what they are over the interface (m, n_interface).
+        """
         b, m = self.batch, right.shape[1]
-        nh, u = b.n_hidden, self.on_poses(right)
-        half = (np.swapaxes(np.linalg.cholesky(b.Vi), 1, 2) @ right[nh:].reshape(-1, 3, m)).reshape(-1, m)
-        own = half.T @ half
+        nh, points = b.n_hidden, right[b.n_hidden :].reshape(-1, 3, m)
+        u, seen = self.on_poses(right), np.flatnonzero(points.any(axis=(1, 2)))
+        half = (np.swapaxes(np.linalg.cholesky(b.Vi[seen]), 1, 2) @ points[seen]).reshape(-1, m)
+        rows = (nh + 3 * seen[:, None] + np.arange(3)).ravel()
         if nh:
-            half = scipy.linalg.lapack.dtrtrs(b.C, u[:nh] / b.scale[:nh, None], lower=0, trans=1)[0]
-            own += half.T @ half
-        return own, self.on_interface(u).T
+            of_poses = scipy.linalg.lapack.dtrtrs(b.C, u[:nh] / b.scale[:nh, None], lower=0, trans=1)[0]
+            rows, half = np.concatenate([np.arange(nh), rows]), np.concatenate([of_poses, half])
+        return rows, half, self.on_interface(u).T

@@ -304,15 +304,14 @@ class BundleBatch(BundleLayout):
             d[:nh] = -scipy.linalg.lapack.dtrtrs(self.C, right, lower=0)[0] / self.scale[:nh]
             for key in self.hidden_poses:
                 delta.insert(key, d[self.key_at[key] : self.key_at[key] + 6])
-        dX = self.points_following((self.G @ d)[:, None], self.h[:, :, None])[:, :, 0]
+        dX = self.points_following((self.G @ d)[:, None], self.h[:, :, None].copy())[:, :, 0]
         for j, i in enumerate(self.reduced):
             delta.insert(self.point_key[i], dX[j])
 
     def points_following(self, local: FloatArray, h: FloatArray) -> FloatArray:
-        """Steps (P, 3, k) of the reduced points from those of the local unknowns (n_local, k); h: their own part."""
-        out = np.empty((len(self.reduced), 3, local.shape[1]))
-        back_substitute(self.arrays, self.of_reduced, h, np.ascontiguousarray(local), out)
-        return out
+        """Steps (P, 3, k) of the reduced points, in place of their own part h, by the local unknowns (n_local, k)."""
+        back_substitute(self.arrays, self.of_reduced, h, np.ascontiguousarray(local), h)
+        return h
 
     def residuals_px(self) -> FloatArray:
         """Unwhitened residuals (K, 2) px, sorted order, of the last :meth:`covariances`."""

@@ -16,7 +16,8 @@ from adjust.statistics.outliers.snooping import Snooping, Verdict
 from adjust.statistics.outliers.watched import WatchedSnooping, watchable, watched
 from adjust.statistics.reliability import observation_name
 from adjust.statistics.result import Alternative
-from adjust.statistics.system import groups_of_others, linear_system
+from adjust.statistics.rows import groups_of_others
+from adjust.statistics.system import linear_system
 from adjust.testing.criteria import MANY, limits
 from adjust.testing.distributions import chi2
 from adjust.testing.gross_errors import Search, State, Verdicts, best_back_first

@@ -13,7 +13,7 @@ from adjust.model.result import Adjustment
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.precision.precision import ObservationRows, Precision, precision_of
 from adjust.statistics.outliers.snooping import Snooping
-from adjust.statistics.system import Entries, groups_of_others
+from adjust.statistics.rows import Entries, groups_of_others
 from adjust.testing.criteria import cauchy_weights
 
 FOLLOWED = 120
