@@ -13,6 +13,7 @@ import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.library import Function
+from adjust.native.parallel import run_ranges
 
 BROWN = 0
 FISHEYE = 1
@@ -25,8 +26,12 @@ MAX_LENS = 14
 N_COLUMNS = MAX_LENS + 3
 
 _lens_rows = Function("lens_rows", "kind lens[*] constants[4] q[n,3] uv[n,2] residuals[n,2] rows[*,2,17]")
-_tangents_of = Function(
-    "tangents_of", "first last kind lens[*] constants[4] uv[n,2] iterations small pixels tangents[n,2] solved[n]"
+_LENS = "first last kind lens[*] constants[4]"
+_rays_of = Function(
+    "rays_of", f"{_LENS} uv[n,2] start[*,2] iterations small pixels widest rays[n,3] solved[n]"
+)
+_image_points_of = Function(
+    "image_points_of", f"{_LENS} q[n,3] iterations small pixels focal uv[n,2] solved[n]"
 )
 _fit_lens = Function(
     "fit_lens",
@@ -42,7 +47,7 @@ class Lens(NamedTuple):
 
 
 class Newton(NamedTuple):
-    """How rays are found: steps at most, relative size of the last one, and how near (px) they must come."""
+    """How rays and image points are found: steps at most, relative size of the last one, how near (px) they come."""
 
     iterations: int
     small: float
@@ -81,15 +86,28 @@ def _check(kind: int, lens: FloatArray) -> None:
         raise ValueError(f"lens model {kind} has {N_LENS[kind]} parameters, {len(lens)} were given")
 
 
-def tangents_of(
-    run: IntArray, lens: Lens, uv: FloatArray, newton: Newton, tangents: FloatArray, solved: BoolArray
-) -> None:
-    """Tangents (n, 2) = x/z, y/z of the rays of image points (n, 2) px, by Newton from the given ones, in place.
+def rays_of(
+    lens: Lens, uv: FloatArray, newton: Newton, widest: float, start: FloatArray = np.zeros((0, 2))
+) -> tuple[FloatArray, BoolArray]:
+    """Unit rays (n, 3) of image points (n, 2) px, by Newton from tangents x/z, y/z (n, 2) or from the axis.
 
-    run: the points to do, one after the other. solved (n,): those so near to their image point, where the lens does not
-    turn the image over.
+    And which (n,) are so near to their image point, where the lens does not turn the image over, their tangent to the
+    axis at most ``widest``.
     """
-    _tangents_of(int(run[0]), int(run[-1]) + 1, *lens, uv, *newton, tangents, solved)
+    _check(lens.kind, lens.values)
+    rays, solved = np.empty((len(uv), 3)), np.empty(len(uv), dtype=np.bool_)
+    run_ranges(_rays_of, len(uv), *lens, uv, start, *newton, widest, rays, solved)
+    return rays, solved
+
+
+def image_points_of(
+    lens: Lens, q: FloatArray, newton: Newton, focal_px: float, start: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Image points (n, 2) px of points q (n, 3) m in the camera, by Newton from those given, and which were found."""
+    _check(lens.kind, lens.values)
+    uv, solved = start.copy(), np.empty(len(q), dtype=np.bool_)
+    run_ranges(_image_points_of, len(q), *lens, q, *newton, focal_px, uv, solved)
+    return uv, solved
 
 
 def fit_lens(
