@@ -1,6 +1,6 @@
 """What single images say by themselves: lenses of cameras, poses of targets; start values of what is new from these."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -10,15 +10,13 @@ from gtsam import Pose3
 from adjust.diagnosis.prediction import Prediction, started_values
 from adjust.frames.lens_times import whole_images
 from adjust.graph.assembly import StartValues
-from adjust.model.boards import deformed
 from adjust.model.errors import SurveyError
 from adjust.model.names import grouped
 from adjust.model.survey import Camera, FloatArray, Survey
 from adjust.spatial.averaging import mean_pose
 from adjust.spatial.rigid import inverse
-from adjust.start.lens_images import Sighting
 from adjust.start.lenses import start_lens
-from adjust.start.views import View, Views, focal_px, joined, make_views, rays_by_block
+from adjust.start.views import Sighting, View, Views, make_views, sightings, sights_of
 
 
 def own_lens(survey: Survey, camera: Camera, near: FloatArray | None = None) -> FloatArray:
@@ -26,13 +24,15 @@ def own_lens(survey: Survey, camera: Camera, near: FloatArray | None = None) -> 
 
     near: see :func:`adjust.start.lenses.start_lens`.
     """
-    points = {t.target_id: deformed(t) for t in survey.targets}
-    mine = [
-        (i, b) for i, b in enumerate(whole_images(survey).image_blocks)
-        if b.camera_id == camera.camera_id and b.target_id is not None
-    ]  # fmt: skip
-    seen = [Sighting(i, points[str(b.target_id)][b.point_idx[b.mask]], b.uv[b.mask]) for i, b in mine]
-    return start_lens(camera, [s for s in seen if len(s.x)], near=near).values
+    seen = [s for s in _of_targets(whole_images(survey), (camera.camera_id,)) if len(s.x)]
+    return start_lens(camera, seen, near=near).values
+
+
+def _of_targets(survey: Survey, cameras: Collection[str]) -> list[Sighting]:
+    """What blocks of targets from these cameras show."""
+    blocks, unknown = survey.image_blocks, np.full((len(survey.points), 3), np.nan)
+    return [s for s in sightings(survey, unknown)
+            if blocks[s.block_idx].target_id is not None and blocks[s.block_idx].camera_id in cameras]  # fmt: skip
 
 
 def own_lenses(survey: Survey, near: Mapping[str, FloatArray] = MappingProxyType({})) -> dict[str, FloatArray]:
@@ -49,14 +49,8 @@ def own_lenses(survey: Survey, near: Mapping[str, FloatArray] = MappingProxyType
 def single_views(survey: Survey, lenses: Mapping[str, FloatArray]) -> Views:
     """Every block of a target with three used points or more that has a pose."""
     survey = whole_images(survey)
-    points = {t.target_id: deformed(t) for t in survey.targets}
-    known = replace(survey, cameras=tuple(c for c in survey.cameras if c.camera_id in lenses))
-    focal = {c.camera_id: focal_px(c, lenses[c.camera_id]) for c in known.cameras}
-    blocks = {i: b for i, b in enumerate(survey.image_blocks) if b.target_id is not None}
-    rays, _ = rays_by_block(known, lenses, {i: b.uv[b.mask] for i, b in blocks.items()})
-    seen = {i: points[str(blocks[i].target_id)][blocks[i].point_idx[blocks[i].mask]] for i in rays}
-    sights = joined([(i, x, rays[i], focal[blocks[i].camera_id]) for i, x in seen.items() if len(x) >= 3])
-    return make_views(sights)[0]
+    sights, _ = sights_of(survey, lenses, _of_targets(survey, lenses))
+    return make_views(sights.only(np.diff(sights.ptr) >= 3))[0]
 
 
 def squares_alone(survey: Survey, lenses: Mapping[str, FloatArray]) -> FloatArray:

@@ -15,16 +15,14 @@ from adjust.model.errors import SurveyError, listed
 from adjust.model.survey import BoolArray, Camera, FloatArray
 from adjust.native import lenses as kernels
 
-RAY_TOLERANCE = 1e-13
-"""Newton's last step on a ray, in tangents of the angle to the axis."""
-PIXEL_TOLERANCE = 1e-7
-"""What a solved point may miss its equation by, px: far above rounding, far below any measurement."""
+RAY_TOLERANCE = 1e-8
+"""Newton's last step on a ray, in tangents of the angle to the axis: what is left is of the size of its square."""
 BEYOND_LIMIT = 1.02
 """Tangential terms move the fold of the image a little off the radius where the radial function turns back."""
 WELL_INSIDE = 0.9
 """Share of that radius up to which a solution is the one on this side of the fold, wherever it was started."""
 MAX_ITERATIONS = 50
-_NEWTON = kernels.Newton(MAX_ITERATIONS, RAY_TOLERANCE, PIXEL_TOLERANCE)
+_NEWTON = kernels.Newton(MAX_ITERATIONS, RAY_TOLERANCE)
 
 
 @dataclass(frozen=True)
@@ -195,14 +193,16 @@ def rays(model: LensModel, values: FloatArray, constants: FloatArray, uv: FloatA
     return np.asarray(unit[:, :2] / unit[:, 2:])
 
 
-def unit_rays(model: LensModel, values: FloatArray, constants: FloatArray, uv: FloatArray) -> FloatArray:
+def unit_rays(
+    model: LensModel, values: FloatArray, constants: FloatArray, uv: FloatArray, out: FloatArray | None = None
+) -> FloatArray:
     """Unit vectors (n, 3) in the camera frame of image points (n, 2) px, up to 180 degrees for the fisheye.
 
-    Raises SurveyError as :func:`rays`; the correction of a backward model has a ray for every point.
+    out: where they go. Raises SurveyError as :func:`rays`; in a backward model every point has a ray.
     """
     lens, uv = kernels.Lens(model.kind, *_arrays(values, constants)), np.ascontiguousarray(uv, dtype=np.float64)
     if model.backward:
-        return kernels.rays_of(lens, uv, _NEWTON, np.inf)[0]
+        return kernels.rays_of(lens, uv, _NEWTON, np.inf, out=out)[0]
     profile = radial_profile(model.kind, values, constants)
     if model.kind == kernels.FISHEYE:
         distorted = _distorted(lens, uv)
@@ -210,14 +210,15 @@ def unit_rays(model: LensModel, values: FloatArray, constants: FloatArray, uv: F
         theta, found = invert_radius(profile, theta_d)
         # sin(theta) / theta_d tends to 1 on the axis
         along = np.divide(np.sin(theta), theta_d, out=np.ones_like(theta), where=theta_d > 0)
-        unit = np.column_stack([distorted * along[:, None], np.cos(theta)])
+        unit = np.concatenate([distorted * along[:, None], np.cos(theta)[:, None]], axis=1, out=out)
     else:
         scale = values[0] if model.in_mm else 1.0
-        unit, found = kernels.rays_of(lens, uv, _NEWTON, profile.limit * WELL_INSIDE / scale)
+        unit, found = kernels.rays_of(lens, uv, _NEWTON, profile.limit * WELL_INSIDE / scale, out=out)
         if not found.all():  # Newton went astray from the axis, or near the fold perhaps to its other side
             lost = np.ascontiguousarray(uv[~found])
             start = np.ascontiguousarray(_without_distortion(profile, _distorted(lens, lost)) / scale)
-            unit[~found], found[~found] = kernels.rays_of(lens, lost, _NEWTON, profile.limit * BEYOND_LIMIT / scale, start)
+            again = kernels.rays_of(lens, lost, _NEWTON, profile.limit * BEYOND_LIMIT / scale, start)
+            unit[~found], found[~found] = again
     if not found.all():
         raise SurveyError(
             f"{_pixels(uv, ~found)} have no ray: the distortion of {model.name} is one to one only up to "

@@ -181,29 +181,26 @@ inline void lens_rows(int64_t kind, Vector l, Vector c, In<double, 2> q, In<doub
     });
 }
 
-inline V larger(V a, V b) { return a > b ? a : b; }
-
-// A zero of a function of x and y, by Newton from there: how far it is missed, and the determinant of the derivatives. A
+// A zero of a function of x and y, by Newton from there; the determinant of the derivatives, or 0 where none was found. A
 // step below `small`, relative to the unit of x and y, is the last one; what has arrived stays, whatever its neighbours do.
-template <class F> [[gnu::always_inline]] inline std::pair<V, V> newton(const F &residual, int64_t iterations, double small, double unit, V &x, V &y) {
-    V dx, dy, going = all<V>(1);
-    const auto linear = [&] {
-        const auto [a, b] = residual(x, y);
-        const V ax = derivative<0>(a), ay = derivative<1>(a), bx = derivative<0>(b), by = derivative<1>(b), determinant = ax * by - ay * bx;
-        dx = (by * a.v - ay * b.v) / determinant, dy = (ax * b.v - bx * a.v) / determinant;
-        return std::pair(larger(magnitude(a.v), magnitude(b.v)), determinant);
-    };
+template <class F> [[gnu::always_inline]] inline V newton(const F &residual, int64_t iterations, double small, double unit, V &x, V &y) {
+    V going = all<V>(1), found = V{};
     for (int64_t n = 0; n < iterations && sum(going) > 0.0; ++n) {
-        linear();
+        const auto [a, b] = residual(x, y);
+        const V ax = derivative<0>(a), ay = derivative<1>(a), bx = derivative<0>(b), by = derivative<1>(b);
+        const V determinant = ax * by - ay * bx, inverse = 1.0 / determinant;
+        const V dx = (by * a.v - ay * b.v) * inverse, dy = (ax * b.v - bx * a.v) * inverse;
         x = going != 0.0 ? x - dx : x, y = going != 0.0 ? y - dy : y;
-        going = larger(magnitude(dx), magnitude(dy)) > small * (unit + larger(magnitude(x), magnitude(y))) ? going : V{};
+        const auto arrived = larger(magnitude(dx), magnitude(dy)) <= small * (unit + larger(magnitude(x), magnitude(y)));
+        found = going != 0.0 ? determinant : found;
+        going = arrived ? V{} : going;
     }
-    return linear();
+    return going == 0.0 ? found : V{};
 }
 // Unit rays of image points first .. last - 1, by Newton on the projection from tangents x/z, y/z, or where there are none
-// from the axis; solved: those within `pixels` of their point and `widest` (a tangent) of the axis, the image not turned over.
+// from the axis; solved: those within `widest` (a tangent) of the axis, where the image is not turned over.
 inline void rays_of(int64_t first, int64_t last, int64_t kind, Vector l, Vector c, In<double, 2> uv, In<double, 2> start, int64_t iterations,
-                    double small, double pixels, double widest, Out<double, 2> rays, Out<bool, 1> solved) {
+                    double small, double widest, Out<double, 2> rays, Out<bool, 1> solved) {
     with_lens(kind, [&]<class Lens>(Lens) {
         const auto p = parameters<Lens>(l.data);
         for (int64_t lo = first; lo < last; lo += W) {
@@ -216,18 +213,18 @@ inline void rays_of(int64_t first, int64_t last, int64_t kind, Vector l, Vector 
             const auto residual = [&](V a, V b) __attribute__((always_inline)) {
                 return Lens::residual(p, c.data, Jet<V, 1u>{a, {all<V>(1)}}, Jet<V, 2u>{b, {all<V>(1)}}, all<V>(1), u, v);
             };
-            const auto [miss, determinant] = newton(residual, iterations, small, 1.0, x, y);
+            const V determinant = newton(residual, iterations, small, 1.0, x, y);
             const V square = x * x + y * y, z = 1.0 / root(1.0 + square);
             for (int i = 0; i < W && lo + i < last; ++i) {
                 rays(lo + i, 0) = x[i] * z[i], rays(lo + i, 1) = y[i] * z[i], rays(lo + i, 2) = z[i];
-                solved.data[lo + i] = miss[i] < pixels && determinant[i] > 0.0 && square[i] <= widest * widest;
+                solved.data[lo + i] = determinant[i] > 0.0 && square[i] <= widest * widest;
             }
         }
     });
 }
 // Image points of points q in the camera, by Newton from what is in uv, whose tangents are of size 1 / focal; solved: as above.
 inline void image_points_of(int64_t first, int64_t last, int64_t kind, Vector l, Vector c, In<double, 2> q, int64_t iterations, double small,
-                            double pixels, double focal, Out<double, 2> uv, Out<bool, 1> solved) {
+                            double focal, Out<double, 2> uv, Out<bool, 1> solved) {
     with_lens(kind, [&]<class Lens>(Lens) {
         const auto p = parameters<Lens>(l.data);
         for (int64_t lo = first; lo < last; lo += W) {
@@ -239,10 +236,10 @@ inline void image_points_of(int64_t first, int64_t last, int64_t kind, Vector l,
             const auto residual = [&](V a, V b) __attribute__((always_inline)) {
                 return Lens::residual(p, c.data, X, Y, Z, Jet<V, 3u>{a, {all<V>(1), V{}}}, Jet<V, 3u>{b, {V{}, all<V>(1)}});
             };
-            const auto [miss, determinant] = newton(residual, iterations, small, focal, u, v);
+            const V determinant = newton(residual, iterations, small, focal, u, v);
             for (int i = 0; i < W && lo + i < last; ++i) {
                 uv(lo + i, 0) = u[i], uv(lo + i, 1) = v[i];
-                solved.data[lo + i] = miss[i] < pixels && determinant[i] > 0.0;
+                solved.data[lo + i] = determinant[i] > 0.0;
             }
         }
     });

@@ -27,12 +27,8 @@ N_COLUMNS = MAX_LENS + 3
 
 _lens_rows = Function("lens_rows", "kind lens[*] constants[4] q[n,3] uv[n,2] residuals[n,2] rows[*,2,17]")
 _LENS = "first last kind lens[*] constants[4]"
-_rays_of = Function(
-    "rays_of", f"{_LENS} uv[n,2] start[*,2] iterations small pixels widest rays[n,3] solved[n]"
-)
-_image_points_of = Function(
-    "image_points_of", f"{_LENS} q[n,3] iterations small pixels focal uv[n,2] solved[n]"
-)
+_rays_of = Function("rays_of", f"{_LENS} uv[n,2] start[*,2] iterations small widest rays[n,3] solved[n]")
+_image_points_of = Function("image_points_of", f"{_LENS} q[n,3] iterations small focal uv[n,2] solved[n]")
 _fit_lens = Function(
     "fit_lens",
     "kind values[n] constants[4] directions[n,p] ptr[B+1] x[N,3] uv[N,2] iterations poses[B,4,4] squares[N] cov[p,p] "
@@ -47,14 +43,13 @@ class Lens(NamedTuple):
 
 
 class Newton(NamedTuple):
-    """How rays and image points are found: steps at most, relative size of the last one, how near (px) they come."""
+    """How rays and image points are found: steps at most, and the relative size of the last one."""
 
     iterations: int
     small: float
-    pixels: float
 
 
-_NO_ROWS = np.zeros((0, 2, N_COLUMNS))
+_NO_ROWS, _NO_START = np.zeros((0, 2, N_COLUMNS)), np.zeros((0, 2))
 
 
 def lens_rows(
@@ -87,16 +82,17 @@ def _check(kind: int, lens: FloatArray) -> None:
 
 
 def rays_of(
-    lens: Lens, uv: FloatArray, newton: Newton, widest: float, start: FloatArray = np.zeros((0, 2))
-) -> tuple[FloatArray, BoolArray]:
+    lens: Lens, uv: FloatArray, newton: Newton, widest: float, start: FloatArray | None = None,
+    out: FloatArray | None = None,
+) -> tuple[FloatArray, BoolArray]:  # fmt: skip
     """Unit rays (n, 3) of image points (n, 2) px, by Newton from tangents x/z, y/z (n, 2) or from the axis.
 
-    And which (n,) are so near to their image point, where the lens does not turn the image over, their tangent to the
-    axis at most ``widest``.
+    And which (n,) were found, where the lens does not turn the image over, their tangent to the axis at most
+    ``widest``. out: where the rays go.
     """
     _check(lens.kind, lens.values)
-    rays, solved = np.empty((len(uv), 3)), np.empty(len(uv), dtype=np.bool_)
-    run_ranges(_rays_of, len(uv), *lens, uv, start, *newton, widest, rays, solved)
+    rays, solved = np.empty((len(uv), 3)) if out is None else out, np.empty(len(uv), dtype=np.bool_)
+    run_ranges(_rays_of, len(uv), *lens, uv, _NO_START if start is None else start, *newton, widest, rays, solved)
     return rays, solved
 
 

@@ -46,16 +46,20 @@ inline double median(double *a, int64_t n) {
     return 0.5 * (lower + upper);
 }
 
-// A point in the camera, its depth along the ray, and the square of its distance from the ray.
+// W points of a view in the camera, from the j-th on: depths along their rays and squares of the distances from these.
 struct Seen {
-    Vec p;
-    double depth, across2;
+    V depth, across2;
 
-    Seen(In<double, 2> pose, const double *x, const double *ray) {
-        for (int a = 0; a < 3; ++a) p[a] = dot3(&pose(a, 0), x) + pose(a, 3);
-        Vec across;
-        cross3(p, ray, across);
-        depth = dot3(p, ray), across2 = dot3(across, across);
+    Seen(In<double, 2> pose, const Views &v, int64_t j, int64_t left) {
+        V x[3], ray[3], p[3];
+        columns(&v.x(j, 0), left, x), columns(&v.rays(j, 0), left, ray);
+        for (int a = 0; a < 3; ++a) p[a] = pose(a, 0) * x[0] + pose(a, 1) * x[1] + pose(a, 2) * x[2] + pose(a, 3);
+        depth = p[0] * ray[0] + p[1] * ray[1] + p[2] * ray[2], across2 = V{};
+        for (int a = 0; a < 3; ++a) {
+            const int b = (a + 1) % 3, c = (a + 2) % 3;
+            const V across = p[b] * ray[c] - p[c] * ray[b];
+            across2 += across * across;
+        }
     }
 };
 
@@ -63,16 +67,15 @@ struct Seen {
 inline void errors_of_views(Ints which, const Views &v, In<double, 3> poses, Out<double, 1> rms, Out<bool, 1> in_front) {
     for (int64_t i = 0; i < which.n[0]; ++i) {
         const int64_t k = which[i], first = v.first(k), n = v.size(k);
-        double total = 0.0;
-        bool front = true;
-        for (int64_t j = first; j < first + n; ++j) {
-            const Seen s(poses[k], &v.x(j, 0), &v.rays(j, 0));
-            const double depth = larger(magnitude(s.depth), 1e-12);
-            front = front && s.depth > 0.0;
-            total += s.across2 / (depth * depth);
+        V total = V{}, behind = V{};
+        for (int64_t j = 0; j < n; j += W) {
+            const Seen s(poses[k], v, first + j, n - j);
+            const V depth = larger(magnitude(s.depth), all<V>(1e-12));
+            behind = s.depth > 0.0 ? behind : all<V>(1.0);
+            total += first_lanes(n - j) * (s.across2 / (depth * depth));
         }
-        rms.data[k] = root(total / double(n));
-        in_front.data[k] = front;
+        rms.data[k] = root(sum(total) / double(n));
+        in_front.data[k] = sum(behind) == 0.0;
     }
 }
 
@@ -82,9 +85,10 @@ inline void offsets_of_views(Ints which, const Views &v, In<double, 3> poses, Ou
     for (int64_t i = 0; i < which.n[0]; ++i) {
         const int64_t k = which[i], first = v.first(k), n = v.size(k);
         if (n == 0) continue;
-        for (int64_t j = 0; j < n; ++j) {
-            const Seen s(poses[k], &v.x(first + j, 0), &v.rays(first + j, 0));
-            work.data[j] = out.data[first + j] = s.depth > 0.0 ? root(s.across2) / larger(s.depth, 1e-12) : __builtin_inf();
+        for (int64_t j = 0; j < n; j += W) {
+            const Seen s(poses[k], v, first + j, n - j);
+            const V depth = larger(s.depth, all<V>(1e-12)), offset = s.depth > 0.0 ? root(s.across2 / (depth * depth)) : all<V>(__builtin_inf());
+            store_lanes(&out.data[first + j], n - j, offset), store_lanes(&work.data[j], n - j, offset);
         }
         medians.data[k] = median(work.data, n);
     }

@@ -24,8 +24,8 @@ from adjust.native.lenses import Lens, fit_lens
 from adjust.native.views import homographies
 from adjust.start.closed_forms.absolute_pose import best_poses
 from adjust.start.closed_forms.zhang import pinhole_from_homographies
-from adjust.start.lens_images import MOST_IMAGES, Sighting, every_nth, plane_coordinates, spread_out, thinned
-from adjust.start.views import ends_of, rays_of_images
+from adjust.start.lens_images import MOST_IMAGES, enough_points, every_nth, plane_coordinates, spread_out, thinned
+from adjust.start.views import Sighting, ends_of, few_of, sights_by_camera
 
 _SCAN_IMAGES = 8
 _MOST_SCREENED = 60
@@ -152,7 +152,7 @@ class _LensSearch:
     def __init__(self, camera: Camera, model: LensModel, lent: Mapping[str, float]) -> None:
         self.camera, self.model, self.size = camera, model, camera.image_size
         self.constants = camera_constants(camera)
-        self._plane: dict[int, FloatArray | None] = {}
+        self._plane: dict[int, bool] = {}
         self.prior = dict(lent)
         if camera.lens.prior is not None:
             self.prior |= dict(zip(camera.lens.prior.names, camera.lens.prior.mean, strict=True))
@@ -165,7 +165,7 @@ class _LensSearch:
                 )
 
     def run(self, sightings: Sequence[Sighting], near: FloatArray | None) -> LensStart:
-        usable = thinned([s for s in sightings if len(s.x) >= 4])
+        usable = [s for s in sightings if len(s.x) >= 4]
         if any(name in self.prior for name in _FOCAL):
             focal = self.prior.get("fx", self.prior.get("c", self.prior.get("ck", 0.0)))
             return LensStart(self._values(focal / (self.constants[0] if self.model.in_mm else 1.0)), "lens prior", {})
@@ -175,10 +175,11 @@ class _LensSearch:
                 " show it a target, or give lens values"
             )
         # the other images of a long series are screened by their poses
-        flat = every_nth([s for s in usable if self._on_plane(s) is not None], _MOST_SCREENED)
+        most = enough_points(len(usable))
+        flat = thinned(every_nth([s for s in usable if self._on_plane(s, most)], _MOST_SCREENED), most)
         maps, excluded = self._screen(flat) if flat else ({}, {})
         chosen = spread_out([s for s in flat if s.block_idx in maps])
-        chosen = chosen or [s for s in usable if s.block_idx not in excluded][:MOST_IMAGES]
+        chosen = chosen or thinned([s for s in usable if s.block_idx not in excluded][:MOST_IMAGES], most)
         if not chosen:
             raise SurveyError(
                 f"camera {self.camera.camera_id!r}: none of its {len(flat)} images fits a plane; the first: "
@@ -194,17 +195,18 @@ class _LensSearch:
         unrefined = first.values, f"lens from {len(chosen)} images ({first.how}; too few to refine it)"
         return LensStart(*(found or unrefined), excluded, found is not None)
 
-    def _on_plane(self, sighting: Sighting) -> FloatArray | None:
-        """Coordinates in the points' plane, asked for once for all images that show the same array of points."""
+    def _on_plane(self, sighting: Sighting, most: int) -> bool:
+        """Whether so many of its points lie in a plane, asked for once for all images that show the same array."""
         key = id(sighting.x)
         if key not in self._plane:
-            self._plane[key] = plane_coordinates(sighting.x)
+            self._plane[key] = plane_coordinates(sighting.x[few_of(len(sighting.x), most)]) is not None
         return self._plane[key]
 
     def _screen(self, flat: Sequence[Sighting]) -> tuple[dict[int, FloatArray | None], dict[int, str]]:
         """Images that fit a plane, with their homographies where determined; a wrong point order misses by far."""
         ptr, uv = ends_of([len(s.x) for s in flat]), np.concatenate([s.uv for s in flat])
-        h, misses, found = homographies(np.concatenate([self._plane[id(s.x)] for s in flat]), uv, ptr, 1)
+        xy = {id(s.x): plane_coordinates(s.x) for s in flat}
+        h, misses, found = homographies(np.concatenate([xy[id(s.x)] for s in flat]), uv, ptr, 1)
         span = np.maximum.reduceat(uv, ptr[:-1]) - np.minimum.reduceat(uv, ptr[:-1])
         misfit = misses[:, 1] / np.maximum(np.hypot(*span.T), 1e-9)
         limit = max(0.02, 6.0 * float(np.median(misfit)))
@@ -269,13 +271,10 @@ class _LensSearch:
 
     def _tried(self, values: FloatArray, how: str, images: Sequence[Sighting]) -> _Trial:
         """A lens with the best pose of every image."""
-        rays = rays_of_images(self.camera, values, [s.uv for s in images])
-        some = [i for i, r in enumerate(rays) if not isinstance(r, SurveyError)]
+        sights, lost = sights_by_camera([(self.camera, values, images)])
+        some = [s.block_idx not in lost for s in images]
         poses, errors = np.tile(np.eye(4), (len(images), 1, 1)), np.full(len(images), np.inf)
-        if some:
-            seen, x = (np.concatenate([part[i] for i in some]) for part in (rays, [s.x for s in images]))
-            ptr = ends_of([len(images[i].x) for i in some])
-            poses[some], errors[some] = best_poses(x, seen, ptr, _REFINEMENTS)
+        poses[some], errors[some] = best_poses(sights.x, sights.rays, sights.ptr, _REFINEMENTS)
         focal = focal_length_px(self.model, values, self.constants)
         return _Trial(values, how, poses, errors, float(np.median(errors)) * focal)
 

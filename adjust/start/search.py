@@ -5,45 +5,32 @@ One search: of the steps that are possible with what is known by now the safest 
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 from types import MappingProxyType
 
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.frames.lens_states import lenders
 from adjust.frames.lens_times import whole_images
 from adjust.frames.unknowns import FrameTree, Unknowns
 from adjust.graph.assembly import StartValues
-from adjust.lenses.models import MODELS
-from adjust.model.boards import deformed
 from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.result import ParameterName
-from adjust.model.survey import FloatArray, IntArray, Survey
+from adjust.model.survey import FloatArray, Survey
 from adjust.observations.geometry.building import frame_refs, position_refs
 from adjust.observations.terrestrial.building import reading_refs
 from adjust.spatial.averaging import pose_distance, typical_distance
 from adjust.spatial.rigid import as_pose3, rigid
 from adjust.start.gauge import fix_one_gauge
-from adjust.start.lens_images import Sighting
-from adjust.start.lenses import start_lens
+from adjust.start.images import images_of
 from adjust.start.motion import solve_motion
 from adjust.start.network import ChainObservation, FrameNetwork, partial_pose
 from adjust.start.points import PARALLAX, improve, intersect_points, orient_second, resect
 from adjust.start.polish import polish
-from adjust.start.positions import PointField, Positions, Sight, point_field, undetermined
+from adjust.start.positions import PointField, Positions, point_field, undetermined
 from adjust.start.readings.start import explain
 from adjust.start.readings.steps import Readings
 from adjust.start.settling import block_rms, contradictions, moved_to_coordinates, scaled_to_lengths
-from adjust.start.views import (
-    Views,
-    block_text,
-    focal_px,
-    joined,
-    make_views,
-    rays_by_block,
-    untrustworthy,
-)
+from adjust.start.views import Views
 
 _ROUNDS = 3
 _POLISH_PX = 2.0  # below this the robust means are a good start already
@@ -174,74 +161,19 @@ class _Search:
         if lacking and not blocks:
             raise explain(self.survey, lacking)
 
-    def _seen(self) -> tuple[dict[int, Sighting], dict[int, IntArray]]:
-        """What the blocks show of targets, one array for all that show the same; points and rows of the others."""
-        whole = {t.target_id: deformed(t) for t in self.survey.targets}
-        parts: dict[tuple[str, bytes], FloatArray] = {}
-        seen, world = {}, {}
-        for i, block in enumerate(self.survey.image_blocks):
-            index, uv = block.point_idx, block.uv
-            if block.used is not None:
-                index, uv = index[block.used], uv[block.used]
-            if block.target_id is None:
-                seen[i], world[i] = Sighting(i, np.zeros((0, 3)), uv), np.asarray(index, dtype=np.int64)
-                continue
-            key = (block.target_id, index.tobytes())
-            if key not in parts:
-                parts[key] = whole[block.target_id][index]
-            seen[i] = Sighting(i, parts[key], uv)
-        return seen, world
-
-    def _find_lenses(self, seen: Mapping[int, Sighting], rows: Mapping[int, IntArray]) -> None:
-        """Lens values of every camera, given or from its images of known points."""
-        known, mine = self.points.known, dict[str, list[Sighting]]()
-        for i, s in seen.items():
-            if i in rows:
-                some = known[rows[i]]
-                s = Sighting(i, self.points.x[rows[i][some]], s.uv[some])
-            if len(s.x):
-                mine.setdefault(self.survey.image_blocks[i].camera_id, []).append(s)
-        shared, known_of = lenders(self.survey), dict[tuple[str, str], float]()
-        for camera in sorted(self.survey.cameras, key=lambda c: -len(mine.get(c.camera_id, ())) if shared else 0):
-            if camera.camera_id not in mine and camera.lens.values is None and self.points.release():
-                self._find_lenses(seen, rows)  # no target shows it: the points as they are given have to do
-                return
-            lender, names = shared.get(camera.camera_id, (camera.camera_id, MODELS[camera.lens.model].names))
-            lent = {x: known_of[lender, x] for x in names if (lender, x) in known_of}
-            found = start_lens(camera, mine.get(camera.camera_id, []), lent)
-            self.lenses[camera.camera_id] = found.values
-            values = dict(zip(MODELS[camera.lens.model].names, found.values.tolist(), strict=True))
-            known_of.update({(lender, x): values[x] for x in names})
-            self.notes.append(f"camera {camera.camera_id!r}: {found.note}")
-            for i, reason in found.excluded.items():
-                self.reasons[i] = f"{block_text(self.survey.image_blocks[i])}: {reason}"
-
-    def _find_views(self, seen: Mapping[int, Sighting], rows: Mapping[int, IntArray]) -> None:
-        """Rays of all blocks and poses of all targets seen; blocks that cannot be trusted are set aside."""
-        blocks = self.survey.image_blocks
-        rays, failed = rays_by_block(self.survey, self.lenses, {i: s.uv for i, s in seen.items()})
-        focal = {c.camera_id: focal_px(c, self.lenses[c.camera_id]) for c in self.survey.cameras}
-        none = np.zeros((0, 3))
-        self.points.sights = [
-            Sight(i, block_text(blocks[i]), row, rays.get(i, none), focal[blocks[i].camera_id], self.chains[i])
-            for i, row in rows.items() if i not in failed
-        ]  # fmt: skip
-        # fewer than three points give no pose, but may well serve in the adjustment
-        sights = joined([
-            (i, seen[i].x, r, focal[blocks[i].camera_id]) for i, r in rays.items() if len(r) >= 3 and i not in rows
-        ])  # fmt: skip
-        self.views, without = make_views(sights, thorough=False)
-        for i, reason in (failed | without).items():
-            self.reasons.setdefault(i, f"{block_text(blocks[i])}: {reason}")
-        reasons, notes = untrustworthy(self.views, self.survey, self.reasons)
-        self.reasons = {**reasons, **self.reasons}
-        self.notes += notes
-        first = pairwise(self.views.first.tolist())
-        for i, (a, b) in zip(self.views.sights.block_idx.tolist(), first, strict=True):
-            observation = ChainObservation(self.chains[i], self.alternatives(i, self.views.poses[a:b]), i)
-            (self.doubtful if i in self.reasons else self.network.observations).append(observation)
-        if len(self.views):
-            self.network.lever = typical_distance(self.views.poses[self.views.first[:-1]])
+    def _see(self) -> None:
+        """Lenses, rays and views of all images; those that cannot be trusted are set aside."""
+        found = images_of(self.survey, self.points, self.chains)
+        self.lenses, self.views, self.reasons = found.lenses, found.views, found.reasons
+        self.points.sights, self.notes = found.sights, self.notes + found.notes
+        views, ends = self.views, self.views.first.tolist()
+        for k in np.argsort(views.sights.block_idx).tolist():
+            i = int(views.sights.block_idx[k])
+            poses = self.alternatives(i, views.poses[ends[k] : ends[k + 1]])
+            trusted = self.doubtful if i in self.reasons else self.network.observations
+            trusted.append(ChainObservation(self.chains[i], poses, i))
+        if len(views):
+            self.network.lever = typical_distance(views.poses[views.first[:-1]])
 
     def alternatives(self, i: int, poses: FloatArray) -> FloatArray:
         """Poses (k, 4, 4) of a block as named, then after every motion that its target cannot be told from."""
@@ -253,9 +185,7 @@ class _Search:
     def solve(self) -> None:
         """Determine lenses, all poses and points, the safest first; what floats is set freely one by one."""
         self._read_first()
-        seen, rows = self._seen()
-        self._find_lenses(seen, rows)
-        self._find_views(seen, rows)
+        self._see()
         while self._advance():
             pass
         self.network.observations += self.doubtful

@@ -8,8 +8,8 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import Camera, LensParameter, Point, PointParameter, PoseParameter, Station, Survey, Tie
 from adjust.start import find_start, lenses
-from adjust.start.lens_images import Sighting
 from adjust.start.lenses import remembering, start_lens
+from adjust.start.views import Sighting
 from tests.adjust.test_initial import FREE, SIZE, TRUE, assert_near, board_views, grid, inv, looking_at, pixels
 from tests.data import data_folder
 

@@ -28,9 +28,9 @@ def _by_opencv(kind, tangents):
 def test_rays_are_those_that_opencv_projects(kind, n):
     tangents = np.random.default_rng(1).uniform(-0.4, 0.4, (n, 2))
     uv, values = _by_opencv(kind, tangents)
-    lens, newton = Lens(kind, values, np.zeros(4)), Newton(50, 1e-14, 1e-9)
+    lens, newton = Lens(kind, values, np.zeros(4)), Newton(50, 1e-8)
     expected = np.column_stack([tangents, np.ones(n)]) / np.sqrt(1.0 + (tangents**2).sum(axis=1))[:, None]
-    for start in (np.zeros((0, 2)), tangents + 0.01):
+    for start in (None, tangents + 0.01):
         found, solved = rays_of(lens, uv, newton, 0.6, start)
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-13)
         assert solved.all()
@@ -44,12 +44,12 @@ def test_rays_that_were_not_found_are_told():
     tangents = np.random.default_rng(2).uniform(-0.3, 0.3, (10, 2))
     uv, values = _by_opencv(BROWN, tangents)
     lens, constants = Lens(BROWN, values, np.zeros(4)), np.zeros(4)
-    assert not rays_of(lens, uv, Newton(2, 1e-14, 1e-9), np.inf)[1].any(), "two steps are not enough"
+    assert not rays_of(lens, uv, Newton(2, 1e-8), np.inf)[1].any(), "two steps are not enough"
     folding = np.zeros(N_LENS[BROWN])
     folding[[0, 1, 3, 4, 5]] = 800.0, 800.0, 320.0, 240.0, -1.0  # r (1 - r^2) comes back to 0 at r = 1
     uv = np.array([[320.0 + 800.0 * 0.9 * (1 - 0.81), 240.0]] * 2)
     start = np.array([[0.9, 0.0], [0.15, 0.0]])
-    found, solved = rays_of(Lens(BROWN, folding, constants), uv, Newton(50, 1e-14, 1e-9), np.inf, start)
+    found, solved = rays_of(Lens(BROWN, folding, constants), uv, Newton(50, 1e-8), np.inf, start)
     assert solved.tolist() == [False, True], "beyond r = 0.577 the image is turned over"
     tangent = found[1, 0] / found[1, 2]
     assert abs(tangent * (1.0 - tangent**2) - 0.9 * (1 - 0.81)) < 1e-13

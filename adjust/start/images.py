@@ -1,0 +1,80 @@
+"""What the images of a survey say by themselves: lenses, poses of targets, rays to points; and which not to trust."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from adjust.frames.lens_states import lenders
+from adjust.frames.unknowns import Chain
+from adjust.lenses.models import MODELS
+from adjust.model.names import grouped
+from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.start.lenses import start_lens
+from adjust.start.positions import PointField, Sight
+from adjust.start.views import Sighting, Views, block_text, make_views, sightings, sights_of, untrustworthy
+
+
+@dataclass(frozen=True, eq=False)
+class Images:
+    """lenses: by camera (n,). views: images of targets; sights: of world points. reasons: against blocks, by number."""
+
+    lenses: dict[str, FloatArray]
+    views: Views
+    sights: list[Sight]
+    reasons: dict[int, str]
+    notes: list[str]
+
+
+def images_of(survey: Survey, points: PointField, chains: Sequence[Chain]) -> Images:
+    """Lenses of all cameras, then rays of all blocks and poses of all targets seen. chains: of every block.
+
+    Raises SurveyError naming the camera whose lens nothing tells; points with a mere start value are released for it
+    before.
+    """
+    blocks = survey.image_blocks
+    seen = sightings(survey, points.x)
+    rows = {i: b.point_idx[b.used] if b.used is not None else b.point_idx for i, b in enumerate(blocks)
+            if b.target_id is None}  # fmt: skip
+    lenses, reasons, notes = _lenses(survey, points, seen, rows)
+    sights, failed = sights_of(survey, lenses, seen)
+    at = dict(zip(sights.block_idx.tolist(), range(len(sights)), strict=True))
+    in_world = [
+        Sight(i, block_text(blocks[i]), row, sights.rays[slice(*sights.ptr[at[i] : at[i] + 2])],
+              float(sights.focal_px[at[i]]), chains[i])
+        for i, row in rows.items() if i in at
+    ]  # fmt: skip
+    # fewer than three points give no pose, but may well serve in the adjustment
+    three = np.diff(sights.ptr) >= 3
+    views, without = make_views(sights.only(three & ~np.isin(sights.block_idx, list(rows))), thorough=False)
+    for i, reason in (failed | without).items():
+        reasons.setdefault(i, f"{block_text(blocks[i])}: {reason}")
+    against, gross = untrustworthy(views, survey, reasons)
+    return Images(lenses, views, in_world, {**against, **reasons}, notes + gross)
+
+
+def _lenses(
+    survey: Survey, points: PointField, seen: Sequence[Sighting], rows: Mapping[int, IntArray]
+) -> tuple[dict[str, FloatArray], dict[int, str], list[str]]:
+    """Lens values of every camera, given or from its images of known points; reasons against blocks; notes."""
+    known, blocks = points.known, survey.image_blocks
+    told = [s if s.block_idx not in rows else _part(s, known[rows[s.block_idx]]) for s in seen]
+    mine = grouped((blocks[s.block_idx].camera_id, s) for s in told if len(s.x))
+    lenses, reasons, notes = dict[str, FloatArray](), dict[int, str](), list[str]()
+    shared, known_of = lenders(survey), dict[tuple[str, str], float]()
+    for camera in sorted(survey.cameras, key=lambda c: -len(mine.get(c.camera_id, ())) if shared else 0):
+        if camera.camera_id not in mine and camera.lens.values is None and points.release():
+            return _lenses(survey, points, seen, rows)  # no target shows it: the points as they are given have to do
+        lender, names = shared.get(camera.camera_id, (camera.camera_id, MODELS[camera.lens.model].names))
+        lent = {x: known_of[lender, x] for x in names if (lender, x) in known_of}
+        found = start_lens(camera, mine.get(camera.camera_id, []), lent)
+        lenses[camera.camera_id] = found.values
+        values = dict(zip(MODELS[camera.lens.model].names, found.values.tolist(), strict=True))
+        known_of.update({(lender, x): values[x] for x in names})
+        notes.append(f"camera {camera.camera_id!r}: {found.note}")
+        reasons |= {i: f"{block_text(blocks[i])}: {reason}" for i, reason in found.excluded.items()}
+    return lenses, reasons, notes
+
+
+def _part(seen: Sighting, kept: BoolArray) -> Sighting:
+    return Sighting(seen.block_idx, seen.x[kept], seen.uv[kept])
