@@ -185,7 +185,7 @@ inline void lens_rows(int64_t kind, Vector l, Vector c, In<double, 2> q, In<doub
 // step below `small`, relative to the unit of x and y, is the last one; what has arrived stays, whatever its neighbours do.
 template <class F> [[gnu::always_inline]] inline V newton(const F &residual, int64_t iterations, double small, double unit, V &x, V &y) {
     V going = all<V>(1), found = V{};
-    for (int64_t n = 0; n < iterations && sum(going) > 0.0; ++n) {
+    for (int64_t n = 0; n < iterations && any(going != 0.0); ++n) {
         const auto [a, b] = residual(x, y);
         const V ax = derivative<0>(a), ay = derivative<1>(a), bx = derivative<0>(b), by = derivative<1>(b);
         const V determinant = ax * by - ay * bx, inverse = 1.0 / determinant;

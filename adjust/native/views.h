@@ -20,22 +20,31 @@ struct Views {
     int64_t size(int64_t k) const { return ptr[of[k] + 1] - first(k); }
 };
 
+// The first of n numbers, put in another order, for which `first` holds; how many. No branch: which way each goes is chance.
+template <class F> inline int64_t parted(double *a, int64_t n, F &&first) {
+    int64_t m = 0;
+    for (int64_t i = 0; i < n; ++i) {
+        const double x = a[i];
+        a[i] = a[m], a[m] = x;
+        m += first(x);
+    }
+    return m;
+}
 // The k-th smallest, from 0, of n numbers, which are put in another order: none before k is larger (Hoare, Algorithm 65:
 // FIND, Comm. ACM 4(7), 1961).
 inline double selected(double *a, int64_t n, int64_t k) {
-    for (int64_t low = 0, high = n - 1; low < high;) {
-        const double pivot = a[(low + high) / 2];
-        int64_t i = low, j = high;
-        while (i <= j) {
-            while (a[i] < pivot) ++i;
-            while (pivot < a[j]) --j;
-            if (i <= j) std::swap(a[i++], a[j--]);
+    while (n > 1) {
+        const double x = a[0], y = a[n / 2], z = a[n - 1], pivot = larger(smaller(x, y), smaller(larger(x, y), z));
+        const int64_t below = parted(a, n, [&](double v) { return v < pivot; });
+        if (k < below) {
+            n = below;
+            continue;
         }
-        if (k <= j) high = j;
-        else if (k >= i) low = i;
-        else break;
+        const int64_t upto = below + parted(a + below, n - below, [&](double v) { return !(pivot < v); });
+        if (k < upto) return pivot;
+        a += upto, n -= upto, k -= upto;
     }
-    return a[k];
+    return *a;
 }
 // The median of n numbers, at least one, which are put in another order.
 inline double median(double *a, int64_t n) {
@@ -145,10 +154,10 @@ struct Stack {
 
     // Cauchy's weights, by the offsets of a state.
     void weigh(int state) const {
-        double *w = row(WEIGHT), *size = row(SIZE), *u = row(state + 3), *v = row(state + 4);
-        for (int64_t i = 0; i < n; ++i) w[i] = size[i] = u[i] * u[i] + v[i] * v[i];
-        const double limit = larger(ROBUST * ROBUST * median(size, n), 1e-24);
-        for (int64_t i = 0; i < n; ++i) w[i] = 1.0 / (1.0 + w[i] / limit);
+        const auto square = [&](int64_t p) { return at(state + 3, p) * at(state + 3, p) + at(state + 4, p) * at(state + 4, p); };
+        for (int64_t p = 0; p < full; p += W) store(row(SIZE) + p, square(p));
+        const double limit = larger(ROBUST * ROBUST * median(row(SIZE), n), 1e-24);
+        for (int64_t p = 0; p < full; p += W) store(row(WEIGHT) + p, first_lanes(n - p) * (limit / (limit + square(p))));
     }
 
     // N (7, 7; upper) of the step's six and the offsets: a turn, then a shift, in the camera's frame.
