@@ -29,10 +29,8 @@ inline double sum(V v) {
 }
 // W rows of D numbers by columns, the first of n at p; behind the last one that again.
 template <int D> inline void by_columns(const double *p, int64_t n, V (&out)[D]) {
-    for (int a = 0; a < D; ++a) {
-        out[a] = V{};
+    for (int a = 0; a < D; ++a)
         for (int i = 0; i < W; ++i) out[a][i] = p[D * (i < n ? i : n - 1) + a];
-    }
 }
 template <int D, int... I> [[gnu::always_inline]] inline void whole_columns(const double *p, V (&out)[D], std::integer_sequence<int, I...>) {
     for (int a = 0; a < D; ++a) out[a] = V{p[D * I + a]...};

@@ -252,7 +252,7 @@ inline bool infinitesimal(const Mat &H, Mat (&turns)[2]) {
 // The translation with which the turned points of a plane fall on their images, by linear least squares.
 inline bool shift_of(const Mat &turn, const double *local, const double *xy, int64_t n, Vec &out) {
     double A[3][3] = {};
-    V p[2], u[2], right[3] = {}, left[3] = {};
+    V p[2] = {}, u[2] = {}, right[3] = {}, left[3] = {};
     for (int64_t i = 0; i < n; i += W) {
         columns(local + 2 * i, n - i, p), columns(xy + 2 * i, n - i, u);
         const V one = first_lanes(n - i), depth = turn[2][0] * p[0] + turn[2][1] * p[1];

@@ -5,8 +5,9 @@ from it; where none is, what is symmetric is fixed (:mod:`adjust.start.gauge`), 
 between them (:mod:`adjust.start.motion`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -59,6 +60,14 @@ class Chains:
         """Some (m,) of them."""
         return Chains(self.slots[rows], self.inverted[rows])
 
+    def and_also(self, more: "Chains") -> "Chains":
+        """With others behind them."""
+        size = max(self.slots.shape[1], more.slots.shape[1])
+        ends = [((0, 0), (0, size - c.slots.shape[1])) for c in (self, more)]
+        slots = [np.pad(c.slots, end, constant_values=-1) for c, end in zip((self, more), ends, strict=True)]
+        inverted = [np.pad(c.inverted, end) for c, end in zip((self, more), ends, strict=True)]
+        return Chains(np.concatenate(slots), np.concatenate(inverted))
+
     def once(self, wanted: BoolArray) -> BoolArray:
         """Where (n, L) they pass a slot that is ``wanted`` (slots,), but none of those that they pass twice."""
         out = (self.slots >= 0) & wanted[self.slots]
@@ -71,6 +80,62 @@ class Chains:
         row, column = np.nonzero(where)
         order = np.argsort(self.slots[row, column], kind="stable")
         return row[order], column[order]
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """n observations as arrays: the product of each chain is one of its poses (K, 4, 4), which begin by first (n + 1,).
+
+    links: the chains. block_idx, rotation_only: (n,), see :class:`ChainObservation`.
+    """
+
+    links: Sequence[Chain]
+    chains: Chains
+    poses: FloatArray
+    first: IntArray
+    block_idx: IntArray
+    rotation_only: BoolArray
+
+    @staticmethod
+    def of(items: Sequence[ChainObservation]) -> "Observations":
+        """In their order."""
+        links = [o.chain for o in items]
+        return Observations(
+            links, Chains.of(links), np.concatenate([np.zeros((0, 4, 4)), *(o.poses for o in items)]),
+            np.cumsum([0] + [len(o.poses) for o in items]), np.array([o.block_idx for o in items], dtype=np.int64),
+            np.array([o.rotation_only for o in items], dtype=np.bool_),
+        )  # fmt: skip
+
+    def __len__(self) -> int:
+        return len(self.links)
+
+    def __iter__(self) -> Iterator[ChainObservation]:
+        return iter(self._items)
+
+    @cached_property
+    def _items(self) -> list[ChainObservation]:
+        parts = np.split(self.poses, self.first[1:-1]) if len(self) else []
+        return list(map(ChainObservation, self.links, parts, self.block_idx.tolist(), self.rotation_only.tolist()))
+
+    def part(self, rows: IntArray) -> "Observations":
+        """Some (m,) of them, in this order."""
+        if np.array_equal(rows, np.arange(len(self))):
+            return self
+        counts = np.diff(self.first)[rows]
+        return Observations(
+            [self.links[i] for i in rows.tolist()], self.chains.part(rows), self.poses[_runs(self.first, rows)],
+            np.concatenate([[0], np.cumsum(counts)]), self.block_idx[rows], self.rotation_only[rows],
+        )  # fmt: skip
+
+    def and_also(self, more: "Observations") -> "Observations":
+        """With others behind them."""
+        if not len(self) or not len(more):
+            return self if len(self) else more
+        return Observations(
+            [*self.links, *more.links], self.chains.and_also(more.chains), np.concatenate([self.poses, more.poses]),
+            np.concatenate([self.first, self.first[-1] + more.first[1:]]),
+            np.concatenate([self.block_idx, more.block_idx]), np.concatenate([self.rotation_only, more.rotation_only]),
+        )  # fmt: skip
 
 
 class FrameNetwork:
@@ -87,7 +152,7 @@ class FrameNetwork:
         self.names = list(frames.unknowns.slot_of)
         n = len(self.names)
         self.pose, self.has = np.tile(IDENTITY, (n, 1, 1)), np.zeros(n, dtype=np.bool_)
-        self.observations: list[ChainObservation] = []
+        self.observations = Observations.of([])
         self.gauged: list[int] = []
         self.lever = 1.0
         readings = {(r.table_id, r.epoch_id): r.angles for r in survey.table_readings}
@@ -112,9 +177,13 @@ class FrameNetwork:
         """The product (4, 4) of a chain that is wholly known."""
         return np.asarray(self.products([chain])[0])
 
-    def products(self, chains: Sequence[Chain]) -> FloatArray:
+    def observe(self, items: Sequence[ChainObservation]) -> None:
+        """Take them among the observations."""
+        self.observations = self.observations.and_also(Observations.of(items))
+
+    def products(self, chains: Sequence[Chain] | Chains) -> FloatArray:
         """The products (n, 4, 4) of chains that are wholly known."""
-        padded = Chains.of(chains)
+        padded = chains if isinstance(chains, Chains) else Chains.of(chains)
         return self._products(padded, padded.slots >= 0)
 
     def _products(self, chains: Chains, taken: BoolArray) -> FloatArray:
@@ -136,10 +205,14 @@ class FrameNetwork:
         """Whether any link of the chain is unknown."""
         return not all(self.has[link.slot] for link in chain)
 
+    def open_chains(self, chains: Chains) -> BoolArray:
+        """The same (n,) of many."""
+        return np.asarray(((chains.slots >= 0) & ~self.has[chains.slots]).any(axis=1))
+
     def _isolate(
-        self, observations: Sequence[ChainObservation], chains: Chains, at: IntArray
+        self, observed: Observations, rows: IntArray, chains: Chains, at: IntArray
     ) -> tuple[FloatArray, IntArray]:
-        """What observations say of the slot at the position (n,) of their chain, all other links being known.
+        """What observations ``rows`` (n,) say of the slot at the position (n,) of their chain, all others being known.
 
         (m, 4, 4), and where those of each begin (n + 1,).
         """
@@ -147,8 +220,7 @@ class FrameNetwork:
         inside = chains.slots >= 0
         before = inverse(self._products(chains, inside & (column < at[:, None])))
         after = inverse(self._products(chains, inside & (column > at[:, None])))
-        counts = [len(o.poses) for o in observations]
-        value = np.concatenate([o.poses for o in observations])
+        counts, value = np.diff(observed.first)[rows], observed.poses[_runs(observed.first, rows)]
         value = np.repeat(before, counts, axis=0) @ value @ np.repeat(after, counts, axis=0)
         turned = np.repeat(chains.inverted[np.arange(len(at)), at], counts)
         value[turned] = inverse(value[turned])
@@ -161,8 +233,8 @@ class FrameNetwork:
         """
         if self.has.all():
             return False
-        observations = [o for o in self.observations if rotation_only or not o.rotation_only]
-        chains = Chains.of([o.chain for o in observations])
+        observed = self.observations.part(np.flatnonzero(rotation_only | ~self.observations.rotation_only))
+        chains = observed.chains
         # a slot that a chain passes twice cannot be isolated
         unknown = (chains.slots >= 0) & ~self.has[chains.slots]
         unknown[(unknown & ~chains.once(~self.has)).any(axis=1)] = False
@@ -181,7 +253,7 @@ class FrameNetwork:
                 ready = np.setdiff1d(ready, np.where(unknown[both], chains.slots[both], -1).max(axis=1))
                 using = _runs(first, ready)
             telling = using[left[row[using]] == 1]
-            self._determine(observations, chains.part(row[telling]), row[telling], column[telling])
+            self._determine(observed, row[telling], column[telling])
             unknown[row[using], column[using]] = False
             np.subtract.at(left, row[using], 1)
             support[ready] = 0
@@ -191,26 +263,23 @@ class FrameNetwork:
             found = True
         return found
 
-    def _determine(
-        self, every: Sequence[ChainObservation], chains: Chains, rows: IntArray, at: IntArray
-    ) -> None:
+    def _determine(self, observed: Observations, rows: IntArray, at: IntArray) -> None:
         """Set the slots at the positions (n,) of the chains of observations ``rows`` (n,), sorted by slot.
 
         To the robust mean over all observations that isolate a slot; the likelier solution where just one does, and of
         two the alternatives in which they agree.
         """
-        observations = [every[i] for i in rows.tolist()]
-        value, begins = self._isolate(observations, chains, at)
-        slot, full = chains.slots[np.arange(len(at)), at], np.array([not o.rotation_only for o in observations])
+        chains = observed.chains.part(rows)
+        value, begins = self._isolate(observed, rows, chains, at)
+        slot, full = chains.slots[np.arange(len(at)), at], ~observed.rotation_only[rows]
         # full poses say more than rotations; a whole image is wrong less often than the ends of a pair are exchanged
         telling = full | ~np.isin(slot, slot[full])
-        image = np.array([o.block_idx >= 0 for o in observations])
-        order = np.lexsort((~image, slot))
+        order = np.lexsort((observed.block_idx[rows] < 0, slot))
         order = order[telling[order]]
         slots, first, count = np.unique(slot[order], return_index=True, return_counts=True)
         self.pose[slots] = value[begins[order[first]]]
         self.has[slots] = True
-        several = [(s, order[a : a + n].tolist()) for s, a, n in zip(slots, first, count, strict=True) if n > 1]
+        several = [(slots[k], order[first[k] : first[k] + count[k]].tolist()) for k in np.flatnonzero(count > 1)]
         parts: list[FloatArray] = []
         members: list[IntArray] = []
         meant: list[int] = []
@@ -231,12 +300,13 @@ class FrameNetwork:
 
     def relax(self, movable: BoolArray) -> None:
         """Renew each movable slot as the mean over all observations that contain it once (Gauss-Seidel)."""
-        whole = [o for o in self.observations if not o.rotation_only and not self.open_slots(o.chain)]
-        chains = Chains.of([o.chain for o in whole])
+        every = self.observations
+        whole = every.part(np.flatnonzero(~every.rotation_only & ~self.open_chains(every.chains)))
+        chains = whole.chains
         row, column = chains.by_slot(chains.once(movable))
         for mine in np.split(np.arange(len(row)), np.flatnonzero(np.diff(chains.slots[row, column])) + 1):
             if len(mine):
-                self._determine(whole, chains.part(row[mine]), row[mine], column[mine])
+                self._determine(whole, row[mine], column[mine])
 
 
 def _runs(first: IntArray, wanted: IntArray) -> IntArray:

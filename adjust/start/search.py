@@ -23,14 +23,14 @@ from adjust.spatial.rigid import as_pose3, rigid
 from adjust.start.gauge import fix_one_gauge
 from adjust.start.images import images_of
 from adjust.start.motion import solve_motion
-from adjust.start.network import ChainObservation, FrameNetwork, partial_pose
+from adjust.start.network import ChainObservation, Chains, FrameNetwork, Observations, partial_pose
 from adjust.start.points import PARALLAX, improve, intersect_points, orient_second, resect
 from adjust.start.polish import polish
 from adjust.start.positions import PointField, Positions, point_field, undetermined
 from adjust.start.readings.start import explain
 from adjust.start.readings.steps import Readings
 from adjust.start.settling import block_rms, contradictions, moved_to_coordinates, scaled_to_lengths
-from adjust.start.views import Views
+from adjust.start.views import Views, ends_of
 
 _ROUNDS = 3
 _POLISH_PX = 2.0  # below this the robust means are a good start already
@@ -80,9 +80,9 @@ def turns_of_views(survey: Survey, turned: Mapping[str, FloatArray]) -> dict[int
     for view in search.views:
         i = view.block_idx
         motions = turned.get(str(survey.image_blocks[i].target_id))
-        if motions is None or search.network.open_slots(search.chains[i]):
+        if motions is None or search.network.open_slots(search.links[i]):
             continue
-        camera_from_target = search.network.product(search.chains[i])
+        camera_from_target = search.network.product(search.links[i])
         away = pose_distance(search.alternatives(i, view.poses), camera_from_target, search.network.lever)
         out[i] = int(np.argmin(away)) // len(view.poses)
     return out
@@ -117,12 +117,13 @@ class _Search:
     def __init__(self, survey: Survey, turned: Mapping[str, FloatArray] = MappingProxyType({})) -> None:
         self.survey, self.turned = survey, turned
         frames = FrameTree(survey, Unknowns())
-        self.chains = [frames.of_image(block) for block in survey.image_blocks]
-        self.doubtful: list[ChainObservation] = []
+        self.links = [frames.of_image(block) for block in survey.image_blocks]
+        self.chains = Chains.of(self.links)
+        self.doubtful = Observations.of([])
         pairs = self._pairs(frames)
         self._register_positions(frames)
         self.network = FrameNetwork(frames, survey)
-        self.network.observations = pairs
+        self.network.observations, self.doubtful = pairs
         self.points: PointField = point_field(survey)
         self.positions = Positions(survey, self.network, self.points)
         self.readings = Readings(survey, self.positions)
@@ -134,16 +135,16 @@ class _Search:
         self.views: Views
         self.rms: FloatArray
 
-    def _pairs(self, frames: FrameTree) -> list[ChainObservation]:
-        """What pairs say; those not in use are doubtful."""
-        out: list[ChainObservation] = []
+    def _pairs(self, frames: FrameTree) -> tuple[Observations, Observations]:
+        """What pairs say: those in use, and the others, which are doubtful."""
+        out: tuple[list[ChainObservation], list[ChainObservation]] = [], []
         for pair in self.survey.pairs:
             full = isinstance(pair.b_from_a, Pose3)
             matrix = pair.b_from_a.matrix()
             pose = np.asarray(matrix, dtype=float) if full else rigid(matrix, np.zeros(3))
             observation = ChainObservation(frames.relative(pair.a, pair.b), pose[None], rotation_only=not full)
-            (out if pair.used else self.doubtful).append(observation)
-        return out
+            out[not pair.used].append(observation)
+        return Observations.of(out[0]), Observations.of(out[1])
 
     def _register_positions(self, frames: FrameTree) -> None:
         refs = position_refs(self.survey) + reading_refs(self.survey)
@@ -163,17 +164,21 @@ class _Search:
 
     def _see(self) -> None:
         """Lenses, rays and views of all images; those that cannot be trusted are set aside."""
-        found = images_of(self.survey, self.points, self.chains)
+        found = images_of(self.survey, self.points, self.links)
         self.lenses, self.views, self.reasons = found.lenses, found.views, found.reasons
         self.points.sights, self.notes = found.sights, self.notes + found.notes
-        views, ends = self.views, self.views.first.tolist()
-        for k in np.argsort(views.sights.block_idx).tolist():
-            i = int(views.sights.block_idx[k])
-            poses = self.alternatives(i, views.poses[ends[k] : ends[k + 1]])
-            trusted = self.doubtful if i in self.reasons else self.network.observations
-            trusted.append(ChainObservation(self.chains[i], poses, i))
-        if len(views):
-            self.network.lever = typical_distance(views.poses[views.first[:-1]])
+        blocks, poses, first = self.views.sights.block_idx, self.views.poses, self.views.first
+        if self.turned:
+            own = zip(blocks.tolist(), np.split(poses, first[1:-1]), strict=True)
+            every = [self.alternatives(i, part) for i, part in own]
+            poses, first = np.concatenate(every), ends_of([len(part) for part in every])
+        links, full = [self.links[i] for i in blocks.tolist()], np.zeros(len(blocks), dtype=np.bool_)
+        seen, order = Observations(links, self.chains.part(blocks), poses, first, blocks, full), np.argsort(blocks)
+        refused = np.isin(blocks, list(self.reasons))[order]
+        self.network.observations = self.network.observations.and_also(seen.part(order[~refused]))
+        self.doubtful = self.doubtful.and_also(seen.part(order[refused]))
+        if len(self.views):
+            self.network.lever = typical_distance(self.views.poses[self.views.first[:-1]])
 
     def alternatives(self, i: int, poses: FloatArray) -> FloatArray:
         """Poses (k, 4, 4) of a block as named, then after every motion that its target cannot be told from."""
@@ -188,12 +193,14 @@ class _Search:
         self._see()
         while self._advance():
             pass
-        self.network.observations += self.doubtful
+        before = len(self.network.observations)
+        self.network.observations = self.network.observations.and_also(self.doubtful)
         # a pose that only distrusted blocks show still needs some value
         while self._advance():
             pass
-        told = {id(o) for o in self.doubtful}
-        self.network.observations = [o for o in self.network.observations if id(o) not in told]
+        place = np.arange(len(self.network.observations)) - before
+        other = (place < 0) | (place >= len(self.doubtful))
+        self.network.observations = self.network.observations.part(np.flatnonzero(other))
         while self._use_open_prior():
             while self._advance():
                 pass
@@ -235,7 +242,7 @@ class _Search:
         )
 
     def _set_freely(self) -> bool:
-        slot = fix_one_gauge(self.network, self.network.observations + self._unseen_chains())
+        slot = fix_one_gauge(self.network, [*self.network.observations, *self._unseen_chains()])
         if slot is not None:
             self.notes.append(f"{' '.join(self.network.names[slot])}: set freely, no observation tells it")
         return slot is not None
@@ -256,7 +263,7 @@ class _Search:
 
     def _unseen_chains(self) -> list[ChainObservation]:
         """Chains of blocks of world points that have no pose yet; they bind the world as soon as any point is known."""
-        have = {o.block_idx for o in self.network.observations}
+        have = set(self.network.observations.block_idx.tolist())
         bound = bool(self.points.known.any() or self.points.rough.any())
         return [
             ChainObservation(s.chain, np.zeros((0, 4, 4)), s.block_idx, ends=(True, bound))

@@ -112,7 +112,7 @@ class TiltedSetups:
             return False
         self._told.add(frame)
         network = self.positions.network
-        network.observations.append(ChainObservation(self.positions.chain(frame), pose[None]))
+        network.observe([ChainObservation(self.positions.chain(frame), pose[None])])
         network.propagate()
         return True
 
