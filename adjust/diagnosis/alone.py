@@ -24,15 +24,15 @@ def own_lens(survey: Survey, camera: Camera, near: FloatArray | None = None) -> 
 
     near: see :func:`adjust.start.lenses.start_lens`.
     """
-    seen = [s for s in _of_targets(whole_images(survey), (camera.camera_id,)) if len(s.x)]
-    return start_lens(camera, seen, near=near).values
+    seen = _of_targets(survey, (camera.camera_id,)).get(camera.camera_id, ())
+    return start_lens(camera, [s for s in seen if len(s.x)], near=near).values
 
 
-def _of_targets(survey: Survey, cameras: Collection[str]) -> list[Sighting]:
-    """What blocks of targets from these cameras show."""
-    blocks, unknown = survey.image_blocks, np.full((len(survey.points), 3), np.nan)
-    return [s for s in sightings(survey, unknown)
-            if blocks[s.block_idx].target_id is not None and blocks[s.block_idx].camera_id in cameras]  # fmt: skip
+def _of_targets(survey: Survey, cameras: Collection[str]) -> dict[str, list[Sighting]]:
+    """What these cameras' blocks of targets show, by camera, in whole images."""
+    survey = whole_images(survey)
+    seen, blocks = sightings(survey, np.full((len(survey.points), 3), np.nan)), survey.image_blocks
+    return {c: [s for s in seen[c] if blocks[s.block_idx].target_id is not None] for c in seen if c in cameras}
 
 
 def own_lenses(survey: Survey, near: Mapping[str, FloatArray] = MappingProxyType({})) -> dict[str, FloatArray]:
@@ -48,8 +48,7 @@ def own_lenses(survey: Survey, near: Mapping[str, FloatArray] = MappingProxyType
 
 def single_views(survey: Survey, lenses: Mapping[str, FloatArray]) -> Views:
     """Every block of a target with three used points or more that has a pose."""
-    survey = whole_images(survey)
-    sights, _ = sights_of(survey, lenses, _of_targets(survey, lenses))
+    sights, _ = sights_of(survey.cameras_by_id, lenses, _of_targets(survey, lenses))
     return make_views(sights.only(np.diff(sights.ptr) >= 3))[0]
 
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import gtsam
 import numpy as np
@@ -23,10 +23,10 @@ from adjust.model.tables import unit_of
 T = TypeVar("T")
 POSE_COMPONENTS = ("rx", "ry", "rz", "tx", "ty", "tz")
 POSE_UNITS = ("rad", "rad", "rad", "m", "m", "m")
+_IDENTITY = Pose3()
 
 
-@dataclass(frozen=True, eq=False)
-class Unknown:
+class Unknown(NamedTuple):
     """One GTSAM variable. ``kind`` is pose, point or vector; components and units are those of its tangent."""
 
     name: ParameterName
@@ -154,11 +154,11 @@ class Unknowns:
 
     def hold(self, unknown: Unknown, names: tuple[str, ...]) -> None:
         """Keep some components. Raises SurveyError for a component that there is not, or where none is left free."""
-        wrong = [x for x in names if x not in unknown.components]
-        if wrong or len(set(names)) == unknown.dim:
-            what = f"no component {wrong[0]!r}" if wrong else "all components held; treat the whole as 'held'"
-            raise SurveyError(f"{' '.join(unknown.name)}: {what} (components: {', '.join(unknown.components)})")
         if names:
+            wrong = [x for x in names if x not in unknown.components]
+            if wrong or len(set(names)) == unknown.dim:
+                what = f"no component {wrong[0]!r}" if wrong else "all components held; treat the whole as 'held'"
+                raise SurveyError(f"{' '.join(unknown.name)}: {what} (components: {', '.join(unknown.components)})")
             self.held[unknown.key] = tuple(i for i, x in enumerate(unknown.components) if x in names)
 
     def status(self, key: int | None, treatment: str, dim: int) -> tuple[str, ...]:
@@ -176,21 +176,21 @@ class Unknowns:
 
     def slot(self, name: ParameterName, parameter: PoseParameter) -> int:
         """The slot of a pose parameter, made at first use."""
-        if name in self.slot_of:
-            return self.slot_of[name]
+        slot = self.slot_of.setdefault(name, len(self.slot_key))
+        if slot < len(self.slot_key):
+            return slot
         held = parameter.treatment == "held"
-        pose = parameter.value if parameter.value is not None else Pose3()
+        pose = parameter.value if parameter.value is not None else _IDENTITY
         key = None
         if not held:
             unknown = self.add(name, "pose", POSE_COMPONENTS, POSE_UNITS)
             self.hold(unknown, parameter.held)
             key = unknown.key
-        self.slot_of[name] = len(self.slot_key)
         self.slot_key.append(key)
         self.slot_pose.append(pose)
-        self.slot_identity.append(held and pose.equals(Pose3(), 0.0))
+        self.slot_identity.append(held and pose.equals(_IDENTITY, 0.0))
         self.parameters[name] = parameter
-        return self.slot_of[name]
+        return slot
 
     def link_keys(self, slot: int) -> list[int]:
         """The unknowns that a slot depends on: its pose, or all those that it follows from; none where all is held."""
@@ -305,17 +305,18 @@ class FrameTree:
 
     def of_image(self, block: ImageBlock) -> Chain:
         """The chain of ``camera_from_target``, or ``camera_from_world``; its halves are shared by many images."""
-        place = block.camera_id, "" if block.camera_id in self._still_cameras else block.epoch_id
+        camera, target, epoch = block.camera_id, block.target_id, block.epoch_id
+        place = camera, "" if camera in self._still_cameras else epoch
         first = self._to_camera.get(place)
         if first is None:
-            links = self.world_from(FrameRef("camera", block.camera_id, block.epoch_id))
+            links = self._camera(self._get(self.cameras, "camera", camera), epoch)
             first = self._to_camera[place] = self.unknowns.tidy(inverse(tuple(links)))
-        if block.target_id is None:
+        if target is None:
             return first
-        place = block.target_id, "" if block.target_id in self._still_targets else block.epoch_id
+        place = target, "" if target in self._still_targets else epoch
         second = self._from_target.get(place)
         if second is None:
-            links = self.world_from(FrameRef("target", block.target_id, block.epoch_id))
+            links = self._target(self._get(self.targets, "target", target), epoch)
             second = self._from_target[place] = self.unknowns.tidy(links)
         if first and second and first[-1].slot == second[0].slot:
             return self.unknowns.tidy([*first, *second])

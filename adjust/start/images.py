@@ -8,7 +8,6 @@ import numpy as np
 from adjust.frames.lens_states import lenders
 from adjust.frames.unknowns import Chain
 from adjust.lenses.models import MODELS
-from adjust.model.names import grouped
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.start.lenses import start_lens
 from adjust.start.positions import PointField, Sight
@@ -37,7 +36,7 @@ def images_of(survey: Survey, points: PointField, chains: Sequence[Chain]) -> Im
     rows = {i: b.point_idx[b.used] if b.used is not None else b.point_idx for i, b in enumerate(blocks)
             if b.target_id is None}  # fmt: skip
     lenses, reasons, notes = _lenses(survey, points, seen, rows)
-    sights, failed = sights_of(survey, lenses, seen)
+    sights, failed = sights_of(survey.cameras_by_id, lenses, seen)
     at = dict(zip(sights.block_idx.tolist(), range(len(sights)), strict=True))
     in_world = [
         Sight(i, block_text(blocks[i]), row, sights.rays[slice(*sights.ptr[at[i] : at[i] + 2])],
@@ -54,12 +53,13 @@ def images_of(survey: Survey, points: PointField, chains: Sequence[Chain]) -> Im
 
 
 def _lenses(
-    survey: Survey, points: PointField, seen: Sequence[Sighting], rows: Mapping[int, IntArray]
+    survey: Survey, points: PointField, seen: Mapping[str, Sequence[Sighting]], rows: Mapping[int, IntArray]
 ) -> tuple[dict[str, FloatArray], dict[int, str], list[str]]:
     """Lens values of every camera, given or from its images of known points; reasons against blocks; notes."""
-    known, blocks = points.known, survey.image_blocks
-    told = [s if s.block_idx not in rows else _part(s, known[rows[s.block_idx]]) for s in seen]
-    mine = grouped((blocks[s.block_idx].camera_id, s) for s in told if len(s.x))
+    known, blocks, mine = points.known, survey.image_blocks, seen
+    if rows:
+        told = {c: [_part(s, known[rows[s.block_idx]]) if s.block_idx in rows else s for s in seen[c]] for c in seen}
+        mine = {c: some for c, of in told.items() if (some := [s for s in of if len(s.x)])}
     lenses, reasons, notes = dict[str, FloatArray](), dict[int, str](), list[str]()
     shared, known_of = lenders(survey), dict[tuple[str, str], float]()
     for camera in sorted(survey.cameras, key=lambda c: -len(mine.get(c.camera_id, ())) if shared else 0):

@@ -25,7 +25,7 @@ from adjust.native.views import homographies
 from adjust.start.closed_forms.absolute_pose import best_poses
 from adjust.start.closed_forms.zhang import pinhole_from_homographies
 from adjust.start.lens_images import MOST_IMAGES, enough_points, every_nth, plane_coordinates, spread_out, thinned
-from adjust.start.views import Sighting, ends_of, few_of, sights_by_camera
+from adjust.start.views import Sighting, ends_of, few_of, sights_of
 
 _SCAN_IMAGES = 8
 _MOST_SCREENED = 60
@@ -96,7 +96,7 @@ def start_lens(
     key = (camera.camera_id, camera.image_size, id(camera.lens), tuple(lent.items()),
            tuple((s.x.tobytes(), s.uv.tobytes()) for s in sightings))  # fmt: skip
     if key not in known or (known[key].near and near is None):
-        alone = [replace(s, block_idx=i) for i, s in enumerate(sightings)]
+        alone = [s._replace(block_idx=i) for i, s in enumerate(sightings)]
         try:
             start: LensStart | SurveyError = _LensSearch(camera, model, lent).run(alone, near)
         except SurveyError as error:
@@ -152,7 +152,6 @@ class _LensSearch:
     def __init__(self, camera: Camera, model: LensModel, lent: Mapping[str, float]) -> None:
         self.camera, self.model, self.size = camera, model, camera.image_size
         self.constants = camera_constants(camera)
-        self._plane: dict[int, bool] = {}
         self.prior = dict(lent)
         if camera.lens.prior is not None:
             self.prior |= dict(zip(camera.lens.prior.names, camera.lens.prior.mean, strict=True))
@@ -176,7 +175,9 @@ class _LensSearch:
             )
         # the other images of a long series are screened by their poses
         most = enough_points(len(usable))
-        flat = thinned(every_nth([s for s in usable if self._on_plane(s, most)], _MOST_SCREENED), most)
+        planar = {i: plane_coordinates(x[few_of(len(x), most)]) is not None
+                  for i, x in {id(s.x): s.x for s in usable}.items()}  # fmt: skip
+        flat = thinned(every_nth([s for s in usable if planar[id(s.x)]], _MOST_SCREENED), most)
         maps, excluded = self._screen(flat) if flat else ({}, {})
         chosen = spread_out([s for s in flat if s.block_idx in maps])
         chosen = chosen or thinned([s for s in usable if s.block_idx not in excluded][:MOST_IMAGES], most)
@@ -194,13 +195,6 @@ class _LensSearch:
         found = found or next((f for other in others if (f := self._refined(other, chosen))), None)
         unrefined = first.values, f"lens from {len(chosen)} images ({first.how}; too few to refine it)"
         return LensStart(*(found or unrefined), excluded, found is not None)
-
-    def _on_plane(self, sighting: Sighting, most: int) -> bool:
-        """Whether so many of its points lie in a plane, asked for once for all images that show the same array."""
-        key = id(sighting.x)
-        if key not in self._plane:
-            self._plane[key] = plane_coordinates(sighting.x[few_of(len(sighting.x), most)]) is not None
-        return self._plane[key]
 
     def _screen(self, flat: Sequence[Sighting]) -> tuple[dict[int, FloatArray | None], dict[int, str]]:
         """Images that fit a plane, with their homographies where determined; a wrong point order misses by far."""
@@ -271,7 +265,8 @@ class _LensSearch:
 
     def _tried(self, values: FloatArray, how: str, images: Sequence[Sighting]) -> _Trial:
         """A lens with the best pose of every image."""
-        sights, lost = sights_by_camera([(self.camera, values, images)])
+        camera_id = self.camera.camera_id
+        sights, lost = sights_of({camera_id: self.camera}, {camera_id: values}, {camera_id: images})
         some = [s.block_idx not in lost for s in images]
         poses, errors = np.tile(np.eye(4), (len(images), 1, 1)), np.full(len(images), np.inf)
         poses[some], errors[some] = best_poses(sights.x, sights.rays, sights.ptr, _REFINEMENTS)

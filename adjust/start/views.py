@@ -1,16 +1,16 @@
 """Blocks of image points as rays, and the camera poses that each explains by itself."""
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from adjust.lenses.models import camera_constants, focal_length_px, lens_model, unit_rays
 from adjust.model.boards import deformed
 from adjust.model.errors import SurveyError
-from adjust.model.names import grouped
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import BoolArray, Camera, FloatArray, IntArray, Survey
 from adjust.native.views import refine_poses, view_errors, view_offsets
@@ -24,8 +24,7 @@ _GROSS_SHARE = 0.2  # more gross points than this make a whole block untrustwort
 _NO_POINTS, _NO_PIXELS = np.zeros((0, 3)), np.zeros((0, 2))
 
 
-@dataclass(frozen=True, eq=False)
-class Sighting:
+class Sighting(NamedTuple):
     """Points (n, 3) m of one rigid body, nan where not known, and their image points (n, 2) px in one image."""
 
     block_idx: int
@@ -113,47 +112,36 @@ def block_text(block: ImageBlock) -> str:
     return f"camera {block.camera_id!r}, epoch {block.epoch_id!r}, {seen}"
 
 
-def focal_px(camera: Camera, values: FloatArray) -> float:
-    """Principal distance in px."""
-    return focal_length_px(lens_model(camera.lens.model), values, camera_constants(camera))
-
-
-def sightings(survey: Survey, x_in_world: FloatArray) -> list[Sighting]:
-    """What every block in use shows, one array of points for all that show the same.
+def sightings(survey: Survey, x_in_world: FloatArray) -> dict[str, list[Sighting]]:
+    """By camera what its blocks show of what is in use, one array of points for all that show the same.
 
     x_in_world: points (P, 3) m of the survey.
     """
     bodies: dict[str | None, FloatArray] = {t.target_id: deformed(t) for t in survey.targets}
     bodies[None] = x_in_world
-    parts, out = dict[tuple[str | None, bytes], FloatArray](), []
+    parts, out = dict[tuple[str | None, bytes], FloatArray](), dict[str, list[Sighting]]()
     for i, block in enumerate(survey.image_blocks):
         index, uv = block.point_idx, block.uv
         if block.used is not None:
             index, uv = index[block.used], uv[block.used]
         key = block.target_id, index.tobytes()
-        if key not in parts:
-            parts[key] = bodies[block.target_id][index]
-        out.append(Sighting(i, parts[key], uv))
+        x = parts.get(key)
+        if x is None:
+            x = parts[key] = bodies[block.target_id][index]
+        out.setdefault(block.camera_id, []).append(Sighting(i, x, uv))
     return out
 
 
 def sights_of(
-    survey: Survey, lenses: Mapping[str, FloatArray], seen: Iterable[Sighting]
+    cameras: Mapping[str, Camera], lenses: Mapping[str, FloatArray], seen: Mapping[str, Sequence[Sighting]]
 ) -> tuple[Sights, dict[int, str]]:
-    """Images as rays, camera by camera, and the reason for each that has none."""
-    mine = grouped((survey.image_blocks[s.block_idx].camera_id, s) for s in seen)
-    return sights_by_camera([(survey.cameras_by_id[c], lenses[c], of_camera) for c, of_camera in mine.items()])
-
-
-def sights_by_camera(
-    seen: Sequence[tuple[Camera, FloatArray, Sequence[Sighting]]]
-) -> tuple[Sights, dict[int, str]]:
-    """The same of images that come with their camera and its lens (n,)."""
-    every = [s for *_, mine in seen for s in mine]
+    """Images by camera as rays, camera by camera, and the reason for each that has none."""
+    every = [s for mine in seen.values() for s in mine]
     x, uv = np.concatenate([_NO_POINTS, *(s.x for s in every)]), np.concatenate([_NO_PIXELS, *(s.uv for s in every)])
-    ptr, ends = ends_of([len(s.uv) for s in every]), ends_of([len(mine) for *_, mine in seen])
+    ptr, ends = ends_of([len(s.uv) for s in every]), ends_of([len(mine) for mine in seen.values()])
     rays, lost, focal = np.empty(x.shape), dict[int, str](), np.empty(len(every))
-    for (camera, values, _), first, last in zip(seen, ends[:-1].tolist(), ends[1:].tolist(), strict=True):
+    for camera_id, first, last in zip(seen, ends[:-1].tolist(), ends[1:].tolist(), strict=True):
+        camera, values = cameras[camera_id], lenses[camera_id]
         model, constants = lens_model(camera.lens.model), camera_constants(camera)
         focal[first:last] = focal_length_px(model, values, constants)
         try:

@@ -5,7 +5,7 @@ divided anew between the two places where most of them meet.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations, islice
 
 import numpy as np
@@ -14,6 +14,7 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.names.images import POINTS, exchange, points_exchanged
 from adjust.diagnosis.prediction import Prediction
+from adjust.model.names import grouped
 from adjust.model.subsets import with_points
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.start.closed_forms.triangulation import intersect
@@ -91,9 +92,11 @@ def _rays(case: Case) -> Rays | None:
     prediction = Prediction(survey, values)
     cameras = {c.camera_id: c for c in survey.cameras if ("lens", c.camera_id) in values}
     lenses = {c: np.asarray(values["lens", c]) for c in cameras}
-    unknown = {i: Sighting(i, np.full((len(b.uv), 3), np.nan), b.uv) for i, b in enumerate(survey.image_blocks)
-               if b.target_id is None and b.camera_id in lenses}  # fmt: skip
-    seen, _ = sights_of(replace(survey, cameras=tuple(cameras.values())), lenses, unknown.values())
+    unknown = grouped(
+        (b.camera_id, Sighting(i, np.full((len(b.uv), 3), np.nan), b.uv))
+        for i, b in enumerate(survey.image_blocks) if b.target_id is None and b.camera_id in lenses
+    )  # fmt: skip
+    seen, _ = sights_of(cameras, lenses, unknown)
     parts = []
     for k in np.argsort(seen.block_idx).tolist():
         i, rays = int(seen.block_idx[k]), seen.rays[slice(*seen.ptr[k : k + 2])]
