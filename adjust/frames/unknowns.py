@@ -79,8 +79,7 @@ class VectorMap:
         return np.asarray(self.base + self.matrix @ values.atVector(self.key))
 
 
-@dataclass(frozen=True)
-class Link:
+class Link(NamedTuple):
     """One step of a chain: a slot, taken as it is or inverted."""
 
     slot: int
