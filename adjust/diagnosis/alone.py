@@ -15,14 +15,14 @@ from adjust.model.names import grouped
 from adjust.model.survey import Camera, FloatArray, Survey
 from adjust.spatial.averaging import mean_pose
 from adjust.spatial.rigid import inverse
-from adjust.start.lenses import start_lens
+from adjust.start.lens.start import start_lens
 from adjust.start.views import Sighting, View, Views, make_views, sightings, sights_of
 
 
 def own_lens(survey: Survey, camera: Camera, near: FloatArray | None = None) -> FloatArray:
     """Start values (n,) of a lens from the camera's images of targets alone; SurveyError where they give none.
 
-    near: see :func:`adjust.start.lenses.start_lens`.
+    near: see :func:`adjust.start.lens.start.start_lens`.
     """
     seen = _of_targets(survey, (camera.camera_id,)).get(camera.camera_id, ())
     return start_lens(camera, [s for s in seen if len(s.x)], near=near).values

@@ -11,7 +11,7 @@ from adjust.diagnosis.ranking import Candidate, ranked
 from adjust.diagnosis.search import Search
 from adjust.diagnosis.trial import Misfit, misfit_of
 from adjust.model.errors import SurveyError
-from adjust.start.lenses import remembering
+from adjust.start.lens.start import remembering
 
 if TYPE_CHECKING:
     from adjust.diagnosis.families import Family

@@ -8,7 +8,8 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.frames.state import State, collect_vectors
-from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Chain, FrameTree, Unknowns
+from adjust.frames.tree import FrameTree
+from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Chain, Unknowns
 from adjust.graph.assembly import AdjustmentGraph, StartValues
 from adjust.model.boards import deformation, warming_of
 from adjust.model.clocks import CLOCKS, EpochTimes, clocks_of

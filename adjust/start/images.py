@@ -9,7 +9,7 @@ from adjust.frames.lens_states import lenders
 from adjust.frames.unknowns import Chain
 from adjust.lenses.models import MODELS
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
-from adjust.start.lenses import start_lens
+from adjust.start.lens.start import start_lens
 from adjust.start.positions import PointField, Sight
 from adjust.start.views import Sighting, Views, block_text, make_views, sightings, sights_of, untrustworthy
 

@@ -11,8 +11,9 @@ from adjust.model.names import grouped
 from adjust.model.survey import FloatArray, IntArray
 from adjust.spatial.averaging import pose_distance
 from adjust.spatial.rigid import inverse, rotation_log
+from adjust.start.chains import ChainObservation
 from adjust.start.closed_forms.hand_eye import relative_motions, solve_ax_xb, solve_ax_zb, solve_views
-from adjust.start.network import ChainObservation, FrameNetwork
+from adjust.start.network import FrameNetwork
 
 _CHOICES = 4
 _CLEAR_TURNS = np.deg2rad(20.0)

@@ -5,137 +5,22 @@ from it; where none is, what is symmetric is fixed (:mod:`adjust.start.gauge`), 
 between them (:mod:`adjust.start.motion`).
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
 
 from adjust.frames.tables import table_motions
-from adjust.frames.unknowns import Chain, FrameTree, Link
+from adjust.frames.tree import FrameTree
+from adjust.frames.unknowns import Chain, Link
 from adjust.model.errors import SurveyError
 from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, Survey, Table
 from adjust.spatial.averaging import mean_poses, pose_distance
 from adjust.spatial.rigid import inverse, rigid
+from adjust.start.chains import ChainObservation, Chains, Observations, runs
 
 IDENTITY = np.eye(4)
 _CONTRADICTION = np.deg2rad(10.0)
 """Two poses that differ by more, as an angle at the typical distance, have no mean."""
-
-
-class ChainObservation(NamedTuple):
-    """The chain's product is one of ``poses`` (k, 4, 4), likeliest first.
-
-    block_idx: the block of image points, -1 for others. rotation_only: the translation of the product is unknown.
-    ends: whether the two ends of the chain are bound to what was seen (False: to points that are unknown themselves).
-    """
-
-    chain: Chain
-    poses: FloatArray
-    block_idx: int = -1
-    rotation_only: bool = False
-    ends: tuple[bool, bool] = (True, True)
-
-
-@dataclass(frozen=True, eq=False)
-class Chains:
-    """Chains padded to L links: slots (n, L), -1 behind the end, which of them (n, L) are inverted."""
-
-    slots: IntArray
-    inverted: BoolArray
-
-    @staticmethod
-    def of(chains: Sequence[Chain]) -> "Chains":
-        """Side by side."""
-        sizes = [len(chain) for chain in chains]
-        slots = np.full((len(chains), max(sizes, default=0)), -1, dtype=np.int64)
-        inverted = np.zeros(slots.shape, dtype=np.bool_)
-        inside = np.arange(slots.shape[1]) < np.array(sizes, dtype=np.int64)[:, None]
-        slots[inside] = [link.slot for chain in chains for link in chain]
-        inverted[inside] = [link.inverse for chain in chains for link in chain]
-        return Chains(slots, inverted)
-
-    def part(self, rows: IntArray) -> "Chains":
-        """Some (m,) of them."""
-        return Chains(self.slots[rows], self.inverted[rows])
-
-    def and_also(self, more: "Chains") -> "Chains":
-        """With others behind them."""
-        size = max(self.slots.shape[1], more.slots.shape[1])
-        ends = [((0, 0), (0, size - c.slots.shape[1])) for c in (self, more)]
-        slots = [np.pad(c.slots, end, constant_values=-1) for c, end in zip((self, more), ends, strict=True)]
-        inverted = [np.pad(c.inverted, end) for c, end in zip((self, more), ends, strict=True)]
-        return Chains(np.concatenate(slots), np.concatenate(inverted))
-
-    def once(self, wanted: BoolArray) -> BoolArray:
-        """Where (n, L) they pass a slot that is ``wanted`` (slots,), but none of those that they pass twice."""
-        out = (self.slots >= 0) & wanted[self.slots]
-        for j in range(out.shape[1]):
-            out[:, j] &= (self.slots == self.slots[:, j : j + 1]).sum(axis=1) == 1
-        return out
-
-    def by_slot(self, where: BoolArray) -> tuple[IntArray, IntArray]:
-        """Rows and columns of the links ``where`` (n, L), sorted by slot."""
-        row, column = np.nonzero(where)
-        order = np.argsort(self.slots[row, column], kind="stable")
-        return row[order], column[order]
-
-
-@dataclass(frozen=True, eq=False)
-class Observations:
-    """n observations as arrays: the product of each chain is one of its poses (K, 4, 4), which begin by first (n + 1,).
-
-    links: the chains. block_idx, rotation_only: (n,), see :class:`ChainObservation`.
-    """
-
-    links: Sequence[Chain]
-    chains: Chains
-    poses: FloatArray
-    first: IntArray
-    block_idx: IntArray
-    rotation_only: BoolArray
-
-    @staticmethod
-    def of(items: Sequence[ChainObservation]) -> "Observations":
-        """In their order."""
-        links = [o.chain for o in items]
-        return Observations(
-            links, Chains.of(links), np.concatenate([np.zeros((0, 4, 4)), *(o.poses for o in items)]),
-            np.cumsum([0] + [len(o.poses) for o in items]), np.array([o.block_idx for o in items], dtype=np.int64),
-            np.array([o.rotation_only for o in items], dtype=np.bool_),
-        )  # fmt: skip
-
-    def __len__(self) -> int:
-        return len(self.links)
-
-    def __iter__(self) -> Iterator[ChainObservation]:
-        return iter(self._items)
-
-    @cached_property
-    def _items(self) -> list[ChainObservation]:
-        parts = np.split(self.poses, self.first[1:-1]) if len(self) else []
-        return list(map(ChainObservation, self.links, parts, self.block_idx.tolist(), self.rotation_only.tolist()))
-
-    def part(self, rows: IntArray) -> "Observations":
-        """Some (m,) of them, in this order."""
-        if np.array_equal(rows, np.arange(len(self))):
-            return self
-        counts = np.diff(self.first)[rows]
-        return Observations(
-            [self.links[i] for i in rows.tolist()], self.chains.part(rows), self.poses[_runs(self.first, rows)],
-            np.concatenate([[0], np.cumsum(counts)]), self.block_idx[rows], self.rotation_only[rows],
-        )  # fmt: skip
-
-    def and_also(self, more: "Observations") -> "Observations":
-        """With others behind them."""
-        if not len(self) or not len(more):
-            return self if len(self) else more
-        return Observations(
-            [*self.links, *more.links], self.chains.and_also(more.chains), np.concatenate([self.poses, more.poses]),
-            np.concatenate([self.first, self.first[-1] + more.first[1:]]),
-            np.concatenate([self.block_idx, more.block_idx]), np.concatenate([self.rotation_only, more.rotation_only]),
-        )  # fmt: skip
 
 
 class FrameNetwork:
@@ -220,7 +105,7 @@ class FrameNetwork:
         inside = chains.slots >= 0
         before = inverse(self._products(chains, inside & (column < at[:, None])))
         after = inverse(self._products(chains, inside & (column > at[:, None])))
-        counts, value = np.diff(observed.first)[rows], observed.poses[_runs(observed.first, rows)]
+        counts, value = np.diff(observed.first)[rows], observed.poses[runs(observed.first, rows)]
         value = np.repeat(before, counts, axis=0) @ value @ np.repeat(after, counts, axis=0)
         turned = np.repeat(chains.inverted[np.arange(len(at)), at], counts)
         value[turned] = inverse(value[turned])
@@ -245,13 +130,13 @@ class FrameNetwork:
         found = False
         while (most := int(support.max(initial=0))) > 0:
             ready = np.flatnonzero(2 * support >= most)
-            using = _runs(first, ready)
+            using = runs(first, ready)
             # of two that one chain joins the second is better off after the first
             both, times = np.unique(row[using], return_counts=True)
             both = both[(times == 2) & (left[both] == 2)]
             if len(both):
                 ready = np.setdiff1d(ready, np.where(unknown[both], chains.slots[both], -1).max(axis=1))
-                using = _runs(first, ready)
+                using = runs(first, ready)
             telling = using[left[row[using]] == 1]
             self._determine(observed, row[telling], column[telling])
             unknown[row[using], column[using]] = False
@@ -307,13 +192,6 @@ class FrameNetwork:
         for mine in np.split(np.arange(len(row)), np.flatnonzero(np.diff(chains.slots[row, column])) + 1):
             if len(mine):
                 self._determine(whole, row[mine], column[mine])
-
-
-def _runs(first: IntArray, wanted: IntArray) -> IntArray:
-    """The numbers from ``first[i]`` up to ``first[i + 1]`` of all wanted i, one after the other."""
-    sizes = first[wanted + 1] - first[wanted]
-    ends = np.cumsum(sizes)
-    return np.asarray(np.repeat(first[wanted] - ends + sizes, sizes) + np.arange(ends[-1] if len(ends) else 0))
 
 
 def given_pose(parameter: PoseParameter) -> FloatArray | None:

@@ -9,8 +9,9 @@ import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.spatial.rigid import inverse, rigid
+from adjust.start.chains import ChainObservation, Observations
 from adjust.start.closed_forms.triangulation import intersect
-from adjust.start.network import ChainObservation, FrameNetwork, Observations
+from adjust.start.network import FrameNetwork
 from adjust.start.positions import PointField, Sight
 from adjust.start.views import View, joined, make_views
 

@@ -10,7 +10,8 @@ from adjust.graph.elimination import positive_definite_lu
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.spatial.averaging import pose_distance
 from adjust.spatial.rigid import adjoint, inverse, rigid, rotation_exp, rotation_log, skew
-from adjust.start.network import ChainObservation, Chains, FrameNetwork
+from adjust.start.chains import ChainObservation, Chains
+from adjust.start.network import FrameNetwork
 from adjust.start.views import View
 
 _DAMPING = 1e-7  # of the diagonal: what the observations leave open stays where it is

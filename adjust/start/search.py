@@ -11,7 +11,8 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.frames.lens_times import whole_images
-from adjust.frames.unknowns import FrameTree, Unknowns
+from adjust.frames.tree import FrameTree
+from adjust.frames.unknowns import Unknowns
 from adjust.graph.assembly import StartValues
 from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.result import ParameterName
@@ -20,10 +21,11 @@ from adjust.observations.geometry.building import frame_refs, position_refs
 from adjust.observations.terrestrial.building import reading_refs
 from adjust.spatial.averaging import pose_distance, typical_distance
 from adjust.spatial.rigid import as_pose3, rigid
+from adjust.start.chains import ChainObservation, Chains, Observations
 from adjust.start.gauge import fix_one_gauge
 from adjust.start.images import images_of
 from adjust.start.motion import solve_motion
-from adjust.start.network import ChainObservation, Chains, FrameNetwork, Observations, partial_pose
+from adjust.start.network import FrameNetwork, partial_pose
 from adjust.start.points import PARALLAX, improve, intersect_points, orient_second, resect
 from adjust.start.polish import polish
 from adjust.start.positions import PointField, Positions, point_field, undetermined

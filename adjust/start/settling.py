@@ -7,8 +7,9 @@ import numpy as np
 from adjust.model.survey import FloatArray, Survey
 from adjust.native.views import view_offsets
 from adjust.spatial.rigid import align
+from adjust.start.chains import Chains
 from adjust.start.gauge import frames_of, world_is_free
-from adjust.start.network import Chains, FrameNetwork
+from adjust.start.network import FrameNetwork
 from adjust.start.points import scale_lengths
 from adjust.start.positions import PointField, Positions
 from adjust.start.views import Views, block_text, ends_of
