@@ -15,7 +15,7 @@ from adjust.frames.tree import FrameTree
 from adjust.frames.unknowns import Chain, Link
 from adjust.model.errors import SurveyError
 from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, Survey, Table
-from adjust.spatial.averaging import mean_poses, pose_distance
+from adjust.spatial.averaging import least, mean_poses, pose_distance
 from adjust.spatial.rigid import inverse, rigid
 from adjust.start.chains import ChainObservation, Chains, Observations, runs
 
@@ -165,24 +165,31 @@ class FrameNetwork:
         slots, first, count = np.unique(slot[order], return_index=True, return_counts=True)
         self.pose[slots] = value[begins[order[first]]]
         self.has[slots] = True
-        several = [(slots[k], order[first[k] : first[k] + count[k]].tolist()) for k in np.flatnonzero(count > 1)]
-        parts: list[FloatArray] = []
-        members: list[IntArray] = []
-        meant: list[int] = []
-        for s, mine in several:
-            offers = [value[begins[i] : begins[i + 1]] for i in mine]
-            if len(offers) == 2:
-                d = pose_distance(offers[0][:, None], offers[1][None], self.lever)
-                i, j = np.unravel_index(int(np.argmin(d)), d.shape)
-                if d[i, j] > _CONTRADICTION * self.lever:  # a mean of right and wrong is wrong for certain
-                    continue
-                offers = [offers[0][i : i + 1], offers[1][j : j + 1]]
-            meant.append(s)
-            parts.append(np.concatenate(offers))
-            members.append(np.repeat(np.arange(len(offers)), [len(o) for o in offers]))
-        if meant:
-            ptr = np.cumsum([0] + [len(part) for part in parts])
-            self.pose[meant] = mean_poses(np.concatenate(parts), self.lever, ptr, np.concatenate(members))
+        # of two that contradict each other the mean of right and wrong is wrong for certain
+        two, more = np.flatnonzero(count == 2), np.flatnonzero(count > 2)
+        pairs, apart = self._nearest(value, begins, order[first[two]], order[first[two] + 1])
+        agree = apart <= _CONTRADICTION * self.lever
+        of_two, others = pairs[agree].ravel(), order[runs(np.append(first, len(order)), more)]
+        sizes = np.diff(begins)[others]
+        member = np.concatenate([np.arange(len(of_two)), len(of_two) + np.repeat(np.arange(len(others)), sizes)])
+        meant = np.concatenate([two[agree], more])
+        if len(meant):
+            owner = np.repeat(np.arange(len(meant)), np.concatenate([count[two[agree]], count[more]]))
+            of_each = np.bincount(owner, np.concatenate([np.ones(len(of_two)), sizes]))
+            ptr = np.append(0, np.cumsum(of_each.astype(np.int64)))
+            rows = np.concatenate([of_two, runs(begins, others)])
+            self.pose[slots[meant]] = mean_poses(value[rows], self.lever, ptr, member)
+
+    def _nearest(self, value: FloatArray, begins: IntArray, a: IntArray, b: IntArray) -> tuple[IntArray, FloatArray]:
+        """Of the alternatives of two observations each (n,) those nearest to each other (n, 2), and how far, m (n,)."""
+        n = np.diff(begins)[b]
+        count = np.diff(begins)[a] * n
+        owner = np.repeat(np.arange(len(a)), count)
+        place = np.arange(len(owner)) - (np.cumsum(count) - count)[owner]
+        both = np.column_stack([begins[a][owner] + place // n[owner], begins[b][owner] + place % n[owner]])
+        distance = pose_distance(value[both[:, 0]], value[both[:, 1]], self.lever)
+        best = least(distance, owner)
+        return both[best], distance[best]
 
     def relax(self, movable: BoolArray) -> None:
         """Renew each movable slot as the mean over all observations that contain it once (Gauss-Seidel)."""
