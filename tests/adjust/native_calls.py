@@ -205,3 +205,6 @@ def _lenses() -> None:
         model, values, constants = lens(name)
         lenses.lens_rows(model.kind, values, constants, q, uv)
         lenses.lens_residuals(model.kind, values, constants, q, uv)
+        given, newton = lenses.Lens(model.kind, values, constants), lenses.Newton(50, 1e-8)
+        seen = lenses.image_points_of(given, q, newton, 800.0, uv)[0]
+        lenses.rays_of(given, seen, newton, 2.0)
