@@ -11,17 +11,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from gtsam import Pose3
 
-from adjust.epochs.change import Change, change_of, open_motions
 from adjust.epochs.congruence_result import Congruence, CongruenceStep, CongruenceTest, Motion
-from adjust.epochs.states import MOTIONS, EpochState, aligned, epoch_state
+from adjust.epochs.states import MOTIONS, EpochState, aligned, differences, epoch_state, gauge_rows
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
-from adjust.model.survey import FloatArray
+from adjust.model.survey import FloatArray, IntArray
+from adjust.precision.s_transformation import transformed
 from adjust.statistics.relative_precision import ellipsoid
 from adjust.statistics.result import Ellipsoid
 from adjust.testing.criteria import LevelOptions, noncentrality, sidak
 from adjust.testing.distributions import chi2, fisher
-from adjust.testing.quadratic_forms import pseudo_square
+from adjust.testing.quadratic_forms import pseudo_precision, pseudo_square, pseudo_square_beside
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,43 @@ class CongruenceOptions:
 DEFAULT_CONGRUENCE = CongruenceOptions()
 
 
+@dataclass(frozen=True, eq=False)
+class _Change:
+    """Differences d (n,), their covariance Q (n, n), the motions G (n, k) that do not count, and whose rows are whose.
+
+    owner: (n,) number of the name. component: (n,) of rx ry rz x y z, 0 to 5. weight: (n,) in the datum. held: (n, k)
+    what the datum holds, held' d = 0. nowhere: names of which an epoch knows the rotation alone.
+    """
+
+    names: tuple[ParameterName, ...]
+    d: FloatArray
+    Q: FloatArray
+    G: FloatArray
+    owner: IntArray
+    component: IntArray
+    weight: FloatArray
+    held: FloatArray
+    nowhere: frozenset[ParameterName]
+
+    def rows(self, stable: Sequence[int]) -> IntArray:
+        """Components of these names."""
+        return np.flatnonzero(np.isin(self.owner, stable))
+
+    def transformed(self, stable: Sequence[int]) -> "_Change":
+        """In the datum of these names: S = I - G (G'EG)^-1 G'E."""
+        if not self.G.shape[1]:
+            return self
+        E = np.zeros(len(self.d))
+        E[self.rows(stable)] = self.weight[self.rows(stable)]
+        if np.linalg.matrix_rank(np.sqrt(E)[:, None] * self.G) < self.G.shape[1]:
+            raise SurveyError(
+                f"{len(stable)} stable points cannot carry the {self.G.shape[1]} motions that the epochs leave open; "
+                "name more, or hold something in both"
+            )
+        d, Q = transformed(self.d, self.Q, self.G, E)
+        return replace(self, d=d, Q=Q, held=E[:, None] * self.G)
+
+
 def congruence(
     first: Adjustment, second: Adjustment, options: CongruenceOptions = DEFAULT_CONGRUENCE
 ) -> Congruence:
@@ -56,24 +93,6 @@ def congruence(
     return compare(both.names, both.before, after, both.directions, both.pooled, options)
 
 
-@dataclass(frozen=True)
-class Pooled:
-    """Sigma0 of both epochs, its redundancy (inf where it is taken as known), and p of the test of equal variances."""
-
-    sigma0: float
-    freedom: float
-    equal_p: float
-
-    def test(self, statistic: float, freedom: int, level: float) -> CongruenceTest:
-        """A square sum of so many degrees of freedom against this variance."""
-        f = self.freedom
-        if freedom == 0:
-            return CongruenceTest(float("nan"), 0, f, float("nan"), True)
-        F = statistic / freedom / self.sigma0**2
-        p = float(fisher.sf(F, freedom, f) if np.isfinite(f) else chi2.sf(F * freedom, freedom))
-        return CongruenceTest(F, freedom, f, p, p >= level)
-
-
 @dataclass(frozen=True, eq=False)
 class Common:
     """What two epochs have in common, not aligned; directions and pooled as :func:`compare` takes them."""
@@ -82,7 +101,7 @@ class Common:
     before: EpochState
     after: EpochState
     directions: FloatArray
-    pooled: Pooled
+    pooled: tuple[float, float, float]
 
 
 def common(first: Adjustment, second: Adjustment, options: CongruenceOptions = DEFAULT_CONGRUENCE) -> Common:
@@ -92,31 +111,31 @@ def common(first: Adjustment, second: Adjustment, options: CongruenceOptions = D
     if not names:
         raise SurveyError("the epochs have no point and no fixed station in common; use the same ids in both")
     before, after = before.part(names), after.part(names)
-    directions = open_motions(before, after)
+    directions = _open_motions(before, after)
     return Common(names, before, after, directions, _pooled(first, second, options.scaled))
 
 
 def compare(
     names: tuple[ParameterName, ...], before: EpochState, after: EpochState, directions: FloatArray,
-    pooled: Pooled, options: CongruenceOptions, cross: FloatArray | None = None,
+    pooled: tuple[float, float, float], options: CongruenceOptions, cross: FloatArray | None = None,
 ) -> Congruence:  # fmt: skip
     """Of two states of the same names, aligned. directions (7, k): motions that do not count.
 
-    cross: covariance (n, n) of the first with the second state where they are not independent.
+    pooled: sigma0, its redundancy, p of the test of equal variances. cross: covariance (n, n) of the first with the
+    second state where they are not independent.
     """
-    change = change_of(names, before, after, directions, cross)
+    change = _change(names, before, after, directions, cross)
     begin = _numbers(names, options.reference)
     kept = [i for i in begin if (change.owner == i).any()]
     if not kept:
         raise SurveyError("no point of the reference is free in either epoch; there is nothing to test")
-    first_test = pooled.test(*change.square(kept), options.alpha)
+    first_test = _global(change, kept, pooled, options.alpha)
     steps, stable, last = _search(change, kept, first_test, pooled, options)
     motions = _motions(change, before, stable, pooled, options)
     moved = tuple(m.name for m in motions if m.significant)
     return Congruence(
-        options.names, options.alpha, options.scaled, pooled.sigma0, pooled.freedom, pooled.equal_p, first_test, last,
-        tuple(steps), tuple(names[i] for i in stable), moved, _named(directions), motions,
-        _warnings(pooled, last, options),
+        options.names, options.alpha, options.scaled, pooled[0], pooled[1], pooled[2], first_test, last, tuple(steps),
+        tuple(names[i] for i in stable), moved, _named(directions), motions, _warnings(pooled, last, options),
     )  # fmt: skip
 
 
@@ -129,7 +148,7 @@ def _numbers(names: Sequence[ParameterName], reference: Sequence[ParameterName] 
     return [names.index(n) for n in reference]
 
 
-def _pooled(first: Adjustment, second: Adjustment, scaled: bool) -> Pooled:
+def _pooled(first: Adjustment, second: Adjustment, scaled: bool) -> tuple[float, float, float]:
     """Sigma0, redundancy, and p of the two-sided F-test of equal variance factors."""
     f1, f2 = first.redundancy, second.redundancy
     p = float("nan")
@@ -138,8 +157,18 @@ def _pooled(first: Adjustment, second: Adjustment, scaled: bool) -> Pooled:
         with np.errstate(divide="ignore", invalid="ignore"):
             p = float(2.0 * min(fisher.sf(b / a, f2, f1), fisher.sf(a / b, f1, f2)))
     if not scaled or f1 + f2 <= 0:
-        return Pooled(1.0, float("inf"), p)
-    return Pooled(float(np.sqrt((first.omega + second.omega) / (f1 + f2))), float(f1 + f2), p)
+        return 1.0, float("inf"), p
+    return float(np.sqrt((first.omega + second.omega) / (f1 + f2))), float(f1 + f2), p
+
+
+def _open_motions(before: EpochState, after: EpochState) -> FloatArray:
+    """Motions (7, k) that either epoch leaves open, orthonormal in units of the extent."""
+    both = np.hstack([before.directions, after.directions])
+    if not both.shape[1]:
+        return both
+    scale = np.array([1.0] * 3 + [before.extent] * 4)
+    U, s, _ = np.linalg.svd(scale[:, None] * both / np.linalg.norm(scale[:, None] * both, axis=0), full_matrices=False)
+    return np.asarray(U[:, s > 1e-6 * s.max()] / scale[:, None])
 
 
 def _named(directions: FloatArray) -> tuple[str, ...]:
@@ -149,8 +178,58 @@ def _named(directions: FloatArray) -> tuple[str, ...]:
     return tuple(MOTIONS[i] for i in range(7) if size[i].max() > 1e-6 * size.max())
 
 
+def _change(
+    names: tuple[ParameterName, ...], before: EpochState, after: EpochState, directions: FloatArray,
+    cross: FloatArray | None,
+) -> _Change:  # fmt: skip
+    d, Q = differences(before, after), before.cov + after.cov
+    if cross is not None:
+        Q = Q - cross - cross.T
+    G = gauge_rows(before) @ directions
+    known = np.isfinite(d) & (np.diag(before.cov) + np.diag(after.cov) > 0.0)
+    owner = np.repeat(np.arange(len(names)), before.sizes)
+    component = np.concatenate([before.components(n) for n in names])
+    nowhere = frozenset(names[int(i)] for i in owner[~np.isfinite(d)])
+    Q_known = Q if known.all() else Q[np.ix_(known, known)]
+    change = _Change(names, d[known], Q_known, G[known], owner[known], component[known],
+                     np.ones(int(known.sum())), np.zeros((int(known.sum()), 0)), nowhere)  # fmt: skip
+    return replace(change, weight=_weights(change))
+
+
+def _weights(change: _Change) -> FloatArray:
+    """One weight for all positions, one for all rotations: the mean precision of a component if all others are known.
+
+    With points alone, or a datum that both epochs have, they do not matter; metres and radians need them.
+    """
+    position, G = change.component >= 3, change.G
+    if position.all() or not position.any() or not G.shape[1]:
+        return np.ones(len(position))
+    precision = pseudo_precision(transformed(change.d, change.Q, G, np.ones(len(G)))[1], G)
+    return np.asarray(np.where(position, precision[position].mean(), precision[~position].mean()))
+
+
+def _test(statistic: float, freedom: int, pooled: tuple[float, float, float], level: float) -> CongruenceTest:
+    sigma0, f, _ = pooled
+    if freedom == 0:
+        return CongruenceTest(float("nan"), 0, f, float("nan"), True)
+    F = statistic / freedom / sigma0**2
+    p = float(fisher.sf(F, freedom, f) if np.isfinite(f) else chi2.sf(F * freedom, freedom))
+    return CongruenceTest(F, freedom, f, p, p >= level)
+
+
+def _global(
+    change: _Change, stable: Sequence[int], pooled: tuple[float, float, float], alpha: float
+) -> CongruenceTest:
+    here = change.transformed(stable)
+    rows = here.rows(stable)
+    statistic, rank = pseudo_square_beside(here.d[rows], here.Q[np.ix_(rows, rows)], here.held[rows])
+    # what the datum takes away is no information, whatever rounding leaves of it
+    rank = min(rank, max(0, len(rows) - change.G.shape[1]))
+    return _test(statistic, rank, pooled, alpha)
+
+
 def _search(
-    change: Change, begin: list[int], test: CongruenceTest, pooled: Pooled,
+    change: _Change, begin: list[int], test: CongruenceTest, pooled: tuple[float, float, float],
     options: CongruenceOptions,
 ) -> tuple[list[CongruenceStep], list[int], CongruenceTest]:  # fmt: skip
     """Take out the worst until the rest is congruent, and back what then fits.
@@ -160,11 +239,11 @@ def _search(
     """
     stable, steps = list(begin), list[CongruenceStep]()
     while options.search and not test.passed:
-        shares = change.shares(stable)
+        shares = _shares(change, stable)
         worst = max(shares, key=lambda i: shares[i])
         rest = [i for i in stable if i != worst]
         try:
-            now = pooled.test(*change.square(rest), options.alpha) if rest else None
+            now = _global(change, rest, pooled, options.alpha) if rest else None
         except SurveyError:
             now = None
         if now is None or now.freedom == 0:
@@ -175,28 +254,42 @@ def _search(
 
 
 def _readmitted(
-    change: Change, begin: list[int], stable: list[int], test: CongruenceTest, steps: list[CongruenceStep],
-    pooled: Pooled, options: CongruenceOptions,
+    change: _Change, begin: list[int], stable: list[int], test: CongruenceTest, steps: list[CongruenceStep],
+    pooled: tuple[float, float, float], options: CongruenceOptions,
 ) -> tuple[list[CongruenceStep], list[int], CongruenceTest]:  # fmt: skip
     level = sidak(options.alpha, len(begin))
     for i in [i for i in begin if i not in stable] if test.passed else []:
         single = _single(change.transformed(stable), i, pooled, level)
         more = sorted([*stable, i])
-        together = pooled.test(*change.square(more), options.alpha)
+        together = _global(change, more, pooled, options.alpha)
         if single.passed and together.passed:
             stable, test = more, together
             steps = [s for s in steps if s.name != change.names[i]]
     return steps, stable, test
 
 
-def _single(here: Change, i: int, pooled: Pooled, level: float) -> CongruenceTest:
+def _shares(change: _Change, stable: Sequence[int]) -> dict[int, float]:
+    """What each name adds to d' Q^+ d of the others alone: (P d)_j' P_jj^-1 (P d)_j (Niemeier 2008, 13.3)."""
+    here = change.transformed(stable)
+    rows = here.rows(stable)
+    d = here.d[rows]
+    _, _, P = pseudo_square(d, here.Q[np.ix_(rows, rows)])
+    gradient, owner, out = P @ d, here.owner[rows], {}
+    for i in stable:
+        mine = np.flatnonzero(owner == i)
+        if len(mine):
+            out[i] = float(gradient[mine] @ np.linalg.pinv(P[np.ix_(mine, mine)], hermitian=True) @ gradient[mine])
+    return out
+
+
+def _single(here: _Change, i: int, pooled: tuple[float, float, float], level: float) -> CongruenceTest:
     rows = here.rows([i])
     statistic, rank, _ = pseudo_square(here.d[rows], here.Q[np.ix_(rows, rows)])
-    return pooled.test(statistic, rank, level)
+    return _test(statistic, rank, pooled, level)
 
 
 def _motions(
-    change: Change, before: EpochState, stable: list[int], pooled: Pooled,
+    change: _Change, before: EpochState, stable: list[int], pooled: tuple[float, float, float],
     options: CongruenceOptions,
 ) -> tuple[Motion, ...]:  # fmt: skip
     here = change.transformed(stable)
@@ -207,7 +300,7 @@ def _motions(
 
 
 def _motion(
-    here: Change, before: EpochState, i: int, stable: bool, pooled: Pooled, level: float,
+    here: _Change, before: EpochState, i: int, stable: bool, pooled: tuple[float, float, float], level: float,
     options: CongruenceOptions,
 ) -> Motion:  # fmt: skip
     name = here.names[i]
@@ -223,28 +316,28 @@ def _motion(
     if isinstance(before.value(name), Pose3):
         turning = np.flatnonzero(place < 3)
         statistic, rank, _ = pseudo_square(d[turning], Q[np.ix_(turning, turning)])
-        turn, rotation_test = full[:3], pooled.test(statistic, rank, level)
+        turn, rotation_test = full[:3], _test(statistic, rank, pooled, level)
     if name in here.nowhere:
         nan = np.full((3, 3), np.nan)
-        region = Ellipsoid(np.zeros(0), np.zeros((3, 0)), 1.0 - options.alpha, np.isfinite(pooled.freedom))
+        region = Ellipsoid(np.zeros(0), np.zeros((3, 0)), 1.0 - options.alpha, np.isfinite(pooled[1]))
         return Motion(name, nan[0], nan, region, test, turn, cov[:3, :3], rotation_test, stable, bool(test.p < level),
                       float("nan"))  # fmt: skip
     q = max(1, test.freedom)
     size = noncentrality(level, options.levels.power, q) * float(np.linalg.eigvalsh(cov_shift)[-1])
-    scale = (pooled.sigma0, int(pooled.freedom)) if np.isfinite(pooled.freedom) else (None, 0)
+    scale = (pooled[0], int(pooled[1])) if np.isfinite(pooled[1]) else (None, 0)
     return Motion(
         name, shift, cov_shift, ellipsoid(cov_shift, 1.0 - options.alpha, *scale), test,
         turn if rotation_test else None, cov[:3, :3] if rotation_test else None, rotation_test, stable,
-        bool(test.p < level), pooled.sigma0 * float(np.sqrt(max(0.0, size))),
+        bool(test.p < level), pooled[0] * float(np.sqrt(max(0.0, size))),
     )  # fmt: skip
 
 
-def _warnings(pooled: Pooled, last: CongruenceTest, options: CongruenceOptions) -> tuple[str, ...]:
+def _warnings(pooled: tuple[float, float, float], last: CongruenceTest, options: CongruenceOptions) -> tuple[str, ...]:
     out = []
-    if pooled.equal_p < options.alpha:
+    if pooled[2] < options.alpha:
         out.append(
-            f"the epochs have different variance factors (p {pooled.equal_p:.2g}); estimate variance components or "
-            "look for gross errors before believing the tests"
+            f"the epochs have different variance factors (p {pooled[2]:.2g}); estimate variance components or look for "
+            "gross errors before believing the tests"
         )
     if not last.passed:
         out.append("no set of stable points was found; what is shown as motion depends on the datum")
@@ -271,5 +364,5 @@ def joint_congruence(
     first, second = (replace(state.part(part), names=names, directions=np.zeros((7, 0))) for part in named)
     sigma0 = adjustment.sigma0 if options.scaled and adjustment.redundancy > 0 else 1.0
     freedom = float(adjustment.redundancy) if options.scaled and adjustment.redundancy > 0 else float("inf")
-    return compare(names, first, second, np.zeros((7, 0)), Pooled(sigma0, freedom, float("nan")),
+    return compare(names, first, second, np.zeros((7, 0)), (sigma0, freedom, float("nan")),
                    replace(options, names=epochs), joined.cov[:n, n:])  # fmt: skip

@@ -8,7 +8,7 @@ from gtsam import Pose3
 from scipy.stats import binom
 
 from adjust.adjustment import adjust
-from adjust.epochs.congruence import CongruenceOptions, Pooled, compare, congruence, joint_congruence
+from adjust.epochs.congruence import CongruenceOptions, compare, congruence, joint_congruence
 from adjust.epochs.joint import joint_survey
 from adjust.epochs.states import EpochState, aligned, epoch_state, moved
 from adjust.graph.assembly import StartValues
@@ -48,7 +48,7 @@ def drawn(state: EpochState, rng: np.random.Generator, factor: float = 1.0) -> E
     return replace(state, values=tuple(np.asarray(v) + x for v, x in zip(state.values, d.reshape(-1, 3), strict=True)))
 
 
-KNOWN = Pooled(1.0, float("inf"), float("nan"))
+KNOWN = (1.0, float("inf"), float("nan"))
 
 
 @pytest.mark.slow
@@ -121,7 +121,7 @@ def test_the_datum_of_the_epochs_does_not_matter() -> None:
     before, after = epoch_state(first), epoch_state(adjust(survey, start))
     away = moved(after, np.array([3.0, -2.0, 1.0, 0.0, 0.0, 0.7, 0.0]))
     back = aligned(before, away, before.directions, range(len(before.names)))
-    again = compare(before.names, before, back, before.directions, Pooled(expected.sigma0, expected.redundancy, 0.5),
+    again = compare(before.names, before, back, before.directions, (expected.sigma0, expected.redundancy, 0.5),
                     CongruenceOptions())  # fmt: skip
     assert again.before.statistic == pytest.approx(expected.before.statistic, rel=1e-6)
     before_motion = {m.name: m.displacement for m in expected.motions}
