@@ -48,14 +48,6 @@ class Chains:
         """Some (m,) of them."""
         return Chains(self.slots[rows], self.inverted[rows])
 
-    def and_also(self, more: "Chains") -> "Chains":
-        """With others behind them."""
-        size = max(self.slots.shape[1], more.slots.shape[1])
-        ends = [((0, 0), (0, size - c.slots.shape[1])) for c in (self, more)]
-        slots = [np.pad(c.slots, end, constant_values=-1) for c, end in zip((self, more), ends, strict=True)]
-        inverted = [np.pad(c.inverted, end) for c, end in zip((self, more), ends, strict=True)]
-        return Chains(np.concatenate(slots), np.concatenate(inverted))
-
     def once(self, wanted: BoolArray) -> BoolArray:
         """Where (n, L) they pass a slot that is ``wanted`` (slots,), but none of those that they pass twice."""
         out = (self.slots >= 0) & wanted[self.slots]
@@ -119,11 +111,7 @@ class Observations:
         """With others behind them."""
         if not len(self) or not len(more):
             return self if len(self) else more
-        return Observations(
-            [*self.links, *more.links], self.chains.and_also(more.chains), np.concatenate([self.poses, more.poses]),
-            np.concatenate([self.first, self.first[-1] + more.first[1:]]),
-            np.concatenate([self.block_idx, more.block_idx]), np.concatenate([self.rotation_only, more.rotation_only]),
-        )  # fmt: skip
+        return Observations.of([*self, *more])
 
 
 def runs(first: IntArray, wanted: IntArray) -> IntArray:

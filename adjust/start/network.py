@@ -88,11 +88,13 @@ class FrameNetwork:
 
     def open_slots(self, chain: Chain) -> bool:
         """Whether any link of the chain is unknown."""
-        return not all(self.has[link.slot] for link in chain)
+        return bool(self.unknown_links(chain))
 
-    def open_chains(self, chains: Chains) -> BoolArray:
-        """The same (n,) of many."""
-        return np.asarray(((chains.slots >= 0) & ~self.has[chains.slots]).any(axis=1))
+    def whole(self) -> Observations:
+        """Observations of poses whose chains are known."""
+        every = self.observations
+        slots = every.chains.slots
+        return every.part(np.flatnonzero(~every.rotation_only & ((slots < 0) | self.has[slots]).all(axis=1)))
 
     def _isolate(
         self, observed: Observations, rows: IntArray, chains: Chains, at: IntArray
@@ -192,8 +194,7 @@ class FrameNetwork:
 
     def relax(self, movable: BoolArray) -> None:
         """Renew each movable slot as the mean over all observations that contain it once (Gauss-Seidel)."""
-        every = self.observations
-        whole = every.part(np.flatnonzero(~every.rotation_only & ~self.open_chains(every.chains)))
+        whole = self.whole()
         chains = whole.chains
         row, column = chains.by_slot(chains.once(movable))
         for mine in np.split(np.arange(len(row)), np.flatnonzero(np.diff(chains.slots[row, column])) + 1):

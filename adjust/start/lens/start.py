@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
@@ -32,16 +32,16 @@ def start_lens(
     known = _remembered.get()
     if known is None:
         return LensSearch(camera, model, lent).run(sightings, near)
-    key = (camera.camera_id, camera.image_size, id(camera.lens), tuple(lent.items()),
+    key = (camera.camera_id, camera.image_size, camera.lens, tuple(lent.items()),
            tuple((s.x.tobytes(), s.uv.tobytes()) for s in sightings))  # fmt: skip
-    if key not in known or (known[key].near and near is None):
+    if key not in known or (known[key][1] and near is None):
         alone = [s._replace(block_idx=i) for i, s in enumerate(sightings)]
         try:
             start: LensStart | SurveyError = LensSearch(camera, model, lent).run(alone, near)
         except SurveyError as error:
             start = error
-        known[key] = _Known(camera, start, near is not None and isinstance(start, LensStart) and not start.refined)
-    found = known[key].start
+        known[key] = start, near is not None and isinstance(start, LensStart) and not start.refined
+    found, _ = known[key]
     if isinstance(found, SurveyError):
         raise found
     return replace(found, values=found.values.copy(),
@@ -52,7 +52,7 @@ def start_lens(
 def remembering() -> Iterator[None]:
     """Inside, what the same images of a camera have told of its lens is not searched again: of surveys that are alike.
 
-    The cameras are kept as long: their lenses are told apart by identity.
+    Lenses are told apart by identity.
     """
     token = _remembered.set({})
     try:
@@ -61,16 +61,9 @@ def remembering() -> Iterator[None]:
         _remembered.reset(token)
 
 
-@dataclass(frozen=True, eq=False)
-class _Known:
-    """near: whether the search ended at values that were known before, though these led nowhere."""
-
-    camera: Camera
-    start: LensStart | SurveyError
-    near: bool
-
-
-_remembered: ContextVar[dict[object, _Known] | None] = ContextVar("remembered lenses", default=None)
+_Found = tuple[LensStart | SurveyError, bool]
+"""What the search gave, and whether it ended at values that were known before, though these led nowhere."""
+_remembered: ContextVar[dict[object, _Found] | None] = ContextVar("remembered lenses", default=None)
 
 
 def _check_given(camera: Camera, model: LensModel) -> None:
