@@ -1,7 +1,8 @@
 """What the images of a survey say by themselves: lenses, poses of targets, rays to points; and which not to trust."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -9,9 +10,10 @@ from adjust.frames.lens_states import lenders
 from adjust.frames.unknowns import Chain
 from adjust.lenses.models import MODELS
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.start.chains import Chains, Observations
 from adjust.start.lens.start import start_lens
 from adjust.start.positions import PointField, Sight
-from adjust.start.views import Sighting, Views, block_text, make_views, sightings, sights_of, untrustworthy
+from adjust.start.views import Sighting, Views, block_text, ends_of, make_views, sightings, sights_of, untrustworthy
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +25,23 @@ class Images:
     sights: list[Sight]
     reasons: dict[int, str]
     notes: list[str]
+
+    def observations(
+        self, links: Sequence[Chain], chains: Chains, alternatives: Callable[[int, FloatArray], FloatArray] | None
+    ) -> tuple[Observations, Observations]:
+        """What views say of the chains of their blocks, those that are trusted and the others; block after block.
+
+        alternatives: of a block and its poses (k, 4, 4) all that it may have.
+        """
+        blocks, poses, first = self.views.sights.block_idx, self.views.poses, self.views.first
+        if alternatives is not None:
+            ends = zip(blocks.tolist(), pairwise(first.tolist()), strict=True)
+            every = [alternatives(i, poses[a:b]) for i, (a, b) in ends]
+            poses, first = np.concatenate([poses[:0], *every]), ends_of([len(own) for own in every])
+        mine, rotations = [links[i] for i in blocks.tolist()], np.zeros(len(blocks), dtype=np.bool_)
+        seen, order = Observations(mine, chains.part(blocks), poses, first, blocks, rotations), np.argsort(blocks)
+        refused = np.isin(blocks[order], list(self.reasons))
+        return seen.part(order[~refused]), seen.part(order[refused])
 
 
 def images_of(survey: Survey, points: PointField, chains: Sequence[Chain]) -> Images:

@@ -8,6 +8,7 @@ between them (:mod:`adjust.start.motion`).
 from collections.abc import Sequence
 
 import numpy as np
+from gtsam import Pose3
 
 from adjust.frames.tables import table_motions
 from adjust.frames.tree import FrameTree
@@ -200,6 +201,18 @@ class FrameNetwork:
         for mine in np.split(np.arange(len(row)), np.flatnonzero(np.diff(chains.slots[row, column])) + 1):
             if len(mine):
                 self._determine(whole, row[mine], column[mine])
+
+
+def pair_observations(survey: Survey, frames: FrameTree) -> tuple[Observations, Observations]:
+    """What pairs say: those in use, and the others, which are doubtful."""
+    out: tuple[list[ChainObservation], list[ChainObservation]] = [], []
+    for pair in survey.pairs:
+        full = isinstance(pair.b_from_a, Pose3)
+        matrix = pair.b_from_a.matrix()
+        pose = np.asarray(matrix, dtype=float) if full else rigid(matrix, np.zeros(3))
+        observation = ChainObservation(frames.relative(pair.a, pair.b), pose[None], rotation_only=not full)
+        out[not pair.used].append(observation)
+    return Observations.of(out[0]), Observations.of(out[1])
 
 
 def given_pose(parameter: PoseParameter) -> FloatArray | None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
-from gtsam import Pose3, Rot3
+from gtsam import Pose3
 
 from adjust.frames.lens_times import whole_images
 from adjust.frames.tree import FrameTree
@@ -20,19 +20,19 @@ from adjust.model.survey import FloatArray, Survey
 from adjust.observations.geometry.building import frame_refs, position_refs
 from adjust.observations.terrestrial.building import reading_refs
 from adjust.spatial.averaging import pose_distance, typical_distance
-from adjust.spatial.rigid import as_pose3, rigid
-from adjust.start.chains import ChainObservation, Chains, Observations
+from adjust.spatial.rigid import as_pose3
+from adjust.start.chains import ChainObservation, Chains
 from adjust.start.gauge import fix_one_gauge
 from adjust.start.images import images_of
 from adjust.start.motion import solve_motion
-from adjust.start.network import FrameNetwork, partial_pose
+from adjust.start.network import FrameNetwork, pair_observations, partial_pose
 from adjust.start.points import PARALLAX, improve, intersect_points, orient_second, resect
 from adjust.start.polish import polish
 from adjust.start.positions import PointField, Positions, point_field, undetermined
 from adjust.start.readings.start import explain
 from adjust.start.readings.steps import Readings
 from adjust.start.settling import block_rms, contradictions, moved_to_coordinates, scaled_to_lengths
-from adjust.start.views import Views, ends_of
+from adjust.start.views import Views
 
 _ROUNDS = 3
 _POLISH_PX = 2.0  # below this the robust means are a good start already
@@ -60,9 +60,13 @@ def find_start(survey: Survey) -> Start:
     are named in ``excluded_blocks`` and do not take part. What no observation tells (the datum) is chosen.
     Raises SurveyError naming each parameter that nothing determines, and what is missing.
     """
-    network = _network_start(survey)
-    if network is not None:
-        return network
+    # surveys of rotations alone, whose positions stay open, are left to the general search
+    if survey.is_pose_network and any(isinstance(p.b_from_a, Pose3) and p.used for p in survey.pairs):
+        from adjust.pose_network.agreement import agreeing_poses  # here: a survey without pairs starts without it
+
+        poses = agreeing_poses(survey)
+        how = "averaged rotations and linear positions of the pairs that agree"
+        return Start({}, poses, {}, notes=(f"{len(poses)} stations from {how}",))
     search = _Search(whole_images(survey))
     search.solve()
     search.settle()
@@ -90,29 +94,6 @@ def turns_of_views(survey: Survey, turned: Mapping[str, FloatArray]) -> dict[int
     return out
 
 
-def _network_start(survey: Survey) -> Start | None:
-    """Averaged rotations and linear positions of the pairs that agree; None where there is more than pairs.
-
-    Surveys of rotations alone, whose positions stay open, are left to the general search, too. Raises
-    IndeterminateError naming the stations that no pair ties to the others.
-    """
-    if not survey.is_pose_network or not any(isinstance(p.b_from_a, Pose3) and p.used for p in survey.pairs):
-        return None
-    # here: a survey without pairs starts without it
-    from adjust.pose_network.agreement import agreeing_start
-    from adjust.pose_network.from_survey import network_from_survey
-    from adjust.pose_network.network import check_determined
-
-    network = network_from_survey(survey, any_datum=True)
-    check_determined(network)
-    R, t = agreeing_start(network)
-    notes = (f"{network.n_stations} stations from averaged rotations and linear positions of the pairs that agree",)
-    poses: dict[ParameterName, Pose3] = {
-        ("world_from_station", s): Pose3(Rot3(R[i]), t[i]) for i, s in enumerate(network.station_ids)
-    }
-    return Start({}, poses, {}, notes=notes)
-
-
 class _Search:
     """The state of one search. turned: see :func:`turns_of_views`."""
 
@@ -121,8 +102,7 @@ class _Search:
         frames = FrameTree(survey, Unknowns())
         self.links = [frames.of_image(block) for block in survey.image_blocks]
         self.chains = Chains.of(self.links)
-        self.doubtful = Observations.of([])
-        pairs = self._pairs(frames)
+        pairs = pair_observations(survey, frames)
         self._register_positions(frames)
         self.network = FrameNetwork(frames, survey)
         self.network.observations, self.doubtful = pairs
@@ -136,17 +116,6 @@ class _Search:
         self.scale_free = False
         self.views: Views
         self.rms: FloatArray
-
-    def _pairs(self, frames: FrameTree) -> tuple[Observations, Observations]:
-        """What pairs say: those in use, and the others, which are doubtful."""
-        out: tuple[list[ChainObservation], list[ChainObservation]] = [], []
-        for pair in self.survey.pairs:
-            full = isinstance(pair.b_from_a, Pose3)
-            matrix = pair.b_from_a.matrix()
-            pose = np.asarray(matrix, dtype=float) if full else rigid(matrix, np.zeros(3))
-            observation = ChainObservation(frames.relative(pair.a, pair.b), pose[None], rotation_only=not full)
-            out[not pair.used].append(observation)
-        return Observations.of(out[0]), Observations.of(out[1])
 
     def _register_positions(self, frames: FrameTree) -> None:
         refs = position_refs(self.survey) + reading_refs(self.survey)
@@ -169,23 +138,14 @@ class _Search:
         found = images_of(self.survey, self.points, self.links)
         self.lenses, self.views, self.reasons = found.lenses, found.views, found.reasons
         self.points.sights, self.notes = found.sights, self.notes + found.notes
-        blocks, poses, first = self.views.sights.block_idx, self.views.poses, self.views.first
-        if self.turned:
-            own = zip(blocks.tolist(), np.split(poses, first[1:-1]), strict=True)
-            every = [self.alternatives(i, part) for i, part in own]
-            poses, first = np.concatenate(every), ends_of([len(part) for part in every])
-        links, full = [self.links[i] for i in blocks.tolist()], np.zeros(len(blocks), dtype=np.bool_)
-        seen, order = Observations(links, self.chains.part(blocks), poses, first, blocks, full), np.argsort(blocks)
-        refused = np.isin(blocks, list(self.reasons))[order]
-        self.network.observations = self.network.observations.and_also(seen.part(order[~refused]))
-        self.doubtful = self.doubtful.and_also(seen.part(order[refused]))
+        trusted, doubtful = found.observations(self.links, self.chains, self.alternatives if self.turned else None)
+        self.network.observations = self.network.observations.and_also(trusted)
+        self.doubtful = self.doubtful.and_also(doubtful)
         if len(self.views):
             self.network.lever = typical_distance(self.views.poses[self.views.first[:-1]])
 
     def alternatives(self, i: int, poses: FloatArray) -> FloatArray:
         """Poses (k, 4, 4) of a block as named, then after every motion that its target cannot be told from."""
-        if not self.turned:
-            return poses
         motions = self.turned.get(str(self.survey.image_blocks[i].target_id), ())
         return np.concatenate([poses, *(poses @ motion for motion in motions)])
 
