@@ -244,5 +244,36 @@ inline void image_points_of(int64_t first, int64_t last, int64_t kind, Vector l,
         }
     });
 }
+// Radii first .. last - 1 at which r N(r^2) / D(r^2), N and D with ascending coefficients, growing up to `limit`, has the value of
+// the target, by Newton inside a bracket that shrinks; where it does not get there, the limit, and not found.
+inline void radii_of(int64_t first, int64_t last, Vector numerator, Vector denominator, double limit, Vector target, Out<double, 1> radii,
+                     Out<bool, 1> found) {
+    const auto value = [&](double r) {
+        const Jet<double, 1u> x{r, {1.0}}, w = x * x;
+        const auto series = [&](const Vector &c) {
+            Jet<double, 1u> sum{0.0, {0.0}};
+            for (int64_t i = c.n[0]; i-- > 0;) sum = sum * w + c.data[i];
+            return sum;
+        };
+        return x * series(numerator) / series(denominator);
+    };
+    for (int64_t k = first; k < last; ++k) {
+        const double t = target.data[k];
+        double low = 0.0, high = limit * (1.0 - 1e-13);  // a hair inside, where a vanishing denominator would be infinite
+        if (limit == __builtin_inf())
+            for (high = larger(t, 1e-6); value(high).v < t && high < 1e12;) high *= 2.0;
+        found.data[k] = value(high).v >= t;
+        double r = found.data[k] ? smaller(t, high) : high, step = high;
+        for (int n = 0; n < 200 && found.data[k] && step > 4e-16 * r; ++n) {
+            const auto f = value(r);
+            if (f.v == t) break;
+            (f.v > t ? high : low) = r;
+            double better = r - (f.v - t) / f.d[0];
+            if (!(better >= low && better <= high)) better = 0.5 * (low + high);
+            step = magnitude(better - r), r = better;
+        }
+        radii.data[k] = r;
+    }
+}
 
 }  // namespace

@@ -29,6 +29,7 @@ _lens_rows = Function("lens_rows", "kind lens[*] constants[4] q[n,3] uv[n,2] res
 _LENS = "first last kind lens[*] constants[4]"
 _rays_of = Function("rays_of", f"{_LENS} uv[n,2] start[*,2] iterations small widest rays[n,3] solved[n]")
 _image_points_of = Function("image_points_of", f"{_LENS} q[n,3] iterations small focal uv[n,2] solved[n]")
+_radii_of = Function("radii_of", "first last numerator[*] denominator[*] limit target[n] radii[n] found[n]")
 _fit_lens = Function(
     "fit_lens",
     "kind values[n] constants[4] directions[n,p] ptr[B+1] x[N,3] uv[N,2] iterations poses[B,4,4] squares[N] cov[p,p] "
@@ -104,6 +105,15 @@ def image_points_of(
     uv, solved = start.copy(), np.empty(len(q), dtype=np.bool_)
     run_ranges(_image_points_of, len(q), *lens, q, *newton, focal_px, uv, solved)
     return uv, solved
+
+
+def radii_of(
+    numerator: FloatArray, denominator: FloatArray, limit: float, target: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Radii r (n,) with r N(r^2) / D(r^2) = target, a function that grows from 0 to ``limit``, and which were found."""
+    radii, found = np.empty(len(target)), np.empty(len(target), dtype=np.bool_)
+    run_ranges(_radii_of, len(target), numerator, denominator, limit, target, radii, found)
+    return radii, found
 
 
 def fit_lens(
