@@ -52,7 +52,7 @@ class FrameTree:
 
     def relative(self, a: FrameRef, b: FrameRef) -> Chain:
         """The chain of ``b_from_a``."""
-        return self.unknowns.tidy(inverse(tuple(self.world_from(b))) + self.world_from(a))
+        return self.unknowns.tidy([link.back for link in reversed(self.world_from(b))] + self.world_from(a))
 
     def of_image(self, block: ImageBlock) -> Chain:
         """The chain of ``camera_from_target``, or ``camera_from_world``; its halves are shared by many images."""
@@ -61,7 +61,7 @@ class FrameTree:
         first = self._to_camera.get(place)
         if first is None:
             links = self._camera(self._get(self.cameras, "camera", camera), epoch)
-            first = self._to_camera[place] = self.unknowns.tidy(inverse(tuple(links)))
+            first = self._to_camera[place] = self.unknowns.tidy([link.back for link in reversed(links)])
         if target is None:
             return first
         place = target, "" if target in self._still_targets else epoch
@@ -134,8 +134,3 @@ class FrameTree:
         geometry = u.vectors[geometry_name]
         u.table_slots[slot] = TableSlot(slot, table.table_id, epoch_id, table.axes, angles.key, geometry)
         return slot
-
-
-def inverse(chain: Chain) -> list[Link]:
-    """The chain the other way round."""
-    return [Link(link.slot, not link.inverse) for link in reversed(chain)]

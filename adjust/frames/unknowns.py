@@ -82,6 +82,11 @@ class Link(NamedTuple):
     slot: int
     inverse: bool = False
 
+    @property
+    def back(self) -> "Link":
+        """The same the other way round."""
+        return Link(self.slot, not self.inverse)
+
 
 Chain = tuple[Link, ...]
 

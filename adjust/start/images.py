@@ -9,7 +9,7 @@ import numpy as np
 from adjust.frames.lens_states import lenders
 from adjust.frames.unknowns import Chain
 from adjust.lenses.models import MODELS
-from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.start.chains import Chains, Observations
 from adjust.start.lens.start import start_lens
 from adjust.start.positions import PointField, Sight
@@ -75,9 +75,11 @@ def _lenses(
     survey: Survey, points: PointField, seen: Mapping[str, Sequence[Sighting]], rows: Mapping[int, IntArray]
 ) -> tuple[dict[str, FloatArray], dict[int, str], list[str]]:
     """Lens values of every camera, given or from its images of known points; reasons against blocks; notes."""
-    known, blocks, mine = points.known, survey.image_blocks, seen
+    blocks, mine = survey.image_blocks, seen
     if rows:
-        told = {c: [_part(s, known[rows[s.block_idx]]) if s.block_idx in rows else s for s in seen[c]] for c in seen}
+        known = {i: points.known[row] for i, row in rows.items()}
+        told = {c: [s if (k := known.get(s.block_idx)) is None else s._replace(x=s.x[k], uv=s.uv[k]) for s in seen[c]]
+                for c in seen}  # fmt: skip
         mine = {c: some for c, of in told.items() if (some := [s for s in of if len(s.x)])}
     lenses, reasons, notes = dict[str, FloatArray](), dict[int, str](), list[str]()
     shared, known_of = lenders(survey), dict[tuple[str, str], float]()
@@ -93,7 +95,3 @@ def _lenses(
         notes.append(f"camera {camera.camera_id!r}: {found.note}")
         reasons |= {i: f"{block_text(blocks[i])}: {reason}" for i, reason in found.excluded.items()}
     return lenses, reasons, notes
-
-
-def _part(seen: Sighting, kept: BoolArray) -> Sighting:
-    return Sighting(seen.block_idx, seen.x[kept], seen.uv[kept])

@@ -51,13 +51,13 @@ class FrameNetwork:
                 self.set(slot, value)
         self.fixed = self.has.copy()
 
-    def set(self, slot: int, value: FloatArray, inverted: bool = False) -> None:
-        """Let a slot, or its inverse, be known."""
-        self.pose[slot], self.has[slot] = inverse(value) if inverted else value, True
+    def set(self, slot: int, value: FloatArray) -> None:
+        """Let a slot be known."""
+        self.pose[slot], self.has[slot] = value, True
 
     def set_link(self, link: Link, value: FloatArray) -> None:
         """Let the pose of a link be known."""
-        self.set(link.slot, value, link.inverse)
+        self.set(link.slot, inverse(value) if link.inverse else value)
 
     def product(self, chain: Chain) -> FloatArray:
         """The product (4, 4) of a chain that is wholly known."""

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from adjust.frames.unknowns import Link
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.spatial.rigid import inverse, rigid
 from adjust.start.chains import ChainObservation, Observations
@@ -46,17 +47,16 @@ def _views(sights: Sequence[Sight], points: PointField, present: FloatArray | No
 
 def _resect_together(network: FrameNetwork, points: PointField) -> bool:
     """Poses of stations whose cameras see enough known points only together; whether one was found."""
-    groups: dict[tuple[int, bool], list[tuple[Sight, int]]] = {}
+    groups: dict[Link, list[tuple[Sight, int]]] = {}
     for sight in points.sights:
         missing = network.unknown_links(sight.chain)
         if len(missing) == 1 and points.known[sight.rows].any():
-            link = sight.chain[missing[0]]
-            groups.setdefault((link.slot, link.inverse), []).append((sight, missing[0]))
+            groups.setdefault(sight.chain[missing[0]], []).append((sight, missing[0]))
     found = False
-    for (slot, inverted), group in sorted(groups.items(), key=lambda item: item[0]):
+    for link, group in sorted(groups.items(), key=lambda item: item[0]):
         pose = _generalised_pose(network, points, group)
         if pose is not None:
-            network.set(slot, pose, inverted)
+            network.set_link(link, pose)
             found = True
     return found
 

@@ -203,25 +203,24 @@ class _Search:
             or (not self.scale_free and self.readings.advance())
         )
 
+    def _noted(self, note: str | None) -> bool:
+        self.notes += [note] if note is not None else []
+        return note is not None
+
     def _set_freely(self) -> bool:
         slot = fix_one_gauge(self.network, [*self.network.observations, *self._unseen_chains()])
-        if slot is not None:
-            self.notes.append(f"{' '.join(self.network.names[slot])}: set freely, no observation tells it")
-        return slot is not None
+        what = "set freely, no observation tells it"
+        return self._noted(None if slot is None else f"{' '.join(self.network.names[slot])}: {what}")
 
     def _from_motion(self) -> bool:
-        note = solve_motion(self.network, degenerate=self.points.released)
-        if note is not None:
-            self.notes.append(note)
-            self.motion_solved = True
-        return note is not None
+        found = self._noted(solve_motion(self.network, degenerate=self.points.released))
+        self.motion_solved |= found
+        return found
 
     def _orient(self) -> bool:
-        note = orient_second(self.network, self.points) if not self.points.known.any() else None
-        if note is not None:
-            self.notes.append(note)
-            self.scale_free = True
-        return note is not None
+        found = not self.points.known.any() and self._noted(orient_second(self.network, self.points))
+        self.scale_free |= found
+        return found
 
     def _unseen_chains(self) -> list[ChainObservation]:
         """Chains of blocks of world points that have no pose yet; they bind the world as soon as any point is known."""

@@ -29,13 +29,8 @@ def enough_points(n_images: int) -> int:
 
 def thinned(images: Sequence[Sighting], most: int) -> list[Sighting]:
     """The images with at most so many points each, one array for all that show the same."""
-    parts, out = dict[int, FloatArray](), []
-    for s in images:
-        if len(s.x) > most:
-            few = few_of(len(s.x), most)
-            s = Sighting(s.block_idx, parts.setdefault(id(s.x), s.x[few]), s.uv[few])
-        out.append(s)
-    return out
+    parts = {i: x[few_of(len(x), most)] for i, x in {id(s.x): s.x for s in images if len(s.x) > most}.items()}
+    return [s._replace(x=parts[id(s.x)], uv=s.uv[few_of(len(s.x), most)]) if id(s.x) in parts else s for s in images]
 
 
 def every_nth(images: Sequence[Sighting], n: int) -> list[Sighting]:
