@@ -180,25 +180,13 @@ def project(model: LensModel, values: FloatArray, constants: FloatArray, x_in_ca
     return uv
 
 
-def rays(model: LensModel, values: FloatArray, constants: FloatArray, uv: FloatArray) -> FloatArray:
-    """Tangents (n, 2) = x/z, y/z of the rays of image points (n, 2) px.
-
-    Raises SurveyError naming the pixels beyond the radius up to which the distortion can be inverted, and those of a
-    fisheye at 90 degrees and more (see ``unit_rays``).
-    """
-    unit = unit_rays(model, values, constants, uv)
-    behind = unit[:, 2] <= 0
-    if behind.any():
-        raise SurveyError(f"{_pixels(uv, behind)} lie 90 deg or more off the axis: use unit rays")
-    return np.asarray(unit[:, :2] / unit[:, 2:])
-
-
 def unit_rays(
     model: LensModel, values: FloatArray, constants: FloatArray, uv: FloatArray, out: FloatArray | None = None
 ) -> FloatArray:
     """Unit vectors (n, 3) in the camera frame of image points (n, 2) px, up to 180 degrees for the fisheye.
 
-    out: where they go. Raises SurveyError as :func:`rays`; in a backward model every point has a ray.
+    out: where they go. Raises SurveyError naming the pixels beyond the radius up to which the distortion is one to one;
+    in a backward model every point has a ray.
     """
     lens, uv = kernels.Lens(model.kind, *_arrays(values, constants)), np.ascontiguousarray(uv, dtype=np.float64)
     if model.backward:
@@ -215,13 +203,14 @@ def unit_rays(
         scale = values[0] if model.in_mm else 1.0
         unit, found = kernels.rays_of(lens, uv, _NEWTON, profile.limit * WELL_INSIDE / scale, out=out)
         if not found.all():  # Newton went astray from the axis, or near the fold perhaps to its other side
-            lost = np.ascontiguousarray(uv[~found])
-            start = np.ascontiguousarray(_without_distortion(profile, _distorted(lens, lost)) / scale)
-            again = kernels.rays_of(lens, lost, _NEWTON, profile.limit * BEYOND_LIMIT / scale, start)
+            rest = np.ascontiguousarray(uv[~found])
+            start = np.ascontiguousarray(_without_distortion(profile, _distorted(lens, rest)) / scale)
+            again = kernels.rays_of(lens, rest, _NEWTON, profile.limit * BEYOND_LIMIT / scale, start)
             unit[~found], found[~found] = again
     if not found.all():
+        lost = listed([f"({u:.1f}, {v:.1f})" for u, v in uv[~found]], 5)
         raise SurveyError(
-            f"{_pixels(uv, ~found)} have no ray: the distortion of {model.name} is one to one only up to "
+            f"pixels {lost} have no ray: the distortion of {model.name} is one to one only up to "
             f"{monotone_radius_px(model, values, constants):.1f} px from the principal point; "
             "estimate fewer distortion terms or leave these pixels out"
         )
@@ -256,12 +245,6 @@ def principal_point_px(model: LensModel, values: FloatArray, constants: FloatArr
 def _arrays(*arrays: FloatArray) -> tuple[FloatArray, ...]:
     """Contiguous float64 arrays, as the kernels take them."""
     return tuple(np.ascontiguousarray(a, dtype=np.float64) for a in arrays)
-
-
-def _pixels(uv: FloatArray, which: BoolArray) -> str:
-    """Some of the named pixels, for a message."""
-    bad = uv[which]
-    return f"pixels {listed([f'({u:.1f}, {v:.1f})' for u, v in bad], 5)}"
 
 
 def _distorted(lens: kernels.Lens, uv: FloatArray) -> FloatArray:
