@@ -32,7 +32,6 @@ from adjust.start.positions import PointField, Positions, point_field, undetermi
 from adjust.start.readings.start import explain
 from adjust.start.readings.steps import Readings
 from adjust.start.settling import block_rms, contradictions, moved_to_coordinates, scaled_to_lengths
-from adjust.start.views import Views
 
 _ROUNDS = 3
 _POLISH_PX = 2.0  # below this the robust means are a good start already
@@ -109,13 +108,8 @@ class _Search:
         self.points: PointField = point_field(survey)
         self.positions = Positions(survey, self.network, self.points)
         self.readings = Readings(survey, self.positions)
-        self.lenses: dict[str, FloatArray] = {}
-        self.reasons: dict[int, str] = {}
         self.notes: list[str] = []
-        self.motion_solved = False
-        self.scale_free = False
-        self.views: Views
-        self.rms: FloatArray
+        self.motion_solved = self.scale_free = False
 
     def _register_positions(self, frames: FrameTree) -> None:
         refs = position_refs(self.survey) + reading_refs(self.survey)
@@ -277,14 +271,11 @@ class _Search:
         poses: dict[ParameterName, Pose3] = {
             name: as_pose3(network.pose[slot]) for slot, name in enumerate(network.names) if name[0] != "table_motion"
         }
-        vectors: dict[ParameterName, FloatArray] = {}
-        for table in survey.tables:
-            vectors[("table_geometry", table.table_id)] = np.array(table.geometry.values, dtype=float)
-        for reading in survey.table_readings:
-            vectors[("table_angles", reading.table_id, reading.epoch_id)] = np.array(reading.angles, dtype=float)
-        for target in survey.targets:
-            if target.warp is not None:
-                vectors[("warp", target.target_id)] = np.array(target.warp.values, dtype=float)
+        vectors: dict[ParameterName, FloatArray] = {
+            ("table_geometry", t.table_id): np.array(t.geometry.values, dtype=float) for t in survey.tables
+        }
+        vectors |= {("table_angles", r.table_id, r.epoch_id): np.array(r.angles, float) for r in survey.table_readings}
+        vectors |= {("warp", t.target_id): np.array(t.warp.values, float) for t in survey.targets if t.warp is not None}
         order = tuple(sorted(self.reasons))
         good = np.delete(rms, order)
         good = good[np.isfinite(good)]
