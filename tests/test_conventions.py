@@ -8,7 +8,8 @@ from gtsam import Pose3, Rot3
 
 from adjust.frames.state import State
 from adjust.frames.tables import table_motions
-from adjust.frames.unknowns import FrameTree, Unknowns
+from adjust.frames.tree import FrameTree
+from adjust.frames.unknowns import Unknowns
 from adjust.lenses.models import MODELS, lens_constants, project
 from adjust.model.boards import deformation
 from adjust.model.observations import FrameRef, ImageBlock, Pair, TableReading

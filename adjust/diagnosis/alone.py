@@ -1,6 +1,6 @@
 """What single images say by themselves: lenses of cameras, poses of targets; start values of what is new from these."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -10,29 +10,29 @@ from gtsam import Pose3
 from adjust.diagnosis.prediction import Prediction, started_values
 from adjust.frames.lens_times import whole_images
 from adjust.graph.assembly import StartValues
-from adjust.model.boards import deformed
 from adjust.model.errors import SurveyError
 from adjust.model.names import grouped
 from adjust.model.survey import Camera, FloatArray, Survey
 from adjust.spatial.averaging import mean_pose
 from adjust.spatial.rigid import inverse
-from adjust.start.lens_images import Sighting
-from adjust.start.lenses import start_lens
-from adjust.start.views import View, Views, focal_px, joined, make_views, rays_by_block
+from adjust.start.lens.start import start_lens
+from adjust.start.views import Sighting, View, Views, make_views, sightings, sights_of
 
 
 def own_lens(survey: Survey, camera: Camera, near: FloatArray | None = None) -> FloatArray:
     """Start values (n,) of a lens from the camera's images of targets alone; SurveyError where they give none.
 
-    near: see :func:`adjust.start.lenses.start_lens`.
+    near: see :func:`adjust.start.lens.start.start_lens`.
     """
-    points = {t.target_id: deformed(t) for t in survey.targets}
-    mine = [
-        (i, b) for i, b in enumerate(whole_images(survey).image_blocks)
-        if b.camera_id == camera.camera_id and b.target_id is not None
-    ]  # fmt: skip
-    seen = [Sighting(i, points[str(b.target_id)][b.point_idx[b.mask]], b.uv[b.mask]) for i, b in mine]
+    seen = _of_targets(survey, (camera.camera_id,)).get(camera.camera_id, ())
     return start_lens(camera, [s for s in seen if len(s.x)], near=near).values
+
+
+def _of_targets(survey: Survey, cameras: Collection[str]) -> dict[str, list[Sighting]]:
+    """What these cameras' blocks of targets show, by camera, in whole images."""
+    survey = whole_images(survey)
+    seen, blocks = sightings(survey, np.full((len(survey.points), 3), np.nan)), survey.image_blocks
+    return {c: [s for s in seen[c] if blocks[s.block_idx].target_id is not None] for c in seen if c in cameras}
 
 
 def own_lenses(survey: Survey, near: Mapping[str, FloatArray] = MappingProxyType({})) -> dict[str, FloatArray]:
@@ -48,15 +48,8 @@ def own_lenses(survey: Survey, near: Mapping[str, FloatArray] = MappingProxyType
 
 def single_views(survey: Survey, lenses: Mapping[str, FloatArray]) -> Views:
     """Every block of a target with three used points or more that has a pose."""
-    survey = whole_images(survey)
-    points = {t.target_id: deformed(t) for t in survey.targets}
-    known = replace(survey, cameras=tuple(c for c in survey.cameras if c.camera_id in lenses))
-    focal = {c.camera_id: focal_px(c, lenses[c.camera_id]) for c in known.cameras}
-    blocks = {i: b for i, b in enumerate(survey.image_blocks) if b.target_id is not None}
-    rays, _ = rays_by_block(known, lenses, {i: b.uv[b.mask] for i, b in blocks.items()})
-    seen = {i: points[str(blocks[i].target_id)][blocks[i].point_idx[blocks[i].mask]] for i in rays}
-    sights = joined([(i, x, rays[i], focal[blocks[i].camera_id]) for i, x in seen.items() if len(x) >= 3])
-    return make_views(sights)[0]
+    sights, _ = sights_of(survey.cameras_by_id, lenses, _of_targets(survey, lenses))
+    return make_views(sights.only(np.diff(sights.ptr) >= 3))[0]
 
 
 def squares_alone(survey: Survey, lenses: Mapping[str, FloatArray]) -> FloatArray:

@@ -13,7 +13,7 @@ from adjust.diagnosis.search import Search
 from adjust.diagnosis.trial import Misfit, Trial, misfit_of
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
-from adjust.start.lenses import remembering
+from adjust.start.lens.start import remembering
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
 

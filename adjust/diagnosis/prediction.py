@@ -10,7 +10,8 @@ from gtsam import Pose3
 from adjust.frames.lens_times import LensTimes
 from adjust.frames.runs import MOVING
 from adjust.frames.tables import table_motions
-from adjust.frames.unknowns import FrameTree, Unknowns
+from adjust.frames.tree import FrameTree
+from adjust.frames.unknowns import Unknowns
 from adjust.graph.assembly import StartValues
 from adjust.lenses.compared import motion_derivatives
 from adjust.lenses.models import MODELS, camera_constants, lens_derivatives, project

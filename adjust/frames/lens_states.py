@@ -11,16 +11,7 @@ from adjust.lenses.crops import UNITS, CroppedLens, cropped_lens
 from adjust.lenses.models import MODELS, LensModel, camera_constants
 from adjust.model.errors import SurveyError
 from adjust.model.result import ParameterName
-from adjust.model.survey import (
-    CROP,
-    BoolArray,
-    Camera,
-    FloatArray,
-    LensDrift,
-    LensSharing,
-    Survey,
-    VectorParameter,
-)
+from adjust.model.survey import CROP, BoolArray, Camera, FloatArray, LensDrift, LensSharing, Survey, VectorParameter
 from adjust.native.lenses import MAX_LENS
 
 

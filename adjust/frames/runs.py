@@ -7,7 +7,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from adjust.frames.unknowns import FrameTree, Unknowns
+from adjust.frames.tree import FrameTree
+from adjust.frames.unknowns import Unknowns
 from adjust.model.clocks import EpochTimes, clock_text, clocks_of, epoch_times
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock, Pair, TableReading

@@ -1,32 +1,29 @@
-"""Which unknowns a survey has, under which GTSAM key, and how any frame is reached from the world.
+"""Which unknowns a survey has, under which GTSAM key, and what follows from them.
 
-Poses live in *slots*: every pose parameter, free or held, and every table motion has one. A frame is a chain of slots,
-each taken forward or inverse; the links that are held at identity are left out.
+Poses live in *slots*: every pose parameter, free or held, and every table motion has one.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import gtsam
 import numpy as np
 from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
-from adjust.model.observations import FrameRef, ImageBlock
 from adjust.model.result import ParameterName
-from adjust.model.survey import Camera, FloatArray, PoseParameter, Station, Survey, Table, Target, VectorParameter
-from adjust.model.tables import unit_of
+from adjust.model.survey import FloatArray, PoseParameter, VectorParameter
 
 T = TypeVar("T")
 POSE_COMPONENTS = ("rx", "ry", "rz", "tx", "ty", "tz")
 POSE_UNITS = ("rad", "rad", "rad", "m", "m", "m")
+_IDENTITY = Pose3()
 
 
-@dataclass(frozen=True, eq=False)
-class Unknown:
+class Unknown(NamedTuple):
     """One GTSAM variable. ``kind`` is pose, point or vector; components and units are those of its tangent."""
 
     name: ParameterName
@@ -79,12 +76,16 @@ class VectorMap:
         return np.asarray(self.base + self.matrix @ values.atVector(self.key))
 
 
-@dataclass(frozen=True)
-class Link:
+class Link(NamedTuple):
     """One step of a chain: a slot, taken as it is or inverted."""
 
     slot: int
     inverse: bool = False
+
+    @property
+    def back(self) -> "Link":
+        """The same the other way round."""
+        return Link(self.slot, not self.inverse)
 
 
 Chain = tuple[Link, ...]
@@ -154,11 +155,11 @@ class Unknowns:
 
     def hold(self, unknown: Unknown, names: tuple[str, ...]) -> None:
         """Keep some components. Raises SurveyError for a component that there is not, or where none is left free."""
-        wrong = [x for x in names if x not in unknown.components]
-        if wrong or len(set(names)) == unknown.dim:
-            what = f"no component {wrong[0]!r}" if wrong else "all components held; treat the whole as 'held'"
-            raise SurveyError(f"{' '.join(unknown.name)}: {what} (components: {', '.join(unknown.components)})")
         if names:
+            wrong = [x for x in names if x not in unknown.components]
+            if wrong or len(set(names)) == unknown.dim:
+                what = f"no component {wrong[0]!r}" if wrong else "all components held; treat the whole as 'held'"
+                raise SurveyError(f"{' '.join(unknown.name)}: {what} (components: {', '.join(unknown.components)})")
             self.held[unknown.key] = tuple(i for i, x in enumerate(unknown.components) if x in names)
 
     def status(self, key: int | None, treatment: str, dim: int) -> tuple[str, ...]:
@@ -176,21 +177,21 @@ class Unknowns:
 
     def slot(self, name: ParameterName, parameter: PoseParameter) -> int:
         """The slot of a pose parameter, made at first use."""
-        if name in self.slot_of:
-            return self.slot_of[name]
+        slot = self.slot_of.setdefault(name, len(self.slot_key))
+        if slot < len(self.slot_key):
+            return slot
         held = parameter.treatment == "held"
-        pose = parameter.value if parameter.value is not None else Pose3()
+        pose = parameter.value if parameter.value is not None else _IDENTITY
         key = None
         if not held:
             unknown = self.add(name, "pose", POSE_COMPONENTS, POSE_UNITS)
             self.hold(unknown, parameter.held)
             key = unknown.key
-        self.slot_of[name] = len(self.slot_key)
         self.slot_key.append(key)
         self.slot_pose.append(pose)
-        self.slot_identity.append(held and pose.equals(Pose3(), 0.0))
+        self.slot_identity.append(held and pose.equals(_IDENTITY, 0.0))
         self.parameters[name] = parameter
-        return self.slot_of[name]
+        return slot
 
     def link_keys(self, slot: int) -> list[int]:
         """The unknowns that a slot depends on: its pose, or all those that it follows from; none where all is held."""
@@ -230,11 +231,6 @@ class Unknowns:
         return tuple(out)
 
 
-def inverse(chain: Chain) -> list[Link]:
-    """The chain the other way round."""
-    return [Link(link.slot, not link.inverse) for link in reversed(chain)]
-
-
 def vector_map(
     parameter: VectorParameter, units: tuple[str, ...], unknowns: Unknowns, name: ParameterName,
     lent: Mapping[str, tuple[int, int]] = MappingProxyType({}),
@@ -265,120 +261,3 @@ def vector_map(
         key = unknowns.add(name, "vector", own, own_units).key
     borrowed = {i: lent[x] for i, x in enumerate(free) if x in lent}
     return VectorMap(parameter.names, units, base, matrix, key, free, tuple(status), borrowed)
-
-
-class FrameTree:
-    """How every frame hangs in the world; makes the unknowns on the way, only those that observations need."""
-
-    def __init__(self, survey: Survey, unknowns: Unknowns) -> None:
-        self.unknowns = unknowns
-        self.cameras, self.stations = survey.cameras_by_id, survey.stations_by_id
-        self.tables, self.targets = survey.tables_by_id, survey.targets_by_id
-        self.on_table = {(r.table_id, r.epoch_id) for r in survey.table_readings}
-        still = {s.station_id for s in survey.stations if s.motion == "fixed"}
-        self._still_cameras = {c.camera_id for c in survey.cameras if c.station_id in still}
-        self._still_targets = {
-            t.target_id for t in survey.targets
-            if t.motion != "epoch" and (t.station_id is None or t.station_id in still)
-        }  # fmt: skip
-        self._to_camera: dict[tuple[str, str], Chain] = {}
-        self._from_target: dict[tuple[str, str], Chain] = {}
-
-    def world_from(self, frame: FrameRef) -> list[Link]:
-        """The chain from a frame to the world. Raises SurveyError for a frame that does not exist."""
-        if frame.kind == "world":
-            return []
-        if frame.kind == "camera":
-            return self._camera(self._get(self.cameras, "camera", frame.frame_id), frame.epoch_id)
-        if frame.kind == "station":
-            return self._station(self._get(self.stations, "station", frame.frame_id), frame.epoch_id)
-        if frame.kind == "target":
-            return self._target(self._get(self.targets, "target", frame.frame_id), frame.epoch_id)
-        table: Table = self._get(self.tables, "table", frame.frame_id)
-        if frame.kind == "mount":
-            return self._mount(table, frame.epoch_id)
-        return [Link(self.unknowns.slot(("world_from_table", table.table_id), table.world_from_table))]
-
-    def relative(self, a: FrameRef, b: FrameRef) -> Chain:
-        """The chain of ``b_from_a``."""
-        return self.unknowns.tidy(inverse(tuple(self.world_from(b))) + self.world_from(a))
-
-    def of_image(self, block: ImageBlock) -> Chain:
-        """The chain of ``camera_from_target``, or ``camera_from_world``; its halves are shared by many images."""
-        place = block.camera_id, "" if block.camera_id in self._still_cameras else block.epoch_id
-        first = self._to_camera.get(place)
-        if first is None:
-            links = self.world_from(FrameRef("camera", block.camera_id, block.epoch_id))
-            first = self._to_camera[place] = self.unknowns.tidy(inverse(tuple(links)))
-        if block.target_id is None:
-            return first
-        place = block.target_id, "" if block.target_id in self._still_targets else block.epoch_id
-        second = self._from_target.get(place)
-        if second is None:
-            links = self.world_from(FrameRef("target", block.target_id, block.epoch_id))
-            second = self._from_target[place] = self.unknowns.tidy(links)
-        if first and second and first[-1].slot == second[0].slot:
-            return self.unknowns.tidy([*first, *second])
-        return first + second
-
-    @staticmethod
-    def _get(things: Mapping[str, T], kind: str, thing_id: str) -> T:
-        if thing_id not in things:
-            raise SurveyError(f"{kind} {thing_id!r} is observed but not part of the survey; add it or correct the id")
-        return things[thing_id]
-
-    def _camera(self, camera: Camera, epoch_id: str | None) -> list[Link]:
-        station = self._get(self.stations, "station", camera.station_id)
-        slot = self.unknowns.slot(("station_from_camera", camera.camera_id), camera.station_from_camera)
-        return self._station(station, epoch_id) + [Link(slot)]
-
-    def _station(self, station: Station, epoch_id: str | None) -> list[Link]:
-        if station.motion == "fixed":
-            return [Link(self.unknowns.slot(("world_from_station", station.station_id), station.world_from_station))]
-        if epoch_id is None:
-            raise SurveyError(f"station {station.station_id!r} moves between epochs: name the observation's epoch")
-        if station.motion == "table" and (station.table_id, epoch_id) in self.on_table:
-            table = self._get(self.tables, "table", station.table_id or "")
-            slot = self.unknowns.slot(("mount_from_station", station.station_id), station.mount_from_station)
-            return [*self._mount(table, epoch_id), Link(slot)]
-        parameter = station.epochs.get(epoch_id, station.world_from_station)
-        return [Link(self.unknowns.slot(("world_from_station", station.station_id, epoch_id), parameter))]
-
-    def _mount(self, table: Table, epoch_id: str | None) -> list[Link]:
-        if epoch_id is None or (table.table_id, epoch_id) not in self.on_table:
-            found = f"no reading at epoch {epoch_id!r}" if epoch_id else "no epoch named"
-            raise SurveyError(f"mount of table {table.table_id!r}: {found}; name an epoch at which its axes are read")
-        base = Link(self.unknowns.slot(("world_from_table", table.table_id), table.world_from_table))
-        return [base, Link(self._table_motion(table, epoch_id))]
-
-    def _target(self, target: Target, epoch_id: str | None) -> list[Link]:
-        name: ParameterName = ("carrier_from_target", target.target_id)
-        parameter = target.carrier_from_target
-        if target.motion == "epoch":
-            if epoch_id is None:
-                raise SurveyError(f"target {target.target_id!r} moves between epochs: name the observation's epoch")
-            name = (*name, epoch_id)
-            parameter = target.epochs.get(epoch_id, parameter)
-        link = [Link(self.unknowns.slot(name, parameter))]
-        if target.station_id is None:
-            return link
-        return self._station(self._get(self.stations, "station", target.station_id), epoch_id) + link
-
-    def _table_motion(self, table: Table, epoch_id: str) -> int:
-        name: ParameterName = ("table_motion", table.table_id, epoch_id)
-        u = self.unknowns
-        if name in u.slot_of:
-            return u.slot_of[name]
-        geometry_name: ParameterName = ("table_geometry", table.table_id)
-        if geometry_name not in u.vectors:
-            units = tuple(unit_of(x) for x in table.geometry.names)
-            u.vectors[geometry_name] = vector_map(table.geometry, units, u, geometry_name)
-        components = tuple(f"axis{i + 1}" for i in range(len(table.axes)))
-        angles = u.add(("table_angles", table.table_id, epoch_id), "vector", components, ("rad",) * len(components))
-        slot = u.slot_of[name] = len(u.slot_key)
-        u.slot_key.append(angles.key)
-        u.slot_pose.append(Pose3())
-        u.slot_identity.append(False)
-        geometry = u.vectors[geometry_name]
-        u.table_slots[slot] = TableSlot(slot, table.table_id, epoch_id, table.axes, angles.key, geometry)
-        return slot

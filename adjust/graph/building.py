@@ -9,7 +9,8 @@ import gtsam
 import numpy as np
 
 from adjust.frames.state import State, collect_vectors
-from adjust.frames.unknowns import Chain, FrameTree, Unknowns
+from adjust.frames.tree import FrameTree
+from adjust.frames.unknowns import Chain, Unknowns
 from adjust.graph.assembly import AdjustmentGraph, StartValues
 from adjust.graph.singles import Singles
 from adjust.model.boards import deformation, warming_of

@@ -5,7 +5,7 @@ models in millimetres measure the image with y up from the image's centre (``bro
 pixel origin (``brown_backward_dbat``). The formulas are in ``adjust/native/lenses.h``.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,18 +14,15 @@ from adjust.lenses.radial import RadialProfile, invert_radius, radial_profile
 from adjust.model.errors import SurveyError, listed
 from adjust.model.survey import BoolArray, Camera, FloatArray
 from adjust.native import lenses as kernels
-from adjust.native.parallel import run_split, split_blocks
 
-RAY_TOLERANCE = 1e-13
-"""Newton's last step on a ray, in tangents of the angle to the axis."""
-PIXEL_TOLERANCE = 1e-7
-"""What a solved point may miss its equation by, px: far above rounding, far below any measurement."""
+RAY_TOLERANCE = 1e-8
+"""Newton's last step on a ray, in tangents of the angle to the axis: what is left is of the size of its square."""
 BEYOND_LIMIT = 1.02
 """Tangential terms move the fold of the image a little off the radius where the radial function turns back."""
 WELL_INSIDE = 0.9
 """Share of that radius up to which a solution is the one on this side of the fold, wherever it was started."""
 MAX_ITERATIONS = 50
-_NEWTON = kernels.Newton(MAX_ITERATIONS, RAY_TOLERANCE, PIXEL_TOLERANCE)
+_NEWTON = kernels.Newton(MAX_ITERATIONS, RAY_TOLERANCE)
 
 
 @dataclass(frozen=True)
@@ -183,41 +180,41 @@ def project(model: LensModel, values: FloatArray, constants: FloatArray, x_in_ca
     return uv
 
 
-def rays(model: LensModel, values: FloatArray, constants: FloatArray, uv: FloatArray) -> FloatArray:
-    """Tangents (n, 2) = x/z, y/z of the rays of image points (n, 2) px.
+def unit_rays(
+    model: LensModel, values: FloatArray, constants: FloatArray, uv: FloatArray, out: FloatArray | None = None
+) -> FloatArray:
+    """Unit vectors (n, 3) in the camera frame of image points (n, 2) px, up to 180 degrees for the fisheye.
 
-    Raises SurveyError naming the pixels beyond the radius up to which the distortion can be inverted, and those of a
-    fisheye at 90 degrees and more (see ``unit_rays``).
+    out: where they go. Raises SurveyError naming the pixels beyond the radius up to which the distortion is one to one;
+    in a backward model every point has a ray.
     """
-    uv = np.ascontiguousarray(uv, dtype=np.float64)
-    if model.kind == kernels.FISHEYE:
-        unit = unit_rays(model, values, constants, uv)
-        behind = unit[:, 2] <= 0
-        if behind.any():
-            raise SurveyError(f"{_pixels(uv, behind)} lie 90 deg or more off the axis: use unit rays")
-        return np.asarray(unit[:, :2] / unit[:, 2:])
+    lens, uv = kernels.Lens(model.kind, *_arrays(values, constants)), np.ascontiguousarray(uv, dtype=np.float64)
     if model.backward:
-        on_axis = np.tile([0.0, 0.0, 1.0], (len(uv), 1))
-        tangents: FloatArray = -lens_residuals(model, values, constants, on_axis, uv) * (constants[0] / values[0])
-        return tangents
-    return _forward_rays(model, values, constants, uv)
-
-
-def unit_rays(model: LensModel, values: FloatArray, constants: FloatArray, uv: FloatArray) -> FloatArray:
-    """Unit vectors (n, 3) in the camera frame of image points (n, 2) px, up to 180 degrees for the fisheye."""
-    uv = np.ascontiguousarray(uv, dtype=np.float64)
-    if model.kind != kernels.FISHEYE:
-        tangents, unit = rays(model, values, constants, uv), np.empty((len(uv), 3))
-        unit[:, 2] = 1.0 / np.sqrt(1.0 + tangents[:, 0] ** 2 + tangents[:, 1] ** 2)
-        unit[:, :2] = tangents * unit[:, 2:]
-        return unit
-    distorted = _affine_inverse(values, uv)
-    theta_d = np.hypot(distorted[:, 0], distorted[:, 1])
-    theta, found = invert_radius(radial_profile(model.kind, values, constants), theta_d)
-    _require_invertible(model, values, constants, uv, found)
-    # sin(theta) / theta_d tends to 1 on the axis
-    along = np.divide(np.sin(theta), theta_d, out=np.ones_like(theta), where=theta_d > 0)
-    return np.column_stack([distorted * along[:, None], np.cos(theta)])
+        return kernels.rays_of(lens, uv, _NEWTON, np.inf, out=out)[0]
+    profile = radial_profile(model.kind, values, constants)
+    if model.kind == kernels.FISHEYE:
+        distorted = _distorted(lens, uv)
+        theta_d = np.hypot(distorted[:, 0], distorted[:, 1])
+        theta, found = invert_radius(profile, theta_d)
+        # sin(theta) / theta_d tends to 1 on the axis
+        along = np.divide(np.sin(theta), theta_d, out=np.ones_like(theta), where=theta_d > 0)
+        unit = np.concatenate([distorted * along[:, None], np.cos(theta)[:, None]], axis=1, out=out)
+    else:
+        scale = values[0] if model.in_mm else 1.0
+        unit, found = kernels.rays_of(lens, uv, _NEWTON, profile.limit * WELL_INSIDE / scale, out=out)
+        if not found.all():  # Newton went astray from the axis, or near the fold perhaps to its other side
+            rest = np.ascontiguousarray(uv[~found])
+            start = np.ascontiguousarray(_without_distortion(profile, _distorted(lens, rest)) / scale)
+            again = kernels.rays_of(lens, rest, _NEWTON, profile.limit * BEYOND_LIMIT / scale, start)
+            unit[~found], found[~found] = again
+    if not found.all():
+        lost = listed([f"({u:.1f}, {v:.1f})" for u, v in uv[~found]], 5)
+        raise SurveyError(
+            f"pixels {lost} have no ray: the distortion of {model.name} is one to one only up to "
+            f"{monotone_radius_px(model, values, constants):.1f} px from the principal point; "
+            "estimate fewer distortion terms or leave these pixels out"
+        )
+    return unit
 
 
 def monotone_radius_px(model: LensModel, values: FloatArray, constants: FloatArray) -> float:
@@ -250,58 +247,14 @@ def _arrays(*arrays: FloatArray) -> tuple[FloatArray, ...]:
     return tuple(np.ascontiguousarray(a, dtype=np.float64) for a in arrays)
 
 
-def _pixels(uv: FloatArray, which: BoolArray) -> str:
-    """Some of the named pixels, for a message."""
-    bad = uv[which]
-    return f"pixels {listed([f'({u:.1f}, {v:.1f})' for u, v in bad], 5)}"
-
-
-def _require_invertible(
-    model: LensModel, values: FloatArray, constants: FloatArray, uv: FloatArray, found: BoolArray
-) -> None:
-    """Raise SurveyError naming the pixels that have no ray."""
-    if not found.all():
-        raise SurveyError(
-            f"{_pixels(uv, ~found)} have no ray: the distortion of {model.name} is one to one only up to "
-            f"{monotone_radius_px(model, values, constants):.1f} px from the principal point; "
-            "estimate fewer distortion terms or leave these pixels out"
-        )
-
-
-def _affine_inverse(values: FloatArray, uv: FloatArray) -> FloatArray:
-    """Distorted tangents (n, 2) of pixels, for the models with fx fy skew u0 v0."""
-    fx, fy, skew, u0, v0 = values[:5]
+def _distorted(lens: kernels.Lens, uv: FloatArray) -> FloatArray:
+    """Pixels (n, 2) in the plane of the radial function of a forward model: tangents, of ``aicon`` mm, y down."""
+    if lens.kind == kernels.AICON:
+        s, centre_u, centre_v, _ = lens.constants
+        return np.column_stack([(uv[:, 0] - centre_u) * s - lens.values[1], (uv[:, 1] - centre_v) * s + lens.values[2]])
+    fx, fy, skew, u0, v0 = lens.values[:5]
     y = (uv[:, 1] - v0) / fy
     return np.column_stack([(uv[:, 0] - u0 - skew * y) / fx, y])
-
-
-def _forward_rays(model: LensModel, values: FloatArray, constants: FloatArray, uv: FloatArray) -> FloatArray:
-    """Tangents (n, 2) by Newton on the projection, from the distorted ones or else the inverse of its radial part."""
-    profile = radial_profile(model.kind, values, constants)
-    if model.kind == kernels.BROWN:
-        scale, distorted = 1.0, _affine_inverse(values, uv)
-    else:
-        s, centre_u, centre_v, _ = constants
-        scale = values[0]
-        distorted = np.column_stack([(uv[:, 0] - centre_u) * s - values[1], (uv[:, 1] - centre_v) * s + values[2]])
-    lens, constants, _, uv = _arrays(values, constants, np.zeros((0, 3)), uv)
-
-    def solved(tangents: FloatArray, uv: FloatArray, most: float) -> BoolArray:
-        found = np.zeros(len(uv), dtype=np.bool_)
-        runs = split_blocks(np.arange(len(uv) + 1))
-        run_split(kernels.tangents_of, runs, kernels.Lens(model.kind, lens, constants), uv, _NEWTON, tangents, found)
-        if np.isfinite(profile.limit):
-            found &= np.einsum("ij,ij->i", tangents, tangents) <= (profile.limit * most / scale) ** 2
-        return found
-
-    tangents = np.ascontiguousarray(distorted / scale)
-    found = solved(tangents, uv, WELL_INSIDE)
-    if not found.all():  # Newton went astray from the distorted point, or near the fold perhaps to its other side
-        again = np.ascontiguousarray(_without_distortion(profile, distorted[~found]) / scale)
-        better = solved(again, uv[~found], BEYOND_LIMIT)
-        tangents[~found], found[~found] = again, better
-    _require_invertible(model, values, constants, uv, found)
-    return tangents
 
 
 def _measured_points(
@@ -311,25 +264,12 @@ def _measured_points(
     profile = radial_profile(model.kind, values, constants)
     # x right, y down, mm
     measured = _without_distortion(profile, values[0] * q[:, :2] / q[:, 2:])
-    pixel_size_mm, stretch = constants[0], _stretch(model, values)
-    principal_point = principal_point_px(model, values, constants)
-    start = measured / (pixel_size_mm * stretch) + principal_point
-    # yp of brown_backward points up, py of DBAT down as v does
-    by_shift = pixel_size_mm * np.array([-1.0, 1.0 if model.kind == kernels.BROWN_BACKWARD else -1.0])
-
-    def equation(uv: FloatArray) -> tuple[FloatArray, FloatArray]:
-        residuals, by_lens, _ = lens_derivatives(model, values, constants, q, uv)
-        # moving the principal point moves the measured point the other way
-        return residuals, by_lens[:, :, 1:3] * by_shift
-
-    uv, solved = _newton(equation, start, focal_length_px(model, values, constants))
-    radius = np.linalg.norm((uv - principal_point) * pixel_size_mm * stretch, axis=1)
+    stretch = np.array([1.0 + values[3] if model.kind == kernels.BROWN_BACKWARD_DBAT else 1.0, 1.0])
+    mm_of_px, principal_point = constants[0] * stretch, principal_point_px(model, values, constants)
+    focal, lens = focal_length_px(model, values, constants), kernels.Lens(model.kind, *_arrays(values, constants))
+    uv, solved = kernels.image_points_of(lens, q, _NEWTON, focal, measured / mm_of_px + principal_point)
+    radius = np.linalg.norm((uv - principal_point) * mm_of_px, axis=1)
     return uv, solved & (radius <= profile.limit * BEYOND_LIMIT)
-
-
-def _stretch(model: LensModel, values: FloatArray) -> FloatArray:
-    """Factors (2,) on the measured x and y before the correction."""
-    return np.array([1.0 + values[3] if model.kind == kernels.BROWN_BACKWARD_DBAT else 1.0, 1.0])
 
 
 def _without_distortion(profile: RadialProfile, points: FloatArray) -> FloatArray:
@@ -338,35 +278,3 @@ def _without_distortion(profile: RadialProfile, points: FloatArray) -> FloatArra
     inverse, _ = invert_radius(profile, radius)
     ratio = np.divide(inverse, radius, out=np.ones_like(radius), where=radius > 0)
     return points * ratio[:, None]
-
-
-def _newton(
-    equation: Callable[[FloatArray], tuple[FloatArray, FloatArray]], start: FloatArray, scale: float
-) -> tuple[FloatArray, BoolArray]:
-    """Solutions (n, 2) of n equations in two unknowns, and which were found with a positive determinant.
-
-    The determinant of every model is positive in the middle of the image; where it is not, the image is turned over.
-    ``scale`` turns a step into tangents of angles.
-    """
-    x = start
-    with np.errstate(all="ignore"):
-        for _ in range(MAX_ITERATIONS):
-            residuals, jacobians = equation(x)
-            step, determinant = _solve_2x2(jacobians, residuals)
-            x = x - step
-            size = np.abs(step).max(axis=1, initial=0.0) / scale
-            if not np.any(size > RAY_TOLERANCE * (1.0 + np.abs(x).max(axis=1, initial=0.0) / scale)):
-                break
-        residuals, jacobians = equation(x)
-        _, determinant = _solve_2x2(jacobians, residuals)
-        found: BoolArray = (np.abs(residuals).max(axis=1, initial=0.0) < PIXEL_TOLERANCE) & (determinant > 0)
-    return x, found
-
-
-def _solve_2x2(matrices: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Solutions (n, 2) of n systems (n, 2, 2), and the determinants (n,)."""
-    a, b, c, d = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 0], matrices[:, 1, 1]
-    determinant = a * d - b * c
-    x = (d * right[:, 0] - b * right[:, 1]) / determinant
-    y = (a * right[:, 1] - c * right[:, 0]) / determinant
-    return np.column_stack([x, y]), determinant

@@ -15,7 +15,6 @@ from adjust.native import lenses as kernels
 
 SMALLEST_ROOT = 1e-12
 """Reciprocals of squared radii below this mean that the radius is out of any camera's sight."""
-MAX_ITERATIONS = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,13 +30,6 @@ class RadialProfile:
         w = np.asarray(radius) ** 2
         f: FloatArray = radius * polynomial.polyval(w, self.numerator) / polynomial.polyval(w, self.denominator)
         return f
-
-    def slope(self, radius: FloatArray) -> FloatArray:
-        """df/dr, element by element."""
-        w = np.asarray(radius) ** 2
-        growth = _growth(self.numerator, self.denominator)
-        df: FloatArray = polynomial.polyval(w, growth) / polynomial.polyval(w, self.denominator) ** 2
-        return df
 
 
 def radial_profile(kind: int, values: FloatArray, constants: FloatArray) -> RadialProfile:
@@ -57,27 +49,8 @@ def radial_profile(kind: int, values: FloatArray, constants: FloatArray) -> Radi
 
 
 def invert_radius(profile: RadialProfile, target: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Radii r with f(r) = target below the profile's limit, and which were found (the others are at the limit).
-
-    Newton kept inside a bracket that shrinks; f grows on it, so there is exactly one solution.
-    """
-    low = np.zeros_like(target)
-    with np.errstate(all="ignore"):
-        high = _upper_bracket(profile, target)
-        found = ~(profile.value(high) < target)
-        radius = np.where(found, np.minimum(target, high), high)
-        for _ in range(MAX_ITERATIONS):
-            error = profile.value(radius) - target
-            high = np.where(error > 0, radius, high)
-            low = np.where(error < 0, radius, low)
-            better = radius - error / profile.slope(radius)
-            outside = ~((better >= low) & (better <= high))
-            better = np.where(outside, (low + high) / 2, better)
-            step = np.abs(better - radius)
-            radius = np.where(found & (error != 0), better, radius)
-            if np.all((step <= 4e-16 * radius) | ~found | (error == 0)):
-                break
-    return radius, found
+    """Radii r with f(r) = target below the profile's limit, and which were found (the others are at the limit)."""
+    return kernels.radii_of(profile.numerator, profile.denominator, profile.limit, np.ascontiguousarray(target))
 
 
 @lru_cache(64)  # a search for start values asks again and again for the lens without distortion
@@ -111,17 +84,3 @@ def _first_root(coefficients: FloatArray) -> float:
     real = reciprocals.real[np.abs(reciprocals.imag) <= 1e-9 * np.abs(reciprocals)]
     largest = float(np.max(real, initial=0.0))
     return float(largest**-0.5) if largest > SMALLEST_ROOT else float("inf")
-
-
-def _upper_bracket(profile: RadialProfile, target: FloatArray) -> FloatArray:
-    """Radii where f has passed the target, or the limit."""
-    if np.isfinite(profile.limit):
-        # a hair inside, where a vanishing denominator would be infinite
-        return np.full_like(target, profile.limit * (1 - 1e-13))
-    high = np.maximum(target, 1e-6)
-    for _ in range(MAX_ITERATIONS):
-        short = profile.value(high) < target
-        if not short.any() or high.max() > 1e12:
-            break
-        high = np.where(short, 2 * high, high)
-    return high

@@ -9,8 +9,10 @@
 
 extern "C" __attribute__((visibility("default"))) const Entry *images() {
     static constexpr Entry table[] = {
-        entry<evaluate_chains>("evaluate_chains"), entry<lens_rows>("lens_rows"), entry<tangents_of>("tangents_of"), entry<normal_equations>("normal_equations"), entry<errors>("errors"),
-        entry<square_roots>("square_roots"), entry<point_columns>("point_columns"), entry<block_rows>("block_rows"), entry<condensed_rows>("condensed_rows"), entry<serve>("serve"), entry<local_by_keys>("local_by_keys"),
+        entry<evaluate_chains>("evaluate_chains"), entry<lens_rows>("lens_rows"), entry<rays_of>("rays_of"),
+        entry<image_points_of>("image_points_of"), entry<radii_of>("radii_of"), entry<normal_equations>("normal_equations"),
+        entry<errors>("errors"), entry<square_roots>("square_roots"), entry<point_columns>("point_columns"),
+        entry<block_rows>("block_rows"), entry<condensed_rows>("condensed_rows"), entry<serve>("serve"), entry<local_by_keys>("local_by_keys"),
         entry<all_statistics>("all_statistics"), entry<reduce_poses>("reduce_poses"), entry<pose_steps>("pose_steps"),
         entry<leaf_rows>("leaf_rows"), entry<tree_block>("tree_block"), entry<invert_cliques>("invert_cliques"), entry<inversion_room>("inversion_room"),
         entry<covariance_room>("covariance_room"), entry<covariance_rows>("covariance_rows"), entry<clique_covariance>("clique_covariance"),

@@ -27,6 +27,30 @@ inline double sum(V v) {
     for (int i = 0; i < W; ++i) s += v[i];
     return s;
 }
+// W rows of D numbers by columns, the first of n at p; behind the last one that again.
+template <int D> inline void by_columns(const double *p, int64_t n, V (&out)[D]) {
+    for (int a = 0; a < D; ++a)
+        for (int i = 0; i < W; ++i) out[a][i] = p[D * (i < n ? i : n - 1) + a];
+}
+template <int D, int... I> [[gnu::always_inline]] inline void whole_columns(const double *p, V (&out)[D], std::integer_sequence<int, I...>) {
+    for (int a = 0; a < D; ++a) out[a] = V{p[D * I + a]...};
+}
+template <int D> [[gnu::always_inline]] inline void columns(const double *p, int64_t n, V (&out)[D]) {
+    if (n >= W) whole_columns(p, out, std::make_integer_sequence<int, W>{});
+    else by_columns(p, n, out);
+}
+// One in the first n lanes, else zero.
+[[gnu::always_inline]] inline V first_lanes(int64_t n) {
+    V o = V{};
+    for (int i = 0; i < W; ++i) o[i] = i < n;
+    return o;
+}
+// The first n numbers, or W.
+inline void store_lanes(double *p, int64_t n, V v) {
+    if (n >= W) store(p, v);
+    else
+        for (int i = 0; i < n; ++i) p[i] = v[i];
+}
 // Lane i, by its bit H: a or b there and H lanes away.
 template <int H, int... I> [[gnu::always_inline]] inline V folded(V a, V b, std::integer_sequence<int, I...>) {
 #if __has_builtin(__builtin_shufflevector)
@@ -53,6 +77,7 @@ inline V root(V v) {
 }
 inline double magnitude(double x) { return __builtin_fabs(x); }
 inline V magnitude(V v) { return v < 0.0 ? -v : v; }
+inline V larger(V a, V b) { return a > b ? a : b; }
 inline double where(bool mask, double a, double b) { return mask ? a : b; }
 template <class M> inline V where(M mask, V a, V b) { return mask ? a : b; }
 typedef int64_t Bits __attribute__((vector_size(8 * W)));

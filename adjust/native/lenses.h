@@ -181,45 +181,99 @@ inline void lens_rows(int64_t kind, Vector l, Vector c, In<double, 2> q, In<doub
     });
 }
 
-inline V larger(V a, V b) { return a > b ? a : b; }
-
-// Tangents x/z, y/z of the rays of points first .. last - 1, by Newton on the projection from what is in `tangents`; solved:
-// those within `pixels` of their image point, where the image is not turned over. A step below `small` is the last one.
-inline void tangents_of(int64_t first, int64_t last, int64_t kind, Vector l, Vector c, In<double, 2> uv, int64_t iterations, double small,
-                        double pixels, Out<double, 2> tangents, Out<bool, 1> solved) {
+// A zero of a function of x and y, by Newton from there; the determinant of the derivatives, or 0 where none was found. A
+// step below `small`, relative to the unit of x and y, is the last one; what has arrived stays, whatever its neighbours do.
+template <class F> [[gnu::always_inline]] inline V newton(const F &residual, int64_t iterations, double small, double unit, V &x, V &y) {
+    V going = all<V>(1), found = V{};
+    for (int64_t n = 0; n < iterations && any(going != 0.0); ++n) {
+        const auto [a, b] = residual(x, y);
+        const V ax = derivative<0>(a), ay = derivative<1>(a), bx = derivative<0>(b), by = derivative<1>(b);
+        const V determinant = ax * by - ay * bx, inverse = 1.0 / determinant;
+        const V dx = (by * a.v - ay * b.v) * inverse, dy = (ax * b.v - bx * a.v) * inverse;
+        x = going != 0.0 ? x - dx : x, y = going != 0.0 ? y - dy : y;
+        const auto arrived = larger(magnitude(dx), magnitude(dy)) <= small * (unit + larger(magnitude(x), magnitude(y)));
+        found = going != 0.0 ? determinant : found;
+        going = arrived ? V{} : going;
+    }
+    return going == 0.0 ? found : V{};
+}
+// Unit rays of image points first .. last - 1, by Newton on the projection from tangents x/z, y/z, or where there are none
+// from the axis; solved: those within `widest` (a tangent) of the axis, where the image is not turned over.
+inline void rays_of(int64_t first, int64_t last, int64_t kind, Vector l, Vector c, In<double, 2> uv, In<double, 2> start, int64_t iterations,
+                    double small, double widest, Out<double, 2> rays, Out<bool, 1> solved) {
     with_lens(kind, [&]<class Lens>(Lens) {
         const auto p = parameters<Lens>(l.data);
         for (int64_t lo = first; lo < last; lo += W) {
-            const int m = int(smaller(last - lo, int64_t(W)));
-            V x, y, u, v;
+            V x = V{}, y = V{}, u, v;
             for (int i = 0; i < W; ++i) {  // the last one again behind the end
-                const int64_t k = lo + smaller(int64_t(i), int64_t(m - 1));
-                x[i] = tangents(k, 0), y[i] = tangents(k, 1), u[i] = uv(k, 0), v[i] = uv(k, 1);
+                const int64_t k = smaller(lo + i, last - 1);
+                u[i] = uv(k, 0), v[i] = uv(k, 1);
+                if (start.n[0]) x[i] = start(k, 0), y[i] = start(k, 1);
             }
-            const auto newton = [&](V &r, V &dx, V &dy) {
-                const auto [a, b] = Lens::residual(p, c.data, Jet<V, 1u>{x, {all<V>(1)}}, Jet<V, 2u>{y, {all<V>(1)}}, all<V>(1), u, v);
-                const V ax = derivative<0>(a), ay = derivative<1>(a), bx = derivative<0>(b), by = derivative<1>(b);
-                const V determinant = ax * by - ay * bx;
-                dx = (by * a.v - ay * b.v) / determinant;
-                dy = (ax * b.v - bx * a.v) / determinant;
-                r = larger(magnitude(a.v), magnitude(b.v));
-                return determinant;
+            const auto residual = [&](V a, V b) __attribute__((always_inline)) {
+                return Lens::residual(p, c.data, Jet<V, 1u>{a, {all<V>(1)}}, Jet<V, 2u>{b, {all<V>(1)}}, all<V>(1), u, v);
             };
-            V r, dx, dy, going = all<V>(1);
-            for (int64_t n = 0; n < iterations; ++n) {  // a point that has arrived stays, whatever its neighbours do
-                newton(r, dx, dy);
-                x = going != 0.0 ? x - dx : x, y = going != 0.0 ? y - dy : y;
-                const V step = larger(magnitude(dx), magnitude(dy));
-                going = step > small * (1.0 + larger(magnitude(x), magnitude(y))) ? going : V{};
-                if (sum(going) == 0.0) break;
-            }
-            const V determinant = newton(r, dx, dy);
-            for (int i = 0; i < m; ++i) {
-                tangents(lo + i, 0) = x[i], tangents(lo + i, 1) = y[i];
-                solved.data[lo + i] = r[i] < pixels && determinant[i] > 0.0;
+            const V determinant = newton(residual, iterations, small, 1.0, x, y);
+            const V square = x * x + y * y, z = 1.0 / root(1.0 + square);
+            for (int i = 0; i < W && lo + i < last; ++i) {
+                rays(lo + i, 0) = x[i] * z[i], rays(lo + i, 1) = y[i] * z[i], rays(lo + i, 2) = z[i];
+                solved.data[lo + i] = determinant[i] > 0.0 && square[i] <= widest * widest;
             }
         }
     });
+}
+// Image points of points q in the camera, by Newton from what is in uv, whose tangents are of size 1 / focal; solved: as above.
+inline void image_points_of(int64_t first, int64_t last, int64_t kind, Vector l, Vector c, In<double, 2> q, int64_t iterations, double small,
+                            double focal, Out<double, 2> uv, Out<bool, 1> solved) {
+    with_lens(kind, [&]<class Lens>(Lens) {
+        const auto p = parameters<Lens>(l.data);
+        for (int64_t lo = first; lo < last; lo += W) {
+            V X, Y, Z, u, v;
+            for (int i = 0; i < W; ++i) {
+                const int64_t k = smaller(lo + i, last - 1);
+                X[i] = q(k, 0), Y[i] = q(k, 1), Z[i] = q(k, 2), u[i] = uv(k, 0), v[i] = uv(k, 1);
+            }
+            const auto residual = [&](V a, V b) __attribute__((always_inline)) {
+                return Lens::residual(p, c.data, X, Y, Z, Jet<V, 3u>{a, {all<V>(1), V{}}}, Jet<V, 3u>{b, {V{}, all<V>(1)}});
+            };
+            const V determinant = newton(residual, iterations, small, focal, u, v);
+            for (int i = 0; i < W && lo + i < last; ++i) {
+                uv(lo + i, 0) = u[i], uv(lo + i, 1) = v[i];
+                solved.data[lo + i] = determinant[i] > 0.0;
+            }
+        }
+    });
+}
+// Radii first .. last - 1 at which r N(r^2) / D(r^2), N and D with ascending coefficients, growing up to `limit`, has the value of
+// the target, by Newton inside a bracket that shrinks; where it does not get there, the limit, and not found.
+inline void radii_of(int64_t first, int64_t last, Vector numerator, Vector denominator, double limit, Vector target, Out<double, 1> radii,
+                     Out<bool, 1> found) {
+    const auto value = [&](double r) {
+        const Jet<double, 1u> x{r, {1.0}}, w = x * x;
+        const auto series = [&](const Vector &c) {
+            Jet<double, 1u> sum{0.0, {0.0}};
+            for (int64_t i = c.n[0]; i-- > 0;) sum = sum * w + c.data[i];
+            return sum;
+        };
+        return x * series(numerator) / series(denominator);
+    };
+    for (int64_t k = first; k < last; ++k) {
+        const double t = target.data[k];
+        double low = 0.0, high = limit * (1.0 - 1e-13);  // a hair inside, where a vanishing denominator would be infinite
+        if (limit == __builtin_inf())
+            for (high = larger(t, 1e-6); value(high).v < t && high < 1e12;) high *= 2.0;
+        found.data[k] = value(high).v >= t;
+        double r = found.data[k] ? smaller(t, high) : high, step = high;
+        for (int n = 0; n < 200 && found.data[k] && step > 4e-16 * r; ++n) {
+            const auto f = value(r);
+            if (f.v == t) break;
+            (f.v > t ? high : low) = r;
+            double better = r - (f.v - t) / f.d[0];
+            if (!(better >= low && better <= high)) better = 0.5 * (low + high);
+            step = magnitude(better - r), r = better;
+        }
+        radii.data[k] = r;
+    }
 }
 
 }  // namespace

@@ -13,6 +13,7 @@ import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.library import Function
+from adjust.native.parallel import run_ranges
 
 BROWN = 0
 FISHEYE = 1
@@ -25,9 +26,10 @@ MAX_LENS = 14
 N_COLUMNS = MAX_LENS + 3
 
 _lens_rows = Function("lens_rows", "kind lens[*] constants[4] q[n,3] uv[n,2] residuals[n,2] rows[*,2,17]")
-_tangents_of = Function(
-    "tangents_of", "first last kind lens[*] constants[4] uv[n,2] iterations small pixels tangents[n,2] solved[n]"
-)
+_LENS = "first last kind lens[*] constants[4]"
+_rays_of = Function("rays_of", f"{_LENS} uv[n,2] start[*,2] iterations small widest rays[n,3] solved[n]")
+_image_points_of = Function("image_points_of", f"{_LENS} q[n,3] iterations small focal uv[n,2] solved[n]")
+_radii_of = Function("radii_of", "first last numerator[*] denominator[*] limit target[n] radii[n] found[n]")
 _fit_lens = Function(
     "fit_lens",
     "kind values[n] constants[4] directions[n,p] ptr[B+1] x[N,3] uv[N,2] iterations poses[B,4,4] squares[N] cov[p,p] "
@@ -42,14 +44,13 @@ class Lens(NamedTuple):
 
 
 class Newton(NamedTuple):
-    """How rays are found: steps at most, relative size of the last one, and how near (px) they must come."""
+    """How rays and image points are found: steps at most, and the relative size of the last one."""
 
     iterations: int
     small: float
-    pixels: float
 
 
-_NO_ROWS = np.zeros((0, 2, N_COLUMNS))
+_NO_ROWS, _NO_START = np.zeros((0, 2, N_COLUMNS)), np.zeros((0, 2))
 
 
 def lens_rows(
@@ -81,15 +82,38 @@ def _check(kind: int, lens: FloatArray) -> None:
         raise ValueError(f"lens model {kind} has {N_LENS[kind]} parameters, {len(lens)} were given")
 
 
-def tangents_of(
-    run: IntArray, lens: Lens, uv: FloatArray, newton: Newton, tangents: FloatArray, solved: BoolArray
-) -> None:
-    """Tangents (n, 2) = x/z, y/z of the rays of image points (n, 2) px, by Newton from the given ones, in place.
+def rays_of(
+    lens: Lens, uv: FloatArray, newton: Newton, widest: float, start: FloatArray | None = None,
+    out: FloatArray | None = None,
+) -> tuple[FloatArray, BoolArray]:  # fmt: skip
+    """Unit rays (n, 3) of image points (n, 2) px, by Newton from tangents x/z, y/z (n, 2) or from the axis.
 
-    run: the points to do, one after the other. solved (n,): those so near to their image point, where the lens does not
-    turn the image over.
+    And which (n,) were found, where the lens does not turn the image over, their tangent to the axis at most
+    ``widest``. out: where the rays go.
     """
-    _tangents_of(int(run[0]), int(run[-1]) + 1, *lens, uv, *newton, tangents, solved)
+    _check(lens.kind, lens.values)
+    rays, solved = np.empty((len(uv), 3)) if out is None else out, np.empty(len(uv), dtype=np.bool_)
+    run_ranges(_rays_of, len(uv), *lens, uv, _NO_START if start is None else start, *newton, widest, rays, solved)
+    return rays, solved
+
+
+def image_points_of(
+    lens: Lens, q: FloatArray, newton: Newton, focal_px: float, start: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Image points (n, 2) px of points q (n, 3) m in the camera, by Newton from those given, and which were found."""
+    _check(lens.kind, lens.values)
+    uv, solved = start.copy(), np.empty(len(q), dtype=np.bool_)
+    run_ranges(_image_points_of, len(q), *lens, q, *newton, focal_px, uv, solved)
+    return uv, solved
+
+
+def radii_of(
+    numerator: FloatArray, denominator: FloatArray, limit: float, target: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Radii r (n,) with r N(r^2) / D(r^2) = target, a function that grows from 0 to ``limit``, and which were found."""
+    radii, found = np.empty(len(target)), np.empty(len(target), dtype=np.bool_)
+    run_ranges(_radii_of, len(target), numerator, denominator, limit, target, radii, found)
+    return radii, found
 
 
 def fit_lens(

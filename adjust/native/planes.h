@@ -30,13 +30,23 @@ struct Unit {
     double scale, mean[2] = {};
 
     Unit(const double *p, int64_t n) {
-        for (int64_t i = 0; i < 2 * n; ++i) mean[i % 2] += p[i] / double(n);
-        double total = 0.0;
-        for (int64_t i = 0; i < n; ++i) {
-            const double du = p[2 * i] - mean[0], dv = p[2 * i + 1] - mean[1];
-            total += root(du * du + dv * dv);
+        V x[2], total[2] = {}, away = V{};
+        for (int64_t i = 0; i < n; i += W) {
+            columns(p + 2 * i, n - i, x);
+            for (int a = 0; a < 2; ++a) total[a] += first_lanes(n - i) * x[a];
         }
-        scale = total > 0.0 ? std::sqrt(2.0) * double(n) / total : 1.0;
+        for (int a = 0; a < 2; ++a) mean[a] = sum(total[a]) / double(n);
+        for (int64_t i = 0; i < n; i += W) {
+            columns(p + 2 * i, n - i, x);
+            const V du = x[0] - mean[0], dv = x[1] - mean[1];
+            away += first_lanes(n - i) * root(du * du + dv * dv);
+        }
+        scale = sum(away) > 0.0 ? std::sqrt(2.0) * double(n) / sum(away) : 1.0;
+    }
+    // W points of n from p on.
+    void at(const double *p, int64_t n, V (&out)[2]) const {
+        columns(p, n, out);
+        for (int a = 0; a < 2; ++a) out[a] = scale * (out[a] - mean[a]);
     }
     void at(const double *p, Vec &out) const { out[0] = scale * (p[0] - mean[0]), out[1] = scale * (p[1] - mean[1]), out[2] = 1.0; }
 };
@@ -66,27 +76,27 @@ struct Pairs {
 // false where it is not determined. The first two rows follow linearly from the last, the vector of length one with the
 // least algebraic error (Harker and O'Leary, Computation of homographies, BMVC 2005).
 inline bool linear_homography(const Pairs &p, Mat &h) {
-    double M[4][3][3] = {};  // sums of x x' with weights 1, u, v, u^2 + v^2
-    for (int64_t i = 0; i < p.n; ++i) {
-        Vec x, u;
-        p.from.at(p.xy + 2 * i, x), p.to.at(p.uv + 2 * i, u);
-        const double weight[4] = {1.0, u[0], u[1], u[0] * u[0] + u[1] * u[1]};
+    double M[4][3][3];  // sums of x x' with weights 1, u, v, u^2 + v^2
+    V sums_of[4][6] = {};
+    for (int64_t i = 0; i < p.n; i += W) {
+        V x[2], u[2];
+        p.from.at(p.xy + 2 * i, p.n - i, x), p.to.at(p.uv + 2 * i, p.n - i, u);
+        const V weight[4] = {first_lanes(p.n - i), weight[0] * u[0], weight[0] * u[1], weight[0] * (u[0] * u[0] + u[1] * u[1])};
+        const V product[6] = {x[0] * x[0], x[0] * x[1], x[0], x[1] * x[1], x[1], all<V>(1.0)};
         for (int k = 0; k < 4; ++k)
-            for (int a = 0; a < 3; ++a)
-                for (int b = 0; b < 3; ++b) M[k][a][b] += weight[k] * x[a] * x[b];
+            for (int m = 0; m < 6; ++m) sums_of[k][m] += weight[k] * product[m];
     }
-    Mat axes, inverse = {}, rows[2] = {};
+    for (int k = 0; k < 4; ++k)
+        for (int a = 0, m = 0; a < 3; ++a)
+            for (int b = a; b < 3; ++b, ++m) M[k][a][b] = M[k][b][a] = sum(sums_of[k][m]);
+    Mat axes, rows[2];
     Vec size;
-    const double trace = M[3][0][0] + M[3][1][1] + M[3][2][2];
-    sorted_eigen(M[0], size, axes);
-    if (!(size[2] > SINGULAR * size[0])) return false;
-    for (int a = 0; a < 3; ++a)
-        for (int b = 0; b < 3; ++b)
-            for (int k = 0; k < 3; ++k) inverse[a][b] += axes[k][a] * axes[k][b] / size[k];
-    for (int k = 0; k < 2; ++k)
-        for (int a = 0; a < 3; ++a)
-            for (int b = 0; b < 3; ++b)
-                for (int c = 0; c < 3; ++c) rows[k][a][b] += inverse[a][c] * M[1 + k][c][b];
+    const double trace = M[3][0][0] + M[3][1][1] + M[3][2][2], spread = M[0][0][0] + M[0][1][1];
+    if (!cholesky(&M[0][0][0], 3, 3)) return false;
+    const double area = M[0][0][0] * M[0][1][1];
+    if (!(area * area > SINGULAR * spread * spread)) return false;
+    std::memcpy(rows, M[1], sizeof rows);
+    for (auto &row : rows) forward_solve(&M[0][0][0], 3, 3, &row[0][0], 3), backward_solve(&M[0][0][0], 3, 3, &row[0][0], 3);
     for (int a = 0; a < 3; ++a)
         for (int b = 0; b < 3; ++b)
             for (int c = 0; c < 3; ++c) M[3][a][b] -= M[1][c][a] * rows[0][c][b] + M[2][c][a] * rows[1][c][b];
@@ -172,27 +182,31 @@ inline void homographies(Ints which, Ints ptr, In<double, 2> xy, In<double, 2> u
 // Points (n, 3) as ones of a plane: its centre, axes (rows, right-handed, the normal last) and extent, and coordinates
 // (n, 2) of unit size; false where they are a line, or thicker than a share of their extent.
 inline bool on_plane(const double *x, int64_t n, double thickness, Vec &centre, Mat &axes, double &extent, double *local) {
-    Mat squares = {};
-    Vec size, d;
-    for (int a = 0; a < 3; ++a) {
-        centre[a] = 0.0;
-        for (int64_t i = 0; i < n; ++i) centre[a] += x[3 * i + a] / double(n);
+    Mat squares;
+    Vec size;
+    V p[3], total[3] = {}, products[6] = {}, most = V{};
+    for (int64_t i = 0; i < n; i += W) {
+        columns(x + 3 * i, n - i, p);
+        for (int a = 0; a < 3; ++a) total[a] += first_lanes(n - i) * p[a];
     }
+    for (int a = 0; a < 3; ++a) centre[a] = sum(total[a]) / double(n);
+    for (int64_t i = 0; i < n; i += W) {
+        columns(x + 3 * i, n - i, p);
+        for (int a = 0; a < 3; ++a) p[a] -= centre[a];
+        most = larger(most, p[0] * p[0] + p[1] * p[1] + p[2] * p[2]);
+        for (int a = 0, m = 0; a < 3; ++a)
+            for (int b = a; b < 3; ++b, ++m) products[m] += first_lanes(n - i) * p[a] * p[b];
+    }
+    for (int a = 0, m = 0; a < 3; ++a)
+        for (int b = a; b < 3; ++b, ++m) squares[a][b] = squares[b][a] = sum(products[m]);
     extent = 0.0;
-    for (int64_t i = 0; i < n; ++i) {
-        for (int a = 0; a < 3; ++a) d[a] = x[3 * i + a] - centre[a];
-        for (int a = 0; a < 3; ++a)
-            for (int b = 0; b < 3; ++b) squares[a][b] += d[a] * d[b];
-        extent = larger(extent, root(dot3(d, d)));
-    }
+    for (int i = 0; i < W; ++i) extent = larger(extent, root(most[i]));
     sorted_eigen(squares, size, axes);
     cross3(axes[0], axes[1], axes[2]);
     for (double &s : size) s = root(larger(s, 0.0));
     if (!(size[1] > 1e-6 * size[0] && size[2] < thickness * size[0])) return false;
-    for (int64_t i = 0; i < n; ++i) {
-        for (int a = 0; a < 3; ++a) d[a] = x[3 * i + a] - centre[a];
-        for (int k = 0; k < 2; ++k) local[2 * i + k] = dot3(axes[k], d) / extent;
-    }
+    for (int64_t i = 0; i < n; ++i)
+        for (int k = 0; k < 2; ++k) local[2 * i + k] = (dot3(axes[k], x + 3 * i) - dot3(axes[k], centre)) * (1.0 / extent);
     return true;
 }
 // The smallest rotation that turns a direction, not nearly backwards, to +z.
@@ -238,15 +252,17 @@ inline bool infinitesimal(const Mat &H, Mat (&turns)[2]) {
 // The translation with which the turned points of a plane fall on their images, by linear least squares.
 inline bool shift_of(const Mat &turn, const double *local, const double *xy, int64_t n, Vec &out) {
     double A[3][3] = {};
-    for (double &x : out) x = 0.0;
-    for (int64_t i = 0; i < n; ++i) {
-        const double *p = local + 2 * i, u = xy[2 * i], v = xy[2 * i + 1];
-        Vec q;
-        for (int a = 0; a < 3; ++a) q[a] = turn[a][0] * p[0] + turn[a][1] * p[1];
-        const double r = u * q[2] - q[0], s = v * q[2] - q[1];
-        out[0] += r, out[1] += s, out[2] -= u * r + v * s;
-        A[2][0] -= u, A[2][1] -= v, A[2][2] += u * u + v * v;
+    V p[2] = {}, u[2] = {}, right[3] = {}, left[3] = {};
+    for (int64_t i = 0; i < n; i += W) {
+        columns(local + 2 * i, n - i, p), columns(xy + 2 * i, n - i, u);
+        const V one = first_lanes(n - i), depth = turn[2][0] * p[0] + turn[2][1] * p[1];
+        V r[2];
+        for (int a = 0; a < 2; ++a) {
+            r[a] = one * (u[a] * depth - (turn[a][0] * p[0] + turn[a][1] * p[1]));
+            right[a] += r[a], right[2] -= u[a] * r[a], left[a] -= one * u[a], left[2] += one * u[a] * u[a];
+        }
     }
+    for (int a = 0; a < 3; ++a) out[a] = sum(right[a]), A[2][a] = sum(left[a]);
     A[0][0] = A[1][1] = double(n);
     if (!cholesky(&A[0][0], 3, 3)) return false;
     forward_solve(&A[0][0], 3, 3, out, 1);
@@ -259,13 +275,14 @@ inline bool poses_of_plane(const double *x, const double *rays, int64_t n, doubl
     double *local = room, *xy = room + 2 * n, extent;
     Vec mean = {}, centre;
     Mat front, axes, H, turns[2];
-    for (int64_t i = 0; i < 3 * n; ++i) mean[i % 3] += rays[i];
+    for (int64_t i = 0; i < n; ++i)
+        for (int a = 0; a < 3; ++a) mean[a] += rays[3 * i + a];
     if (!(mean[2] > -0.5 * root(dot3(mean, mean)))) return false;
     to_front(mean, front);
     for (int64_t i = 0; i < n; ++i) {
         const double depth = dot3(front[2], rays + 3 * i);
         if (!(depth > widest)) return false;
-        for (int k = 0; k < 2; ++k) xy[2 * i + k] = dot3(front[k], rays + 3 * i) / depth;
+        for (int k = 0; k < 2; ++k) xy[2 * i + k] = dot3(front[k], rays + 3 * i) * (1.0 / depth);
     }
     if (!on_plane(x, n, thickness, centre, axes, extent, local)) return false;
     const Pairs pairs(local, xy, n);

@@ -20,22 +20,31 @@ struct Views {
     int64_t size(int64_t k) const { return ptr[of[k] + 1] - first(k); }
 };
 
+// The first of n numbers, put in another order, for which `first` holds; how many. No branch: which way each goes is chance.
+template <class F> inline int64_t parted(double *a, int64_t n, F &&first) {
+    int64_t m = 0;
+    for (int64_t i = 0; i < n; ++i) {
+        const double x = a[i];
+        a[i] = a[m], a[m] = x;
+        m += first(x);
+    }
+    return m;
+}
 // The k-th smallest, from 0, of n numbers, which are put in another order: none before k is larger (Hoare, Algorithm 65:
 // FIND, Comm. ACM 4(7), 1961).
 inline double selected(double *a, int64_t n, int64_t k) {
-    for (int64_t low = 0, high = n - 1; low < high;) {
-        const double pivot = a[(low + high) / 2];
-        int64_t i = low, j = high;
-        while (i <= j) {
-            while (a[i] < pivot) ++i;
-            while (pivot < a[j]) --j;
-            if (i <= j) std::swap(a[i++], a[j--]);
+    while (n > 1) {
+        const double x = a[0], y = a[n / 2], z = a[n - 1], pivot = larger(smaller(x, y), smaller(larger(x, y), z));
+        const int64_t below = parted(a, n, [&](double v) { return v < pivot; });
+        if (k < below) {
+            n = below;
+            continue;
         }
-        if (k <= j) high = j;
-        else if (k >= i) low = i;
-        else break;
+        const int64_t upto = below + parted(a + below, n - below, [&](double v) { return !(pivot < v); });
+        if (k < upto) return pivot;
+        a += upto, n -= upto, k -= upto;
     }
-    return a[k];
+    return *a;
 }
 // The median of n numbers, at least one, which are put in another order.
 inline double median(double *a, int64_t n) {
@@ -46,16 +55,20 @@ inline double median(double *a, int64_t n) {
     return 0.5 * (lower + upper);
 }
 
-// A point in the camera, its depth along the ray, and the square of its distance from the ray.
+// W points of a view in the camera, from the j-th on: depths along their rays and squares of the distances from these.
 struct Seen {
-    Vec p;
-    double depth, across2;
+    V depth, across2;
 
-    Seen(In<double, 2> pose, const double *x, const double *ray) {
-        for (int a = 0; a < 3; ++a) p[a] = dot3(&pose(a, 0), x) + pose(a, 3);
-        Vec across;
-        cross3(p, ray, across);
-        depth = dot3(p, ray), across2 = dot3(across, across);
+    Seen(In<double, 2> pose, const Views &v, int64_t j, int64_t left) {
+        V x[3], ray[3], p[3];
+        columns(&v.x(j, 0), left, x), columns(&v.rays(j, 0), left, ray);
+        for (int a = 0; a < 3; ++a) p[a] = pose(a, 0) * x[0] + pose(a, 1) * x[1] + pose(a, 2) * x[2] + pose(a, 3);
+        depth = p[0] * ray[0] + p[1] * ray[1] + p[2] * ray[2], across2 = V{};
+        for (int a = 0; a < 3; ++a) {
+            const int b = (a + 1) % 3, c = (a + 2) % 3;
+            const V across = p[b] * ray[c] - p[c] * ray[b];
+            across2 += across * across;
+        }
     }
 };
 
@@ -63,16 +76,15 @@ struct Seen {
 inline void errors_of_views(Ints which, const Views &v, In<double, 3> poses, Out<double, 1> rms, Out<bool, 1> in_front) {
     for (int64_t i = 0; i < which.n[0]; ++i) {
         const int64_t k = which[i], first = v.first(k), n = v.size(k);
-        double total = 0.0;
-        bool front = true;
-        for (int64_t j = first; j < first + n; ++j) {
-            const Seen s(poses[k], &v.x(j, 0), &v.rays(j, 0));
-            const double depth = larger(magnitude(s.depth), 1e-12);
-            front = front && s.depth > 0.0;
-            total += s.across2 / (depth * depth);
+        V total = V{}, behind = V{};
+        for (int64_t j = 0; j < n; j += W) {
+            const Seen s(poses[k], v, first + j, n - j);
+            const V depth = larger(magnitude(s.depth), all<V>(1e-12));
+            behind = s.depth > 0.0 ? behind : all<V>(1.0);
+            total += first_lanes(n - j) * (s.across2 / (depth * depth));
         }
-        rms.data[k] = root(total / double(n));
-        in_front.data[k] = front;
+        rms.data[k] = root(sum(total) / double(n));
+        in_front.data[k] = sum(behind) == 0.0;
     }
 }
 
@@ -82,9 +94,10 @@ inline void offsets_of_views(Ints which, const Views &v, In<double, 3> poses, Ou
     for (int64_t i = 0; i < which.n[0]; ++i) {
         const int64_t k = which[i], first = v.first(k), n = v.size(k);
         if (n == 0) continue;
-        for (int64_t j = 0; j < n; ++j) {
-            const Seen s(poses[k], &v.x(first + j, 0), &v.rays(first + j, 0));
-            work.data[j] = out.data[first + j] = s.depth > 0.0 ? root(s.across2) / larger(s.depth, 1e-12) : __builtin_inf();
+        for (int64_t j = 0; j < n; j += W) {
+            const Seen s(poses[k], v, first + j, n - j);
+            const V depth = larger(s.depth, all<V>(1e-12)), offset = s.depth > 0.0 ? root(s.across2 / (depth * depth)) : all<V>(__builtin_inf());
+            store_lanes(&out.data[first + j], n - j, offset), store_lanes(&work.data[j], n - j, offset);
         }
         medians.data[k] = median(work.data, n);
     }
@@ -141,10 +154,10 @@ struct Stack {
 
     // Cauchy's weights, by the offsets of a state.
     void weigh(int state) const {
-        double *w = row(WEIGHT), *size = row(SIZE), *u = row(state + 3), *v = row(state + 4);
-        for (int64_t i = 0; i < n; ++i) w[i] = size[i] = u[i] * u[i] + v[i] * v[i];
-        const double limit = larger(ROBUST * ROBUST * median(size, n), 1e-24);
-        for (int64_t i = 0; i < n; ++i) w[i] = 1.0 / (1.0 + w[i] / limit);
+        const auto square = [&](int64_t p) { return at(state + 3, p) * at(state + 3, p) + at(state + 4, p) * at(state + 4, p); };
+        for (int64_t p = 0; p < full; p += W) store(row(SIZE) + p, square(p));
+        const double limit = larger(ROBUST * ROBUST * median(row(SIZE), n), 1e-24);
+        for (int64_t p = 0; p < full; p += W) store(row(WEIGHT) + p, first_lanes(n - p) * (limit / (limit + square(p))));
     }
 
     // N (7, 7; upper) of the step's six and the offsets: a turn, then a shift, in the camera's frame.

@@ -16,7 +16,8 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.frames.state import State
-from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, FrameTree, Unknowns
+from adjust.frames.tree import FrameTree
+from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Unknowns
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Pair, frame_text
 from adjust.model.result import Named, OtherArrays, Residuals

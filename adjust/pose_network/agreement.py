@@ -10,11 +10,14 @@ from collections.abc import Sequence
 from itertools import count
 
 import numpy as np
+from gtsam import Pose3, Rot3
 
-from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.model.result import ParameterName
+from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.pose_network.cycles import flat, short_loops
+from adjust.pose_network.from_survey import network_from_survey
 from adjust.pose_network.loops import Loops, misclosures, walked
-from adjust.pose_network.network import PoseNetwork
+from adjust.pose_network.network import PoseNetwork, check_determined
 from adjust.pose_network.solve import NetworkOptions, minimize
 from adjust.pose_network.start import find_network_start
 from adjust.spatial.rigid_motions import Motions
@@ -129,6 +132,17 @@ def _tested(
 def _measured(network: PoseNetwork) -> Motions:
     motions = network.arrays.motions
     return motions if network.dim == 6 else Motions(motions.rotation)
+
+
+def agreeing_poses(survey: Survey) -> dict[ParameterName, Pose3]:
+    """Start values of all stations of a survey of nothing but pairs, as :func:`agreeing_start` finds them.
+
+    Raises IndeterminateError naming the stations that no pair ties to the others.
+    """
+    network = network_from_survey(survey, any_datum=True)
+    check_determined(network)
+    R, t = agreeing_start(network)
+    return {("world_from_station", s): Pose3(Rot3(R[i]), t[i]) for i, s in enumerate(network.station_ids)}
 
 
 def agreeing_start(network: PoseNetwork) -> tuple[FloatArray, FloatArray]:

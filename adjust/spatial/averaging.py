@@ -68,9 +68,12 @@ def mean_poses(
 
 
 def least(values: FloatArray, owner: IntArray) -> IntArray:
-    """Position of the least of the values (n,) of each owner (n,), in the order of the owners' numbers."""
-    order = np.lexsort((values, owner))
-    return np.asarray(order[np.flatnonzero(np.diff(owner[order], prepend=-1))])
+    """Position of the least of the values (n,) of each owner (n,), whose numbers are in order; the first of equals."""
+    new = np.diff(owner, prepend=-1) != 0
+    if new.all():
+        return np.arange(len(owner))
+    hits = np.flatnonzero(values == np.minimum.reduceat(values, np.flatnonzero(new))[np.cumsum(new) - 1])
+    return np.asarray(hits[np.diff(owner[hits], prepend=-1) != 0])
 
 
 def medians(values: FloatArray, owner: IntArray, k: int) -> FloatArray:

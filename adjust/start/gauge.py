@@ -4,7 +4,8 @@ from typing import TypeVar
 
 from adjust.model.result import ParameterName
 from adjust.model.survey import Survey
-from adjust.start.network import IDENTITY, ChainObservation, FrameNetwork, partial_pose
+from adjust.start.chains import ChainObservation
+from adjust.start.network import IDENTITY, FrameNetwork, partial_pose
 
 Node = tuple[str, ...]
 End = tuple[int, bool]  # a slot and its side: False the frame on the left of its name, True the one on the right

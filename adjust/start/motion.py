@@ -5,14 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_array
 
-from adjust.frames.unknowns import Chain
+from adjust.frames.unknowns import Chain, Link
 from adjust.model.errors import SurveyError
 from adjust.model.names import grouped
 from adjust.model.survey import FloatArray, IntArray
 from adjust.spatial.averaging import pose_distance
 from adjust.spatial.rigid import inverse, rotation_log
+from adjust.start.chains import ChainObservation
 from adjust.start.closed_forms.hand_eye import relative_motions, solve_ax_xb, solve_ax_zb, solve_views
-from adjust.start.network import ChainObservation, FrameNetwork
+from adjust.start.network import FrameNetwork
 
 _CHOICES = 4
 _CLEAR_TURNS = np.deg2rad(20.0)
@@ -21,10 +22,10 @@ _CLEAR_TURNS = np.deg2rad(20.0)
 
 @dataclass(frozen=True, eq=False)
 class _Group:
-    """Observations ``first * motions[i] * second = products[i]`` with both ends unknown; a link is (slot, inverse)."""
+    """Observations ``first * motions[i] * second = products[i]`` with both ends unknown."""
 
-    first: tuple[int, bool]
-    second: tuple[int, bool]
+    first: Link
+    second: Link
     motions: FloatArray
     products: FloatArray
 
@@ -37,8 +38,7 @@ class _Group:
 
     def swapped(self) -> "_Group":
         """The same the other way round, so that each unknown comes second once."""
-        (a, a_inverse), (b, b_inverse) = self.first, self.second
-        return _Group((b, not b_inverse), (a, not a_inverse), inverse(self.motions), inverse(self.products))
+        return _Group(self.second.back, self.first.back, inverse(self.motions), inverse(self.products))
 
 
 def solve_motion(network: FrameNetwork, degenerate: bool = True) -> str | None:
@@ -59,8 +59,8 @@ def solve_motion(network: FrameNetwork, degenerate: bool = True) -> str | None:
             second, first, _ = solve_ax_zb(group.motions, group.products)
         except SurveyError:
             continue
-        network.set(group.second[0], second, group.second[1])
-        network.set(group.first[0], inverse(first), group.first[1])
+        network.set_link(group.second, second)
+        network.set_link(group.first, inverse(first))
         return f"{_text(network, group.first)} and {_text(network, group.second)} from {len(group.motions)} motions"
     note = _shared(network, groups, False) or _together(network, found)
     if note is not None or not degenerate:
@@ -74,7 +74,7 @@ def _shared(network: FrameNetwork, groups: list[_Group], minimum_norm: bool) -> 
     for link, sharing in sorted(by_second.items(), key=lambda item: item[0]):
         found = _hand_eye([relative_motions(g.motions, g.products) for g in sharing], minimum_norm)
         if found is not None:
-            network.set(link[0], found[0], link[1])
+            network.set_link(link, found[0])
             how = "turns about one axis only: smallest consistent solution" if minimum_norm else f"{found[1]} motions"
             return f"{_text(network, link)} from {how}"
     return None
@@ -116,7 +116,7 @@ def _side_by_side(network: FrameNetwork) -> str | None:
         found = _hand_eye([relative_motions(inverse(both[:, 0]), inverse(both[:, 1])) for both in several])
         if found is not None:
             network.set_link(other[0], inverse(found[0]) @ network.product(before))
-            return f"{_text(network, (other[0].slot, other[0].inverse))} from {found[1]} motions of two on one body"
+            return f"{_text(network, other[0])} from {found[1]} motions of two on one body"
     return None
 
 
@@ -124,11 +124,11 @@ def _side_by_side(network: FrameNetwork) -> str | None:
 class _RowsOfPoses:
     """Chains ``before * first * motion * second * after`` that lack a row of poses on either side of a motion.
 
-    first, second: (n,) positions in ``rows``, each the slots of such a row in order, with their direction. products:
+    first, second: (n,) positions in ``rows``, each the links of such a row in order. products:
     per chain the alternatives (k, 4, 4) of ``first * motion * second``, likeliest first.
     """
 
-    rows: list[tuple[tuple[int, bool], ...]]
+    rows: list[Chain]
     first: list[int]
     second: list[int]
     motions: FloatArray
@@ -147,7 +147,7 @@ def _together(network: FrameNetwork, every: _RowsOfPoses) -> str | None:
             continue
         for i, side in alone:
             pose = inverse(solved[0][list(first).index(i)]) if side == 0 else solved[1][list(second).index(i)]
-            network.set(found.rows[i][0][0], pose, found.rows[i][0][1])
+            network.set_link(found.rows[i][0], pose)
         names = " and ".join(_text(network, found.rows[i][0]) for i, _ in alone)
         return f"{names} from {len(found.motions)} views of {len(second)} things by {len(first)} together"
     return None
@@ -174,10 +174,9 @@ def _solved_views(
 
 
 def _rows_of_poses(network: FrameNetwork) -> _RowsOfPoses:
-    rows: dict[tuple[tuple[int, bool], ...], int] = {}
+    rows: dict[Chain, int] = {}
     split = [(o, ends) for o in network.observations if (ends := _split(network, o)) is not None]
-    unknown = [tuple((k.slot, k.inverse) for k in o.chain[a:b]) for o, ends in split for a, b in ends]
-    numbers = [rows.setdefault(row, len(rows)) for row in unknown]
+    numbers = [rows.setdefault(o.chain[a:b], len(rows)) for o, ends in split for a, b in ends]
     motions = network.products([o.chain[ends[0][1] : ends[1][0]] for o, ends in split])
     before = inverse(network.products([o.chain[: ends[0][0]] for o, ends in split]))
     after = inverse(network.products([o.chain[ends[1][1] :] for o, ends in split]))
@@ -228,5 +227,5 @@ def _groups(found: _RowsOfPoses) -> list[_Group]:
     return groups
 
 
-def _text(network: FrameNetwork, link: tuple[int, bool]) -> str:
-    return " ".join(network.names[link[0]])
+def _text(network: FrameNetwork, link: Link) -> str:
+    return " ".join(network.names[link.slot])

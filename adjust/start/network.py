@@ -6,71 +6,22 @@ between them (:mod:`adjust.start.motion`).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
+from gtsam import Pose3
 
 from adjust.frames.tables import table_motions
-from adjust.frames.unknowns import Chain, FrameTree, Link
+from adjust.frames.tree import FrameTree
+from adjust.frames.unknowns import Chain, Link
 from adjust.model.errors import SurveyError
 from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, Survey, Table
-from adjust.spatial.averaging import mean_poses, pose_distance
+from adjust.spatial.averaging import least, mean_poses, pose_distance
 from adjust.spatial.rigid import inverse, rigid
+from adjust.start.chains import ChainObservation, Chains, Observations, runs
 
 IDENTITY = np.eye(4)
 _CONTRADICTION = np.deg2rad(10.0)
 """Two poses that differ by more, as an angle at the typical distance, have no mean."""
-
-
-class ChainObservation(NamedTuple):
-    """The chain's product is one of ``poses`` (k, 4, 4), likeliest first.
-
-    block_idx: the block of image points, -1 for others. rotation_only: the translation of the product is unknown.
-    ends: whether the two ends of the chain are bound to what was seen (False: to points that are unknown themselves).
-    """
-
-    chain: Chain
-    poses: FloatArray
-    block_idx: int = -1
-    rotation_only: bool = False
-    ends: tuple[bool, bool] = (True, True)
-
-
-@dataclass(frozen=True, eq=False)
-class Chains:
-    """Chains padded to L links: slots (n, L), -1 behind the end, which of them (n, L) are inverted."""
-
-    slots: IntArray
-    inverted: BoolArray
-
-    @staticmethod
-    def of(chains: Sequence[Chain]) -> "Chains":
-        """Side by side."""
-        sizes = [len(chain) for chain in chains]
-        slots = np.full((len(chains), max(sizes, default=0)), -1, dtype=np.int64)
-        inverted = np.zeros(slots.shape, dtype=np.bool_)
-        inside = np.arange(slots.shape[1]) < np.array(sizes, dtype=np.int64)[:, None]
-        slots[inside] = [link.slot for chain in chains for link in chain]
-        inverted[inside] = [link.inverse for chain in chains for link in chain]
-        return Chains(slots, inverted)
-
-    def part(self, rows: IntArray) -> "Chains":
-        """Some (m,) of them."""
-        return Chains(self.slots[rows], self.inverted[rows])
-
-    def once(self, wanted: BoolArray) -> BoolArray:
-        """Where (n, L) they pass a slot that is ``wanted`` (slots,), but none of those that they pass twice."""
-        out = (self.slots >= 0) & wanted[self.slots]
-        for j in range(out.shape[1]):
-            out[:, j] &= (self.slots == self.slots[:, j : j + 1]).sum(axis=1) == 1
-        return out
-
-    def by_slot(self, where: BoolArray) -> tuple[IntArray, IntArray]:
-        """Rows and columns of the links ``where`` (n, L), sorted by slot."""
-        row, column = np.nonzero(where)
-        order = np.argsort(self.slots[row, column], kind="stable")
-        return row[order], column[order]
 
 
 class FrameNetwork:
@@ -87,7 +38,7 @@ class FrameNetwork:
         self.names = list(frames.unknowns.slot_of)
         n = len(self.names)
         self.pose, self.has = np.tile(IDENTITY, (n, 1, 1)), np.zeros(n, dtype=np.bool_)
-        self.observations: list[ChainObservation] = []
+        self.observations = Observations.of([])
         self.gauged: list[int] = []
         self.lever = 1.0
         readings = {(r.table_id, r.epoch_id): r.angles for r in survey.table_readings}
@@ -100,21 +51,25 @@ class FrameNetwork:
                 self.set(slot, value)
         self.fixed = self.has.copy()
 
-    def set(self, slot: int, value: FloatArray, inverted: bool = False) -> None:
-        """Let a slot, or its inverse, be known."""
-        self.pose[slot], self.has[slot] = inverse(value) if inverted else value, True
+    def set(self, slot: int, value: FloatArray) -> None:
+        """Let a slot be known."""
+        self.pose[slot], self.has[slot] = value, True
 
     def set_link(self, link: Link, value: FloatArray) -> None:
         """Let the pose of a link be known."""
-        self.set(link.slot, value, link.inverse)
+        self.set(link.slot, inverse(value) if link.inverse else value)
 
     def product(self, chain: Chain) -> FloatArray:
         """The product (4, 4) of a chain that is wholly known."""
         return np.asarray(self.products([chain])[0])
 
-    def products(self, chains: Sequence[Chain]) -> FloatArray:
+    def observe(self, items: Sequence[ChainObservation]) -> None:
+        """Take them among the observations."""
+        self.observations = self.observations.and_also(Observations.of(items))
+
+    def products(self, chains: Sequence[Chain] | Chains) -> FloatArray:
         """The products (n, 4, 4) of chains that are wholly known."""
-        padded = Chains.of(chains)
+        padded = chains if isinstance(chains, Chains) else Chains.of(chains)
         return self._products(padded, padded.slots >= 0)
 
     def _products(self, chains: Chains, taken: BoolArray) -> FloatArray:
@@ -134,12 +89,18 @@ class FrameNetwork:
 
     def open_slots(self, chain: Chain) -> bool:
         """Whether any link of the chain is unknown."""
-        return not all(self.has[link.slot] for link in chain)
+        return bool(self.unknown_links(chain))
+
+    def whole(self) -> Observations:
+        """Observations of poses whose chains are known."""
+        every = self.observations
+        slots = every.chains.slots
+        return every.part(np.flatnonzero(~every.rotation_only & ((slots < 0) | self.has[slots]).all(axis=1)))
 
     def _isolate(
-        self, observations: Sequence[ChainObservation], chains: Chains, at: IntArray
+        self, observed: Observations, rows: IntArray, chains: Chains, at: IntArray
     ) -> tuple[FloatArray, IntArray]:
-        """What observations say of the slot at the position (n,) of their chain, all other links being known.
+        """What observations ``rows`` (n,) say of the slot at the position (n,) of their chain, all others being known.
 
         (m, 4, 4), and where those of each begin (n + 1,).
         """
@@ -147,8 +108,7 @@ class FrameNetwork:
         inside = chains.slots >= 0
         before = inverse(self._products(chains, inside & (column < at[:, None])))
         after = inverse(self._products(chains, inside & (column > at[:, None])))
-        counts = [len(o.poses) for o in observations]
-        value = np.concatenate([o.poses for o in observations])
+        counts, value = np.diff(observed.first)[rows], observed.poses[runs(observed.first, rows)]
         value = np.repeat(before, counts, axis=0) @ value @ np.repeat(after, counts, axis=0)
         turned = np.repeat(chains.inverted[np.arange(len(at)), at], counts)
         value[turned] = inverse(value[turned])
@@ -161,8 +121,8 @@ class FrameNetwork:
         """
         if self.has.all():
             return False
-        observations = [o for o in self.observations if rotation_only or not o.rotation_only]
-        chains = Chains.of([o.chain for o in observations])
+        observed = self.observations.part(np.flatnonzero(rotation_only | ~self.observations.rotation_only))
+        chains = observed.chains
         # a slot that a chain passes twice cannot be isolated
         unknown = (chains.slots >= 0) & ~self.has[chains.slots]
         unknown[(unknown & ~chains.once(~self.has)).any(axis=1)] = False
@@ -173,15 +133,15 @@ class FrameNetwork:
         found = False
         while (most := int(support.max(initial=0))) > 0:
             ready = np.flatnonzero(2 * support >= most)
-            using = _runs(first, ready)
+            using = runs(first, ready)
             # of two that one chain joins the second is better off after the first
             both, times = np.unique(row[using], return_counts=True)
             both = both[(times == 2) & (left[both] == 2)]
             if len(both):
                 ready = np.setdiff1d(ready, np.where(unknown[both], chains.slots[both], -1).max(axis=1))
-                using = _runs(first, ready)
+                using = runs(first, ready)
             telling = using[left[row[using]] == 1]
-            self._determine(observations, chains.part(row[telling]), row[telling], column[telling])
+            self._determine(observed, row[telling], column[telling])
             unknown[row[using], column[using]] = False
             np.subtract.at(left, row[using], 1)
             support[ready] = 0
@@ -191,59 +151,68 @@ class FrameNetwork:
             found = True
         return found
 
-    def _determine(
-        self, every: Sequence[ChainObservation], chains: Chains, rows: IntArray, at: IntArray
-    ) -> None:
+    def _determine(self, observed: Observations, rows: IntArray, at: IntArray) -> None:
         """Set the slots at the positions (n,) of the chains of observations ``rows`` (n,), sorted by slot.
 
         To the robust mean over all observations that isolate a slot; the likelier solution where just one does, and of
         two the alternatives in which they agree.
         """
-        observations = [every[i] for i in rows.tolist()]
-        value, begins = self._isolate(observations, chains, at)
-        slot, full = chains.slots[np.arange(len(at)), at], np.array([not o.rotation_only for o in observations])
+        chains = observed.chains.part(rows)
+        value, begins = self._isolate(observed, rows, chains, at)
+        slot, full = chains.slots[np.arange(len(at)), at], ~observed.rotation_only[rows]
         # full poses say more than rotations; a whole image is wrong less often than the ends of a pair are exchanged
         telling = full | ~np.isin(slot, slot[full])
-        image = np.array([o.block_idx >= 0 for o in observations])
-        order = np.lexsort((~image, slot))
+        order = np.lexsort((observed.block_idx[rows] < 0, slot))
         order = order[telling[order]]
         slots, first, count = np.unique(slot[order], return_index=True, return_counts=True)
         self.pose[slots] = value[begins[order[first]]]
         self.has[slots] = True
-        several = [(s, order[a : a + n].tolist()) for s, a, n in zip(slots, first, count, strict=True) if n > 1]
-        parts: list[FloatArray] = []
-        members: list[IntArray] = []
-        meant: list[int] = []
-        for s, mine in several:
-            offers = [value[begins[i] : begins[i + 1]] for i in mine]
-            if len(offers) == 2:
-                d = pose_distance(offers[0][:, None], offers[1][None], self.lever)
-                i, j = np.unravel_index(int(np.argmin(d)), d.shape)
-                if d[i, j] > _CONTRADICTION * self.lever:  # a mean of right and wrong is wrong for certain
-                    continue
-                offers = [offers[0][i : i + 1], offers[1][j : j + 1]]
-            meant.append(s)
-            parts.append(np.concatenate(offers))
-            members.append(np.repeat(np.arange(len(offers)), [len(o) for o in offers]))
-        if meant:
-            ptr = np.cumsum([0] + [len(part) for part in parts])
-            self.pose[meant] = mean_poses(np.concatenate(parts), self.lever, ptr, np.concatenate(members))
+        # of two that contradict each other the mean of right and wrong is wrong for certain
+        two, more = np.flatnonzero(count == 2), np.flatnonzero(count > 2)
+        pairs, apart = self._nearest(value, begins, order[first[two]], order[first[two] + 1])
+        agree = apart <= _CONTRADICTION * self.lever
+        of_two, others = pairs[agree].ravel(), order[runs(np.append(first, len(order)), more)]
+        sizes = np.diff(begins)[others]
+        member = np.concatenate([np.arange(len(of_two)), len(of_two) + np.repeat(np.arange(len(others)), sizes)])
+        meant = np.concatenate([two[agree], more])
+        if len(meant):
+            owner = np.repeat(np.arange(len(meant)), np.concatenate([count[two[agree]], count[more]]))
+            of_each = np.bincount(owner, np.concatenate([np.ones(len(of_two)), sizes]))
+            ptr = np.append(0, np.cumsum(of_each.astype(np.int64)))
+            rows = np.concatenate([of_two, runs(begins, others)])
+            self.pose[slots[meant]] = mean_poses(value[rows], self.lever, ptr, member)
+
+    def _nearest(self, value: FloatArray, begins: IntArray, a: IntArray, b: IntArray) -> tuple[IntArray, FloatArray]:
+        """Of the alternatives of two observations each (n,) those nearest to each other (n, 2), and how far, m (n,)."""
+        n = np.diff(begins)[b]
+        count = np.diff(begins)[a] * n
+        owner = np.repeat(np.arange(len(a)), count)
+        place = np.arange(len(owner)) - (np.cumsum(count) - count)[owner]
+        both = np.column_stack([begins[a][owner] + place // n[owner], begins[b][owner] + place % n[owner]])
+        distance = pose_distance(value[both[:, 0]], value[both[:, 1]], self.lever)
+        best = least(distance, owner)
+        return both[best], distance[best]
 
     def relax(self, movable: BoolArray) -> None:
         """Renew each movable slot as the mean over all observations that contain it once (Gauss-Seidel)."""
-        whole = [o for o in self.observations if not o.rotation_only and not self.open_slots(o.chain)]
-        chains = Chains.of([o.chain for o in whole])
+        whole = self.whole()
+        chains = whole.chains
         row, column = chains.by_slot(chains.once(movable))
         for mine in np.split(np.arange(len(row)), np.flatnonzero(np.diff(chains.slots[row, column])) + 1):
             if len(mine):
-                self._determine(whole, chains.part(row[mine]), row[mine], column[mine])
+                self._determine(whole, row[mine], column[mine])
 
 
-def _runs(first: IntArray, wanted: IntArray) -> IntArray:
-    """The numbers from ``first[i]`` up to ``first[i + 1]`` of all wanted i, one after the other."""
-    sizes = first[wanted + 1] - first[wanted]
-    ends = np.cumsum(sizes)
-    return np.asarray(np.repeat(first[wanted] - ends + sizes, sizes) + np.arange(ends[-1] if len(ends) else 0))
+def pair_observations(survey: Survey, frames: FrameTree) -> tuple[Observations, Observations]:
+    """What pairs say: those in use, and the others, which are doubtful."""
+    out: tuple[list[ChainObservation], list[ChainObservation]] = [], []
+    for pair in survey.pairs:
+        full = isinstance(pair.b_from_a, Pose3)
+        matrix = pair.b_from_a.matrix()
+        pose = np.asarray(matrix, dtype=float) if full else rigid(matrix, np.zeros(3))
+        observation = ChainObservation(frames.relative(pair.a, pair.b), pose[None], rotation_only=not full)
+        out[not pair.used].append(observation)
+    return Observations.of(out[0]), Observations.of(out[1])
 
 
 def given_pose(parameter: PoseParameter) -> FloatArray | None:

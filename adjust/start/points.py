@@ -7,10 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from adjust.frames.unknowns import Link
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.spatial.rigid import inverse, rigid
+from adjust.start.chains import ChainObservation, Observations
 from adjust.start.closed_forms.triangulation import intersect
-from adjust.start.network import ChainObservation, FrameNetwork
+from adjust.start.network import FrameNetwork
 from adjust.start.positions import PointField, Sight
 from adjust.start.views import View, joined, make_views
 
@@ -24,7 +26,7 @@ _THRESHOLD_PX = 3.0
 
 def resect(network: FrameNetwork, points: PointField) -> bool:
     """Give a pose to the blocks that see enough known points and have none yet; whether there were any."""
-    have, known = {o.block_idx for o in network.observations}, points.known
+    have, known = set(network.observations.block_idx.tolist()), points.known
     sights = {s.block_idx: s for s in points.sights if s.block_idx not in have and network.unknown_links(s.chain)}
     seen = {i: int(known[s.rows].sum()) for i, s in sights.items()}
     # three points fit up to four poses exactly: they count only where nothing better is left
@@ -32,7 +34,7 @@ def resect(network: FrameNetwork, points: PointField) -> bool:
     if not views and _resect_together(network, points):
         return True
     views = views or _views([s for i, s in sights.items() if seen[i] == 3], points)
-    network.observations += [ChainObservation(sights[v.block_idx].chain, v.poses, v.block_idx) for v in views]
+    network.observe([ChainObservation(sights[v.block_idx].chain, v.poses, v.block_idx) for v in views])
     return bool(views)
 
 
@@ -45,17 +47,16 @@ def _views(sights: Sequence[Sight], points: PointField, present: FloatArray | No
 
 def _resect_together(network: FrameNetwork, points: PointField) -> bool:
     """Poses of stations whose cameras see enough known points only together; whether one was found."""
-    groups: dict[tuple[int, bool], list[tuple[Sight, int]]] = {}
+    groups: dict[Link, list[tuple[Sight, int]]] = {}
     for sight in points.sights:
         missing = network.unknown_links(sight.chain)
         if len(missing) == 1 and points.known[sight.rows].any():
-            link = sight.chain[missing[0]]
-            groups.setdefault((link.slot, link.inverse), []).append((sight, missing[0]))
+            groups.setdefault(sight.chain[missing[0]], []).append((sight, missing[0]))
     found = False
-    for (slot, inverted), group in sorted(groups.items(), key=lambda item: item[0]):
+    for link, group in sorted(groups.items(), key=lambda item: item[0]):
         pose = _generalised_pose(network, points, group)
         if pose is not None:
-            network.set(slot, pose, inverted)
+            network.set_link(link, pose)
             found = True
     return found
 
@@ -120,7 +121,8 @@ def improve(network: FrameNetwork, points: PointField, movable: BoolArray) -> No
     sights = {s.block_idx: s for s in placed}
     views = _views(placed, points, network.products([s.chain for s in placed]))
     renewed = {v.block_idx: ChainObservation(sights[v.block_idx].chain, v.poses, v.block_idx) for v in views}
-    network.observations = [renewed.pop(o.block_idx, o) for o in network.observations] + list(renewed.values())
+    kept = [renewed.pop(o.block_idx, o) for o in network.observations]
+    network.observations = Observations.of([*kept, *renewed.values()])
     touched = np.zeros(len(movable), dtype=np.bool_)
     touched[[link.slot for view in views for link in sights[view.block_idx].chain]] = True
     network.relax(movable & touched)

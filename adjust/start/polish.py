@@ -10,7 +10,8 @@ from adjust.graph.elimination import positive_definite_lu
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.spatial.averaging import pose_distance
 from adjust.spatial.rigid import adjoint, inverse, rigid, rotation_exp, rotation_log, skew
-from adjust.start.network import ChainObservation, Chains, FrameNetwork
+from adjust.start.chains import ChainObservation, Chains
+from adjust.start.network import FrameNetwork
 from adjust.start.views import View
 
 _DAMPING = 1e-7  # of the diagonal: what the observations leave open stays where it is
@@ -37,14 +38,12 @@ def polish(network: FrameNetwork, movable: BoolArray, views: Iterable[View], ite
     Source: pose-graph least squares with each measured pose weighted by the normal matrix of its image points, which is
     the bundle adjustment linearised at the measured poses. The caller's gauge poses are to be left out of ``movable``.
     """
-    items = [
-        o
-        for o in network.observations
-        if not o.rotation_only and not network.open_slots(o.chain) and any(movable[k.slot] for k in o.chain)
-    ]
-    if not items:
+    items = network.whole()
+    chains, of_block = items.chains, {v.block_idx: v for v in views}
+    items = items.part(np.flatnonzero(((chains.slots >= 0) & movable[chains.slots]).any(axis=1)))
+    if not len(items):
         return
-    chains, of_block = Chains.of([o.chain for o in items]), {v.block_idx: v for v in views}
+    chains = items.chains
     moving = np.unique(chains.slots[chains.slots >= 0])
     moving = moving[movable[moving]]
     number = np.full(len(network.has) + 1, -1)

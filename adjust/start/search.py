@@ -5,45 +5,33 @@ One search: of the steps that are possible with what is known by now the safest 
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 from types import MappingProxyType
 
 import numpy as np
-from gtsam import Pose3, Rot3
+from gtsam import Pose3
 
-from adjust.frames.lens_states import lenders
 from adjust.frames.lens_times import whole_images
-from adjust.frames.unknowns import FrameTree, Unknowns
+from adjust.frames.tree import FrameTree
+from adjust.frames.unknowns import Unknowns
 from adjust.graph.assembly import StartValues
-from adjust.lenses.models import MODELS
-from adjust.model.boards import deformed
 from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.result import ParameterName
-from adjust.model.survey import FloatArray, IntArray, Survey
+from adjust.model.survey import FloatArray, Survey
 from adjust.observations.geometry.building import frame_refs, position_refs
 from adjust.observations.terrestrial.building import reading_refs
 from adjust.spatial.averaging import pose_distance, typical_distance
-from adjust.spatial.rigid import as_pose3, rigid
+from adjust.spatial.rigid import as_pose3
+from adjust.start.chains import ChainObservation, Chains
 from adjust.start.gauge import fix_one_gauge
-from adjust.start.lens_images import Sighting
-from adjust.start.lenses import start_lens
+from adjust.start.images import images_of
 from adjust.start.motion import solve_motion
-from adjust.start.network import ChainObservation, FrameNetwork, partial_pose
+from adjust.start.network import FrameNetwork, pair_observations, partial_pose
 from adjust.start.points import PARALLAX, improve, intersect_points, orient_second, resect
 from adjust.start.polish import polish
-from adjust.start.positions import PointField, Positions, Sight, point_field, undetermined
+from adjust.start.positions import PointField, Positions, point_field, undetermined
 from adjust.start.readings.start import explain
 from adjust.start.readings.steps import Readings
 from adjust.start.settling import block_rms, contradictions, moved_to_coordinates, scaled_to_lengths
-from adjust.start.views import (
-    Views,
-    block_text,
-    focal_px,
-    joined,
-    make_views,
-    rays_by_block,
-    untrustworthy,
-)
 
 _ROUNDS = 3
 _POLISH_PX = 2.0  # below this the robust means are a good start already
@@ -71,9 +59,13 @@ def find_start(survey: Survey) -> Start:
     are named in ``excluded_blocks`` and do not take part. What no observation tells (the datum) is chosen.
     Raises SurveyError naming each parameter that nothing determines, and what is missing.
     """
-    network = _network_start(survey)
-    if network is not None:
-        return network
+    # surveys of rotations alone, whose positions stay open, are left to the general search
+    if survey.is_pose_network and any(isinstance(p.b_from_a, Pose3) and p.used for p in survey.pairs):
+        from adjust.pose_network.agreement import agreeing_poses  # here: a survey without pairs starts without it
+
+        poses = agreeing_poses(survey)
+        how = "averaged rotations and linear positions of the pairs that agree"
+        return Start({}, poses, {}, notes=(f"{len(poses)} stations from {how}",))
     search = _Search(whole_images(survey))
     search.solve()
     search.settle()
@@ -93,35 +85,12 @@ def turns_of_views(survey: Survey, turned: Mapping[str, FloatArray]) -> dict[int
     for view in search.views:
         i = view.block_idx
         motions = turned.get(str(survey.image_blocks[i].target_id))
-        if motions is None or search.network.open_slots(search.chains[i]):
+        if motions is None or search.network.open_slots(search.links[i]):
             continue
-        camera_from_target = search.network.product(search.chains[i])
+        camera_from_target = search.network.product(search.links[i])
         away = pose_distance(search.alternatives(i, view.poses), camera_from_target, search.network.lever)
         out[i] = int(np.argmin(away)) // len(view.poses)
     return out
-
-
-def _network_start(survey: Survey) -> Start | None:
-    """Averaged rotations and linear positions of the pairs that agree; None where there is more than pairs.
-
-    Surveys of rotations alone, whose positions stay open, are left to the general search, too. Raises
-    IndeterminateError naming the stations that no pair ties to the others.
-    """
-    if not survey.is_pose_network or not any(isinstance(p.b_from_a, Pose3) and p.used for p in survey.pairs):
-        return None
-    # here: a survey without pairs starts without it
-    from adjust.pose_network.agreement import agreeing_start
-    from adjust.pose_network.from_survey import network_from_survey
-    from adjust.pose_network.network import check_determined
-
-    network = network_from_survey(survey, any_datum=True)
-    check_determined(network)
-    R, t = agreeing_start(network)
-    notes = (f"{network.n_stations} stations from averaged rotations and linear positions of the pairs that agree",)
-    poses: dict[ParameterName, Pose3] = {
-        ("world_from_station", s): Pose3(Rot3(R[i]), t[i]) for i, s in enumerate(network.station_ids)
-    }
-    return Start({}, poses, {}, notes=notes)
 
 
 class _Search:
@@ -130,33 +99,17 @@ class _Search:
     def __init__(self, survey: Survey, turned: Mapping[str, FloatArray] = MappingProxyType({})) -> None:
         self.survey, self.turned = survey, turned
         frames = FrameTree(survey, Unknowns())
-        self.chains = [frames.of_image(block) for block in survey.image_blocks]
-        self.doubtful: list[ChainObservation] = []
-        pairs = self._pairs(frames)
+        self.links = [frames.of_image(block) for block in survey.image_blocks]
+        self.chains = Chains.of(self.links)
+        pairs = pair_observations(survey, frames)
         self._register_positions(frames)
         self.network = FrameNetwork(frames, survey)
-        self.network.observations = pairs
+        self.network.observations, self.doubtful = pairs
         self.points: PointField = point_field(survey)
         self.positions = Positions(survey, self.network, self.points)
         self.readings = Readings(survey, self.positions)
-        self.lenses: dict[str, FloatArray] = {}
-        self.reasons: dict[int, str] = {}
         self.notes: list[str] = []
-        self.motion_solved = False
-        self.scale_free = False
-        self.views: Views
-        self.rms: FloatArray
-
-    def _pairs(self, frames: FrameTree) -> list[ChainObservation]:
-        """What pairs say; those not in use are doubtful."""
-        out: list[ChainObservation] = []
-        for pair in self.survey.pairs:
-            full = isinstance(pair.b_from_a, Pose3)
-            matrix = pair.b_from_a.matrix()
-            pose = np.asarray(matrix, dtype=float) if full else rigid(matrix, np.zeros(3))
-            observation = ChainObservation(frames.relative(pair.a, pair.b), pose[None], rotation_only=not full)
-            (out if pair.used else self.doubtful).append(observation)
-        return out
+        self.motion_solved = self.scale_free = False
 
     def _register_positions(self, frames: FrameTree) -> None:
         refs = position_refs(self.survey) + reading_refs(self.survey)
@@ -174,96 +127,36 @@ class _Search:
         if lacking and not blocks:
             raise explain(self.survey, lacking)
 
-    def _seen(self) -> tuple[dict[int, Sighting], dict[int, IntArray]]:
-        """What the blocks show of targets, one array for all that show the same; points and rows of the others."""
-        whole = {t.target_id: deformed(t) for t in self.survey.targets}
-        parts: dict[tuple[str, bytes], FloatArray] = {}
-        seen, world = {}, {}
-        for i, block in enumerate(self.survey.image_blocks):
-            index, uv = block.point_idx, block.uv
-            if block.used is not None:
-                index, uv = index[block.used], uv[block.used]
-            if block.target_id is None:
-                seen[i], world[i] = Sighting(i, np.zeros((0, 3)), uv), np.asarray(index, dtype=np.int64)
-                continue
-            key = (block.target_id, index.tobytes())
-            if key not in parts:
-                parts[key] = whole[block.target_id][index]
-            seen[i] = Sighting(i, parts[key], uv)
-        return seen, world
-
-    def _find_lenses(self, seen: Mapping[int, Sighting], rows: Mapping[int, IntArray]) -> None:
-        """Lens values of every camera, given or from its images of known points."""
-        known, mine = self.points.known, dict[str, list[Sighting]]()
-        for i, s in seen.items():
-            if i in rows:
-                some = known[rows[i]]
-                s = Sighting(i, self.points.x[rows[i][some]], s.uv[some])
-            if len(s.x):
-                mine.setdefault(self.survey.image_blocks[i].camera_id, []).append(s)
-        shared, known_of = lenders(self.survey), dict[tuple[str, str], float]()
-        for camera in sorted(self.survey.cameras, key=lambda c: -len(mine.get(c.camera_id, ())) if shared else 0):
-            if camera.camera_id not in mine and camera.lens.values is None and self.points.release():
-                self._find_lenses(seen, rows)  # no target shows it: the points as they are given have to do
-                return
-            lender, names = shared.get(camera.camera_id, (camera.camera_id, MODELS[camera.lens.model].names))
-            lent = {x: known_of[lender, x] for x in names if (lender, x) in known_of}
-            found = start_lens(camera, mine.get(camera.camera_id, []), lent)
-            self.lenses[camera.camera_id] = found.values
-            values = dict(zip(MODELS[camera.lens.model].names, found.values.tolist(), strict=True))
-            known_of.update({(lender, x): values[x] for x in names})
-            self.notes.append(f"camera {camera.camera_id!r}: {found.note}")
-            for i, reason in found.excluded.items():
-                self.reasons[i] = f"{block_text(self.survey.image_blocks[i])}: {reason}"
-
-    def _find_views(self, seen: Mapping[int, Sighting], rows: Mapping[int, IntArray]) -> None:
-        """Rays of all blocks and poses of all targets seen; blocks that cannot be trusted are set aside."""
-        blocks = self.survey.image_blocks
-        rays, failed = rays_by_block(self.survey, self.lenses, {i: s.uv for i, s in seen.items()})
-        focal = {c.camera_id: focal_px(c, self.lenses[c.camera_id]) for c in self.survey.cameras}
-        none = np.zeros((0, 3))
-        self.points.sights = [
-            Sight(i, block_text(blocks[i]), row, rays.get(i, none), focal[blocks[i].camera_id], self.chains[i])
-            for i, row in rows.items() if i not in failed
-        ]  # fmt: skip
-        # fewer than three points give no pose, but may well serve in the adjustment
-        sights = joined([
-            (i, seen[i].x, r, focal[blocks[i].camera_id]) for i, r in rays.items() if len(r) >= 3 and i not in rows
-        ])  # fmt: skip
-        self.views, without = make_views(sights, thorough=False)
-        for i, reason in (failed | without).items():
-            self.reasons.setdefault(i, f"{block_text(blocks[i])}: {reason}")
-        reasons, notes = untrustworthy(self.views, self.survey, self.reasons)
-        self.reasons = {**reasons, **self.reasons}
-        self.notes += notes
-        first = pairwise(self.views.first.tolist())
-        for i, (a, b) in zip(self.views.sights.block_idx.tolist(), first, strict=True):
-            observation = ChainObservation(self.chains[i], self.alternatives(i, self.views.poses[a:b]), i)
-            (self.doubtful if i in self.reasons else self.network.observations).append(observation)
+    def _see(self) -> None:
+        """Lenses, rays and views of all images; those that cannot be trusted are set aside."""
+        found = images_of(self.survey, self.points, self.links)
+        self.lenses, self.views, self.reasons = found.lenses, found.views, found.reasons
+        self.points.sights, self.notes = found.sights, self.notes + found.notes
+        trusted, doubtful = found.observations(self.links, self.chains, self.alternatives if self.turned else None)
+        self.network.observations = self.network.observations.and_also(trusted)
+        self.doubtful = self.doubtful.and_also(doubtful)
         if len(self.views):
             self.network.lever = typical_distance(self.views.poses[self.views.first[:-1]])
 
     def alternatives(self, i: int, poses: FloatArray) -> FloatArray:
         """Poses (k, 4, 4) of a block as named, then after every motion that its target cannot be told from."""
-        if not self.turned:
-            return poses
         motions = self.turned.get(str(self.survey.image_blocks[i].target_id), ())
         return np.concatenate([poses, *(poses @ motion for motion in motions)])
 
     def solve(self) -> None:
         """Determine lenses, all poses and points, the safest first; what floats is set freely one by one."""
         self._read_first()
-        seen, rows = self._seen()
-        self._find_lenses(seen, rows)
-        self._find_views(seen, rows)
+        self._see()
         while self._advance():
             pass
-        self.network.observations += self.doubtful
+        before = len(self.network.observations)
+        self.network.observations = self.network.observations.and_also(self.doubtful)
         # a pose that only distrusted blocks show still needs some value
         while self._advance():
             pass
-        told = {id(o) for o in self.doubtful}
-        self.network.observations = [o for o in self.network.observations if id(o) not in told]
+        place = np.arange(len(self.network.observations)) - before
+        other = (place < 0) | (place >= len(self.doubtful))
+        self.network.observations = self.network.observations.part(np.flatnonzero(other))
         while self._use_open_prior():
             while self._advance():
                 pass
@@ -304,29 +197,28 @@ class _Search:
             or (not self.scale_free and self.readings.advance())
         )
 
+    def _noted(self, note: str | None) -> bool:
+        self.notes += [note] if note is not None else []
+        return note is not None
+
     def _set_freely(self) -> bool:
-        slot = fix_one_gauge(self.network, self.network.observations + self._unseen_chains())
-        if slot is not None:
-            self.notes.append(f"{' '.join(self.network.names[slot])}: set freely, no observation tells it")
-        return slot is not None
+        slot = fix_one_gauge(self.network, [*self.network.observations, *self._unseen_chains()])
+        what = "set freely, no observation tells it"
+        return self._noted(None if slot is None else f"{' '.join(self.network.names[slot])}: {what}")
 
     def _from_motion(self) -> bool:
-        note = solve_motion(self.network, degenerate=self.points.released)
-        if note is not None:
-            self.notes.append(note)
-            self.motion_solved = True
-        return note is not None
+        found = self._noted(solve_motion(self.network, degenerate=self.points.released))
+        self.motion_solved |= found
+        return found
 
     def _orient(self) -> bool:
-        note = orient_second(self.network, self.points) if not self.points.known.any() else None
-        if note is not None:
-            self.notes.append(note)
-            self.scale_free = True
-        return note is not None
+        found = not self.points.known.any() and self._noted(orient_second(self.network, self.points))
+        self.scale_free |= found
+        return found
 
     def _unseen_chains(self) -> list[ChainObservation]:
         """Chains of blocks of world points that have no pose yet; they bind the world as soon as any point is known."""
-        have = {o.block_idx for o in self.network.observations}
+        have = set(self.network.observations.block_idx.tolist())
         bound = bool(self.points.known.any() or self.points.rough.any())
         return [
             ChainObservation(s.chain, np.zeros((0, 4, 4)), s.block_idx, ends=(True, bound))
@@ -379,14 +271,11 @@ class _Search:
         poses: dict[ParameterName, Pose3] = {
             name: as_pose3(network.pose[slot]) for slot, name in enumerate(network.names) if name[0] != "table_motion"
         }
-        vectors: dict[ParameterName, FloatArray] = {}
-        for table in survey.tables:
-            vectors[("table_geometry", table.table_id)] = np.array(table.geometry.values, dtype=float)
-        for reading in survey.table_readings:
-            vectors[("table_angles", reading.table_id, reading.epoch_id)] = np.array(reading.angles, dtype=float)
-        for target in survey.targets:
-            if target.warp is not None:
-                vectors[("warp", target.target_id)] = np.array(target.warp.values, dtype=float)
+        vectors: dict[ParameterName, FloatArray] = {
+            ("table_geometry", t.table_id): np.array(t.geometry.values, dtype=float) for t in survey.tables
+        }
+        vectors |= {("table_angles", r.table_id, r.epoch_id): np.array(r.angles, float) for r in survey.table_readings}
+        vectors |= {("warp", t.target_id): np.array(t.warp.values, float) for t in survey.targets if t.warp is not None}
         order = tuple(sorted(self.reasons))
         good = np.delete(rms, order)
         good = good[np.isfinite(good)]

@@ -1,37 +1,30 @@
 """What is known, beside what was observed: misfits, scale, place in the world, and blocks that contradict the rest."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
-from adjust.frames.unknowns import Chain
 from adjust.model.survey import FloatArray, Survey
 from adjust.native.views import view_offsets
 from adjust.spatial.rigid import align
+from adjust.start.chains import Chains
 from adjust.start.gauge import frames_of, world_is_free
 from adjust.start.network import FrameNetwork
 from adjust.start.points import scale_lengths
 from adjust.start.positions import PointField, Positions
-from adjust.start.views import Views, block_text, ends_of
+from adjust.start.views import Views, block_text, joined
 
 _OFF = 10.0  # a block this many times worse than the typical one contradicts the others
 
 
-def block_rms(network: FrameNetwork, chains: Sequence[Chain], views: Views, points: PointField) -> FloatArray:
+def block_rms(network: FrameNetwork, chains: Chains, views: Views, points: PointField) -> FloatArray:
     """Robust misfit of every block at the present values: 1.2 times the median offset, px; nan where it has no rays."""
-    rms = np.full(len(chains), np.nan)
-    s, world = views.sights, [sight for sight in points.sights if len(sight.rows)]
-    seen = [(s.block_idx, s.x, s.rays, s.ptr, s.focal_px)] if len(s) else []
-    if world:
-        seen.append((
-            np.array([sight.block_idx for sight in world]), points.x[np.concatenate([sight.rows for sight in world])],
-            np.concatenate([sight.rays for sight in world]), ends_of([len(sight.rows) for sight in world]),
-            np.array([sight.focal_px for sight in world]),
-        ))  # fmt: skip
-    for blocks, x, rays, ptr, focal in seen:
-        medians = view_offsets(network.products([chains[i] for i in blocks.tolist()]), x, rays, ptr)[1]
+    rms = np.full(len(chains.slots), np.nan)
+    world = joined([(s.block_idx, points.x[s.rows], s.rays, s.focal_px) for s in points.sights if len(s.rows)])
+    for s in (views.sights, world):
+        medians = view_offsets(network.products(chains.part(s.block_idx)), s.x, s.rays, s.ptr)[1]
         # the median of a circular normal's radius is 1.18 sigma, its rms 1.41 sigma
-        rms[blocks] = 1.2 * focal * medians
+        rms[s.block_idx] = 1.2 * s.focal_px * medians
     return rms
 
 

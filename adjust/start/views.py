@@ -4,15 +4,15 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from adjust.lenses.models import camera_constants, focal_length_px, lens_model, unit_rays
+from adjust.model.boards import deformed
 from adjust.model.errors import SurveyError
-from adjust.model.names import grouped
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import BoolArray, Camera, FloatArray, IntArray, Survey
-from adjust.native.parallel import side_by_side
 from adjust.native.views import refine_poses, view_errors, view_offsets
 from adjust.start.closed_forms.absolute_pose import view_poses
 
@@ -21,6 +21,15 @@ _NOISE_PX = 0.3  # ... or within this much of it
 ENOUGH = 36  # points of a view from which its pose is found before all of them refine it
 _STEPS = 8, 2  # of refinement with these, and with all points of a view
 _GROSS_SHARE = 0.2  # more gross points than this make a whole block untrustworthy
+_NO_POINTS, _NO_PIXELS = np.zeros((0, 3)), np.zeros((0, 2))
+
+
+class Sighting(NamedTuple):
+    """Points (n, 3) m of one rigid body, nan where not known, and their image points (n, 2) px in one image."""
+
+    block_idx: int
+    x: FloatArray
+    uv: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,9 +101,8 @@ def ends_of(sizes: Sequence[int] | IntArray) -> IntArray:
 def joined(items: Sequence[tuple[int, FloatArray, FloatArray, float]]) -> Sights:
     """Images, each as its position in the survey, x (n, 3), rays (n, 3) and principal distance in px."""
     blocks, x, rays, focal = zip(*items, strict=True) if items else ((), (), (), ())
-    none = [np.zeros((0, 3))]
-    ptr = ends_of([len(part) for part in x])
-    return Sights(np.array(blocks, dtype=np.int64), np.concatenate(x or none), np.concatenate(rays or none), ptr,
+    points, unit = np.concatenate([_NO_POINTS, *x]), np.concatenate([_NO_POINTS, *rays])
+    return Sights(np.array(blocks, dtype=np.int64), points, unit, ends_of([len(part) for part in x]),
                   np.array(focal, dtype=np.float64))  # fmt: skip
 
 
@@ -104,49 +112,66 @@ def block_text(block: ImageBlock) -> str:
     return f"camera {block.camera_id!r}, epoch {block.epoch_id!r}, {seen}"
 
 
-def focal_px(camera: Camera, values: FloatArray) -> float:
-    """Principal distance in px."""
-    return focal_length_px(lens_model(camera.lens.model), values, camera_constants(camera))
+def sightings(survey: Survey, x_in_world: FloatArray) -> dict[str, list[Sighting]]:
+    """By camera what its blocks show of what is in use, one array of points for all that show the same.
+
+    x_in_world: points (P, 3) m of the survey.
+    """
+    bodies: dict[str | None, FloatArray] = {t.target_id: deformed(t) for t in survey.targets}
+    bodies[None] = x_in_world
+    parts, out = dict[tuple[str | None, bytes], FloatArray](), dict[str, list[Sighting]]()
+    for i, block in enumerate(survey.image_blocks):
+        index, uv = block.point_idx, block.uv
+        if block.used is not None:
+            index, uv = index[block.used], uv[block.used]
+        key = block.target_id, index.tobytes()
+        x = parts.get(key)
+        if x is None:
+            x = parts[key] = bodies[block.target_id][index]
+        out.setdefault(block.camera_id, []).append(Sighting(i, x, uv))
+    return out
 
 
-def rays_by_block(
-    survey: Survey, lenses: Mapping[str, FloatArray], seen: Mapping[int, FloatArray]
-) -> tuple[dict[int, FloatArray], dict[int, str]]:
-    """Rays (n, 3) of the image points ``seen`` (n, 2) px of some blocks, and the reason for each that has none."""
-    rays: dict[int, FloatArray] = {}
-    failed: dict[int, str] = {}
-    mine = grouped((survey.image_blocks[i].camera_id, i) for i, uv in seen.items() if len(uv))
-    cameras = [c for c in survey.cameras if c.camera_id in mine]
-    found = side_by_side(
-        lambda c: rays_of_images(c, lenses[c.camera_id], [seen[i] for i in mine[c.camera_id]]), cameras
-    )
-    for camera, of_camera in zip(cameras, found, strict=True):
-        for i, of_block in zip(mine[camera.camera_id], of_camera, strict=True):
-            if isinstance(of_block, SurveyError):
-                failed[i] = str(of_block)
-            else:
-                rays[i] = of_block
-    return rays, failed
-
-
-def rays_of_images(
-    camera: Camera, values: FloatArray, images: Sequence[FloatArray]
-) -> Sequence[FloatArray | SurveyError]:
-    """Unit rays (n, 3) of every image (n, 2) px, or why it has none."""
-    if not images:
-        return []
-    uv = np.concatenate(images, dtype=float)
-    try:
-        rays = unit_rays(lens_model(camera.lens.model), values, camera_constants(camera), uv)
-        return [rays[a:b] for a, b in pairwise(ends_of([len(uv) for uv in images]).tolist())]
-    except SurveyError as error:  # some pixel of some image: find out which
-        return [error] if len(images) == 1 else [rays_of_images(camera, values, [uv])[0] for uv in images]
+def sights_of(
+    cameras: Mapping[str, Camera], lenses: Mapping[str, FloatArray], seen: Mapping[str, Sequence[Sighting]]
+) -> tuple[Sights, dict[int, str]]:
+    """Images by camera as rays, camera by camera, and the reason for each that has none."""
+    every = [s for mine in seen.values() for s in mine]
+    x, uv = np.concatenate([_NO_POINTS, *(s.x for s in every)]), np.concatenate([_NO_PIXELS, *(s.uv for s in every)])
+    ptr, ends = ends_of([len(s.uv) for s in every]), ends_of([len(mine) for mine in seen.values()])
+    rays, lost, focal = np.empty(x.shape), dict[int, str](), np.empty(len(every))
+    for camera_id, first, last in zip(seen, ends[:-1].tolist(), ends[1:].tolist(), strict=True):
+        camera, values = cameras[camera_id], lenses[camera_id]
+        model, constants = lens_model(camera.lens.model), camera_constants(camera)
+        focal[first:last] = focal_length_px(model, values, constants)
+        try:
+            unit_rays(model, values, constants, uv[ptr[first] : ptr[last]], rays[ptr[first] : ptr[last]])
+        except SurveyError:  # some pixel of some image: find out which
+            for i in range(first, last):
+                try:
+                    unit_rays(model, values, constants, uv[ptr[i] : ptr[i + 1]], rays[ptr[i] : ptr[i + 1]])
+                except SurveyError as error:
+                    lost[i] = str(error)
+    sights = Sights(np.array([s.block_idx for s in every], dtype=np.int64), x, rays, ptr, focal)
+    kept = ~np.isin(np.arange(len(every)), list(lost))
+    return sights.only(kept), {every[i].block_idx: reason for i, reason in lost.items()}
 
 
 @lru_cache(maxsize=256)
 def few_of(n: int, most: int = ENOUGH) -> IntArray:
     """Positions of at most so many of n points, without the pattern of a grid, the same at every call."""
     return np.arange(n) if n <= most else np.sort(np.random.default_rng(n).permutation(n)[:most])
+
+
+def _few_rows(ptr: IntArray) -> tuple[IntArray, IntArray]:
+    """Rows (M,) of a few points of each of B images, one after the other, and where those of each begin (B + 1,)."""
+    sizes = np.diff(ptr)
+    ends = ends_of(np.minimum(sizes, ENOUGH))
+    rows = np.empty(ends[-1], dtype=np.int64)
+    for n in np.unique(sizes).tolist():
+        mine, few = sizes == n, few_of(n)
+        rows[ends[:-1][mine, None] + np.arange(len(few))] = ptr[:-1][mine, None] + few
+    return rows, ends
 
 
 def make_views(
@@ -160,10 +185,8 @@ def make_views(
     if not len(sights):
         return Views(sights, np.zeros((0, 4, 4)), np.zeros(0), np.zeros(1, dtype=np.int64)), {}
     x, rays, ptr, focal = sights.x, sights.rays, sights.ptr, sights.focal_px
-    few = [few_of(n) for n in np.diff(ptr).tolist()]
-    few_ptr = ends_of([len(r) for r in few])
-    rows = np.concatenate(few) + np.repeat(ptr[:-1], np.diff(few_ptr))
-    part = x[rows], rays[rows], few_ptr
+    rows, few_ptr = _few_rows(ptr)
+    part = x.take(rows, axis=0), rays.take(rows, axis=0), few_ptr
     poses, of, failed = view_poses(*part)
     error, in_front = view_errors(poses, *part, of)
     kept = _likeliest(focal, error, in_front, of)

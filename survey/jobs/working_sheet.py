@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from gtsam import Rot3
 
-from adjust.frames.unknowns import FrameTree
+from adjust.frames.tree import FrameTree
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment

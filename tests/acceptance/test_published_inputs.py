@@ -4,8 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from adjust.lenses.models import MODELS, lens_constants, lens_derivatives, lens_residuals, rays
+from adjust.lenses.models import MODELS, lens_constants, lens_derivatives, lens_residuals
 from tests.acceptance import published
+from tests.adjust.lenses import slopes
 from tests.data import data_folder
 
 
@@ -37,7 +38,7 @@ def dbat_point_squares(survey, solution, point_idx, x_in_world):
     R = np.array([p.rotation().matrix().T for p in poses])
     origins = np.array([p.translation() for p in poses])
     if x_in_world is None:
-        directions = np.column_stack([rays(model, solution.lens, constants, uv), np.ones(len(uv))])
+        directions = np.column_stack([slopes(model, solution.lens, constants, uv), np.ones(len(uv))])
         d = np.einsum("nji,nj->ni", R, directions / np.linalg.norm(directions, axis=1, keepdims=True))
         across = np.eye(3) - d[:, :, None] * d[:, None, :]
         x_in_world = np.linalg.solve(across.sum(0), np.einsum("nij,nj->i", across, origins))

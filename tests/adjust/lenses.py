@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from adjust.lenses.models import MODELS, LensModel, lens_constants
+from adjust.lenses.models import MODELS, LensModel, lens_constants, unit_rays
 from adjust.model.survey import FloatArray
 
 IMAGE_SIZE = (640, 480)
@@ -31,3 +31,9 @@ def points_in_camera(n: int, seed: int = 1) -> FloatArray:
     q = rng.uniform([-0.4, -0.3, 0.9], [0.4, 0.3, 1.2], (n, 3))
     q[:3, :2] *= 1e-5
     return q
+
+
+def slopes(model: LensModel, values: FloatArray, constants: FloatArray, uv: FloatArray) -> FloatArray:
+    """Tangents (n, 2) = x/z, y/z of the rays of image points (n, 2) px."""
+    unit = unit_rays(model, values, constants, uv)
+    return np.asarray(unit[:, :2] / unit[:, 2:])

@@ -209,3 +209,7 @@ def _lenses() -> None:
         model, values, constants = lens(name)
         lenses.lens_rows(model.kind, values, constants, q, uv)
         lenses.lens_residuals(model.kind, values, constants, q, uv)
+        given, newton = lenses.Lens(model.kind, values, constants), lenses.Newton(50, 1e-8)
+        seen = lenses.image_points_of(given, q, newton, 800.0, uv)[0]
+        lenses.rays_of(given, seen, newton, 2.0)
+    lenses.radii_of(np.array([1.0, -0.2, 0.01]), np.array([1.0, 0.1]), np.inf, np.linspace(0.0, 0.9, 50))

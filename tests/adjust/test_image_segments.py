@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from gtsam import Pose3
 
-from adjust.frames.unknowns import FrameTree, Unknowns
+from adjust.frames.tree import FrameTree
+from adjust.frames.unknowns import Unknowns
 from adjust.model.observations import FrameRef, ImageBlock, TableReading
 from adjust.model.survey import Camera, LensParameter, PoseParameter, Station, Survey, Table, Target
 from adjust.observations.images.segments import first_seen, ranges

@@ -7,9 +7,11 @@ import pytest
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import Camera, LensParameter, Point, PointParameter, PoseParameter, Station, Survey, Tie
-from adjust.start import find_start, lenses
-from adjust.start.lens_images import Sighting
-from adjust.start.lenses import remembering, start_lens
+from adjust.start import find_start
+from adjust.start.lens import search
+from adjust.start.lens.search import LensSearch
+from adjust.start.lens.start import remembering, start_lens
+from adjust.start.views import Sighting
 from tests.adjust.test_initial import FREE, SIZE, TRUE, assert_near, board_views, grid, inv, looking_at, pixels
 from tests.data import data_folder
 
@@ -167,8 +169,8 @@ def test_the_same_images_are_searched_once(monkeypatch):
     images = sightings(rng, 6, project)
     images[2] = Sighting(2, images[2].x, images[2].uv[::-1])
     plain, ran = start_lens(camera, images), []
-    run = lenses._LensSearch.run
-    monkeypatch.setattr(lenses._LensSearch, "run", lambda *a: ran.append(1) or run(*a))
+    run = LensSearch.run
+    monkeypatch.setattr(LensSearch, "run", lambda *a: ran.append(1) or run(*a))
     with remembering():
         for first in (0, 10, 20):
             found = start_lens(camera, [Sighting(first + s.block_idx, s.x, s.uv) for s in images])
@@ -193,7 +195,7 @@ def test_values_that_were_known_before_save_the_scan(monkeypatch):
     def none(*_):
         raise SurveyError("no closed form")
 
-    monkeypatch.setattr(lenses, "pinhole_from_homographies", none)
+    monkeypatch.setattr(search, "pinhole_from_homographies", none)
     near = best.copy()
     near[:2] *= 1.03
     found = start_lens(camera, images, near=near)

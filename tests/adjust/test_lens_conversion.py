@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from adjust.lenses.conversion import convert, rebalance_aicon
-from adjust.lenses.models import MODELS, default_start, lens_constants, project, rays
+from adjust.lenses.models import MODELS, default_start, lens_constants, project
 from adjust.model.errors import SurveyError
-from tests.adjust.lenses import IMAGE_SIZE, NAMES, PIXEL_SIZE_MM, R0_MM, lens
+from tests.adjust.lenses import IMAGE_SIZE, NAMES, PIXEL_SIZE_MM, R0_MM, lens, slopes
 
 # an ordinary lens: 3 px of barrel in the corners, a little of everything else
 BROWN = np.array([800.0, 800.4, 0.3, 322, 241, -0.08, 0.02, 0.0003, -0.0002, 0, 0, 0, 0])
@@ -36,7 +36,7 @@ def test_brown_converts_there_and_back_within_the_stated_difference(name, allowe
     assert there.rms_px < there.largest_difference_px < allowed_px
     back = convert(MODELS[name], there.values, constants_of(name), MODELS["brown"], PIXELS, IMAGE_SIZE)
     uv = np.random.default_rng(4).uniform([0, 0], [639, 479], (300, 2))
-    q = np.column_stack([rays(MODELS["brown"], BROWN, PIXELS, uv), np.ones(300)])
+    q = np.column_stack([slopes(MODELS["brown"], BROWN, PIXELS, uv), np.ones(300)])
     seen = project(MODELS[name], there.values, constants_of(name), q)
     assert np.linalg.norm(seen - uv, axis=1).max() <= there.largest_difference_px
     returned = project(MODELS["brown"], back.values, PIXELS, q)
@@ -46,7 +46,7 @@ def test_brown_converts_there_and_back_within_the_stated_difference(name, allowe
 def test_the_largest_difference_is_where_it_is_said_to_be():
     there = convert(MODELS["brown"], BROWN, PIXELS, MODELS["fisheye"], PIXELS, IMAGE_SIZE)
     uv = np.array([there.largest_at])
-    q = np.column_stack([rays(MODELS["brown"], BROWN, PIXELS, uv), [1.0]])
+    q = np.column_stack([slopes(MODELS["brown"], BROWN, PIXELS, uv), [1.0]])
     difference = np.linalg.norm(project(MODELS["fisheye"], there.values, PIXELS, q) - uv)
     assert difference == pytest.approx(there.largest_difference_px, rel=1e-9)
 
@@ -78,7 +78,7 @@ def test_aicon_keeps_its_image_when_it_is_balanced_elsewhere(r0_mm):
     model, values, constants = lens("aicon")
     other = constants_of("aicon", r0_mm)
     moved = rebalance_aicon(values, R0_MM, r0_mm)
-    q = np.column_stack([rays(model, values, constants, np.array([[0, 0], [500, 30], [639, 479.0]])), np.ones(3)])
+    q = np.column_stack([slopes(model, values, constants, np.array([[0, 0], [500, 30], [639, 479.0]])), np.ones(3)])
     np.testing.assert_allclose(project(model, moved, other, q), [[0, 0], [500, 30], [639, 479.0]], atol=1e-9)
     assert convert(model, values, constants, model, other, IMAGE_SIZE).largest_difference_px < 1e-9
     np.testing.assert_allclose(rebalance_aicon(moved, r0_mm, R0_MM), values, rtol=1e-13)
@@ -122,7 +122,7 @@ def test_covariance_goes_through_the_jacobian_and_keeps_the_precision_of_rays():
     np.testing.assert_allclose(there.cov, there.jacobian @ cov @ there.jacobian.T)
     # a change of the old lens moves the image of a fixed ray as the converted change of the new one does
     uv = rng.uniform([0, 0], [639, 479], (20, 2))
-    q = np.column_stack([rays(MODELS["brown"], BROWN, PIXELS, uv), np.ones(20)])
+    q = np.column_stack([slopes(MODELS["brown"], BROWN, PIXELS, uv), np.ones(20)])
     d_old = root[:, 3] * 0.1
     d_new = there.jacobian @ d_old
     old = project(MODELS["brown"], BROWN + d_old, PIXELS, q) - uv

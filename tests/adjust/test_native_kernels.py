@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from adjust.native.lenses import BROWN, FISHEYE, N_LENS, Lens, Newton, tangents_of
+from adjust.native.lenses import BROWN, FISHEYE, N_LENS, Lens, Newton, image_points_of, rays_of
 from adjust.native.library import instruction_sets
 from adjust.native.trees import TreeArrays, row_influences
 from adjust.native.vision import _corner_rows
@@ -24,30 +24,35 @@ def _by_opencv(kind, tangents):
 
 
 @pytest.mark.parametrize("kind", [BROWN, FISHEYE])
-def test_tangents_are_those_that_opencv_projects(kind):
-    tangents = np.random.default_rng(1).uniform(-0.4, 0.4, (40, 2))
-    uv, lens = _by_opencv(kind, tangents)
-    found, solved, constants = np.zeros((40, 2)), np.zeros(40, bool), np.zeros(4)
-    tangents_of(np.arange(5, 40), Lens(kind, lens, constants), uv, Newton(50, 1e-14, 1e-9), found, solved)
-    np.testing.assert_allclose(found[5:], tangents[5:], rtol=0.0, atol=1e-13)
-    assert solved[5:].all()
-    assert not solved[:5].any()
-    assert not found[:5].any()
+@pytest.mark.parametrize("n", [1, 35, 6001])
+def test_rays_are_those_that_opencv_projects(kind, n):
+    tangents = np.random.default_rng(1).uniform(-0.4, 0.4, (n, 2))
+    uv, values = _by_opencv(kind, tangents)
+    lens, newton = Lens(kind, values, np.zeros(4)), Newton(50, 1e-8)
+    expected = np.column_stack([tangents, np.ones(n)]) / np.sqrt(1.0 + (tangents**2).sum(axis=1))[:, None]
+    for start in (None, tangents + 0.01):
+        found, solved = rays_of(lens, uv, newton, 0.6, start)
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-13)
+        assert solved.all()
+    assert rays_of(lens, uv, newton, 0.2)[1].tolist() == (np.linalg.norm(tangents, axis=1) <= 0.2).tolist()
+    again, solved = image_points_of(lens, expected, newton, 800.0, np.zeros((n, 2)))
+    np.testing.assert_allclose(again, uv, rtol=0.0, atol=1e-10)
+    assert solved.all()
 
 
-def test_tangents_that_were_not_found_are_told():
+def test_rays_that_were_not_found_are_told():
     tangents = np.random.default_rng(2).uniform(-0.3, 0.3, (10, 2))
-    uv, lens = _by_opencv(BROWN, tangents)
-    found, solved, constants = np.zeros((10, 2)), np.zeros(10, bool), np.zeros(4)
-    tangents_of(np.arange(10), Lens(BROWN, lens, constants), uv, Newton(1, 1e-14, 1e-9), found, solved)
-    assert not solved.any(), "one step is not enough"
+    uv, values = _by_opencv(BROWN, tangents)
+    lens, constants = Lens(BROWN, values, np.zeros(4)), np.zeros(4)
+    assert not rays_of(lens, uv, Newton(2, 1e-8), np.inf)[1].any(), "two steps are not enough"
     folding = np.zeros(N_LENS[BROWN])
     folding[[0, 1, 3, 4, 5]] = 800.0, 800.0, 320.0, 240.0, -1.0  # r (1 - r^2) comes back to 0 at r = 1
     uv = np.array([[320.0 + 800.0 * 0.9 * (1 - 0.81), 240.0]] * 2)
-    found, solved = np.array([[0.9, 0.0], [0.15, 0.0]]), np.zeros(2, bool)
-    tangents_of(np.arange(2), Lens(BROWN, folding, constants), uv, Newton(50, 1e-14, 1e-9), found, solved)
+    start = np.array([[0.9, 0.0], [0.15, 0.0]])
+    found, solved = rays_of(Lens(BROWN, folding, constants), uv, Newton(50, 1e-8), np.inf, start)
     assert solved.tolist() == [False, True], "beyond r = 0.577 the image is turned over"
-    assert abs(found[1, 0] * (1.0 - found[1, 0] ** 2) - 0.9 * (1 - 0.81)) < 1e-13
+    tangent = found[1, 0] / found[1, 2]
+    assert abs(tangent * (1.0 - tangent**2) - 0.9 * (1 - 0.81)) < 1e-13
 
 
 def _tree():

@@ -5,7 +5,7 @@ divided anew between the two places where most of them meet.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations, islice
 
 import numpy as np
@@ -14,10 +14,11 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.names.images import POINTS, exchange, points_exchanged
 from adjust.diagnosis.prediction import Prediction
+from adjust.model.names import grouped
 from adjust.model.subsets import with_points
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.start.closed_forms.triangulation import intersect
-from adjust.start.views import focal_px, rays_by_block
+from adjust.start.views import Sighting, sights_of
 
 _NEAR_PX = 15.0
 """Rays of rough poses that miss a point by less are its own."""
@@ -91,13 +92,17 @@ def _rays(case: Case) -> Rays | None:
     prediction = Prediction(survey, values)
     cameras = {c.camera_id: c for c in survey.cameras if ("lens", c.camera_id) in values}
     lenses = {c: np.asarray(values["lens", c]) for c in cameras}
-    mine = {i: b.uv for i, b in enumerate(survey.image_blocks) if b.target_id is None and b.camera_id in lenses}
+    unknown = grouped(
+        (b.camera_id, Sighting(i, np.full((len(b.uv), 3), np.nan), b.uv))
+        for i, b in enumerate(survey.image_blocks) if b.target_id is None and b.camera_id in lenses
+    )  # fmt: skip
+    seen, _ = sights_of(cameras, lenses, unknown)
     parts = []
-    for i, rays in rays_by_block(replace(survey, cameras=tuple(cameras.values())), lenses, mine)[0].items():
+    for k in np.argsort(seen.block_idx).tolist():
+        i, rays = int(seen.block_idx[k]), seen.rays[slice(*seen.ptr[k : k + 2])]
         block, n = survey.image_blocks[i], len(rays)
         pose = prediction.pose(block, {})
         if pose is not None:
-            focal = focal_px(cameras[block.camera_id], lenses[block.camera_id])
             o = np.tile(-pose[:3, :3].T @ pose[:3, 3], (n, 1))
-            parts.append((np.full(n, i), block.point_idx, o, rays @ pose[:3, :3], np.full(n, focal)))
+            parts.append((np.full(n, i), block.point_idx, o, rays @ pose[:3, :3], np.full(n, seen.focal_px[k])))
     return Rays(*(np.concatenate(x) for x in zip(*parts, strict=True))) if parts else None

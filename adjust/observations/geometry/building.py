@@ -8,7 +8,8 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.frames.state import State
-from adjust.frames.unknowns import Chain, FrameTree, Unknowns, VectorMap, vector_map
+from adjust.frames.tree import FrameTree
+from adjust.frames.unknowns import Chain, Unknowns, VectorMap, vector_map
 from adjust.model.errors import SurveyError
 from adjust.model.observations import (
     Alignment,

@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 
 from adjust.frames.state import State
-from adjust.frames.unknowns import FrameTree, Unknowns
+from adjust.frames.tree import FrameTree
+from adjust.frames.unknowns import Unknowns
 from adjust.model.observations import FrameRef, PositionRef
 from adjust.model.survey import Survey
 from adjust.observations.factors import ChainPose, Position

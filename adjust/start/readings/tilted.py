@@ -15,9 +15,9 @@ from adjust.model.observations import FrameRef, PositionRef
 from adjust.model.survey import FloatArray, Survey
 from adjust.observations.terrestrial.batch import circular_median
 from adjust.spatial.rigid import align, inverse, rotation_exp
+from adjust.start.chains import ChainObservation
 from adjust.start.closed_forms.absolute_pose import best_of, pose_solutions
 from adjust.start.closed_forms.triangulation import intersect
-from adjust.start.network import ChainObservation
 from adjust.start.positions import Positions
 from adjust.start.readings.sights import Node, node_of, spread_differences, ties
 
@@ -112,7 +112,7 @@ class TiltedSetups:
             return False
         self._told.add(frame)
         network = self.positions.network
-        network.observations.append(ChainObservation(self.positions.chain(frame), pose[None]))
+        network.observe([ChainObservation(self.positions.chain(frame), pose[None])])
         network.propagate()
         return True
 

@@ -13,7 +13,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from adjust.frames.unknowns import FrameTree, Link, Unknowns
+from adjust.frames.tree import FrameTree
+from adjust.frames.unknowns import Link, Unknowns
 from adjust.model.errors import listed
 from adjust.model.observations import FrameRef, ImageBlock, PositionRef
 from adjust.model.result import ParameterName

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adjust.frames.unknowns import FrameTree, Unknowns
+from adjust.frames.tree import FrameTree
+from adjust.frames.unknowns import Unknowns
 from adjust.model.errors import SurveyError, listed
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.spatial.rigid import align

@@ -1,24 +1,14 @@
 """Images of known points from which a lens is found: which of many, and how many points of each."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from adjust.model.survey import FloatArray
-from adjust.start.views import ENOUGH, few_of
+from adjust.start.views import ENOUGH, Sighting, few_of
 
 MOST_IMAGES = 30
 _MOST_POINTS = 1080  # of all images together
-
-
-@dataclass(frozen=True, eq=False)
-class Sighting:
-    """Known points (n, 3) m of one rigid body and their image points (n, 2) px in one image."""
-
-    block_idx: int
-    x: FloatArray
-    uv: FloatArray
 
 
 def plane_coordinates(x: FloatArray) -> FloatArray | None:
@@ -32,18 +22,15 @@ def plane_coordinates(x: FloatArray) -> FloatArray | None:
     return np.asarray(xy / np.sqrt((xy**2).sum(axis=1).max()))
 
 
-def thinned(images: Sequence[Sighting]) -> list[Sighting]:
-    """The images with no more points each than tell the lens and all poses, one array for all that show the same."""
-    most, parts = max(ENOUGH, _MOST_POINTS // max(1, min(len(images), MOST_IMAGES))), dict[int, FloatArray]()
-    out = []
-    for s in images:
-        if len(s.x) > most:
-            few = few_of(len(s.x), most)
-            if id(s.x) not in parts:
-                parts[id(s.x)] = s.x[few]
-            s = Sighting(s.block_idx, parts[id(s.x)], s.uv[few])
-        out.append(s)
-    return out
+def enough_points(n_images: int) -> int:
+    """Points of each of so many images that tell the lens and all poses."""
+    return max(ENOUGH, _MOST_POINTS // max(1, min(n_images, MOST_IMAGES)))
+
+
+def thinned(images: Sequence[Sighting], most: int) -> list[Sighting]:
+    """The images with at most so many points each, one array for all that show the same."""
+    parts = {i: x[few_of(len(x), most)] for i, x in {id(s.x): s.x for s in images if len(s.x) > most}.items()}
+    return [s._replace(x=parts[id(s.x)], uv=s.uv[few_of(len(s.x), most)]) if id(s.x) in parts else s for s in images]
 
 
 def every_nth(images: Sequence[Sighting], n: int) -> list[Sighting]:

@@ -1,11 +1,8 @@
-"""A start for the lens of one camera, from the targets it sees."""
+"""The search for the lens of one camera: a closed form or a scan, then the richest lens that its images determine."""
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
-from dataclasses import dataclass, replace
-from types import MappingProxyType
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,7 +11,6 @@ from adjust.lenses.models import (
     camera_constants,
     default_start,
     focal_length_px,
-    lens_model,
     principal_point_px,
     unit_rays,
 )
@@ -24,8 +20,8 @@ from adjust.native.lenses import Lens, fit_lens
 from adjust.native.views import homographies
 from adjust.start.closed_forms.absolute_pose import best_poses
 from adjust.start.closed_forms.zhang import pinhole_from_homographies
-from adjust.start.lens_images import MOST_IMAGES, Sighting, every_nth, plane_coordinates, spread_out, thinned
-from adjust.start.views import ends_of, rays_of_images
+from adjust.start.lens.images import MOST_IMAGES, enough_points, every_nth, plane_coordinates, spread_out, thinned
+from adjust.start.views import Sighting, ends_of, few_of, sights_of
 
 _SCAN_IMAGES = 8
 _MOST_SCREENED = 60
@@ -34,7 +30,7 @@ _GOOD_START = 0.01  # of the image width: with less error a closed form needs no
 _SEVERAL, _OTHER_STARTS = 3, 4  # images, and starts that are tried beside the first where that leads nowhere
 _LEVELS = ("focal centre k1 k2", "focal centre k1", "focal k1", "focal")
 _SIMPLE_PX = 2.0
-_FOCAL = {"fx", "fy", "c", "ck"}
+FOCAL = {"fx", "fy", "c", "ck"}
 _CENTRE = {"u0", "v0", "xp", "yp", "px", "py", "xh", "yh"}
 _RADIAL = {"k1": 1, "k2": 2, "K1": 1, "K2": 2, "A1": 1, "A2": 2}
 
@@ -76,97 +72,27 @@ class LensStart:
     refined: bool = True
 
 
-def start_lens(
-    camera: Camera, sightings: Sequence[Sighting], lent: Mapping[str, float] = MappingProxyType({}),
-    near: FloatArray | None = None,
-) -> LensStart:  # fmt: skip
-    """Lens values from the given ones, or from the images of known points; ``lent``: those that another camera tells.
-
-    Planar targets: Zhang's closed form, or the best of a scan of focal lengths, then lens and poses together on at most
-    30 well-spread images. Raises SurveyError naming the camera where nothing determines its focal length.
-    near: values (n,) whose focal length and centre are taken where no closed form misses little: nothing is scanned.
-    """
-    model = lens_model(camera.lens.model)
-    if camera.lens.values is not None:
-        _check_given(camera, model)
-        return LensStart(np.array(camera.lens.values, dtype=float), "lens as given", {})
-    known = _remembered.get()
-    if known is None:
-        return _LensSearch(camera, model, lent).run(sightings, near)
-    key = (camera.camera_id, camera.image_size, id(camera.lens), tuple(lent.items()),
-           tuple((s.x.tobytes(), s.uv.tobytes()) for s in sightings))  # fmt: skip
-    if key not in known or (known[key].near and near is None):
-        alone = [replace(s, block_idx=i) for i, s in enumerate(sightings)]
-        try:
-            start: LensStart | SurveyError = _LensSearch(camera, model, lent).run(alone, near)
-        except SurveyError as error:
-            start = error
-        known[key] = _Known(camera, start, near is not None and isinstance(start, LensStart) and not start.refined)
-    found = known[key].start
-    if isinstance(found, SurveyError):
-        raise found
-    return replace(found, values=found.values.copy(),
-                   excluded={sightings[i].block_idx: why for i, why in found.excluded.items()})  # fmt: skip
-
-
-@contextmanager
-def remembering() -> Iterator[None]:
-    """Inside, what the same images of a camera have told of its lens is not searched again: of surveys that are alike.
-
-    The cameras are kept as long: their lenses are told apart by identity.
-    """
-    token = _remembered.set({})
-    try:
-        yield
-    finally:
-        _remembered.reset(token)
-
-
-@dataclass(frozen=True, eq=False)
-class _Known:
-    """near: whether the search ended at values that were known before, though these led nowhere."""
-
-    camera: Camera
-    start: LensStart | SurveyError
-    near: bool
-
-
-_remembered: ContextVar[dict[object, _Known] | None] = ContextVar("remembered lenses", default=None)
-
-
-def _check_given(camera: Camera, model: LensModel) -> None:
-    values = np.asarray(camera.lens.values)
-    if values.shape != (model.n,):
-        raise SurveyError(f"camera {camera.camera_id!r}: {values.size} lens values given, {model.name} has {model.n}")
-    for name, value in zip(model.names, values, strict=True):
-        if name in _FOCAL and not value > 0:
-            raise SurveyError(
-                f"camera {camera.camera_id!r}: the lens value {name} is {value:g}; give a positive start for it, or no"
-                " lens values at all, then they are found from the images"
-            )
-
-
-class _LensSearch:
+class LensSearch:
     """The search for one camera; keeps what does not change on the way."""
 
     def __init__(self, camera: Camera, model: LensModel, lent: Mapping[str, float]) -> None:
         self.camera, self.model, self.size = camera, model, camera.image_size
         self.constants = camera_constants(camera)
-        self._plane: dict[int, FloatArray | None] = {}
         self.prior = dict(lent)
         if camera.lens.prior is not None:
             self.prior |= dict(zip(camera.lens.prior.names, camera.lens.prior.mean, strict=True))
         self.tied = {tie.name: tie for tie in camera.lens.ties}
         free = set(camera.lens.free) | {t.name for t in camera.lens.ties if t.to in camera.lens.free}
         for name in model.names:
-            if name in (_FOCAL | {"u0", "v0", "px", "py"}) and name not in free and name not in self.prior:
+            if name in (FOCAL | {"u0", "v0", "px", "py"}) and name not in free and name not in self.prior:
                 raise SurveyError(
                     f"camera {camera.camera_id!r}: {name} is held but has no value; give lens values or free it"
                 )
 
     def run(self, sightings: Sequence[Sighting], near: FloatArray | None) -> LensStart:
-        usable = thinned([s for s in sightings if len(s.x) >= 4])
-        if any(name in self.prior for name in _FOCAL):
+        """See :func:`adjust.start.lens.start.start_lens`."""
+        usable = [s for s in sightings if len(s.x) >= 4]
+        if any(name in self.prior for name in FOCAL):
             focal = self.prior.get("fx", self.prior.get("c", self.prior.get("ck", 0.0)))
             return LensStart(self._values(focal / (self.constants[0] if self.model.in_mm else 1.0)), "lens prior", {})
         if not usable:
@@ -175,10 +101,13 @@ class _LensSearch:
                 " show it a target, or give lens values"
             )
         # the other images of a long series are screened by their poses
-        flat = every_nth([s for s in usable if self._on_plane(s) is not None], _MOST_SCREENED)
+        most = enough_points(len(usable))
+        planar = {i: plane_coordinates(x[few_of(len(x), most)]) is not None
+                  for i, x in {id(s.x): s.x for s in usable}.items()}  # fmt: skip
+        flat = thinned(every_nth([s for s in usable if planar[id(s.x)]], _MOST_SCREENED), most)
         maps, excluded = self._screen(flat) if flat else ({}, {})
         chosen = spread_out([s for s in flat if s.block_idx in maps])
-        chosen = chosen or [s for s in usable if s.block_idx not in excluded][:MOST_IMAGES]
+        chosen = chosen or thinned([s for s in usable if s.block_idx not in excluded][:MOST_IMAGES], most)
         if not chosen:
             raise SurveyError(
                 f"camera {self.camera.camera_id!r}: none of its {len(flat)} images fits a plane; the first: "
@@ -194,17 +123,11 @@ class _LensSearch:
         unrefined = first.values, f"lens from {len(chosen)} images ({first.how}; too few to refine it)"
         return LensStart(*(found or unrefined), excluded, found is not None)
 
-    def _on_plane(self, sighting: Sighting) -> FloatArray | None:
-        """Coordinates in the points' plane, asked for once for all images that show the same array of points."""
-        key = id(sighting.x)
-        if key not in self._plane:
-            self._plane[key] = plane_coordinates(sighting.x)
-        return self._plane[key]
-
     def _screen(self, flat: Sequence[Sighting]) -> tuple[dict[int, FloatArray | None], dict[int, str]]:
         """Images that fit a plane, with their homographies where determined; a wrong point order misses by far."""
         ptr, uv = ends_of([len(s.x) for s in flat]), np.concatenate([s.uv for s in flat])
-        h, misses, found = homographies(np.concatenate([self._plane[id(s.x)] for s in flat]), uv, ptr, 1)
+        xy = {id(s.x): plane_coordinates(s.x) for s in flat}
+        h, misses, found = homographies(np.concatenate([xy[id(s.x)] for s in flat]), uv, ptr, 1)
         span = np.maximum.reduceat(uv, ptr[:-1]) - np.minimum.reduceat(uv, ptr[:-1])
         misfit = misses[:, 1] / np.maximum(np.hypot(*span.T), 1e-9)
         limit = max(0.02, 6.0 * float(np.median(misfit)))
@@ -269,13 +192,11 @@ class _LensSearch:
 
     def _tried(self, values: FloatArray, how: str, images: Sequence[Sighting]) -> _Trial:
         """A lens with the best pose of every image."""
-        rays = rays_of_images(self.camera, values, [s.uv for s in images])
-        some = [i for i, r in enumerate(rays) if not isinstance(r, SurveyError)]
+        camera_id = self.camera.camera_id
+        sights, lost = sights_of({camera_id: self.camera}, {camera_id: values}, {camera_id: images})
+        some = [s.block_idx not in lost for s in images]
         poses, errors = np.tile(np.eye(4), (len(images), 1, 1)), np.full(len(images), np.inf)
-        if some:
-            seen, x = (np.concatenate([part[i] for i in some]) for part in (rays, [s.x for s in images]))
-            ptr = ends_of([len(images[i].x) for i in some])
-            poses[some], errors[some] = best_poses(x, seen, ptr, _REFINEMENTS)
+        poses[some], errors[some] = best_poses(sights.x, sights.rays, sights.ptr, _REFINEMENTS)
         focal = focal_length_px(self.model, values, self.constants)
         return _Trial(values, how, poses, errors, float(np.median(errors)) * focal)
 
@@ -321,7 +242,7 @@ class _LensSearch:
 
     def _directions(self, level: str) -> FloatArray:
         """Columns (n, p) of the lens components that this level frees, with ties; fx, fy apart only with the centre."""
-        wanted = set(_FOCAL)
+        wanted = set(FOCAL)
         wanted |= _CENTRE if "centre" in level else set()
         wanted |= {name for name, order in _RADIAL.items() if f"k{order}" in level}
         names, columns = self.model.names, []
@@ -347,7 +268,7 @@ class _LensSearch:
         width = max(self.size)
         sigma = np.sqrt(np.einsum("ij,jk,ik->i", directions, fit.cov, directions))
         pixel = 1.0 / self.constants[0] if self.model.in_mm else 1.0
-        limits = {**dict.fromkeys(_FOCAL, 0.1 * focal), **dict.fromkeys(_CENTRE, 0.1 * width)}
+        limits = {**dict.fromkeys(FOCAL, 0.1 * focal), **dict.fromkeys(_CENTRE, 0.1 * width)}
         known = all(s * pixel <= limits[n] for n, s in zip(self.model.names, sigma, strict=True) if n in limits)
         centre = principal_point_px(self.model, fit.values, self.constants)
         inside = np.all(np.abs(centre - self.constants[1:3]) < 0.3 * width)
