@@ -83,8 +83,8 @@ def launched() -> Iterator[Any]:
 class Page:
     """A page, with what it complained of and what it asked of others: of nothing where it is left without an error.
 
-    All pages of a browser are tabs of one context, whose scripts are compiled once: half of what a page takes. What a
-    page keeps for the next one goes when it is closed. ``apart``: in a context, and so in a process, of its own.
+    All pages of a browser are tabs of one context, for which scripts are compiled once. What a page keeps for the next
+    one goes when it is closed. ``apart``: in a context, and so in a process, of its own.
     """
 
     def __init__(
