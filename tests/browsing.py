@@ -6,11 +6,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pytest
 
 from survey.report import page as printing
+from survey.workbench.guard import new_token
+from survey.workbench.live import Listening
+from survey.workbench.server import Server
 
 SECONDS = 120.0  # the machine may be busy
 READY = "document.body.dataset.ready !== undefined"
@@ -78,11 +81,19 @@ def launched() -> Iterator[Any]:
 
 
 class Page:
-    """A page, with what it complained of and what it asked of others."""
+    """A page, with what it complained of and what it asked of others: of nothing where it is left without an error.
 
-    def __init__(self, browser: Any, address: str, width: int, ready: str = READY, **given: Any) -> None:
-        self.context = browser.new_context(viewport={"width": width, "height": 800}, locale="en-GB", **given)
-        self.page = self.context.new_page()
+    All pages of a browser are tabs of one context, for which scripts are compiled once. What a page keeps for the next
+    one goes when it is closed. ``apart``: in a context, and so in a process, of its own.
+    """
+
+    def __init__(
+        self, browser: Any, address: str, width: int, ready: str = READY, dark: bool = False, apart: bool = False
+    ) -> None:
+        shared = [] if apart else browser.contexts
+        self.page = (shared[0] if shared else browser.new_context(locale="en-GB")).new_page()
+        self.page.set_viewport_size({"width": width, "height": 800})
+        self.page.emulate_media(color_scheme="dark" if dark else "light")
         self.complaints: list[str] = []
         self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
         self.page.on("console", lambda m: self.complaints.append(m.text) if m.type in ("error", "warning") else None)
@@ -90,6 +101,17 @@ class Page:
                      self.complaints.append(r.url))  # fmt: skip
         self.page.goto(address)
         self.wait(ready)
+
+    def close(self) -> None:
+        self.page.evaluate("localStorage.clear()")
+        self.page.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, error: object, *_: object) -> None:
+        self.close()
+        assert error or self.complaints == []
 
     def wait(self, expression: str) -> None:
         """Polls from outside: inside the page the content policy forbids evaluating a text. What is slow less often."""
@@ -106,8 +128,24 @@ class Page:
         act()
         self.wait("document.body.dataset.done !== undefined")
 
+    def drawn(self, expression: str) -> Any:
+        """What an expression is once all that was changed has been drawn."""
+        self.page.evaluate("new Promise((r) => requestAnimationFrame(() => requestAnimationFrame(() => r(0))))")
+        return self.page.evaluate(expression)
+
     def facts(self) -> str:
         return str(self.page.inner_text("#facts"))
+
+
+@contextmanager
+def opened(browser: Any, shown: Any, width: int = 1280, place: str = "", apart: bool = False) -> Iterator[Page]:
+    """The workbench at a place of what it shows, served until its page is closed."""
+    token = new_token()
+    with (
+        Listening(Server(shown, token), "127.0.0.1", 0) as listening,
+        Page(browser, f"{listening.address}#token={token}{place}", width, apart=apart) as page,
+    ):
+        yield page
 
 
 def asked(
@@ -117,11 +155,5 @@ def asked(
     """What expressions are, one after the other, on a page as first opened, at a place of it."""
     path = folder / "page.html"
     path.write_text(page, encoding="utf-8")
-    shown = Page(browser, path.as_uri() + place, width, ready, color_scheme="dark" if dark else "light")
-    found = []
-    for question in questions:
-        shown.page.evaluate("new Promise((r) => requestAnimationFrame(() => requestAnimationFrame(() => r(0))))")
-        found.append(shown.page.evaluate(question))
-    shown.context.close()
-    assert shown.complaints == []
-    return found
+    with Page(browser, path.as_uri() + place, width, ready, dark) as shown:
+        return [shown.drawn(question) for question in questions]

@@ -74,13 +74,9 @@ class Outcome:
     def summary(self) -> dict[str, Any]:
         """As plain values."""
         return {
-            "folder": str(self.folder),
-            "epochs_planned": self.planned,
-            "epochs_before": self.before,
-            "epochs_taken": self.taken,
-            "retries": dict(self.retries),
-            "seconds": round(self.seconds, 3),
-        }
+            "folder": str(self.folder), "epochs_planned": self.planned, "epochs_before": self.before,
+            "epochs_taken": self.taken, "retries": dict(self.retries), "seconds": round(self.seconds, 3),
+        }  # fmt: skip
 
 
 class Session:
@@ -221,17 +217,10 @@ class Session:
         images = {camera_id: self._write(camera_id, shot, frame) for camera_id, frame in frames.items()}
         journal = self._require_journal()
         record = journal.append(
-            "set",
-            epoch_id=shot.epoch_id,
-            pose_id=shot.pose_id,
-            repeat=shot.repeat,
-            attempt=attempt,
-            planned_deg=np.degrees(shot.angles).tolist(),
-            before=location_dict(before),
-            after=location_dict(after),
-            images=images,
-            **clocks(),
-        )
+            "set", epoch_id=shot.epoch_id, pose_id=shot.pose_id, repeat=shot.repeat, attempt=attempt,
+            planned_deg=np.degrees(shot.angles).tolist(), before=location_dict(before), after=location_dict(after),
+            images=images, **clocks(),
+        )  # fmt: skip
         done = len(set(journal.taken()) & {s.epoch_id for s in plan.shots})
         self._listener(Taken(record, frames, done, len(plan.shots)))
 

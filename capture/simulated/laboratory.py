@@ -15,8 +15,9 @@ from gtsam import Pose3
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
 from survey.simulate.draft import Draft
+from survey.simulate.facets import PlacedTarget
 from survey.simulate.parts import BOARD, add_beacons, add_head, add_table, shoot_board_from_table, turn_to_walls
-from survey.simulate.rendering import Beacons, GrayImage, Imaging, PlacedTarget, may_be_seen, render, scene_camera
+from survey.simulate.rendering import Beacons, GrayImage, Imaging, may_be_seen, render, scene_camera
 from survey.simulate.scene import Scene, Truth, transform
 
 CAMERA_IDS = ("X", "Y", "Z")

@@ -14,7 +14,8 @@ from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
 from survey.project.targets import PointList
 from survey.simulate.draft import Draft, Shot
-from survey.simulate.rendering import Beacons, GrayImage, Imaging, PlacedTarget, may_be_seen, render, scene_camera
+from survey.simulate.facets import PlacedTarget
+from survey.simulate.rendering import Beacons, GrayImage, Imaging, may_be_seen, render, scene_camera
 from survey.simulate.scene import Scene, transform
 
 # a gray sensor with some gain in a room of ordinary light

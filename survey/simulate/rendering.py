@@ -3,14 +3,11 @@
 The lens is OpenCV's (fx fy cx cy, k1 k2 p1 p2 k3 k4 k5 k6), the centre of the first pixel is (0, 0). Sub-pixels
 integrate over their area (a Fibonacci lattice of rays where they see an edge); then follow a Gaussian point spread, the
 sum to pixels, illumination, Gaussian noise and the digits of the sensor. What is nearer hides what is behind it.
-
-Textures: the square of a checkerboard between r0c0, r0c1, r1c1 and r1c0 is dark, as is the outer one at r0c0; boards
-have one row of squares outside the inner corners and a bright margin. Targets show a plain back.
 """
 
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
@@ -23,8 +20,7 @@ from scipy.special import erf
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
 from adjust.native.vision import Facets, draw_facets, pixel_corner_rays, spread_and_sum
-from survey.project.dictionaries import charuco_board, marker_cells
-from survey.project.targets import Charuco, Checkerboard, DetectableTarget, MarkerBlock, MarkerGrid
+from survey.simulate.facets import Facet, PlacedTarget, facets_of
 from survey.simulate.scene import BROWN, Scene
 
 GrayImage = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
@@ -54,16 +50,6 @@ class BrownCamera:
         if len(self.distortion) > 8:
             raise SurveyError(f"distortion: {len(self.distortion)} coefficients given; give k1 k2 p1 p2 k3 k4 k5 k6")
         return self.distortion + (0.0,) * (8 - len(self.distortion))
-
-
-@dataclass(frozen=True, eq=False)
-class PlacedTarget:
-    """A target in front of the camera, with the grey values of its ink and its paper."""
-
-    target: DetectableTarget
-    camera_from_target: Pose3
-    dark_gray: float = 30.0
-    bright_gray: float = 220.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,33 +87,6 @@ class Imaging:
     bits: int = 8
 
 
-@dataclass(frozen=True, eq=False)
-class _Facet:
-    """A plane of grey cells: ``camera_from_facet`` columns are x, y axes and origin; z = x cross y is its back."""
-
-    camera_from_facet: FloatArray
-    x_edges: FloatArray
-    y_edges: FloatArray
-    cells: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class _Patch:
-    """Cells (rows, columns), 0 dark and 1 bright, over a rectangle of a plane: origin and width of one cell, in m."""
-
-    x0: float
-    y0: float
-    x_step: float
-    y_step: float
-    cells: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
-
-    def x_edges(self) -> FloatArray:
-        return self.x0 + self.x_step * np.arange(self.cells.shape[1] + 1)
-
-    def y_edges(self) -> FloatArray:
-        return self.y0 + self.y_step * np.arange(self.cells.shape[0] + 1)
-
-
 def scene_camera(scene: Scene, camera_id: str) -> BrownCamera:
     """A camera as it truly is."""
     lens = dict(zip(BROWN, scene.vector("lens", camera_id), strict=True))
@@ -157,7 +116,7 @@ def render(
 ) -> GrayImage:
     """The image (height, width) of all targets and beacons; equal arguments give equal images."""
     imaging = imaging or Imaging()
-    facets = [facet for placed in targets for facet in _facets(placed)]
+    facets = [facet for placed in targets for facet in facets_of(placed)]
     image = _blurred_planes(camera, facets, imaging)
     image *= _illumination(camera.image_size, imaging.gradient)
     if beacons is not None:
@@ -173,7 +132,7 @@ def render(
     return np.asarray(image, np.uint8) if imaging.bits <= 8 else np.asarray(image, np.uint16)
 
 
-def _blurred_planes(camera: BrownCamera, facets: list[_Facet], imaging: Imaging) -> _Gray32:
+def _blurred_planes(camera: BrownCamera, facets: list[Facet], imaging: Imaging) -> _Gray32:
     """Grey values under the point spread, which acts on sub-pixels before they are summed to pixels."""
     width, height = camera.image_size
     if not imaging.blur_px > 0.0:
@@ -220,7 +179,7 @@ def _lattice(n: int) -> FloatArray:
     return np.stack([(i + 0.5) / n, ((i * previous) % n + 0.5) / n], axis=1)
 
 
-def _draw_planes(camera: BrownCamera, n: int, facets: list[_Facet], imaging: Imaging, image: _Gray32) -> None:
+def _draw_planes(camera: BrownCamera, n: int, facets: list[Facet], imaging: Imaging, image: _Gray32) -> None:
     """Grey values of n x n sub-pixels in each pixel, before the point spread, into image."""
     if not facets:
         image.fill(imaging.background_gray)
@@ -233,105 +192,17 @@ def _draw_planes(camera: BrownCamera, n: int, facets: list[_Facet], imaging: Ima
         counts[k] = columns, rows
         x_edges[k, : columns + 1], y_edges[k, : rows + 1], cells[k, :rows, :columns] = f.x_edges, f.y_edges, f.cells
     inverse = np.stack([np.linalg.inv(f.camera_from_facet) for f in facets])
-    bounds = np.stack([_bounds(f) for f in facets])
+    bounds = np.stack([f.bounds() for f in facets])
     planes = Facets(inverse, bounds, counts, x_edges, y_edges, cells)
     draw_facets(_rays(camera), n, planes, float(imaging.background_gray), _lattice(imaging.samples), image)
 
 
-def _bounds(facet: _Facet) -> FloatArray:
-    """Bounding box (4,) of the facet in x/z, y/z: x from, x to, y from, y to."""
-    a, b = facet.x_edges[[0, -1, 0, -1]], facet.y_edges[[0, 0, -1, -1]]
-    x = facet.camera_from_facet @ np.stack([a, b, np.ones(4)])
-    if x[2].max() <= 0.0:
-        return np.array([np.inf, -np.inf, np.inf, -np.inf])
-    if x[2].min() <= 0.0:
-        return np.array([-np.inf, np.inf, -np.inf, np.inf])
-    p = x[:2] / x[2]
-    return np.array([p[0].min(), p[0].max(), p[1].min(), p[1].max()])
-
-
-def _facets(placed: PlacedTarget) -> list[_Facet]:
-    pose = placed.camera_from_target
-    target = placed.target
-    if not isinstance(target, MarkerBlock):
-        patches = _board_patches(target)
-        axes = np.column_stack([pose.rotation().matrix()[:, :2], pose.translation()])
-        return [_facet(placed, axes, patches)]
-    facets = []
-    for marker, corners in sorted(target.corners.items()):
-        cells = marker_cells(target.dictionary, marker)
-        n = len(cells)
-        c = pose.transformFrom(np.ascontiguousarray(np.asarray(corners, float).T)).T
-        axes = np.column_stack([c[1] - c[0], c[3] - c[0], c[0]])
-        quiet = _Patch(-1.0 / n, -1.0 / n, 1.0 + 2.0 / n, 1.0 + 2.0 / n)
-        facets.append(_facet(placed, axes, [quiet, _Patch(0.0, 0.0, 1.0 / n, 1.0 / n, cells)]))
-    return facets
-
-
-def _facet(placed: PlacedTarget, axes: FloatArray, patches: list[_Patch]) -> _Facet:
-    """One plane of cells from patches, the later ones on top; its back is plain."""
-    x_edges, y_edges = _union([p.x_edges() for p in patches]), _union([p.y_edges() for p in patches])
-    x, y = (x_edges[1:] + x_edges[:-1]) / 2, (y_edges[1:] + y_edges[:-1]) / 2
-    cells = np.ones((len(y), len(x)))
-    for p in patches:
-        i, j = np.searchsorted(p.x_edges(), x) - 1, np.searchsorted(p.y_edges(), y) - 1
-        inside_x, inside_y = (i >= 0) & (i < p.cells.shape[1]), (j >= 0) & (j < p.cells.shape[0])
-        cells[np.ix_(inside_y, inside_x)] = p.cells[np.ix_(j[inside_y], i[inside_x])]
-    if np.linalg.det(axes) < 0.0:
-        cells[:] = 0.5
-    gray = placed.dark_gray + (placed.bright_gray - placed.dark_gray) * cells
-    return _Facet(axes, x_edges, y_edges, gray)
-
-
-def _union(edges: list[FloatArray]) -> FloatArray:
-    """All edges in order; those that differ by rounding alone are one."""
-    merged = np.sort(np.concatenate(edges))
-    keep = np.concatenate([[True], np.diff(merged) > 1e-9 * (merged[-1] - merged[0])])
-    return np.asarray(merged[keep], float)
-
-
-def _board_patches(target: Checkerboard | Charuco | MarkerGrid) -> list[_Patch]:
-    if isinstance(target, Checkerboard):
-        s = target.square_m
-        j, i = np.mgrid[-1 : target.rows, -1 : target.columns]
-        margin = _Patch(-2.0 * s, -2.0 * s, (target.columns + 3) * s, (target.rows + 3) * s)
-        return [margin, _Patch(-s, -s, s, s, ((i + j) % 2).astype(float))]
-    if isinstance(target, Charuco):
-        return _charuco_patches(target)
-    step, m = target.marker_m + target.gap_m, target.marker_m
-    edge = max(target.gap_m, m / 4.0)
-    margin = _Patch(
-        -edge, -edge, target.columns * step - target.gap_m + 2 * edge, target.rows * step - target.gap_m + 2 * edge
-    )
-    patches = [margin]
-    for k in range(target.rows * target.columns):
-        cells = marker_cells(target.dictionary, target.first_id + k)
-        row, column = divmod(k, target.columns)
-        patches.append(_Patch(column * step, row * step, m / len(cells), m / len(cells), cells))
-    return patches
-
-
-def _charuco_patches(target: Charuco) -> list[_Patch]:
-    """The board as OpenCV lays it out; a square that holds a marker is bright."""
-    board, s = charuco_board(target), target.square_m
-    squares = np.zeros((target.squares_y, target.squares_x))
-    markers = []
-    for marker, corners in zip(np.ravel(board.getIds()), board.getObjPoints(), strict=True):
-        x, y = np.asarray(corners, float).reshape(4, 3)[0, :2]
-        squares[int(y / s), int(x / s)] = 1.0
-        cells = marker_cells(target.dictionary, int(marker))
-        step = target.marker_m / len(cells)
-        markers.append(_Patch(x - s, y - s, step, step, cells))
-    margin = _Patch(-1.5 * s, -1.5 * s, (target.squares_x + 1.0) * s, (target.squares_y + 1.0) * s)
-    return [margin, _Patch(-s, -s, s, s, squares), *markers]
-
-
-def _add_beacons(image: _Gray32, camera: BrownCamera, beacons: Beacons, facets: list[_Facet], blur_px: float) -> None:
+def _add_beacons(image: _Gray32, camera: BrownCamera, beacons: Beacons, facets: list[Facet], blur_px: float) -> None:
     """Adds the spots to ``image``: many points of each disc, each with its point spread integrated over the pixels."""
     x = np.asarray(beacons.x_in_camera, float).reshape(-1, 3)
     surface = np.broadcast_to(np.asarray(beacons.surface_gray, float), (len(x),))
     for centre, gray in zip(x, surface, strict=True):
-        if centre[2] <= 0.0 or any(_hides(f, centre) for f in facets):
+        if centre[2] <= 0.0 or any(f.hides(centre) for f in facets):
             continue
         points, area = _spot_points(centre, beacons)
         uv = camera.project(points)
@@ -382,13 +253,3 @@ def _integral(distance: FloatArray, sigma: float) -> FloatArray:
     """Share of a Gaussian that falls on a pixel at ``distance`` from its centre, in one direction."""
     s = sigma * np.sqrt(2.0)
     return np.asarray(0.5 * (erf((distance + 0.5) / s) - erf((distance - 0.5) / s)))
-
-
-def _hides(facet: _Facet, x_in_camera: FloatArray) -> bool:
-    """Whether the facet lies between the camera and the point."""
-    q = np.linalg.solve(facet.camera_from_facet, x_in_camera)
-    if q[2] <= 1.0:  # q[2] is the depth of the point over that of the facet
-        return False
-    a, b = q[0] / q[2], q[1] / q[2]
-    inside = facet.x_edges[0] <= a <= facet.x_edges[-1] and facet.y_edges[0] <= b <= facet.y_edges[-1]
-    return bool(inside)

@@ -93,12 +93,14 @@ def test_killed_before_any_step(grounds: dict[str, Ground], name: str) -> None:
 
 @pytest.mark.parametrize("name", ["adjust", "remove"])
 def test_killed_at_any_instant(grounds: dict[str, Ground], name: str) -> None:
-    ground, hits = grounds[name], 0
+    """The machine may have been busier when the command's time was taken: where it had ended, it is killed earlier."""
+    seconds = grounds[name].seconds
     for share in (0.3, 0.6, 0.85):
-        was_at_work, faults = killed_at_instant(ground, share * ground.seconds)
-        hits += was_at_work
-        assert faults == []
-    assert hits > 0
+        was_at_work = False
+        while not was_at_work:
+            was_at_work, faults = killed_at_instant(grounds[name], share * seconds)
+            assert faults == []
+            seconds *= 1.0 if was_at_work else 0.5
 
 
 def test_what_was_half_replaced_is_undone_with_a_line(

@@ -125,6 +125,7 @@ def test_parts_are_those_of_navigation_one_at_a_time():
         assert np.all(ratio > 0.4)
 
 
+@pytest.mark.slow
 def test_tolerances_keep_the_requirement_in_simulation():
     beacons, at = scattered_beacons(24, seed=4), poses(3)
     found = pose_budget(wide_head(), beacons, at)

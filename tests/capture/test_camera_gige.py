@@ -59,19 +59,19 @@ def test_pixels_are_those_that_were_sent_of_the_region_that_was_set(server: Gige
 
 
 def test_its_clock_is_told_in_nanoseconds(server: GigeServer) -> None:
+    """The best of several pauses, because other work on the machine may hold up one image on its way."""
     with open_camera(GIGE) as camera:
         set_up(camera)
         camera.arm()
-        stamps = []
-        for pause in (0.0, 0.2):
+        device, host = [], []
+        for pause in (0.0, 0.2, 0.2, 0.2):
             time.sleep(pause)
             camera.trigger()
-            frame = camera.fetch(2.0)
-            stamps.append((frame.device_time_ns, frame.host_monotonic_ns))
-    (device0, host0), (device1, host1) = stamps
-    assert device0 is not None
-    assert device1 is not None
-    assert (device1 - device0) * 1e-9 == pytest.approx((host1 - host0) * 1e-9, abs=0.05)
+            frame = camera.fetch(10.0)
+            assert frame.device_time_ns is not None
+            device.append(frame.device_time_ns)
+            host.append(frame.host_monotonic_ns)
+    assert np.abs(np.diff(device) - np.diff(host)).min() * 1e-9 < 0.05
 
 
 def test_block_ids_of_16_bit_begin_anew_at_1(port: None) -> None:

@@ -158,7 +158,7 @@ def test_restless_readback_does_not_settle(poll_s):
 
 
 def test_stop_ends_the_move_and_brakes():
-    table, _controller = make(AxisPhysics(speed=100 * DEG, acceleration=1000 * DEG))
+    table, _controller = make(AxisPhysics(speed=10 * DEG, acceleration=100 * DEG))  # 5 and 10 s away
     status = table.set(np.radians([50.0, 100.0]))
     time.sleep(0.15)
     table.stop()

@@ -12,13 +12,11 @@ from starlette.testclient import TestClient
 
 from survey.examples import write_example
 from survey.project.captured import Qualities, quality_path, session_status, status_path
-from survey.workbench.guard import new_token
-from survey.workbench.live import Listening
 from survey.workbench.pages import capturing
 from survey.workbench.pages.capturing import FolderView
 from survey.workbench.server import Server
 from survey.workbench.session import Workbench
-from tests.browsing import Page
+from tests.browsing import opened
 from tests.survey.test_workbench_server import BASE, HERE, TOKEN
 
 
@@ -135,10 +133,9 @@ def test_a_session_is_watched_in_the_workbench(browser, tmp_path, width):
     write_example("head", tmp_path / "lab")
     (tmp_path / "lab/images/X").mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(tmp_path / "lab/images/X/live1.png"), np.full((80, 100), 90, np.uint8))
-    bench, token = Workbench(tmp_path / "lab"), new_token()
+    bench = Workbench(tmp_path / "lab")
     bench.adjust()
-    with Listening(Server(bench, token), "127.0.0.1", 0) as listening:
-        page = Page(browser, f"{listening.address}#token={token}&view=findings,capture", width)
+    with opened(browser, bench, width, "&view=findings,capture") as page:
         page.wait("document.querySelector('#right .state')?.textContent === 'not started'")
         said(tmp_path / "lab", "live1")
         seen(tmp_path / "lab", "live1", [[10.0, 20.0], [60.0, 50.0]])
@@ -147,5 +144,3 @@ def test_a_session_is_watched_in_the_workbench(browser, tmp_path, width):
         assert "X · live1" in page.page.evaluate("document.querySelector('#right .camera').textContent")
         assert "1 of 4 epochs" in page.page.evaluate("document.querySelector('#right .capture').textContent")
         assert page.page.evaluate("document.documentElement.scrollWidth") <= width
-        page.context.close()
-    assert page.complaints == []

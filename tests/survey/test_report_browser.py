@@ -2,6 +2,8 @@
 
 import html
 import re
+from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -46,6 +48,21 @@ def cells(dom: str, column: int) -> list[str]:
 
 def numbers(texts: list[str]) -> list[float]:
     return [float(x.replace("−", "-").replace(",", ".")) for x in texts if x != "–"]
+
+
+@pytest.fixture(scope="module")
+def page(browser: Any, english: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    """A page that is looked at, and by no test changed."""
+    path = tmp_path_factory.mktemp("report") / "page.html"
+    path.write_text(english, encoding="utf-8")
+    with Page(browser, path.as_uri(), 1280, "document.documentElement.classList.contains('ready')") as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def paper(german: str) -> bytes:
+    need_browser()
+    return printing.report_pdf(german)
 
 
 def test_all_observations_can_be_sorted_and_searched(browser: Any, german: str, tmp_path: Path) -> None:
@@ -98,20 +115,19 @@ def test_places_of_the_workbench_lead_to_rows_of_the_report(
     assert is_inside
 
 
-def test_view_in_space_is_drawn_when_the_page_opens(browser: Any, english: str, tmp_path: Path) -> None:
+def test_view_in_space_is_drawn_when_the_page_opens(page: Page) -> None:
     space = "document.querySelector('#space canvas')"
-    width, n = asked(browser, english, tmp_path, f"{space}.width", f"{INKED}({space})")
-    assert width > 1000
-    assert n > 2000
+    assert page.drawn(f"{space}.width") > 1000
+    assert page.drawn(f"{INKED}({space})") > 2000
 
 
-def test_wheel_scrolls_the_page_and_zooms_with_ctrl(browser: Any, english: str, tmp_path: Path) -> None:
+def test_wheel_scrolls_the_page_and_zooms_with_ctrl(page: Page) -> None:
     turned = """[false, true].map((ctrlKey) => {
       const e = new WheelEvent("wheel", { deltaY: 100, ctrlKey, cancelable: true, bubbles: true });
       document.querySelector("#space canvas").dispatchEvent(e);
       return e.defaultPrevented; })"""
     touched = "getComputedStyle(document.querySelector('#space canvas')).touchAction"
-    assert asked(browser, english, tmp_path, turned, touched) == [[False, True], "pan-y"]
+    assert [page.drawn(turned), page.drawn(touched)] == [[False, True], "pan-y"]
 
 
 @pytest.mark.parametrize("width", [PHONE, 1280])
@@ -121,23 +137,24 @@ def test_nothing_is_wider_than_the_screen_and_no_figure_vanishes(
     measure = """[document.documentElement.scrollWidth,
       Math.min(...[...document.querySelectorAll("figure svg, canvas")].map((e) => e.getBoundingClientRect().width)),
       document.querySelector("#all [aria-sort]").getBoundingClientRect().right]"""
-    for page in (english, german):
-        ((page_width, smallest, sort_key),) = asked(browser, page, tmp_path, measure, width=width)
+    for text in (english, german):
+        ((page_width, smallest, sort_key),) = asked(browser, text, tmp_path, measure, width=width)
         assert page_width <= width
         assert smallest > 200
         assert sort_key <= width  # what the rows are sorted by is on the screen
 
 
-def test_every_control_and_heading_has_a_name(browser: Any, english: str, german: str, tmp_path: Path) -> None:
-    assert [asked(browser, page, tmp_path, FAULTS) for page in (english, german)] == [[[]], [[]]]
+def test_every_control_and_heading_has_a_name(browser: Any, page: Page, german: str, tmp_path: Path) -> None:
+    assert [page.drawn(FAULTS)] == asked(browser, german, tmp_path, FAULTS) == [[]]
 
 
-@pytest.mark.parametrize("dark", [False, True])
-def test_every_word_can_be_read_in_light_and_dark(browser: Any, english: str, tmp_path: Path, dark: bool) -> None:
-    behind = "getComputedStyle(document.body).backgroundColor"
-    (ratio, words), background = asked(browser, english, tmp_path, CONTRAST, behind, dark=dark)
-    assert ratio >= 4.5, words
-    assert (background != "rgb(255, 255, 255)") == dark
+def test_every_word_can_be_read_in_light_and_dark(page: Page) -> None:
+    for scheme in ("dark", "light"):
+        page.page.emulate_media(color_scheme=scheme)
+        ratio, words = page.drawn(CONTRAST)
+        assert ratio >= 4.5, words
+        background = page.page.evaluate("getComputedStyle(document.body).backgroundColor")
+        assert (background != "rgb(255, 255, 255)") == (scheme == "dark")
 
 
 def test_pictures_use_colours_that_have_a_dark_counterpart(english: str) -> None:
@@ -146,37 +163,28 @@ def test_pictures_use_colours_that_have_a_dark_counterpart(english: str) -> None
     assert used <= set(DARK)
 
 
-def test_on_paper_stands_nothing_that_needs_a_hand(browser: Any, english: str, tmp_path: Path) -> None:
-    (tmp_path / "page.html").write_text(english, encoding="utf-8")
-    ready = "document.documentElement.classList.contains('ready')"
-    shown = Page(browser, (tmp_path / "page.html").as_uri(), 1280, ready)
+def test_on_paper_stands_nothing_that_needs_a_hand(page: Page) -> None:
     displayed = """[...document.querySelectorAll("#all, #space, .screen, .paper")]
       .map((e) => [e.id || e.className.split(" ").pop(), getComputedStyle(e).display])"""
-    assert {name for name, how in shown.page.evaluate(displayed) if how != "none"} >= {"all", "space", "screen"}
-    shown.page.emulate_media(media="print")
-    assert {name for name, how in shown.page.evaluate(displayed) if how != "none"} == {"paper"}
-    shown.context.close()
+    assert {name for name, how in page.drawn(displayed) if how != "none"} >= {"all", "space", "screen"}
+    page.page.emulate_media(media="print")
+    assert {name for name, how in page.drawn(displayed) if how != "none"} == {"paper"}
+    page.page.emulate_media(media="screen")
 
 
-def test_a_camera_is_one_page_of_paper(german: str, tmp_path: Path) -> None:
-    need_browser()
+def test_a_camera_is_one_page_of_paper(paper: bytes) -> None:
     pypdf = pytest.importorskip("pypdf")
-    path = tmp_path / "report.pdf"
-    path.write_bytes(printing.report_pdf(german))
-    pages = [page.extract_text() for page in pypdf.PdfReader(path).pages]
+    pages = [page.extract_text() for page in pypdf.PdfReader(BytesIO(paper)).pages]
     at = [next(i for i, text in enumerate(pages) if f"Kamera {name}" in text) for name in "XYZ"]
     assert at == list(range(at[0], at[0] + 3))
     for name, i in zip("XYZ", at, strict=True):
         assert f"{name} station_from_camera" in pages[i]
 
 
-def test_report_on_paper_has_the_words_of_the_page(german: str, tmp_path: Path) -> None:
-    need_browser()
-    path = tmp_path / "report.pdf"
-    path.write_bytes(printing.report_pdf(german))
-    assert path.read_bytes().startswith(b"%PDF")
+def test_report_on_paper_has_the_words_of_the_page(paper: bytes) -> None:
+    assert paper.startswith(b"%PDF")
     pypdf = pytest.importorskip("pypdf")
-    pages = [page.extract_text() for page in pypdf.PdfReader(path).pages]
+    pages = [page.extract_text() for page in pypdf.PdfReader(BytesIO(paper)).pages]
     assert "Ausgleichungsbericht" in pages[0]
     assert "Globaltest" in pages[0]
     assert len(pages) > 3

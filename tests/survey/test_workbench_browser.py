@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+from base64 import b64encode
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from survey.workbench.pages.beginning import Beginning
 from survey.workbench.rows import columns
 from survey.workbench.server import WEB, Server
 from survey.workbench.session import Workbench
-from tests.browsing import CONTRAST, INKED, Page
+from tests.browsing import CONTRAST, INKED, Page, opened
 from tests.survey.accessible import FAULTS
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -82,10 +83,8 @@ def address(folder: Path) -> Iterator[str]:
 @pytest.fixture
 def page(browser: Any, address: str) -> Iterator[Page]:
     """The page as first opened on a desk; it may complain of nothing."""
-    found = Page(browser, address, 1280)
-    yield found
-    found.context.close()
-    assert found.complaints == []
+    with Page(browser, address, 1280) as found:
+        yield found
 
 
 def test_a_wrong_point_is_found_left_out_and_taken_back(page: Page, folder: Path) -> None:
@@ -114,25 +113,24 @@ def test_a_wrong_point_is_found_left_out_and_taken_back(page: Page, folder: Path
     assert "excluded 0" in page.facts()
 
 
-def test_back_and_links_lead_to_places(page: Page) -> None:
-    p = page.page
+def test_back_and_links_lead_to_places(desk: Page) -> None:
+    p = desk.page
     p.locator("#tables .rows .row").nth(3).click()
-    page.wait("location.hash.startsWith('#obs=')")
+    desk.wait("location.hash.startsWith('#obs=')")
     first = p.evaluate("location.hash")
     p.locator("#inspector dd a").first.click()
-    page.wait("location.hash.startsWith('#image=')")
+    desk.wait("location.hash.startsWith('#image=')")
     assert p.inner_text("#inspector h2").startswith("image ")
     p.go_back()
-    page.wait(f"location.hash === {json.dumps(first)}")
+    desk.wait(f"location.hash === {json.dumps(first)}")
     assert p.inner_text("#inspector h2").startswith("observation ")
 
 
 @pytest.fixture(scope="module")
 def desk(browser: Any, address: str) -> Iterator[Page]:
     """A page on which views are chosen one after the other; it may complain of nothing."""
-    found = Page(browser, address, 1280)
-    yield found
-    found.context.close()
+    with Page(browser, address, 1280) as found:
+        yield found
 
 
 @pytest.mark.parametrize("view", VIEWS)
@@ -171,16 +169,16 @@ def test_the_table_is_a_grid_of_rows_in_sight(page: Page) -> None:
     page.wait("(location.hash.match(/obs=/g) ?? []).length === 2")
 
 
-def test_places_that_the_terminal_names_are_places_of_the_page(page: Page, folder: Path) -> None:
+def test_places_that_the_terminal_names_are_places_of_the_page(desk: Page, folder: Path) -> None:
     bench = Workbench(folder, read_only=True)
     bench.adjust()
     said = summary_text(bench.adjustment, bench.run())
     places = re.findall(r"(?m)  (#\w+=\S+)$", said)
     assert {place.partition("=")[0] for place in places} >= {"#image", "#reading"}
     for place in places:
-        page.page.evaluate(f"location.hash = {json.dumps(place)}")
-        page.wait(f"document.querySelector('#inspector .anchor')?.textContent === {json.dumps(place)}")
-        assert "There is no such" not in page.page.inner_text("#inspector")
+        desk.page.evaluate(f"location.hash = {json.dumps(place)}")
+        desk.wait(f"document.querySelector('#inspector .anchor')?.textContent === {json.dumps(place)}")
+        assert "There is no such" not in desk.page.inner_text("#inspector")
 
 
 @pytest.mark.parametrize(("place", "shown"), [
@@ -191,21 +189,19 @@ def test_places_that_the_terminal_names_are_places_of_the_page(page: Page, folde
 ])  # fmt: skip
 def test_every_kind_of_place_opens_what_it_names(browser: Any, address: str, place: str, shown: str) -> None:
     """As a link from a terminal or a mail: behind the token, in a page that was not open before."""
-    page = Page(browser, f"{address}&{place}", 1280)
-    p = page.page
-    page.wait("document.body.dataset.results !== undefined")
-    if place.startswith("run="):
-        assert p.inner_text("#right h2") == "History"
-    else:
-        assert p.inner_text("#inspector h2").endswith(shown)
-        assert p.locator("#inspector dl.facts, #inspector table").count() > 0
-        assert "There is no such" not in p.inner_text("#inspector")
-    if place.startswith(("image=", "obs=", "epoch=")):
-        assert "tX05" in p.inner_text("#right .bar b")
-    if place.startswith(("obs=", "reading=", "param=")):
-        page.wait("document.querySelectorAll('#tables .row[aria-selected=true]').length > 0")
-    page.context.close()
-    assert page.complaints == []
+    with Page(browser, f"{address}&{place}", 1280) as page:
+        p = page.page
+        page.wait("document.body.dataset.results !== undefined")
+        if place.startswith("run="):
+            assert p.inner_text("#right h2") == "History"
+        else:
+            assert p.inner_text("#inspector h2").endswith(shown)
+            assert p.locator("#inspector dl.facts, #inspector table").count() > 0
+            assert "There is no such" not in p.inner_text("#inspector")
+        if place.startswith(("image=", "obs=", "epoch=")):
+            assert "tX05" in p.inner_text("#right .bar b")
+        if place.startswith(("obs=", "reading=", "param=")):
+            page.wait("document.querySelectorAll('#tables .row[aria-selected=true]').length > 0")
 
 
 def test_the_address_of_a_run_shows_the_history(page: Page) -> None:
@@ -213,52 +209,48 @@ def test_the_address_of_a_run_shows_the_history(page: Page) -> None:
     page.wait("document.querySelector('#right h2')?.textContent === 'History'")
 
 
-def test_nothing_of_a_project_becomes_markup(page: Page) -> None:
-    p = page.page
+def test_nothing_of_a_project_becomes_markup(desk: Page) -> None:
+    p = desk.page
     assert p.inner_text("#title") == "<img src=x onerror=window.ran=1>"
     assert p.locator("header img").count() == 0
     assert p.evaluate("window.ran") is None
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1280, 390])
-def test_readable_on_desk_and_phone(browser: Any, address: str, scheme: str, width: int) -> None:
-    page = Page(browser, address, width, color_scheme=scheme)
-    p = page.page
-    for region in ("left", "tables", "inspector", "tree"):
-        p.evaluate(f"document.body.dataset.pane = '{region}'")
-        p.wait_for_timeout(30)
-        wide = p.evaluate("document.documentElement.scrollWidth")
-        assert wide <= width, region
-    ratio, text = p.evaluate(CONTRAST.replace("getClientRects().length", "checkVisibility({visibilityProperty: true})"
-                                              " || e.closest(':disabled')"))  # fmt: skip
-    page.context.close()
-    assert ratio >= 4.5, text
-    assert page.complaints == []
+def test_readable_on_desk_and_phone(browser: Any, address: str, width: int) -> None:
+    seen = CONTRAST.replace(
+        "getClientRects().length", "checkVisibility({visibilityProperty: true}) || e.closest(':disabled')"
+    )
+    with Page(browser, address, width) as page:
+        for scheme in ("light", "dark"):
+            page.page.emulate_media(color_scheme=scheme)
+            for region in ("left", "tables", "inspector", "tree"):
+                page.page.evaluate(f"document.body.dataset.pane = '{region}'")
+                assert page.drawn("document.documentElement.scrollWidth") <= width, (scheme, region)
+            ratio, text = page.drawn(seen)
+            assert ratio >= 4.5, (scheme, text)
 
 
 @pytest.mark.parametrize("width", [1280, 390])
 def test_no_table_of_a_view_is_cut(browser: Any, address: str, width: int) -> None:
     """In German too, whose words are longer."""
-    page = Page(browser, address, width)
-    p = page.page
-    page.wait("document.body.dataset.results !== undefined")
-    p.evaluate("document.body.dataset.pane = 'left'")
-    for language in ("en", "de"):
-        for view in ("findings", *VIEWS):
-            p.locator("#left .chooser select").select_option(view)
-            page.wait("document.querySelector('#left [aria-busy=true]') === null")
-            cut = "[...document.querySelectorAll('#left .t')].map((t) => t.scrollWidth - t.clientWidth)"
-            assert max([0, *p.evaluate(cut)]) <= 1, (language, view)
-        assert max(p.evaluate(WIDE)) <= 1, language
-        p.keyboard.press("g")
-        page.wait(f"document.documentElement.lang === '{'de' if language == 'en' else 'en'}'")
-    page.context.close()
-    assert page.complaints == []
+    with Page(browser, address, width) as page:
+        p = page.page
+        page.wait("document.body.dataset.results !== undefined")
+        p.evaluate("document.body.dataset.pane = 'left'")
+        for language in ("en", "de"):
+            for view in ("findings", *VIEWS):
+                p.locator("#left .chooser select").select_option(view)
+                page.wait("document.querySelector('#left [aria-busy=true]') === null")
+                cut = "[...document.querySelectorAll('#left .t')].map((t) => t.scrollWidth - t.clientWidth)"
+                assert max([0, *p.evaluate(cut)]) <= 1, (language, view)
+            assert max(p.evaluate(WIDE)) <= 1, language
+            p.keyboard.press("g")
+            page.wait(f"document.documentElement.lang === '{'de' if language == 'en' else 'en'}'")
 
 
-def test_a_choice_stays_when_values_arrive(page: Page) -> None:
-    p = page.page
+def test_a_choice_stays_when_values_arrive(desk: Page) -> None:
+    p = desk.page
     p.locator("#right .chooser select").select_option("settings")
     p.locator("#right").get_by_label("Datum", exact=True).select_option("inner")
     p.evaluate("""(async () => { const { bench } = await import("/bench.js"); bench.parameters = [...bench.parameters];
@@ -326,9 +318,9 @@ def test_scripts_make_no_markup_and_need_no_exception_of_the_policy() -> None:
     assert not re.search(r"<style|\bstyle=|<script(?! type=\"module\" src=)|\bon\w+=", (WEB / "index.html").read_text())
 
 
-def test_a_million_points_are_sorted_and_filtered_without_a_pause(page: Page) -> None:
+def test_a_million_points_are_sorted_and_filtered_without_a_pause(desk: Page) -> None:
     """Times of the page's own order of 10^6 rows, wide of what was measured (0.25 s and 0.05 s) for a busy machine."""
-    order, rows, chosen = page.page.evaluate(
+    order, rows, chosen = desk.page.evaluate(
         """async () => { const { orderOf, chosen } = await import("./order.js"); const n = 1e6, w = new Float32Array(n);
         for (let i = 0; i < n; i++) w[i] = Math.sin(i * 12.9898) * 5; w[7] = NaN; let t = performance.now();
         const order = orderOf(w, false, true), a = performance.now() - t; t = performance.now();
@@ -345,15 +337,14 @@ def test_a_million_points_are_sorted_and_filtered_without_a_pause(page: Page) ->
 def test_of_a_solution_that_has_gone_the_page_keeps_nothing(browser: Any, tmp_path: Path) -> None:
     """Bytes that the page holds of each image point once one was left out and taken back: its columns have 45."""
     write_project(tmp_path / "lab", stereo(3, n_pairs=300)[0])
-    token = new_token()
-    with Listening(Server(Workbench(tmp_path / "lab"), token), "127.0.0.1", 0) as listening:
-        page = Page(browser, f"{listening.address}#token={token}", 1280, "document.body.dataset.results !== undefined")
+    with opened(browser, Workbench(tmp_path / "lab"), apart=True) as page:
         p = page.page
+        page.wait("document.body.dataset.results !== undefined")
         p.locator("#tables .row.head button").nth(4).click()
         p.locator("#tables .rows .row").nth(2).click()
         for keys in (("x", "w", "h", "y", "Enter"), ("u",)):
             page.done(lambda keys=keys: [p.keyboard.press(key) for key in keys])
-        session = page.context.new_cdp_session(p)
+        session = p.context.new_cdp_session(p)
         held = np.inf
         for _ in range(20):  # what is given back is swept beside other work
             session.send("HeapProfiler.collectGarbage")
@@ -361,19 +352,19 @@ def test_of_a_solution_that_has_gone_the_page_keeps_nothing(browser: Any, tmp_pa
             if held < 65.0:
                 break
             p.wait_for_timeout(250)
-        page.context.close()
     assert 20.0 < held < 65.0
 
 
-def test_columns_as_the_page_reads_them(page: Page, folder: Path) -> None:
+def test_columns_as_the_page_reads_them(desk: Page, folder: Path) -> None:
     bench = Workbench(folder, read_only=True)
     bench.adjust()
     data = columns(bench.rows, 4.0, 1)
-    found = page.page.evaluate(
-        """async (bytes) => { const { columns, withImages, pointId, rowsOfImage } = await import("./columns.js");
-        const data = withImages(columns(Uint8Array.from(bytes).buffer)); const k = 1234;
+    found = desk.page.evaluate(
+        """async (text) => { const { columns, withImages, pointId, rowsOfImage } = await import("./columns.js");
+        const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+        const data = withImages(columns(bytes.buffer)); const k = 1234;
         return [data.n, pointId(data, k), data.u[k], data.images.length, [...rowsOfImage(data, "X/tX05")].length]; }""",
-        list(data),
+        b64encode(data).decode(),
     )
     u = np.concatenate([b.uv for b in bench.rows.survey.image_blocks])[1234, 0]
     assert found == [5544, bench.rows.id_of(1234), float(np.float32(u)), 63, 88]
@@ -395,9 +386,7 @@ def test_a_folder_of_images_becomes_a_project_on_the_page(browser: Any, tmp_path
         name.unlink()
     (tmp_path / "lab/survey.toml").unlink()
     images = {path: path.read_bytes() for path in (tmp_path / "lab/images").glob("*/*")}
-    token = new_token()
-    with Listening(Server(Beginning(tmp_path / "lab"), token), "127.0.0.1", 0) as listening:
-        page = Page(browser, f"{listening.address}#token={token}", 390)
+    with opened(browser, Beginning(tmp_path / "lab"), 390) as page:
         p = page.page
         assert "holds images and no survey.toml" in p.inner_text("#left")
         assert p.evaluate("document.documentElement.scrollWidth") <= 390
@@ -405,17 +394,13 @@ def test_a_folder_of_images_becomes_a_project_on_the_page(browser: Any, tmp_path
         page.wait("document.querySelector('#left .next')?.textContent.includes('nothing was looked for')")
         assert p.inner_text("#verdict") == ""
         assert p.locator("#left .verdict, #left .failed").count() == 0
-        page.context.close()
     assert (tmp_path / "lab/survey.toml").read_text().startswith("# Begun by labsurvey init")
     assert {path: path.read_bytes() for path in (tmp_path / "lab/images").glob("*/*")} == images
-    assert page.complaints == []
 
 
 def test_before_anything_is_observed_every_view_says_what_it_waits_for(browser: Any, tmp_path: Path) -> None:
     write_example("one-camera", tmp_path / "lab")
-    token = new_token()
-    with Listening(Server(Workbench(tmp_path / "lab"), token), "127.0.0.1", 0) as listening:
-        page = Page(browser, f"{listening.address}#token={token}", 1280)
+    with opened(browser, Workbench(tmp_path / "lab")) as page:
         p, waiting = page.page, set()
         for view in (*VIEWS, "halves"):
             p.locator("#right .chooser select").select_option(view)
@@ -423,15 +408,13 @@ def test_before_anything_is_observed_every_view_says_what_it_waits_for(browser: 
             if "Known once the survey is adjusted." in p.inner_text("#right"):
                 waiting.add(view)
             assert p.locator("#right .warn, #right .bad").all_inner_texts() in ([], [""])
-        page.context.close()
     assert waiting == {"scene", "plan", "south", "east", "network", "halves", "loops", "correlations"}
-    assert page.complaints == []
 
 
 @pytest.mark.parametrize("mode", ["scene", "plan", "south", "east"])
-def test_ellipsoids_are_in_sight_when_a_scene_is_opened(page: Page, mode: str) -> None:
+def test_ellipsoids_are_in_sight_when_a_scene_is_opened(desk: Page, mode: str) -> None:
     """Their ends along the axes of the world, on a surface of 400 x 300 px."""
-    ends = page.page.evaluate(
+    ends = desk.page.evaluate(
         """async (mode) => { const { SceneView } = await import("./scene.js");
         const cov = [[3e-8, 0, 0], [0, 3e-8, 0], [0, 0, 3e-8]], spot = (id, x) => ({ id, kind: "point", x, cov });
         const spots = [spot("A", [0, 0, 0]), spot("B", [1, 0.2, 0]), spot("C", [0.5, 1, 0.3])];
@@ -452,9 +435,7 @@ def test_images_are_detected_and_shown_as_they_come(browser: Any, tmp_path: Path
     names = sorted((tmp_path / "lab/images").glob("*/*"))
     for name in names[6:]:
         name.unlink()
-    token = new_token()
-    with Listening(Server(Workbench(tmp_path / "lab"), token), "127.0.0.1", 0) as listening:
-        page = Page(browser, f"{listening.address}#token={token}&view=findings,jobs", 1280)
+    with opened(browser, Workbench(tmp_path / "lab"), 1280, "&view=findings,jobs") as page:
         p = page.page
         page.wait("document.querySelector('#left .next')?.textContent.includes('nothing was looked for')")
         page.done(lambda: p.get_by_label("Run: Detect").click())
@@ -464,8 +445,6 @@ def test_images_are_detected_and_shown_as_they_come(browser: Any, tmp_path: Path
         assert p.evaluate(ROWS) > 100
         p.locator("#right .arrived button").first.click()
         page.wait("location.hash.startsWith('#image=')")
-        page.context.close()
-    assert page.complaints == []
 
 
 def test_what_a_solution_has_is_said_in_words() -> None:

@@ -12,11 +12,8 @@ import pytest
 from survey.examples import write_example
 from survey.notebook.steps import detect
 from survey.project.exclusions import read_exclusions
-from survey.workbench.guard import new_token
-from survey.workbench.live import Listening
-from survey.workbench.server import Server
 from survey.workbench.session import Workbench
-from tests.browsing import Page
+from tests.browsing import Page, opened
 
 pytestmark = [pytest.mark.slow, pytest.mark.browser]
 
@@ -102,14 +99,10 @@ def page(request: pytest.FixtureRequest, browser: Any, tmp_path: Path) -> Iterat
     """A page of a project that the function given has spoilt."""
     folder = tmp_path / "lab"
     request.param(folder)
-    token = new_token()
     bench = Workbench(folder)
     bench.adjust()
-    with Listening(Server(bench, token), "127.0.0.1", 0) as listening:
-        found = Page(browser, f"{listening.address}#token={token}", 1280)
+    with opened(browser, bench) as found:
         yield found, folder
-        found.context.close()
-        assert found.complaints == []
 
 
 @pytest.mark.parametrize("page", [write_spoilt], indirect=True)
@@ -157,7 +150,7 @@ def test_a_reflection_is_seen_in_the_image_and_left_out(page: tuple[Page, Path])
     shown.wait(f"location.hash.includes({REFLECTED!r})")
     click("#right button", "1:1")
     p.locator("#right canvas").first.press("o")  # without marks
-    p.wait_for_timeout(400)
+    shown.wait("document.querySelector('#right .bar output').textContent.includes('(o)')")
     picture = cv2.imdecode(np.frombuffer(p.locator("#right canvas").first.screenshot(), np.uint8), cv2.IMREAD_GRAYSCALE)
     assert picture is not None
     x, y = round(place["x"]), round(place["y"])

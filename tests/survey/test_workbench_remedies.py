@@ -23,11 +23,8 @@ from adjust.diagnosis.hypothesis import (
 from survey.project import write_project
 from survey.project.exclusions import in_force, read_exclusions
 from survey.simulate import stereo
-from survey.workbench.guard import new_token
-from survey.workbench.live import Listening
-from survey.workbench.server import Server
 from survey.workbench.session import Workbench
-from tests.browsing import Page
+from tests.browsing import Page, opened
 
 pytestmark = [pytest.mark.slow, pytest.mark.browser]
 
@@ -85,12 +82,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def page(browser: Any, folder: Path) -> Iterator[Page]:
     """One page for all of them."""
-    bench, token = Offering(folder), new_token()
+    bench = Offering(folder)
     bench.adjust()
-    with Listening(Server(bench, token), "127.0.0.1", 0) as listening:
-        found = Page(browser, f"{listening.address}#token={token}", 1280)
+    with opened(browser, bench) as found:
         yield found
-        found.context.close()
 
 
 def files_of(folder: Path) -> dict[str, bytes]:

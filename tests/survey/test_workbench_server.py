@@ -26,6 +26,7 @@ from survey.workbench.pages.beginning import Beginning
 from survey.workbench.server import WEB, Server
 from survey.workbench.session import Workbench
 from survey.workbench.views import PARTS
+from tests.browsing import SECONDS
 from tests.survey.test_workbench import exclusions, wrong_point
 
 TOKEN = "secret-token-of-this-test"
@@ -326,7 +327,7 @@ def test_what_there_is_is_shown_while_the_first_solution_is_waited_for(mine, kep
     bench, seen = Workbench(mine), threading.Event()
     server = Server(bench, TOKEN)
     server.patience_s = 0.0  # no page joins here
-    bench.watch = lambda _step, _omega: seen.wait(20.0)
+    bench.watch = lambda _step, _omega: seen.wait(SECONDS)
     with TestClient(server.app(), base_url=BASE) as client:
         state = client.get("/api/state", headers=HERE).json()
         assert state["solution"] is None
@@ -336,7 +337,8 @@ def test_what_there_is_is_shown_while_the_first_solution_is_waited_for(mine, kep
         assert bool(early["findings"]) == kept
         assert client.get("/api/state", headers=HERE).json()["solution"] is None
         seen.set()
-        for _ in range(400):
+        end = time.monotonic() + SECONDS
+        while time.monotonic() < end:
             state = client.get("/api/state", headers=HERE).json()
             if state["solution"] is not None:
                 break
