@@ -131,6 +131,10 @@ class ImageBlocks(tuple[ImageBlock, ...]):
         made.points = points
         return made
 
+    def __reduce__(self) -> tuple[type[Self], tuple[tuple[ImageBlock, ...], ImagePoints]]:
+        """How it is copied and sent to other processes."""
+        return type(self), (tuple(self), self.points)
+
 
 @dataclass(frozen=True, eq=False)
 class TableReading:

@@ -169,11 +169,10 @@ class Precision(Covariances):
         in_tree = [pair for pair in keys if not self.hidden.keys() & pair]
         apart = [pair for pair in in_tree if self.tree.shared(*pair) is None]
         if apart:
-            rows = [self.tree.rows(pair) for pair in apart]
-            ends = np.cumsum([0, *map(len, rows)])
-            self._together |= dict(zip(
-                apart, self.tree.each_among(unit_rows(np.concatenate(rows), self.tree.n), ends), strict=True
-            ))  # fmt: skip
+            of_pairs = [self.tree.rows(pair) for pair in apart]
+            A = unit_rows(np.concatenate(of_pairs), self.tree.n)
+            found = self.tree.each_among(A, np.cumsum([0, *map(len, of_pairs)]))
+            self._together |= dict(zip(apart, found, strict=True))
         below = [pair for pair in keys if self.hidden.keys() & pair]
         for k in range(0, len(below), _PAIRS):
             some = list(dict.fromkeys(key for pair in below[k : k + _PAIRS] for key in pair))

@@ -1,5 +1,6 @@
 """The image points of a survey as one table, whose blocks are cut out of it or put together."""
 
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,6 +24,9 @@ def test_blocks_that_are_read_are_cut_out_of_one_table(tmp_path: Path) -> None:
     for name in ("ptr", "point_idx", "uv", "cov", "used"):
         np.testing.assert_array_equal(getattr(blocks.points, name), getattr(together, name))
     assert all(np.shares_memory(b.uv, blocks.points.uv) for b in blocks)
+    sent = pickle.loads(pickle.dumps(blocks))
+    np.testing.assert_array_equal(sent.points.uv, blocks.points.uv)
+    np.testing.assert_array_equal(sent[-1].uv, blocks[-1].uv)
 
 
 def test_points_out_of_use_change_their_blocks_alone() -> None:
