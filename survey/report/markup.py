@@ -5,12 +5,10 @@ Every text that is not markup already is escaped on its way into a page; the HTM
 
 import json
 import math
-import re
 from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
@@ -23,11 +21,6 @@ MISSING = "–"
 _MOST_IN_FULL = 1e9  # a larger number of unknown size has a power of ten
 MINUS = "−"
 _HERE = Path(__file__).parent
-ANCHORED = ("image", "obs", "point", "reading", "param", "camera", "epoch", "target", "group", "station", "table")
-"""Kinds of things that have a place, as the page, the report and the terminal name it: ``#image=X/hX05``."""
-_IN_MESSAGE = re.compile(r"camera '?(?P<camera>[^\s',]+)'?(?: at|,) epoch '?(?P<epoch>[^\s',:]+)|"
-                         r"table (?P<table>\S+), epoch (?P<read>[^\s,:]+)|"
-                         r"images/(?P<image>[^\s/:]+/[^\s/:,.]+)")  # fmt: skip
 
 
 @cache
@@ -192,16 +185,3 @@ def figures(drawn: Iterable[Markup], kind: str = "figures") -> Markup:
     """Pictures side by side; nothing where there is none."""
     drawn = list(drawn)
     return part("figures", drawn, kind) if drawn else Markup()
-
-
-def anchor(kind: str, text: str) -> str:
-    """The part of an address that names a thing: ``#image=X/hX05``."""
-    return f"#{kind}={quote(text, safe='/:@,.-_')}"
-
-
-def anchors_in(text: str) -> list[str]:
-    """The places that a message of an adjustment names."""
-    return [
-        anchor("reading", f"table_angles:{m['table']}/{m['read']}") if m["table"] else
-        anchor("image", m["image"] or f"{m['camera']}/{m['epoch']}") for m in _IN_MESSAGE.finditer(text)
-    ]  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 
 from adjust.model.result import Adjustment
 from survey.project.observed import name_of_residual
-from survey.report.markup import anchor, anchors_in
+from survey.report.anchors import anchor, anchors_in
 from survey.report.sections.published import head_rows, worst_pairs
 from survey.solution.dictionary import RunInfo, solution_dict
 from survey.solution.records import having

@@ -12,8 +12,8 @@ from adjust.model.result import Adjustment
 from survey.folder.plain import attributes, plain
 from survey.folder.text import suggestion
 from survey.project.observed import Observed, name_of_residual
+from survey.report.anchors import ANCHORED, anchor, anchors_in
 from survey.report.language import message
-from survey.report.markup import ANCHORED, anchor, anchors_in
 from survey.solution.earlier.changes import snapshot
 from survey.solution.earlier.runs import list_runs
 from survey.solution.frames import AdjustedFrames

@@ -13,8 +13,8 @@ import pytest
 from adjust.model.errors import SurveyError
 from survey.project.observed import name_of_residual
 from survey.report import page as printing
+from survey.report.anchors import anchor
 from survey.report.drawing import DARK
-from survey.report.markup import anchor
 from survey.report.page import report_html
 from survey.report.sections import observations
 from survey.solution.dictionary import RunInfo

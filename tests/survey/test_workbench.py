@@ -19,7 +19,7 @@ from survey.examples import write_example
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.excluding import exclude_job
 from survey.project import read
-from survey.report.markup import anchors_in
+from survey.report.anchors import anchors_in
 from survey.solution.earlier.changes import snapshot, solution_changes
 from survey.solution.earlier.runs import MOST, list_runs, load_run
 from survey.workbench import views
