@@ -25,6 +25,8 @@ _WRONG, _FITS = 1e-4, 1e-3
 _NEAR, _EXACT = 0.2, 0.02
 """Of two names that changed places: their miss, over their distance; of a ratio of units: how far off it may be."""
 _MOST_PAIRS = 8
+_MOST_IN_PAIRS, _PAIRS = 1_000, 500_000
+"""Names of which all distances are compared, and how many drawn ones of more names."""
 _RIGID, _SCALE = np.eye(7)[:, :6], np.eye(7)[:, 6:]
 
 
@@ -103,7 +105,8 @@ def _scaled(both: Common, found: Congruence) -> Iterator[_Trial]:
     if len(both.names) < 3:
         return
     x, y = _places(both)
-    i, j = np.triu_indices(len(x), 1)
+    many = len(x) > _MOST_IN_PAIRS
+    i, j = np.random.default_rng(0).integers(len(x), size=(2, _PAIRS)) if many else np.triu_indices(len(x), 1)
     was, now = (np.linalg.norm(p[i] - p[j], axis=1) for p in (x, y))
     good = (was > 0.0) & (now > 0.0)
     ratio = float(np.median(was[good] / now[good])) if good.any() else 1.0

@@ -24,6 +24,7 @@ _CANDIDATES = 12
 _PROBES = 64
 """Random displacements of all that stand for the mean precision of one; of fewer components each by itself."""
 _APART = 1e-6
+_ROOM = 64_000_000  # numbers of what was freed
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +64,10 @@ class _Together:
 
 @dataclass(frozen=True, eq=False)
 class _Rise:
-    """What v'Pv rises by where names are the same. gradient: (u,) by the unknowns. M, across: of what was freed."""
+    """What v'Pv rises by where names are the same. gradient: (u,) by the unknowns.
+
+    at: unknowns (k,) that are displaced of what was freed. N_freed: (u, k), M: (k, k) of these.
+    """
 
     value: float
     gradient: FloatArray
@@ -112,10 +116,17 @@ class JoinedChange(Change):
         return []
 
     def _together(self, stable: Sequence[int]) -> _Together:
-        """With at least these names the same; kept, since a search goes on from there."""
-        if not self._kept or not self._kept[-1].names.issuperset(stable):
-            self._kept[:] = [self._joined(frozenset(stable))]
-        return self._kept[-1]
+        """With these names the same, or a few more; kept, since a search goes on from there."""
+        wanted = frozenset(stable)
+        kept = self._kept[-1] if self._kept else None
+        if kept is None or not kept.names.issuperset(wanted) or len(kept.names) - len(wanted) > self._most_freed:
+            self._kept[:] = [kept := self._joined(wanted)]
+        return kept
+
+    @property
+    def _most_freed(self) -> int:
+        """Names of which displacements are kept."""
+        return int(max(2 * _CANDIDATES, _ROOM // (12 * self._N.shape[0])))
 
     def _joined(self, names: frozenset[int]) -> _Together:
         N, rows, first = self._N, self.rows(sorted(names)), self.before.N.shape[0]
@@ -174,6 +185,9 @@ class JoinedChange(Change):
             M = Nz[mine] - rise.N_freed[mine] @ np.linalg.solve(rise.M, Nz[rise.at])
             g = rise.gradient[mine]
             out[i] = float(g @ np.linalg.pinv(M, hermitian=True) @ g)
+        if len(both.freed) > self._most_freed:
+            for i in both.names.intersection(stable, both.freed):
+                del both.freed[i]
         return out
 
     def _alone(self, stable: Sequence[int], gradient: FloatArray) -> list[tuple[float, int]]:
