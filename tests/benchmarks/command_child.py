@@ -91,7 +91,7 @@ def main() -> None:
     parallel.Beside.__enter__ = lambda self: pool.beside(self)
     parallel.Beside.__exit__ = lambda self, *_: pool.finished(self)
     plain = parallel.Beside.of
-    parallel.Beside.of = lambda self, step: plain(self, step) if self._alone else pool.given(self, step)
+    parallel.Beside.of = lambda self, step: plain(self, step) if self.alone else pool.given(self, step)
     from survey.solution.earlier import runs
 
     runs.time = SimpleNamespace(perf_counter=time.process_time)
