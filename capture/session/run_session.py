@@ -145,7 +145,7 @@ class Session:
         """Look for the references, where the plan wants it and anything is to be taken."""
         if missing and self._table is not None and self._plan.table is not None and self._plan.table.home:
             self._note(f"{self._table.name}: looking for its references")
-            self._table.home().wait()
+            self._table.home().result()
 
     def _session_record(self) -> dict[str, Any]:
         plan = self._plan
@@ -228,7 +228,7 @@ class Session:
         if self._table is None or self._plan.table is None:
             return
         if self._at is None or self._at.pose_id != shot.pose_id:
-            self._table.set(shot.angles).wait()
+            self._table.set(shot.angles).result()
             self.control.sleep(self._plan.options.wait_s)
         self._at = shot
 
