@@ -422,7 +422,7 @@ TABLE_FAULTS = [
     Fault("coordinates not definite", _row("coordinates", "0.5,0,0,s1", "0.9,0.9,-0.9,s1"), r"csv:3: .*not positive definite"),
     Fault("correlation too large", _row("coordinates", "0.5,0,0,s1", "1.5,0,0,s1"), r"csv:3: .*between -1 and 1"),
     Fault("covariance of unknown set", _row("coordinates_covariance", "s1,B1", "s2,B1"), r"csv:2: set_id: unknown set 's2'"),
-    Fault("covariance of unknown point", _row("coordinates_covariance", "x,B2,x", "x,B3,x"), r"csv:2: .*no coordinates of 'B3'"),
+    Fault("covariance of unknown point", _row("coordinates_covariance", "x,B2,x", "x,B3,x"), r"csv:2: b_id: unknown point 'B3'; known: B1, B2"),
     Fault("joint covariance", _replace("observations/coordinates_covariance.csv", "0.002", "0.02", "B1,1,2,3,0.1,0.1,0.1,0,0,0,s1"), r"set 's1': the covariance is not positive"),
 ]  # fmt: skip
 

@@ -16,8 +16,9 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Estimate
 from adjust.model.survey import Survey
 from survey.folder.units import from_si
-from survey.project.declared.owners import geometry_key, geometry_unit
+from survey.project.declared.owners import geometry_units
 from survey.project.declared.poses import quaternion_wxyz
+from survey.project.declared.vectors import key_of
 
 LENGTHS = ("square_mm", "marker_mm", "gap_mm", "markers")
 """The keys of a target that say how large it is."""
@@ -154,8 +155,9 @@ def _of_vector(document: Any, estimate: Estimate, component: str, treatment: str
         return
     values = dict(zip(names, np.asarray(estimate.value, dtype=float).tolist(), strict=True))
     if kind == "table_geometry":
-        for key in wanted:
-            entry[geometry_key(key)] = float(from_si(values[key], geometry_unit(key)))
+        units = geometry_units(wanted)
+        for key, unit in units.items():
+            entry[key_of(key, units)] = float(from_si(values[key], unit))
         return
     known = _table(entry, "values")
     for key in values if not known else wanted:

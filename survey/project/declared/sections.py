@@ -23,11 +23,11 @@ from survey.project.declared.clocks import clock_to_toml
 from survey.project.declared.instruments import body_sections, instrument_sections, vertical_sections
 from survey.project.declared.lenses import lens_to_toml
 from survey.project.declared.options import closure_sections, tolerance_sections
-from survey.project.declared.owners import geometry_key, geometry_unit
+from survey.project.declared.owners import geometry_units
 from survey.project.declared.poses import quaternion_wxyz
 from survey.project.declared.targets import board_key
 from survey.project.declared.toml_text import Section
-from survey.project.declared.vectors import check_vector, vector_to_toml
+from survey.project.declared.vectors import vector_to_toml
 from survey.project.project import FORMAT, AdjustmentOptions, Sigmas, SpotsRequest
 from survey.project.targets import BOARDS, MarkerBlock, PointList, TargetKind
 
@@ -158,16 +158,10 @@ def _table(table: Table, sigma: FloatArray | None, timed: bool) -> dict[str, Any
     if sigma is not None:
         values["sigma_arcsec"] = from_si(sigma, "arcsec").tolist()
     values |= _poses({"world_from_table": table.world_from_table}, f"tables.{table.table_id}")
-    geometry, where = table.geometry, f"tables.{table.table_id}.geometry"
-    check_vector(geometry, where)
-    numbers = {
-        geometry_key(name): float(from_si(value, geometry_unit(name)))
-        for name, value in zip(geometry.names, geometry.values, strict=True)
-    }
-    values["geometry"] = {"free": geometry.free, **numbers}
-    if geometry.prior is not None:
-        sigmas = zip(geometry.prior.names, np.sqrt(np.diagonal(geometry.prior.cov)), strict=True)
-        values["geometry_sigma"] = {geometry_key(n): float(from_si(s, geometry_unit(n))) for n, s in sigmas}
+    units = geometry_units(table.geometry.names)
+    geometry = vector_to_toml(table.geometry, units, f"tables.{table.table_id}.geometry")
+    sigma_of = geometry.pop("sigma", None)
+    values |= {"geometry": geometry} | ({} if sigma_of is None else {"geometry_sigma": sigma_of})
     return values | clock_to_toml(table.clock, timed, f"tables.{table.table_id}.clock")
 
 
