@@ -143,9 +143,7 @@ def _lens(camera: ColmapCamera) -> LensParameter:
         values["fx"] = values["fy"] = values.pop("f")
     values["u0"] -= HALF_PIXEL
     values["v0"] -= HALF_PIXEL
-    if not (values["fx"] > 0.0 and values["fy"] > 0.0):
-        raise camera.where.error("the focal lengths must be positive; correct the camera")
-    return lens_of(model, **values)
+    return lens_of(model, camera.where, **values)
 
 
 def _point_names(path: Path, model: ColmapModel) -> dict[int, str]:

@@ -23,7 +23,6 @@ from survey.interop.networks.foreign import ForeignNetwork
 from survey.interop.safe_yaml import Entry, quoted, read_yaml, yaml_text
 
 CHOICES = {"brown": ("skew", *BROWN_8), "fisheye": FISHEYE_4}
-_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _MATRIX = ("camera_matrix", "cameraMatrix", "K", "M", "intrinsic_matrix")
 _DISTORTION = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D", "distortion")
 
@@ -125,14 +124,10 @@ Value = str | int | FloatArray | list[dict[str, "Value"]]
 
 
 def _camera_values(camera: RigCamera, lens: MappedLens) -> dict[str, Value]:
-    names = ("k1", "k2", "k3", "k4") if lens.model == "fisheye" else _NAMES
-    k = lens.array(*names)
-    if lens.model == "brown" and not k[5:].any():
-        k = k[:5]
     return {
         "name": camera.camera_id, "image_width": camera.image_size[0], "image_height": camera.image_size[1],
         "fisheye_model": int(lens.model == "fisheye"), "camera_matrix": camera_matrix(lens),
-        "distortion_coefficients": k.reshape(1, -1),
+        "distortion_coefficients": lens.distortion()[None],
     }  # fmt: skip
 
 
@@ -213,11 +208,9 @@ def mc_calib_text(found: RigValues) -> str:
     base = (found.rig.cameras[0].rig_from_camera or Pose3()).inverse()
     document: dict[str, object] = {"nb_camera": len(found.lenses)}
     for i, (camera, lens) in enumerate(zip(found.rig.cameras, found.lenses, strict=True)):
-        fisheye = lens.model == "fisheye"
-        k = lens.array(*(("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")))
         document[f"camera_{i}"] = {
-            "camera_matrix": camera_matrix(lens), "distortion_vector": k.reshape(1, -1),
-            "distortion_type": int(fisheye), "camera_group": 0,
+            "camera_matrix": camera_matrix(lens), "distortion_vector": lens.distortion()[None],
+            "distortion_type": int(lens.model == "fisheye"), "camera_group": 0,
             "img_width": camera.image_size[0], "img_height": camera.image_size[1],
             "camera_pose_matrix": np.asarray((base * (camera.rig_from_camera or Pose3())).matrix()),
         }  # fmt: skip

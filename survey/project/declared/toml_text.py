@@ -8,6 +8,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
 from typing import Any
 
+import numpy as np
+
+from survey.folder.units import from_si, unit_in
+
 Section = tuple[tuple[str, ...], Mapping[str, Any]]
 
 
@@ -44,6 +48,13 @@ def _value(value: Any) -> str:
     if isinstance(value, list | tuple):
         return f"[{', '.join(_value(item) for item in value)}]"
     raise TypeError(f"no TOML for {type(value)}")
+
+
+def in_units(**values: Any) -> dict[str, Any]:
+    """Keys with what they hold: numbers in SI as the unit at the end of the key wants them; without what is empty."""
+    found = {key: from_si(x, unit_in(key)).tolist() if isinstance(x, float | np.ndarray) else x
+             for key, x in values.items()}  # fmt: skip
+    return {key: x for key, x in found.items() if x is not None and x not in ((), [], {})}
 
 
 _HEADER = re.compile(r"\[([A-Za-z0-9_-]+(?:\.[A-Za-z0-9_-]+)*)\]")
