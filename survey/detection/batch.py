@@ -1,7 +1,7 @@
 """Targets in one image, and in many in parallel: one that fails is reported, the others go on; pictures of it."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from functools import partial
@@ -78,17 +78,14 @@ def detect_images(
     """
     if pictures is not None:
         pictures.mkdir(parents=True, exist_ok=True)
-    most = cores()
-    if jobs is None and min(most, len(tasks)) > 1:
-        processes = min(most, len(tasks) // _IMAGES_PER_PROCESS)
-        many = processes > _MOST_THREADS
-        jobs, run = (processes, _in_processes) if many else (min(most, _MOST_THREADS), _in_threads)
-    else:
-        jobs = jobs or 1
-        run = _in_processes if jobs > 1 and len(tasks) > 1 else _here
+    run, n = _in_processes, min(jobs or cores(), len(tasks) if jobs else len(tasks) // _IMAGES_PER_PROCESS)
+    if jobs is None and n <= _MOST_THREADS:
+        run, n = _in_threads, min(cores(), _MOST_THREADS, len(tasks))
+    if n <= 1:
+        run = _here
     reports: dict[int, ImageReport] = {}
     with tqdm(total=len(tasks), desc="detect", unit="image", disable=not progress) as bar:
-        for position, report in run(tasks, jobs, pictures):
+        for position, report in run(tasks, n, pictures):
             reports[position] = report
             bar.update()
             if told is not None:
@@ -96,38 +93,41 @@ def detect_images(
     return [reports[position] for position in range(len(tasks))]
 
 
-def _here(tasks: Sequence[DetectionTask], jobs: int, pictures: Path | None) -> Iterator[tuple[int, ImageReport]]:
-    for position, task in enumerate(tasks):
-        yield position, detect_task(task, pictures)
+_Found = Iterator[tuple[int, ImageReport]]
 
 
-def _in_threads(tasks: Sequence[DetectionTask], jobs: int, pictures: Path | None) -> Iterator[tuple[int, ImageReport]]:
+def _here(tasks: Sequence[DetectionTask], n: int, pictures: Path | None) -> _Found:
+    yield from enumerate(detect_task(task, pictures) for task in tasks)
+
+
+def _in_threads(tasks: Sequence[DetectionTask], n: int, pictures: Path | None) -> _Found:
     """What takes time holds no lock: OpenCV's finders and the compiled fits."""
     before = cv2.getNumThreads()
     _one_thread()
     try:
-        with ThreadPoolExecutor(min(jobs, len(tasks))) as pool:
-            futures = {pool.submit(detect_task, task, pictures): position for position, task in enumerate(tasks)}
-            for future in as_completed(futures):
-                yield futures[future], future.result()
+        with ThreadPoolExecutor(n) as pool:
+            yield from _of(pool, tasks, pictures)
     finally:
         cv2.setNumThreads(before)
 
 
-def _in_processes(
-    tasks: Sequence[DetectionTask], jobs: int, pictures: Path | None
-) -> Iterator[tuple[int, ImageReport]]:
+def _in_processes(tasks: Sequence[DetectionTask], n: int, pictures: Path | None) -> _Found:
+    with ProcessPoolExecutor(n, get_context("spawn"), initializer=_one_thread) as pool:
+        yield from _of(pool, tasks, pictures)
+
+
+def _of(pool: Executor, tasks: Sequence[DetectionTask], pictures: Path | None) -> _Found:
+    """The reports as they come."""
     work = partial(detect_task, pictures=pictures)
-    with ProcessPoolExecutor(min(jobs, len(tasks)), get_context("spawn"), initializer=_one_thread) as pool:
-        futures = {pool.submit(work, task): position for position, task in enumerate(tasks)}
-        for future in as_completed(futures):
-            position = futures[future]
-            try:
-                yield position, future.result()
-            except BrokenProcessPool:
-                task = tasks[position]
-                message = f"{task.path}: a detection process ended abruptly (memory?); run again with fewer jobs"
-                yield position, ImageReport(task.path, task.camera_id, task.epoch_id, "failed", message)
+    futures = {pool.submit(work, task): position for position, task in enumerate(tasks)}
+    for future in as_completed(futures):
+        position = futures[future]
+        try:
+            yield position, future.result()
+        except BrokenProcessPool:
+            task = tasks[position]
+            message = f"{task.path}: a detection process ended abruptly (memory?); run again with fewer jobs"
+            yield position, ImageReport(task.path, task.camera_id, task.epoch_id, "failed", message)
 
 
 def _one_thread() -> None:
