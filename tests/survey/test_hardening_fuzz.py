@@ -57,8 +57,8 @@ NO_READERS = {
     "capture/simulated/controller.py:SimulatedTable.__init__": "opens to write",
     "capture/simulated/pylon_camera.py:LabPylonCamera.open": "a device",
     "capture/session/table_jobs.py:_with_table": "a device",
-    "capture/web/serve.py:_Handler.do_GET": "the program's own page",
-    "capture/web/serve.py:_Handler.do_POST": "a request; tests/capture/test_web.py",
+    "capture/web/serve.py:_file": "the program's own page",
+    "capture/web/serve.py:Pages._command": "a request; tests/capture/test_web.py",
     "capture/web/state.py:LiveView.__init__": "a device",
 }
 """Functions that open or parse something, and why nothing that a stranger has written comes through them."""
