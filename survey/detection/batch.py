@@ -13,6 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from adjust.model.errors import SurveyError
+from adjust.model.survey import FloatArray
 from adjust.native.parallel import cores
 from survey.detection.checkerboard import find_checkerboard
 from survey.detection.gray import AnyImage, Gray8, Gray32, for_finding, gray_values, read_image
@@ -192,19 +193,21 @@ def _summary(detection: Detection) -> str:
 def _draw_points(
     canvas: Gray8, detection: Detection, point_ids: tuple[str, ...], colour: tuple[int, int, int], scale: int
 ) -> None:
-    # OpenCV draws in 1/16 pixel
-    places = np.rint(((detection.uv + 0.5) * scale - 0.5) * 16.0).astype(int)
-    for (u, v), k in zip(places.tolist(), detection.point_idx.tolist(), strict=True):
+    for (u, v), k in zip(_places(detection.uv, scale), detection.point_idx.tolist(), strict=True):
         cv2.circle(canvas, (u, v), 5 * 16, colour, 1, cv2.LINE_AA, 4)
         _text(canvas, point_ids[k], (u // 16 + 6, v // 16 - 4), colour, 0.33)
 
 
 def _draw_spots(canvas: Gray8, spots: Spots, scale: int) -> None:
-    places = np.rint(((spots.uv + 0.5) * scale - 0.5) * 16.0).astype(int)
-    for k, ((u, v), diameter) in enumerate(zip(places.tolist(), spots.diameter_px.tolist(), strict=True)):
+    for k, ((u, v), diameter) in enumerate(zip(_places(spots.uv, scale), spots.diameter_px.tolist(), strict=True)):
         radius = round(16.0 * scale * (diameter / 2.0 + 2.0))
         cv2.circle(canvas, (u, v), radius, _SPOT_COLOUR, 1, cv2.LINE_AA, 4)
         _text(canvas, f"s{k}", (u // 16 + 8, v // 16 - 6), _SPOT_COLOUR, 0.4)
+
+
+def _places(uv: FloatArray, scale: int) -> list[list[int]]:
+    """In 1/16 pixel of the picture, as OpenCV draws."""
+    return list(np.rint(((uv + 0.5) * scale - 0.5) * 16.0).astype(int).tolist())
 
 
 def _text(canvas: Gray8, text: str, place: tuple[int, int], colour: tuple[int, int, int], size: float) -> None:

@@ -18,8 +18,9 @@ from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import Survey
 from adjust.statistics.outliers.supported import supported
-from survey.folder.replacing import complete, copy_folder, place_for, replace_parts
+from survey.folder.replacing import place_for, replace_parts
 from survey.folder.text import atomic_write
+from survey.folder.whole import complete, copy_folder
 from survey.jobs.adjusting.outcome import AdjustOutcome, made
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.adjusting.warm_start import COLD, warm_adjustment

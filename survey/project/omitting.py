@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from adjust.model.observations import CoordinateDifferences, Coordinates, Observation, ReadingCovariance
+from adjust.model.observations import CoordinateDifferences, Coordinates, Observation
 from adjust.model.survey import BoolArray, IntArray, Survey
 from survey.project.observed import IMAGES, SPOTS, Hits
 from survey.project.project import SpotBlock
@@ -51,20 +51,9 @@ def _fewer(spot: SpotBlock, kept: BoolArray) -> SpotBlock:
 
 
 def _with_joint_readings_apart(survey: Survey) -> Survey:
-    """Readings with a joint covariance are all used or none: those left out get their own sigma, the others theirs."""
-    used = {r.reading_id: r.used for r in survey.readings}
-    alone: dict[str, float] = {}
-    joint = []
-    for item in survey.reading_covariances:
-        flags = [used[name] for name in item.reading_ids]
-        if all(flags) or not any(flags):
-            joint.append(item)
-            continue
-        kept = [i for i, flag in enumerate(flags) if flag]
-        single = [i for i in range(len(flags)) if i not in kept or len(kept) == 1]
-        alone |= {item.reading_ids[i]: float(np.sqrt(item.cov[i, i])) for i in single}
-        if len(kept) > 1:
-            names = tuple(item.reading_ids[i] for i in kept)
-            joint.append(ReadingCovariance(names, item.cov[np.ix_(kept, kept)]))
-    readings = tuple(replace(r, sigma=alone[r.reading_id]) if r.reading_id in alone else r for r in survey.readings)
-    return replace(survey, readings=readings, reading_covariances=tuple(joint))
+    """Readings with a joint covariance are all used or none: each of those left out gets one of its own."""
+    left = {r.reading_id for r in survey.readings if r.used}
+    parts = [part for c in survey.reading_covariances
+             for part in ((c.of(left), *(c.of({name}) for name in c.reading_ids if name not in left))
+                          if left.intersection(c.reading_ids) else (c,))]  # fmt: skip
+    return replace(survey, reading_covariances=tuple(parts))

@@ -13,7 +13,7 @@ from gtsam import Pose3
 from adjust.model.errors import SurveyError
 from adjust.model.survey import LensParameter, Survey, Target
 from survey.interop.cameras.rig import Rig, RigCamera, lens_of, pose_of, rig_network
-from survey.interop.cameras.values import BROWN_4, FISHEYE_4, CameraValues, RigValues, rig_values
+from survey.interop.cameras.values import BROWN_4, FISHEYE_4, RigValues
 from survey.interop.networks.foreign import ForeignNetwork, Where
 from survey.interop.safe_yaml import Entry, read_yaml, yaml_text
 from survey.project.targets import Checkerboard, MarkerBlock, PointList, TargetKind
@@ -73,13 +73,7 @@ def _lens(entry: Entry) -> LensParameter:
     return lens_of(name, entry, **plain, **dict(zip(names, k, strict=True)))
 
 
-def kalibr_files(values: CameraValues, station: str | None) -> tuple[dict[str, str], tuple[str, ...]]:
-    """The camchain of one station, and what was approximated."""
-    found = rig_values(values, station, "kalibr", CHOICES)
-    return {"": camchain_text(found)}, found.notes
-
-
-def camchain_text(found: RigValues) -> str:
+def kalibr_files(found: RigValues) -> dict[str, str]:
     """The camchain: cameras in order as cam0, cam1 ..., their own names as topics."""
     chain: dict[str, object] = {}
     before: Pose3 | None = None
@@ -94,7 +88,7 @@ def camchain_text(found: RigValues) -> str:
             **({} if before is None else {"T_cn_cnm1": (pose.inverse() * before).matrix().tolist()}),
         }  # fmt: skip
         before = pose
-    return yaml_text(chain)
+    return {"": yaml_text(chain)}
 
 
 def _target_network(root: Entry, path: Path) -> ForeignNetwork:

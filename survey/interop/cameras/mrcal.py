@@ -20,7 +20,7 @@ from adjust.model.survey import FloatArray
 from adjust.spatial.rigid import skew
 from survey.folder.text import decode, read_bytes
 from survey.interop.cameras.rig import Rig, RigCamera, lens_of, pose_of, rig_network
-from survey.interop.cameras.values import BROWN_8, CameraValues, MappedLens, rig_values
+from survey.interop.cameras.values import BROWN_8, MappedLens, RigValues
 from survey.interop.networks.foreign import ForeignNetwork, Where
 from survey.interop.safe_yaml import Entry
 
@@ -148,10 +148,9 @@ def rt_by_tangent(rt: FloatArray) -> FloatArray:
     return J
 
 
-def mrcal_files(values: CameraValues, station: str | None) -> tuple[dict[str, str], tuple[str, ...]]:
-    """One model per camera of a station, whose frame is mrcal's reference; what was approximated."""
-    found = rig_values(values, station, "mrcal", CHOICES)
-    return found.files(mrcal_text, ENDING), found.notes
+def mrcal_files(found: RigValues) -> dict[str, str]:
+    """One model per camera of a station, whose frame is mrcal's reference."""
+    return found.files(mrcal_text, ENDING)
 
 
 def rt_of(pose: Pose3) -> FloatArray:

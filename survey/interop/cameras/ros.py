@@ -27,7 +27,7 @@ from survey.interop.cameras.rig import (
     quaternion_xyzw,
     rig_network,
 )
-from survey.interop.cameras.values import BROWN_5, BROWN_8, FISHEYE_4, CameraValues, MappedLens, rig_values
+from survey.interop.cameras.values import BROWN_5, BROWN_8, FISHEYE_4, MappedLens, RigValues
 from survey.interop.networks.foreign import ForeignNetwork
 from survey.interop.safe_yaml import Entry, matrix_entry, read_yaml, yaml_text
 
@@ -92,13 +92,12 @@ def _transform(entry: Entry) -> Pose3:
     return pose_of_quaternion(xyzw, np.array([t.get(a).number for a in "xyz"]), q.where)
 
 
-def ros_files(values: CameraValues, station: str | None) -> tuple[dict[str, str], tuple[str, ...]]:
-    """camera_info of one station's cameras, with extrinsics where there are several; what was approximated."""
-    found = rig_values(values, station, "ros", CHOICES)
+def ros_files(found: RigValues) -> dict[str, str]:
+    """camera_info of one station's cameras, with extrinsics where there are several."""
     files = found.files(camera_info_text, ".yaml")
     if EXTRINSICS in files:
         raise SurveyError("a camera called 'extrinsics' cannot be written beside extrinsics.yaml; rename it")
-    return files if "" in files else {**files, EXTRINSICS: extrinsics_text(found.rig)}, found.notes
+    return files if "" in files else {**files, EXTRINSICS: extrinsics_text(found.rig)}
 
 
 def camera_info_text(camera: RigCamera, lens: MappedLens) -> str:
@@ -177,12 +176,16 @@ def _industrial_camera(entry: Entry) -> RigCamera:
     return RigCamera(entry.get("camera_name").text, size, lens_of("brown", entry, **values), pose)
 
 
-def industrial_files(values: CameraValues, station: str | None) -> tuple[dict[str, str], tuple[str, ...]]:
-    """One file per camera: intrinsics, distortions and its pose on the station; what is to be known."""
-    found = rig_values(values, station, "ros-industrial", INDUSTRIAL_CHOICES)
-    notes = [f"camera {c.camera_id}: distortions are written, but ROS-Industrial's extrinsic tools take lenses without"
-             for c, lens in zip(found.rig.cameras, found.lenses, strict=True) if lens.distortion().any()]  # fmt: skip
-    return found.files(_industrial_text, ".yaml"), (*found.notes, *notes[:1])
+def industrial_files(found: RigValues) -> dict[str, str]:
+    """One file per camera: intrinsics, distortions and its pose on the station."""
+    return found.files(_industrial_text, ".yaml")
+
+
+def industrial_notes(found: RigValues) -> tuple[str, ...]:
+    """What is to be known of distortions, of the first camera that has any."""
+    notes = (f"camera {c.camera_id}: distortions are written, but ROS-Industrial's extrinsic tools take lenses without"
+             for c, lens in zip(found.rig.cameras, found.lenses, strict=True) if lens.distortion().any())  # fmt: skip
+    return tuple(notes)[:1]
 
 
 def _industrial_text(camera: RigCamera, lens: MappedLens) -> str:

@@ -117,9 +117,9 @@ def _cluster(survey: Survey, members: Sequence[Reading]) -> list[str]:
     units = np.array([CC if r.kind in ANGLES else MM for r in members])
     cov = np.diag(np.array([r.sigma for r in members]) ** 2)
     for joint in survey.reading_covariances:
-        rows = [k for k, i in enumerate(joint.reading_ids) if i in place]
-        idx = [place[joint.reading_ids[k]] for k in rows]
-        cov[np.ix_(idx, idx)] = joint.cov[np.ix_(rows, rows)]
+        here = joint.of(place)
+        idx = [place[name] for name in here.reading_ids]
+        cov[np.ix_(idx, idx)] = here.cov
     if np.count_nonzero(cov) > len(cov):
         lines += _matrix(cov / np.outer(units, units))
     return [*lines, "</obs>"]
