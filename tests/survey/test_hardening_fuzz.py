@@ -39,6 +39,8 @@ NO_READERS = {
     "survey/interop/cameras/colmap_writer.py:reconstruction": "an empty model of pycolmap, to be filled and written",
     "survey/report/page.py:_by_browser": "a PDF that was just printed",
     "survey/report/language.py:catalogue": "the program's own words",
+    "survey/workbench/bodies.py:json_of": "a request; tests/survey/test_workbench_hostile.py",
+    "survey/workbench/server.py:Server._file": "the workbench's own files",
     "survey/jobs/adjusting/edits.py:_table": "a table of a project that was read and diagnosed before",
     "survey/project/declared/editing.py:with_product": "the text of survey.toml, read before",
     "survey/project/declared/editing.py:_with_change": "the text of survey.toml, read before",
