@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from adjust.model.observations import PositionRef, ReadingCovariance
+from adjust.model.observations import PositionRef
 from adjust.model.survey import Survey
 
 if TYPE_CHECKING:
@@ -35,12 +35,7 @@ def only_between(survey: Survey, keep: Callable[[PositionRef], bool]) -> Survey:
 
     readings = tuple(r for r in survey.readings if all_kept((r.at, r.to, r.second)))
     left = {r.reading_id for r in readings}
-    covariances = []
-    for item in survey.reading_covariances:
-        rows = [i for i, name in enumerate(item.reading_ids) if name in left]
-        if len(rows) > 1:
-            names = tuple(item.reading_ids[i] for i in rows)
-            covariances.append(ReadingCovariance(names, item.cov[np.ix_(rows, rows)]))
+    covariances = (item.of(left) for item in survey.reading_covariances)
     vertical = survey.vertical
     if not readings and not survey.levels:  # nothing is left that could tell its tilt
         vertical = replace(vertical, tilt=replace(vertical.tilt, free=(), prior=None))
@@ -52,7 +47,7 @@ def only_between(survey: Survey, keep: Callable[[PositionRef], bool]) -> Survey:
         coordinate_differences=tuple(d for d in survey.coordinate_differences if all_kept((*d.at, *d.to))),
         on_surfaces=tuple(o for o in survey.on_surfaces if all_kept((o.position,))),
         readings=readings,
-        reading_covariances=tuple(covariances),
+        reading_covariances=tuple(c for c in covariances if len(c.reading_ids) > 1),
     )
 
 

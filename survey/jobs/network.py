@@ -11,7 +11,8 @@ from gtsam import Pose3, Rot3
 
 from adjust.model.errors import SurveyError, listed
 from adjust.model.observations import Pair
-from survey.folder.replacing import complete, place_for, replace_parts
+from survey.folder.replacing import place_for, replace_parts
+from survey.folder.whole import complete
 from survey.jobs.adjusting.outcome import AdjustOutcome, made
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.adjusting.warm_start import warm_adjustment

@@ -39,7 +39,6 @@ from survey.project.project import (
     IMAGES_FOLDER,
     OBSERVATIONS_FOLDER,
     Definition,
-    LeftOut,
     Project,
     Sigmas,
     SpotsRequest,
@@ -110,9 +109,9 @@ def leaving_out(project: Project, exclusions: Iterable[Exclusion]) -> Project:
         else:
             notes.append(f"{path}:{one.line}: {one.name} is left out, but nothing has that name; "
                          f"{observed.near(one.name)}")  # fmt: skip
-        found.append(LeftOut(one, len(hit.images), hit.n_image_points, hit.n_spots, hit.n_readings))
-    survey, spots = without(project.survey, project.spots, hits)
+        found.append(hit.left_out(one))
     every = union(hits)
+    survey, spots = without(project.survey, project.spots, every)
     in_files = _n_unused(survey) - (every.n - every.n_spots)
     return dataclasses.replace(
         project, survey=survey, spots=spots, left_out=tuple(found), n_left_out=every.n, n_unused_in_files=in_files,

@@ -101,12 +101,8 @@ def _blocks(survey: Survey, found: Candidates, out: BoolArray) -> tuple[ImageBlo
 
 def _parts(c: ReadingCovariance, lost: set[str]) -> list[ReadingCovariance]:
     """The covariance of what is left, and that of what is out: all readings of one covariance are used, or none."""
-    ids = np.array(c.reading_ids)
-    gone = np.array([i in lost for i in c.reading_ids], dtype=np.bool_)
-    if not gone.any():
-        return [c]
-    parts = [np.flatnonzero(~gone), np.flatnonzero(gone)]
-    return [ReadingCovariance(tuple(ids[p].tolist()), c.cov[np.ix_(p, p)]) for p in parts if len(p)]
+    parts = c.of(set(c.reading_ids) - lost), c.of(lost)
+    return [part for part in parts if part.reading_ids]
 
 
 def as_given(survey: Survey, given: Survey) -> Survey:
