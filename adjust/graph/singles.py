@@ -22,6 +22,7 @@ from adjust.observations.factors import (
     distance_factor,
     gaussian,
     hold_factor,
+    known_components,
     pair_factor,
     pose_prior_factor,
     step_factor,
@@ -76,10 +77,8 @@ class Singles:
     def add_coordinates(self, at: Mapping[PositionRef, Position]) -> None:
         """Each set is one factor."""
         for c in self.survey.coordinates:
-            known = np.isfinite(np.diag(c.cov))
-            names = tuple(f"{position_text(p)} {axis}" for p in c.positions for axis in "xyz")
-            names = tuple(np.array(names)[known].tolist())
-            owners = tuple(position_text(p) for p in c.positions)
+            known, owners = known_components(c.cov), tuple(position_text(p) for p in c.positions)
+            names = tuple(np.array([f"{owner} {axis}" for owner in owners for axis in "xyz"])[known].tolist())
             self._add(coordinates_factor(c, [at[p] for p in c.positions]), "coordinates", c.group, owners, names,
                         ("m",) * len(names), c.values.ravel()[known], c.used)  # fmt: skip
 
@@ -96,7 +95,7 @@ class Singles:
     def _add_prior(self, name: ParameterName, parameter: PoseParameter | PointParameter) -> None:
         if parameter.value is None or parameter.prior_cov is None:
             raise SurveyError(f"{' '.join(name)} has a prior without value or covariance; give both")
-        unknown, known = self.unknowns.by_name[name], np.isfinite(np.diag(parameter.prior_cov))
+        unknown, known = self.unknowns.by_name[name], known_components(parameter.prior_cov)
         if isinstance(parameter, PoseParameter):
             factor, observed = pose_prior_factor(parameter, unknown.key), np.zeros(6)
         else:

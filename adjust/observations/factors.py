@@ -148,26 +148,26 @@ def distance_factor(observation: Distance, a: Position, b: Position) -> gtsam.No
 
 
 def coordinates_factor(observation: Coordinates, positions: Sequence[Position]) -> gtsam.NonlinearFactor:
-    """GTSAM's prior for one world point, or coordinates of several positions with their joint covariance.
-
-    Coordinates with an infinite variance were not observed.
-    """
-    known = np.isfinite(np.diag(observation.cov))
-    if len(positions) == 1 and positions[0].point_key is not None and known.all():
-        return gtsam.PriorFactorPoint3(positions[0].point_key, observation.values[0], gaussian(observation.cov))
-    keys = list(dict.fromkeys(k for p in positions for k in p.keys))
-    residual = positions_residual([((p, 1.0),) for p in positions], observation.values, known)
-    return custom(keys, observation.cov[np.ix_(known, known)], residual)
+    """GTSAM's prior for one world point, or coordinates of several positions with their joint covariance."""
+    cov = observation.cov
+    if len(positions) == 1 and positions[0].point_key is not None and known_components(cov).all():
+        return gtsam.PriorFactorPoint3(positions[0].point_key, observation.values[0], gaussian(cov))
+    return positions_factor([((p, 1.0),) for p in positions], observation.values, cov)
 
 
-def positions_residual(
-    sums: Sequence[Sequence[tuple[Position, float]]], values: FloatArray, known: BoolArray
-) -> Residual:
-    """Sums of positions with signs minus what was observed of them (n, 3); ``known`` (3n,): which components were."""
-    wanted = values.ravel()
+def known_components(cov: FloatArray) -> BoolArray:
+    """Which components of an observation were observed: those with a finite variance."""
+    return np.asarray(np.isfinite(np.diag(cov)))
+
+
+def positions_factor(
+    sums: Sequence[Sequence[tuple[Position, float]]], observed: FloatArray, cov: FloatArray
+) -> gtsam.CustomFactor:
+    """Sums of positions with signs minus what was observed of them (n, 3), with joint covariance cov (3n, 3n)."""
+    known, keys = known_components(cov), list(dict.fromkeys(k for signed in sums for p, _ in signed for k in p.keys))
 
     def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
-        out, blocks = np.zeros(3 * len(sums)), []
+        out, blocks = -observed.ravel(), []
         for i, signed in enumerate(sums):
             rows = slice(3 * i, 3 * i + 3)
             for position, sign in signed:
@@ -177,9 +177,9 @@ def positions_residual(
                     block = np.zeros((len(out), J.shape[1]))
                     block[rows] = sign * J
                     blocks.append((key, block[known]))
-        return (out - wanted)[known], blocks
+        return out[known], blocks
 
-    return residual
+    return custom(keys, cov[np.ix_(known, known)], residual)
 
 
 def pair_factor(observation: Pair, unknowns: Unknowns, state: State, chain: Chain) -> gtsam.NonlinearFactor:
@@ -246,7 +246,7 @@ def pose_prior_factor(parameter: PoseParameter, key: int) -> gtsam.NonlinearFact
     if parameter.value is None or parameter.prior_cov is None:
         raise ValueError("a pose prior needs a value and a covariance")
     mean, cov = parameter.value, parameter.prior_cov
-    known = np.isfinite(np.diag(cov))
+    known = known_components(cov)
     if known.all():
         return gtsam.PriorFactorPose3(key, mean, gaussian(cov))
     residual = _components_residual(_unknown_pose(key), mean, np.flatnonzero(known))
