@@ -4,12 +4,11 @@ from collections.abc import Mapping
 
 import gtsam
 import numpy as np
-from gtsam import Pose3, Rot3
 
 from adjust.frames.state import State
-from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Chain, Unknowns
+from adjust.frames.unknowns import Chain, Unknowns
 from adjust.model.errors import SurveyError
-from adjust.model.observations import Coordinates, PositionRef, frame_text, position_text
+from adjust.model.observations import Coordinates, PositionRef, position_text
 from adjust.model.result import ParameterName
 from adjust.model.rewriting import vector_parameters
 from adjust.model.survey import FloatArray, PointParameter, PoseParameter, Survey, VectorPrior
@@ -23,7 +22,7 @@ from adjust.observations.factors import (
     gaussian,
     hold_factor,
     known_components,
-    pair_factor,
+    pair_item,
     pose_prior_factor,
     step_factor,
     vector_prior_factor,
@@ -56,14 +55,8 @@ class Singles:
 
     def add_pairs(self, chains: Mapping[int, Chain]) -> None:
         """Those of these numbers, with their chains."""
-        for i, chain in chains.items():
-            pair = self.survey.pairs[i]
-            factor = pair_factor(pair, self.unknowns, self.state, chain)
-            measured = pair.b_from_a
-            observed = Pose3.Logmap(measured) if isinstance(measured, Pose3) else Rot3.Logmap(measured)
-            n = len(observed)
-            self._add(factor, "pair", pair.group, (pair.pair_id, frame_text(pair.a), frame_text(pair.b)),
-                      POSE_COMPONENTS[:n], POSE_UNITS[:n], observed, pair.used)  # fmt: skip
+        pairs = self.survey.pairs
+        self.items += [pair_item(pairs[i], self.unknowns, self.state, chain) for i, chain in chains.items()]
 
     def add_distances(self, at: Mapping[PositionRef, Position]) -> None:
         """Raises SurveyError for one between held positions."""

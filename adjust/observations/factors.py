@@ -11,7 +11,7 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.frames.state import State
-from adjust.frames.unknowns import Chain, Unknown, Unknowns, VectorMap
+from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Chain, Unknown, Unknowns, VectorMap
 from adjust.model.observations import Coordinates, Distance, Pair
 from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, VectorPrior
 from adjust.observations.adapter import evaluated
@@ -182,20 +182,25 @@ def positions_factor(
     return custom(keys, cov[np.ix_(known, known)], residual)
 
 
-def pair_factor(observation: Pair, unknowns: Unknowns, state: State, chain: Chain) -> gtsam.NonlinearFactor:
+def pair_item(pair: Pair, unknowns: Unknowns, state: State, chain: Chain) -> ObservationFactor:
     """A measured relative pose or rotation: GTSAM's between factor for two fixed bodies, else the general chain."""
-    simple = len(chain) == 2 and chain[0].inverse and not chain[1].inverse
-    keys = [unknowns.slot_key[link.slot] for link in chain]
-    measured = observation.b_from_a
-    predicted = ChainPose(unknowns, state, chain)
+    measured, keys = pair.b_from_a, [unknowns.slot_key[link.slot] for link in chain]
+    simple = len(chain) == 2 and chain[0].inverse and not chain[1].inverse and keys[0] != keys[1]
+    factor: gtsam.NonlinearFactor
     if isinstance(measured, Rot3):
-        turn = _components_residual(predicted, Pose3(measured, np.zeros(3)), np.arange(3))
-        return custom(predicted.keys, observation.cov, turn)
-    if simple and all(unknowns.derived(link.slot) is None for link in chain):
-        b, a = keys
-        if a is not None and b is not None and a != b:
-            return gtsam.BetweenFactorPose3(b, a, measured, gaussian(observation.cov))
-    return custom(predicted.keys, observation.cov, _components_residual(predicted, measured, np.arange(6)))
+        observed, given = Rot3.Logmap(measured), Pose3(measured, np.zeros(3))
+    else:
+        observed, given = Pose3.Logmap(measured), measured
+    n = len(observed)
+    free = simple and all(unknowns.derived(link.slot) is None for link in chain) and n == 6
+    if free and (b := keys[0]) is not None and (a := keys[1]) is not None:
+        factor = gtsam.BetweenFactorPose3(b, a, given, gaussian(pair.cov))
+    else:
+        predicted = ChainPose(unknowns, state, chain)
+        factor = custom(predicted.keys, pair.cov, _components_residual(predicted, given, np.arange(n)))
+    ids = pair.pair_id, pair.a.text, pair.b.text
+    return ObservationFactor(factor, "pair", pair.group, ids, POSE_COMPONENTS[:n], POSE_UNITS[:n],
+                             np.asarray(observed, dtype=float), pair.used)  # fmt: skip
 
 
 def _components_residual(predicted: PoseOf, given: Pose3, rows: IntArray) -> Residual:

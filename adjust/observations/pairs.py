@@ -17,14 +17,14 @@ from gtsam import Pose3, Rot3
 
 from adjust.frames.state import State
 from adjust.frames.tree import FrameTree
-from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Unknowns
+from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Link, Unknowns
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Pair, frame_text
 from adjust.model.result import Named, OtherArrays, Residuals
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.pairs import pair_jacobians, pair_rows, sure_forms
 from adjust.native.trees import KeyCovariances
-from adjust.observations.factors import Jacobians, ObservationFactor, custom
+from adjust.observations.factors import ObservationFactor, pair_item
 from adjust.spatial.rigid_motions import Motions, exp
 from adjust.testing.distributions import chi2
 
@@ -95,11 +95,7 @@ class PairArrays:
     @cached_property
     def poses(self) -> list[Pose3]:
         """The same one by one."""
-        return [self.pose(e) for e in range(len(self.used))]
-
-    def pose(self, e: int) -> Pose3:
-        """One of them."""
-        return Pose3(Rot3(self.rotations[e]), self.shifts[e])
+        return [Pose3(Rot3(R), t) for R, t in zip(self.rotations, self.shifts, strict=True)]
 
     @cached_property
     def logs(self) -> FloatArray:
@@ -281,31 +277,8 @@ class PairBatch:
 
     def item(self, e: int, pairs: Sequence[Pair]) -> ObservationFactor:
         """What a report needs to know of one; ``pairs`` are those of the survey."""
-        pair, is_pose = pairs[int(self.rows[e])], bool(self.arrays.is_pose[e])
-        k = 6 if is_pose else 3
-        return ObservationFactor(self._exact(e, pair, is_pose), "pair", pair.group, _ids(pair), POSE_COMPONENTS[:k],
-                                 POSE_UNITS[:k], self.arrays.logs[e, :k], pair.used)  # fmt: skip
-
-    def _exact(self, e: int, pair: Pair, is_pose: bool) -> gtsam.NonlinearFactor:
-        """A factor with just the measured components as residual, in frame a."""
-        (a, b), measured = self._ends(e), self.arrays.pose(e)
-        if is_pose and not isinstance(a, Pose3):
-            factor = native_factor(a, b, measured, self.arrays.whitening[e], self.noise)
-            if factor is not None:
-                return factor
-        keys = list(dict.fromkeys(x for x in (b, a) if not isinstance(x, Pose3)))
-        k = 6 if is_pose else 3
-
-        def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
-            world_from_a, world_from_b = (x if isinstance(x, Pose3) else values.atPose3(x) for x in (a, b))
-            b_from_a, D = world_from_b.between(world_from_a), np.zeros((6, 6), order="F")
-            r = np.asarray(Pose3.Logmap(measured.between(b_from_a), D))
-            by: Jacobians = [] if isinstance(a, Pose3) else [(a, D[:k])]
-            if not isinstance(b, Pose3):
-                by.append((b, -(D @ b_from_a.inverse().AdjointMap())[:k]))
-            return r[:k], by
-
-        return custom(keys, pair.cov, residual)
+        chain = Link(int(self.b_slot[e]), inverse=True), Link(int(self.a_slot[e]))
+        return pair_item(pairs[int(self.rows[e])], self.unknowns, self.state, chain)
 
     def jacobians(self, values: gtsam.Values) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Residuals (E, 6), derivatives (E, 6, 6) by b and by a, and Ad(b_from_a^-1) (E, 6, 6), unweighted."""
