@@ -312,11 +312,9 @@ class PairBatch:
         # a row of the whitening that is zero was not measured
         Qvv = sign * (W @ scatter @ np.swapaxes(W, 1, 2)) + np.any(W, axis=2)[..., None] * np.eye(6)
         white = np.einsum("nij,nj->ni", W, residual)
-        test, freedom = _quadratic(Qvv, white)
-        with np.errstate(invalid="ignore"):
-            p = np.where(freedom > 0, chi2.sf(test, np.maximum(freedom, 1)), np.nan)
         redundancy = np.where(used[:, None], np.diagonal(Qvv, axis1=1, axis2=2), 0.0)
-        return PairStatistics(residual, white, redundancy, test, freedom, p, own, arrays.cov + sign * scatter)
+        tests = pair_tests(Qvv, white, UNCONTROLLED)
+        return PairStatistics(residual, white, redundancy, *tests, own, arrays.cov + sign * scatter)
 
     def residuals(self, stats: PairStatistics, pairs: Sequence[Pair]) -> Residuals:
         """As reports take them; ``pairs`` are those of the survey."""
@@ -341,16 +339,22 @@ def _named(pairs: Sequence[Pair], sizes: Sequence[int], e: int) -> Named:
     return "pair", pairs[e].group, _ids(pairs[e]), POSE_COMPONENTS[: sizes[e]], POSE_UNITS[: sizes[e]]
 
 
-def _quadratic(Q: FloatArray, v: FloatArray) -> tuple[FloatArray, IntArray]:
-    """The forms v' Q^+ v (E,) and the rank of Q, eigenvalues below ``UNCONTROLLED`` counting as zero."""
-    test, freedom = sure_forms(Q, v, UNCONTROLLED), np.full(len(v), 6, dtype=np.int64)
+def pair_tests(Q: FloatArray, v: FloatArray, least: float) -> tuple[FloatArray, IntArray, FloatArray]:
+    """The forms v' Q^+ v (E,), the rank of Q, and p: whitened residuals v (E, k) with their covariances Q (E, k, k).
+
+    Eigenvalues below ``least`` count as zero; nan where all do.
+    """
+    n, k = v.shape
+    test, freedom = sure_forms(Q, v, least) if k == 6 else np.full(n, -1.0), np.full(n, k, dtype=np.int64)
     rest = np.flatnonzero(test < 0.0)
     w, U = np.linalg.eigh(Q[rest])
-    kept = w > UNCONTROLLED
+    kept = w > least
     y = np.einsum("nij,ni->nj", U, v[rest])
     test[rest] = (np.where(kept, y * y, 0.0) / np.where(kept, w, 1.0)).sum(axis=1)
     freedom[rest] = kept.sum(axis=1)
-    return np.where(freedom > 0, test, np.nan), freedom
+    test = np.where(freedom > 0, test, np.nan)
+    with np.errstate(invalid="ignore"):
+        return test, freedom, np.where(freedom > 0, chi2.sf(test, np.maximum(freedom, 1)), np.nan)
 
 
 def simple_pairs(survey: Survey, frames: FrameTree) -> tuple[IntArray, IntArray, IntArray]:
