@@ -11,7 +11,7 @@ from gtsam import Pose3, Rot3
 from adjust.model.errors import IndeterminateError, SurveyError, listed
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import BoolArray, Datum, FloatArray, IntArray, PoseParameter, Station, Survey, Treatment
-from adjust.observations.pairs import PairArrays
+from adjust.observations.pair_arrays import PairArrays
 from adjust.pose_network.cycles import connected_parts
 from adjust.spatial.rigid import nearest_rotation
 
