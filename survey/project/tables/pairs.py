@@ -9,7 +9,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.names import natural_key
 from adjust.model.observations import FrameRef, Pair, frame_text
 from adjust.model.survey import BoolArray, FloatArray
-from adjust.observations.pairs import pair_arrays
+from adjust.observations.pair_arrays import pair_arrays
 from adjust.spatial.rotation_forms import euler_from_matrix, tangent_cov_from_euler
 from survey.folder.units import from_si, to_si, unit_in
 from survey.project.declared.poses import is_unit, quaternion_wxyz, rotation_from_euler
