@@ -12,7 +12,7 @@ is more than both have together. Epochs whose datum is carried by other names, o
 comparable; they are left out by name.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,11 +26,12 @@ from adjust.model.survey import FloatArray
 from adjust.spatial.rotation_forms import quaternion_wxyz
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
-from survey.solution.covariances import read_covariances
+from survey.solution.covariances import read_estimates
 from survey.solution.quantities import ARCSEC_PER_RAD, sigmas_in
 
 _Kind = tuple[tuple[bool, ...], frozenset[str]]
 """The motions that a free datum leaves open, and what carries it."""
+_PLACED = ("point", "world_from_station", "world_from_table", "carrier_from_target")
 _TURNED = 1e-6
 _ROUNDS, _SETTLED = 20, 1e-13
 _SCALE = 6
@@ -81,28 +82,16 @@ def free_datum(solution: Mapping[str, Any], covariances: Path) -> FreeDatum | No
     datum = solution.get("free_datum")
     if datum is None:
         return None
-    covs = read_covariances(covariances)
-    places = tuple(
-        Place(name, tuple(x), None if q is None else tuple(q), tuple(np.asarray(covs[key]).ravel().tolist()))
-        for name, key, x, q in _world(solution) if key in covs
-    )  # fmt: skip
+    factor, places = float(solution["summary"]["sigma_factor"]), []
+    for (kind, *ids), e in read_estimates(covariances).items():
+        world = "world_from_target" if kind == "carrier_from_target" else kind
+        on_station = kind == "carrier_from_target" and "station" in solution["targets"][ids[0]]
+        if kind in _PLACED and len(ids) == 1 and not on_station:
+            wxyz = quaternion_wxyz(e.value.rotation()) if isinstance(e.value, Pose3) else None
+            cov = tuple((factor**2 * e.cov).ravel().tolist())
+            places.append(Place(f"{world}/{ids[0]}", tuple((1e3 * origin(e.value)).tolist()), wxyz, cov))
     motions = tuple(tuple(float(x) for x in row) for row in datum["open_motions"])
-    return FreeDatum(motions, tuple(datum["carried_by"]), places)
-
-
-def _world(solution: Mapping[str, Any]) -> Iterator[tuple[str, str, Sequence[float], Sequence[float] | None]]:
-    """Name as in records, name in ``covariance.npz``, mm, quaternion."""
-    for name, entry in solution["points"].items():
-        yield f"point/{name}", f"point/{name}", [entry[f"{axis}_mm"] for axis in "xyz"], None
-    for section, key, parameter in (
-        ("stations", "world_from_station", "world_from_station"), ("tables", "world_from_table", "world_from_table"),
-        ("targets", "world_from_target", "carrier_from_target"),
-    ):  # fmt: skip
-        for name, entry in solution[section].items():
-            if key in entry:
-                pose = entry[key]
-                yield (f"{key}/{name}", f"{parameter}/{name}", pose["translation_mm"],
-                       pose["rotation_quaternion_wxyz"])  # fmt: skip
+    return FreeDatum(motions, tuple(datum["carried_by"]), tuple(places))
 
 
 def incomparable(data: Sequence[FreeDatum | None]) -> dict[int, str]:

@@ -31,7 +31,8 @@ from survey.project.tables.pairs import (
 from survey.project.tables.reading import Table
 from survey.project.tables.references import Names
 from survey.report.results import RESULTS
-from survey.solution.earlier.previous import Move, Previous, change_dict, change_lines, moves, read_previous
+from survey.solution.earlier.changes import Snapshot
+from survey.solution.earlier.previous import Move, change_dict, change_lines, moves, read_previous
 from survey.solution.earlier.runs import Clock, command_line
 from survey.solution.loops import network_dict, pair_network
 
@@ -135,7 +136,7 @@ class AddOutcome:
     outcome: AdjustOutcome
     added: dict[str, list[str] | int]
     moved: tuple[Move, ...]
-    before: Previous
+    before: Snapshot
     start: str
     seconds: float
 

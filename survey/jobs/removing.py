@@ -30,7 +30,8 @@ from survey.project.merging import point_files, read_copy
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
 from survey.project.reading import read_all
 from survey.report.results import RESULTS
-from survey.solution.earlier.previous import Move, Previous, change_dict, change_lines, moves, read_previous
+from survey.solution.earlier.changes import Snapshot
+from survey.solution.earlier.previous import Move, change_dict, change_lines, moves, read_previous
 from survey.solution.earlier.runs import Clock, command_line
 
 
@@ -44,7 +45,7 @@ class RemoveOutcome:
     outcome: AdjustOutcome
     removed: tuple[str, ...]
     moved: tuple[Move, ...]
-    before: Previous | None
+    before: Snapshot | None
     why: str
     start: str
     seconds: float
@@ -102,7 +103,7 @@ def remove_job(
 
 
 def _adjusted(
-    folder: Path, project: Project, reduced: Project, names: Sequence[Name], before: Previous | None, progress: bool
+    folder: Path, project: Project, reduced: Project, names: Sequence[Name], before: Snapshot | None, progress: bool
 ) -> tuple[Adjustment, str]:
     try:
         _require_nothing_lost(project.survey, reduced.survey, names)
@@ -133,7 +134,7 @@ def _is_declared(survey: Survey, name: ParameterName) -> bool:
     return len(name) == 2 and (name[0] != "point" or any(p.point_id == name[1] for p in survey.points))
 
 
-def _previous(project: Project) -> tuple[Previous | None, str]:
+def _previous(project: Project) -> tuple[Snapshot | None, str]:
     """The last solution, or why there is none to compare with."""
     try:
         return read_previous(project), ""
