@@ -4,7 +4,7 @@ The result is that of adjusting everything at once: the minimum does not depend 
 might (free networks, whose datum is that of the start), the search begins anew.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -29,20 +29,18 @@ _TERMS = ("table_geometry", "warp", "lens_drift", *CLOCKS)
 WARM, COLD = "from the previous solution", "from the beginning"
 
 
-def warm_adjustment(
-    project: Project, before: Snapshot, cold: Callable[[Project], Adjustment], progress: bool
-) -> tuple[Adjustment, str]:
-    """Adjust a project that has grown or shrunk, and how that began. cold: adjusts a project from the beginning.
+def warm_adjustment(project: Project, before: Snapshot | None, progress: bool) -> tuple[Adjustment, str]:
+    """Adjust a project that has grown or shrunk, and how that began; where nothing was before, from the beginning.
 
     What people left out and what the tables leave out is obeyed as always; what the previous run screened out by
     itself is tested anew, because what it contradicted may be gone.
     """
-    survey = project.survey
-    if survey.datum.kind == "inner" or project.options.pairs == "closed":
-        return cold(project), COLD
     found: list[bool] = []
+    free = project.survey.datum.kind == "inner" or project.options.pairs == "closed"
 
     def begin(part: Survey) -> StartValues | None:
+        if before is None or free:
+            return None
         start = (survey_start if network_of_pairs(part) is None else network_start)(part, before)
         found.append(start is not None)
         return start
@@ -50,8 +48,10 @@ def warm_adjustment(
     try:
         adjustment = adjust_project(project, progress, begin)
     except NotConvergedError:  # what is new may contradict what was there; the search from the beginning looks for that
-        return cold(project), COLD
-    return adjustment, WARM if all(found) else COLD
+        if not any(found):
+            raise
+        return adjust_project(project, progress), COLD
+    return adjustment, WARM if found and all(found) else COLD
 
 
 def network_start(survey: Survey, before: Snapshot) -> StartValues | None:
