@@ -172,13 +172,8 @@ def _report(arguments: argparse.Namespace) -> int:
         report=ReportOptions(arguments.language, arguments.pdf), said=command_line("report", arguments.folder, **flags),
     )  # fmt: skip
     unmet = [v for v in outcome.statistics.verdicts if not v.met] if outcome.statistics is not None else []
-    if is_set(arguments, "json"):
-        print_json(outcome.summary())
-    else:
-        print(outcome.text())
-        for v in unmet:
-            times = f"{v.found / v.allowed:.2f} times what is allowed"
-            print(f"  tolerance {v.tolerance} not met: {' '.join(v.result)} {v.quantity}, {times}")
-        say(arguments, *(f"written: {path}" for path in outcome.paths.values()))
+    lines = (f"\n  tolerance {v.tolerance} not met: {' '.join(v.result)} {v.quantity}, {v.found / v.allowed:.2f} times "
+             "what is allowed" for v in unmet)  # fmt: skip
+    show(arguments, outcome, outcome.paths.values(), "".join(lines))
     code = tested(outcome.solution["summary"])
     return TEST_FAILED if code == DONE and arguments.check and unmet else code

@@ -4,7 +4,7 @@ import argparse
 import time
 from pathlib import Path
 
-from survey.commands.common import DONE, begin_adjusting, is_set, print_json, require_project, say, show, tested
+from survey.commands.common import DONE, begin_adjusting, is_set, require_project, say, show, tell, tested
 from survey.commands.excluding import NAMES, add_names
 from survey.commands.parser import Commands, project_folder
 
@@ -141,9 +141,6 @@ def _trackers(arguments: argparse.Namespace) -> int:
     written = None
     if arguments.out is not None:
         written = write_relay_pairs(arguments.out, tracker_pairs(found).pairs)
-    if is_set(arguments, "json"):
-        print_json({"trackers": list(files), "report": trackers_text(found), "written": written and str(written)})
-    else:
-        print(trackers_text(found), end="")
-        say(arguments, *([f"written: {written}"] if written else []))
+    said = {"trackers": list(files), "report": trackers_text(found), "written": written and str(written)}
+    tell(arguments, said, trackers_text(found).rstrip("\n"), [written] if written else [])
     return DONE

@@ -7,7 +7,7 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from survey.commands.common import DONE, is_set, not_negative, positive, print_json, require_project, say
+from survey.commands.common import DONE, not_negative, positive, require_project, say, tell
 from survey.commands.parser import Commands, project_folder
 from survey.folder.kept import undo_killed
 
@@ -117,11 +117,7 @@ def _runs(arguments: argparse.Namespace) -> int:
     if len(arguments.numbers) != wanted:
         arguments.parser.error(f"{arguments.action} takes {wanted} number{'s' * (wanted != 1)} of runs")
     require_project(arguments.folder)
-    found, text = _done(arguments)
-    if is_set(arguments, "json"):
-        print_json(found)
-    else:
-        print(text)
+    tell(arguments, *_done(arguments))
     return DONE
 
 

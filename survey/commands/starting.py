@@ -4,7 +4,7 @@ import argparse
 import json
 from pathlib import Path
 
-from survey.commands.common import DONE, is_set, not_negative, positive, print_json, require_project, say, show
+from survey.commands.common import DONE, is_set, not_negative, positive, require_project, say, show, tell
 from survey.commands.parser import Commands, project_folder
 from survey.examples import EXAMPLES, write_example
 
@@ -53,7 +53,7 @@ def declare_detect(commands: Commands) -> None:
 
 def _detect(arguments: argparse.Namespace) -> int:
     require_project(arguments.folder)
-    from survey.jobs.detecting import detect_job
+    from survey.jobs.detecting.job import detect_job
 
     outcome = detect_job(
         arguments.folder,
@@ -104,13 +104,9 @@ def declare_schema(commands: Commands) -> None:
 def _example(arguments: argparse.Namespace) -> int:
     progress = not is_set(arguments, "quiet")
     n = write_example(arguments.name, arguments.folder, seed=arguments.seed, jobs=arguments.jobs, progress=progress)
-    if is_set(arguments, "json"):
-        print_json({"example": arguments.name, "folder": str(arguments.folder), "seed": arguments.seed, "images": n})
-    else:
-        print(
-            f"{arguments.folder}: example {arguments.name}{f' with {n} images' if n else ''}\n"
-            f"Next: labsurvey adjust {arguments.folder}"
-        )
+    found = {"example": arguments.name, "folder": str(arguments.folder), "seed": arguments.seed, "images": n}
+    tell(arguments, found, f"{arguments.folder}: example {arguments.name}{f' with {n} images' if n else ''}\n"
+         f"Next: labsurvey adjust {arguments.folder}")  # fmt: skip
     return DONE
 
 

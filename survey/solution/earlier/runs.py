@@ -9,12 +9,14 @@ Images are never kept.
 import hashlib
 import json
 import os
+import platform
 import re
 import shlex
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -34,6 +36,7 @@ if TYPE_CHECKING:  # loads what adjusts
 
 RUNS, MOST = "runs", 50
 _RUN, _ESTIMATES, _SOLUTION = "run.json", "estimates.npz", "solution.json"
+_PACKAGES = ("labsurvey", "gtsam", "numpy", "scipy", "opencv-contrib-python-headless")
 _FILES = (_RUN, _ESTIMATES, _SOLUTION, DEFINITION_FILE)
 
 
@@ -49,6 +52,15 @@ class Clock:
         begin = time.perf_counter()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+
+
+def installed_versions() -> dict[str, str]:
+    """Versions of Python and of the packages that results depend on, as far as they are installed."""
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        with suppress(PackageNotFoundError):
+            found[package] = version(package)
+    return found
 
 
 def command_line(command: str, folder: Path, *words: str | Path, **flags: object) -> str:
