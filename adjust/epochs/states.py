@@ -312,8 +312,9 @@ def aligned(before: Epoch, after: SomeEpoch, directions: FloatArray, reference: 
 def laid_onto(
     target: Sequence[Pose3 | FloatArray], values: tuple[Pose3 | FloatArray, ...], directions: FloatArray, kept: BoolArray
 ) -> tuple[tuple[Pose3 | FloatArray, ...], FloatArray, float]:
-    """Values moved as a whole until the kept components (n,) lie on the target, and what they were mapped by: L, scale."""
-    along, L, scale = np.concatenate([value_motions(v) for v in target]) @ directions, np.eye(3), 1.0
+    """Values moved as a whole until the kept components (n,) lie on the target; L and scale took them there."""
+    along = np.concatenate([value_motions(v) for v in target]) @ directions
+    L, scale = np.eye(3), 1.0
     for _ in range(20):
         d = differences(target, values)
         rows = kept & np.isfinite(d)
