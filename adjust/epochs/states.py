@@ -309,9 +309,12 @@ def aligned(before: Epoch, after: SomeEpoch, directions: FloatArray, reference: 
     return after.mapped(values, L, scale)
 
 
+Values = tuple[Pose3 | FloatArray, ...]
+
+
 def laid_onto(
-    target: Sequence[Pose3 | FloatArray], values: tuple[Pose3 | FloatArray, ...], directions: FloatArray, kept: BoolArray
-) -> tuple[tuple[Pose3 | FloatArray, ...], FloatArray, float]:
+    target: Sequence[Pose3 | FloatArray], values: Values, directions: FloatArray, kept: BoolArray
+) -> tuple[Values, FloatArray, float]:
     """Values moved as a whole until the kept components (n,) lie on the target; L and scale took them there."""
     along = np.concatenate([value_motions(v) for v in target]) @ directions
     L, scale = np.eye(3), 1.0
