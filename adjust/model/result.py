@@ -39,6 +39,14 @@ class Estimate:
     status: tuple[str, ...]
 
 
+class Estimated(Protocol):
+    """What has estimates by name: an adjustment, or what is kept of one."""
+
+    @property
+    def estimates(self) -> Mapping[ParameterName, Estimate]:
+        """Every parameter."""
+
+
 def adjusted_pose(
     estimates: Mapping[ParameterName, Estimate], name: ParameterName, parameter: PoseParameter
 ) -> Pose3 | None:

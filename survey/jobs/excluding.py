@@ -6,7 +6,9 @@
 Nothing is adjusted: every command obeys the file from then on.
 """
 
-from collections.abc import Sequence
+import getpass
+import os
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,6 @@ from typing import Any
 from adjust.model.errors import SurveyError
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write, suggestion, time_text
-from survey.jobs.detecting import author_name
 from survey.project import Project
 from survey.project.exclusions import EXCLUSIONS_FILE, Exclusion, Name, Row, appended, in_force, read_exclusions
 from survey.project.observed import Observed
@@ -91,6 +92,15 @@ def _outcome(folder: Path, project: Project, rows: Sequence[Row], excluded: bool
     done = tuple(h.left_out(row.exclusion) for row, h in zip(rows, hits, strict=True))
     now = in_force(read_exclusions(folder / OBSERVATIONS_FOLDER)[0])
     return ExcludeOutcome(folder, excluded, done, tuple(h.text() for h in hits), folder / FILE, len(now))
+
+
+def author_name(said: Iterable[tuple[str, str]] = ()) -> str:
+    """Who decides: $LABSURVEY_AUTHOR, the surveyor of [identification], or the user of the computer."""
+    surveyor = next((value for key, value in said if key == "surveyor"), "")
+    try:
+        return os.environ.get("LABSURVEY_AUTHOR", "") or surveyor or getpass.getuser()
+    except (OSError, KeyError):  # a user without a name, as in a container
+        return ""
 
 
 def _said(project: Project, name: Name, reason: str, author: str, at: tuple[float, float] | None = None) -> Exclusion:

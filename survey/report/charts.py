@@ -6,11 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
-from adjust.model.survey import BoolArray, FloatArray
+from adjust.model.result import Adjustment
+from adjust.model.survey import BoolArray, Camera, FloatArray, IntArray
 from adjust.testing.distributions import beta, norm
 from survey.report import drawing as d
 from survey.report.language import esc, known, localised, t
 from survey.report.markup import MINUS, count
+from survey.solution.residual_tables import ImageRows
 from survey.solution.statistics import CorrelationMatrix
 
 WIDTH = 316.0
@@ -34,18 +36,28 @@ class CameraResiduals:
     suspect: BoolArray
 
 
+def camera_residuals(adjustment: Adjustment, rows: ImageRows, suspect: BoolArray, camera: Camera) -> CameraResiduals:
+    """Of one of the cameras; ``suspect``: of all image points (N,)."""
+    found = adjustment.image_residuals
+    blocks = [i for i, b in enumerate(adjustment.survey.image_blocks) if b.camera_id == camera.camera_id]
+    mine = _rows_of(blocks, found.block_ptr)
+    return CameraResiduals(camera.camera_id, camera.image_size, rows.uv[mine], found.residuals[mine],
+                           found.standardized[mine], found.used[mine], suspect[mine])  # fmt: skip
+
+
+def _rows_of(blocks: Sequence[int], ptr: IntArray) -> IntArray | slice:
+    """Rows of these blocks, as a slice where they follow each other: then nothing is copied."""
+    if len(blocks) and blocks[-1] - blocks[0] == len(blocks) - 1:
+        return slice(int(ptr[blocks[0]]), int(ptr[blocks[-1] + 1]))
+    return np.concatenate([np.zeros(0, dtype=np.int64), *(np.arange(ptr[b], ptr[b + 1]) for b in blocks)])
+
+
 def _frame(size: tuple[int, int], title: str) -> tuple[float, float, list[str]]:
     """Pixels of the picture per image pixel, height of the image, and the parts to start with."""
     scale = WIDTH / size[0]
     height = scale * size[1]
-    return (
-        scale,
-        height,
-        [
-            d.heading(title),
-            d.rect(0.5, _ABOVE, WIDTH - 1, height, d.FRAME, f' stroke="{d.FAINT}"'),
-        ],
-    )
+    frame = d.rect(0.5, _ABOVE, WIDTH - 1, height, d.FRAME, f' stroke="{d.FAINT}"')
+    return scale, height, [d.heading(title), frame]
 
 
 def _arrow_scale(lengths: FloatArray, wanted: float) -> float:

@@ -3,8 +3,9 @@
 Also the view in space, to be turned around on the screen: lines, points and ellipsoids as plain values for the page.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -187,9 +188,14 @@ def scene_values(adjustment: Adjustment, scale: Scale, drawn: Scene | None = Non
     taken = dict.fromkeys((b.camera_id, b.epoch_id) for b in adjustment.survey.image_blocks)
     shown = set(_shown(adjustment))
     poses = {key: frames.world_from(FrameRef("camera", *key)) for key in taken if every or key[1] in shown}
+    return drawn_values(drawn, scale.ellipsoid, {"/".join(k): pose for k, pose in poses.items() if pose is not None})
+
+
+def drawn_values(drawn: Scene, ellipsoid: float, images: Mapping[str, Pose3] = MappingProxyType({})) -> dict[str, Any]:
+    """The same of any scene; images: ``world_from_camera`` by image."""
     return dict(plain({
-        "ellipsoid": scale.ellipsoid,
-        "images": {"/".join(key): pose.matrix()[:3].ravel() for key, pose in poses.items() if pose is not None},
+        "ellipsoid": ellipsoid,
+        "images": {name: pose.matrix()[:3].ravel() for name, pose in images.items()},
         "cameras": {s.label: {"index": s.camera_idx, "half_angles_rad": s.half_angles} for s in drawn.shots},
         "spots": [{"id": s.label, "kind": s.kind, "x": x, "cov": cov} for s, x, cov in zip(
             drawn.spots, drawn.spot_places().tolist(), drawn.spot_covs().reshape(-1, 9).tolist(), strict=True)],

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from gtsam import Pose3, Rot3
+from gtsam import Pose3
 
 from adjust.model.names import natural_key
 from adjust.model.observations import FrameRef, Pair
@@ -217,14 +217,6 @@ def loops_after(adjustment: Adjustment, loops: LoopMisclosures) -> FloatArray:
     return w
 
 
-def motion_arrays(of: Sequence[Pose3 | Rot3], dim: int) -> Motions:
-    """Rotations or poses (then all of them) as arrays; of poses the rotations alone where ``dim`` is 3."""
-    rotation = np.array([(m.rotation() if isinstance(m, Pose3) else m).matrix() for m in of])
-    if dim == 3:
-        return Motions(rotation)
-    return Motions(rotation, np.array([m.translation() for m in of if isinstance(m, Pose3)]))
-
-
 def network_dict(network: PairNetwork) -> dict[str, Any]:
     """The counts as plain values."""
     c = network.counts
@@ -285,21 +277,17 @@ def closures_dict(adjustment: Adjustment) -> dict[str, Any]:
     sigma: of the mount, as given. play_over_sigma: length of the play over its sigmas, of dim components.
     """
     survey, out = adjustment.survey, {}
-    by_id = {p.pair_id: p for p in survey.pairs}
+    every, number = pair_arrays(survey.pairs), {p.pair_id: e for e, p in enumerate(survey.pairs)}
     of_pairs = adjustment.other_residuals if survey.closures else ()
     found = {o.ids[0]: np.asarray(o.residual) for o in of_pairs if o.kind == "pair"}
     for closure in survey.closures:
-        pairs = [by_id[i] for i in closure.pair_ids]
-        dim = 6 if all(isinstance(p.b_from_a, Pose3) for p in pairs) else 3
-        covs = np.array([np.asarray(p.cov)[:dim, :dim] for p in pairs])
-        motions = motion_arrays([p.b_from_a for p in pairs], dim)
-        loop = loop_misclosures(MeasuredPairs(topology(_ends(pairs)), motions, covs))
-        w, cov = loop.vector[0], loop.cov[0]
+        rows = [number[i] for i in closure.pair_ids]
+        pairs, dim = [survey.pairs[e] for e in rows], 6 if every.is_pose[rows].all() else 3
+        motions = Motions(every.rotations[rows], every.translations[rows] if dim == 6 else None)
+        loop = loop_misclosures(MeasuredPairs(topology(_ends(pairs)), motions, every.cov[rows, :dim, :dim]))
         entry: dict[str, Any] = {"pairs": list(closure.pair_ids), "used": pairs[-1].used}
         entry |= {"sigma_arcsec": ARCSEC_PER_RAD * closure.rotation_sigma, "sigma_mm": 1e3 * closure.translation_sigma}
-        entry["misclosure_arcsec"], entry["sigma_misclosure_arcsec"] = _along(w[:3], cov[:3, :3], ARCSEC_PER_RAD)
-        if dim == 6:
-            entry["misclosure_mm"], entry["sigma_misclosure_mm"] = _along(w[3:], cov[3:, 3:], 1e3)
+        entry |= misclosure_dict(loop.vector[0], loop.cov[0])
         entry |= {"test": loop.test[0], "freedom": dim, "p_value": loop.p_value[0]}
         v = found.get(closure.pair_ids[-1])
         if v is not None:
@@ -313,17 +301,20 @@ def closures_dict(adjustment: Adjustment) -> dict[str, Any]:
 
 
 def _loop(loops: LoopMisclosures, k: int, failed: bool, left_out: set[str]) -> dict[str, Any]:
-    w, cov = loops.vector[k], loops.cov[k]
     pairs = _real(loops.basis.pairs(k))
-    entry: dict[str, Any] = {"stations": list(loops.basis.stations(k)), "pairs": list(pairs)}
-    entry["misclosure_arcsec"], entry["sigma_misclosure_arcsec"] = _along(w[:3], cov[:3, :3], ARCSEC_PER_RAD)
-    if len(w) == 6:
-        entry["misclosure_mm"], entry["sigma_misclosure_mm"] = _along(w[3:], cov[3:, 3:], 1e3)
-    entry |= {"test": loops.test[k], "freedom": len(w), "p_value": loops.p_value[k], "closes": not failed}
-    return entry | {"pairs_not_used": [p for p in pairs if p in left_out]}
+    return {
+        "stations": list(loops.basis.stations(k)), "pairs": list(pairs),
+        **misclosure_dict(loops.vector[k], loops.cov[k]), "test": loops.test[k], "freedom": len(loops.vector[k]),
+        "p_value": loops.p_value[k], "closes": not failed, "pairs_not_used": [p for p in pairs if p in left_out],
+    }  # fmt: skip
 
 
-def _along(w: FloatArray, cov: FloatArray, factor: float) -> tuple[float, float]:
-    size = float(np.linalg.norm(w))
-    sigma = float(np.sqrt(w @ cov @ w)) / size if size > 0.0 else float(np.sqrt(np.trace(cov) / 3.0))
-    return factor * size, factor * sigma
+def misclosure_dict(w: FloatArray, cov: FloatArray) -> dict[str, float]:
+    """Lengths of a misclosure (3 or 6,), and their sigmas along it."""
+    parts = (("arcsec", slice(3), ARCSEC_PER_RAD), ("mm", slice(3, 6), 1e3))
+    out: dict[str, float] = {}
+    for unit, of, factor in parts[: len(w) // 3]:
+        size = float(np.linalg.norm(w[of]))
+        sigma = np.sqrt(w[of] @ cov[of, of] @ w[of]) / size if size > 0.0 else np.sqrt(np.trace(cov[of, of]) / 3.0)
+        out |= {f"misclosure_{unit}": factor * size, f"sigma_misclosure_{unit}": factor * float(sigma)}
+    return out

@@ -10,8 +10,7 @@ from adjust.model.errors import SurveyError
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write, read_text
 from survey.jobs.adjusting.edits import changed_files, kept_name, left_out
-from survey.jobs.detecting import author_name
-from survey.jobs.excluding import FILE, included_rows, new_rows
+from survey.jobs.excluding import FILE, author_name, included_rows, new_rows
 from survey.project.declared.editing import with_datum, with_sigma_scale, with_treatment
 from survey.project.exclusions import Exclusion, Name, Row, appended, in_force, read_exclusions
 from survey.project.observed import IMAGES, Observed, union

@@ -12,8 +12,7 @@ itself. Only the third is found anew by every adjustment, which begins at the va
 
 from dataclasses import replace
 
-from survey.jobs.detecting import author_name
-from survey.jobs.excluding import FILE
+from survey.jobs.excluding import FILE, author_name
 from survey.project.exclusions import Row
 from survey.project.project import DEFINITION_FILE
 from survey.solution.earlier.changes import Changes, Snapshot, snapshot, solution_changes

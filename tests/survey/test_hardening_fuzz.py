@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 CORPUS = ROOT / "tests" / "fuzz" / "corpus"
 NO_READERS = {
-    "survey/commands/opening.py:_open": "a browser",
+    "survey/commands/opening.py:open_project": "a browser",
     "survey/report/modules.py:bundled": "a part of the package",
     "survey/report/modules.py:looks": "a part of the package",
     "survey/report/page.py:_words": "a part of the package",

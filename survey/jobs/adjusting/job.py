@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from adjust.model.errors import SurveyError
 from survey.folder.replacing import changing, replace_parts
-from survey.jobs.detecting import detect_in, detect_job, remember_images
+from survey.jobs.detecting.job import detect_in, detect_job, remember_images
 from survey.project import read
 from survey.project.project import RESULTS
 from survey.report.language import ENGLISH_PAGE, ReportOptions

@@ -9,8 +9,8 @@ from adjust.model.errors import DiagnosedError, SurveyError
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write
 from survey.jobs.adjusting.edits import changed_files, left_out
-from survey.jobs.adjusting.image_defects import blurred
 from survey.jobs.adjusting.steps import adjust_project
+from survey.jobs.detecting.image_defects import blurred
 from survey.jobs.excluding import FILE, new_rows
 from survey.project import read
 from survey.project.exclusions import appended

@@ -7,7 +7,6 @@ from typing import Any, TypeVar
 import numpy as np
 from markupsafe import Markup
 
-from adjust.model.survey import IntArray
 from survey.report import charts
 from survey.report import markup as m
 from survey.report.context import Context
@@ -19,8 +18,7 @@ _MOST_ROWS, _MOST_CAMERAS, _MOST_BLOCKS = 250, 40, 100
 _MANY_EPOCHS = 12
 T = TypeVar("T")
 _Pose = tuple[str, str, str, Callable[[], dict[str, Any]]]
-"""A thing, the name of its pose, the epoch, and what gives the entry: few of many are shown."""
-"""Thing, name of its pose, epoch or nothing, entry."""
+"""A thing, the name of its pose, the epoch or nothing, and what gives the entry: few of many are shown."""
 _POSE_COLUMNS = ("<Pose", "<Epoch", "x [mm]", "y [mm]", "z [mm]", "rx [°]", "ry [°]", "rz [°]", "<Status")
 _POSE_NOTE = (
     "A pose a_from_b is the origin of b in a and R = Rz Ry Rx. Below each coordinate its sigma along the axes of a in "
@@ -130,21 +128,14 @@ def _more(n: int) -> Markup:
 
 def cameras(c: Context) -> Markup:
     """Every camera: lens, pose, residuals."""
-    found = c.adjustment.image_residuals
-    camera_of_block = np.array([b.camera_id for b in c.adjustment.survey.image_blocks], dtype=object)
     entries, parts = c.solution["cameras"], []
     # of very many cameras those with the largest residuals are shown whole
     by_size = sorted(entries, key=lambda k: -(entries[k]["rms_residual_px"] or 0.0))
     shown, others = set(by_size[:_MOST_CAMERAS]), by_size[_MOST_CAMERAS:]
     for camera in c.adjustment.survey.cameras:
-        if camera.camera_id not in shown:
-            continue
-        mine = _rows_of(np.flatnonzero(camera_of_block == camera.camera_id), found.block_ptr)
-        residuals = charts.CameraResiduals(
-            camera.camera_id, camera.image_size, c.rows.uv[mine], found.residuals[mine], found.standardized[mine],
-            found.used[mine], c.suspect[mine],
-        )  # fmt: skip
-        parts.append(_camera(camera.camera_id, entries[camera.camera_id], residuals))
+        if camera.camera_id in shown:
+            residuals = charts.camera_residuals(c.adjustment, c.rows, c.suspect, camera)
+            parts.append(_camera(camera.camera_id, entries[camera.camera_id], residuals))
     if others:
         n = m.count(len(others))
         title = t("{n} more cameras, with smaller residuals; their lenses and poses in solution.json", n=n)
@@ -155,13 +146,6 @@ def cameras(c: Context) -> Markup:
         "A pattern in the mean per cell is what the lens model leaves over; empty cells hold no points."
     )
     return m.section("cameras", "Cameras", m.joined(parts), said)
-
-
-def _rows_of(blocks: IntArray, ptr: IntArray) -> IntArray | slice:
-    """Rows of these blocks, as a slice where they follow each other: then nothing is copied."""
-    if len(blocks) and blocks[-1] - blocks[0] == len(blocks) - 1:
-        return slice(int(ptr[blocks[0]]), int(ptr[blocks[-1] + 1]))
-    return np.concatenate([np.zeros(0, dtype=np.int64), *(np.arange(ptr[b], ptr[b + 1]) for b in blocks)])
 
 
 def _camera_row(camera_id: str, entry: dict[str, Any]) -> list[str]:
@@ -295,13 +279,8 @@ def targets(c: Context) -> Markup:
 def _target_row(target: tuple[str, dict[str, Any]]) -> list[str]:
     target_id, entry = target
     carrier = t("station {name}", name=entry["station"]) if "station" in entry else t("the world")
-    return [
-        target_id,
-        m.count(entry["n_points"]),
-        carrier,
-        known(entry["motion"]),
-        m.count(len(entry.get("epochs", {}))),
-    ]
+    epochs = m.count(len(entry.get("epochs", {})))
+    return [target_id, m.count(entry["n_points"]), carrier, known(entry["motion"]), epochs]
 
 
 def points(c: Context) -> Markup:
