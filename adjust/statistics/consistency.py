@@ -30,9 +30,7 @@ _EXACT = 400
 _ESTIMATED = ("estimated", "unseparable")
 
 
-def consistency(
-    adjustment: Adjustment, condensed: CondensedSystem | None, alpha: float = 0.05, changes: bool = True
-) -> Consistency:
+def consistency(adjustment: Adjustment, condensed: CondensedSystem | None, alpha: float = 0.05) -> Consistency:
     """Test every part, and look for changes; ``alpha`` is the error probability of all of it together.
 
     condensed: the system of this adjustment; None for a large network of pairs, of which the groups are tested. Where
@@ -52,7 +50,7 @@ def consistency(
     fitted = {c.group for c in known.components if c.status in _ESTIMATED} if known is not None else set()
     parts = tuple(p for p in parts if not (p.kind == "group" and p.name in fitted))
     search = None
-    if changes and condensed is not None and len(condensed.e):
+    if condensed is not None and len(condensed.e):
         search = ChangeSearch(adjustment, condensed)
     n_changes = search.n_tests if search is not None else 0
     n = len(parts) + n_changes

@@ -51,9 +51,8 @@ DEFAULT_COMPONENTS = ComponentOptions()
 
 @dataclass(frozen=True, eq=False)
 class Scaled:
-    """The survey with its estimated variances, adjusted, and the components that were found."""
+    """A survey adjusted with its estimated variances, and the components that were found."""
 
-    survey: Survey
     adjustment: Adjustment
     components: VarianceComponents
 
@@ -92,12 +91,12 @@ def estimate_variance_components(
         change = max((abs(np.log(c.factor)) for c in found.components if c.status in _CHANGED), default=0.0)
         if change < options.convergence:
             total = {c.group: total.get(c.group, 1.0) for c in found.components}
-            return Scaled(now.survey, now, _totals(found, total, iteration, True, options))
+            return Scaled(now, _totals(found, total, iteration, True, options))
         total = {c.group: total.get(c.group, 1.0) * c.factor for c in found.components}
         now = adjust(scaled_survey(survey, total), values_of(now), options.adjust, progress)
     found = _of_adjustment(now, options)
     total = {c.group: total.get(c.group, 1.0) for c in found.components}
-    return Scaled(now.survey, now, _totals(found, total, options.max_iterations, False, options))
+    return Scaled(now, _totals(found, total, options.max_iterations, False, options))
 
 
 _CHANGED = ("estimated", "unseparable", "vanished")

@@ -44,7 +44,7 @@ class Round:
         self.found = candidates(precision.graph, images)
         points = 0 if images else int(now.image_residuals.used.sum())
         self.given = used_at(now, self.found) if given is None else given
-        allowed = self.found.mask() & self.given
+        allowed = self.found.mask & self.given
         if options.kinds is not None:
             kinds = ["image"] * self.found.n_image + precision.graph.of_others(lambda o: o.kind, lambda _: "pair")
             kinds += [r.kind for r in now.survey.readings]
@@ -211,7 +211,7 @@ class Round:
         suspects.sort(key=lambda i: -float(last.over[i]))
         mine = {names[g] for g in np.unique(now.group[now.candidates]).tolist()}
         return OutlierSearch(
-            adjustment, adjustment.survey, tuple(sorted(rejected, key=lambda d: -d.statistic / d.limit)), tuple(log),
+            adjustment, tuple(sorted(rejected, key=lambda d: -d.statistic / d.limit)), tuple(log),
             tuple(self._decision("rejected", i, now, "test") for i in suspects), self.number, converged,
             tuple(self._alternative(x) for x in equal_sets(now, self._limits())),
             tuple(n for n, timid in zip(names, self.cautious, strict=False) if timid),
