@@ -11,9 +11,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from gtsam import Pose3
 
-from adjust.epochs.change import Change, Displaced, MatrixChange
-from adjust.epochs.congruence_result import Congruence, CongruenceStep, CongruenceTest, Motion
+from adjust.epochs.change import Change, MatrixChange
+from adjust.epochs.congruence_result import Congruence, CongruenceStep, CongruenceTest
 from adjust.epochs.joined import JoinedChange
+from adjust.epochs.judging import Judging, Pooled, tests_of
 from adjust.epochs.states import (
     MOTIONS,
     Epoch,
@@ -26,12 +27,10 @@ from adjust.epochs.states import (
 )
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
-from adjust.model.survey import FloatArray, IntArray
-from adjust.statistics.relative_precision import ellipsoid
-from adjust.statistics.result import Ellipsoid
-from adjust.testing.criteria import LevelOptions, noncentrality, sidak
-from adjust.testing.distributions import chi2, fisher
-from adjust.testing.quadratic_forms import pseudo_square
+from adjust.model.survey import FloatArray
+from adjust.testing.criteria import LevelOptions, sidak
+from adjust.testing.distributions import fisher
+from adjust.testing.quadratic_forms import squares_in_sigmas
 
 MOST_IN_MATRIX = 600
 """Components up to which epochs are compared by one covariance matrix; more, by their normal equations."""
@@ -77,7 +76,7 @@ class Common:
     before: Epoch
     after: Epoch
     directions: FloatArray
-    pooled: tuple[float, float, float]
+    pooled: Pooled
 
 
 def common(first: Adjustment, second: Adjustment, options: CongruenceOptions = DEFAULT_CONGRUENCE) -> Common:
@@ -99,12 +98,11 @@ def _size(adjustment: Adjustment) -> int:
 
 def compare(
     names: tuple[ParameterName, ...], before: Epoch, after: Epoch, directions: FloatArray,
-    pooled: tuple[float, float, float], options: CongruenceOptions, cross: FloatArray | None = None,
+    pooled: Pooled, options: CongruenceOptions, cross: FloatArray | None = None,
 ) -> Congruence:  # fmt: skip
     """Of two states of the same names, aligned. directions (7, k): motions that do not count.
 
-    pooled: sigma0, its redundancy, p of the test of equal variances. cross: covariance (n, n) of the first with the
-    second state where they are not independent.
+    cross: covariance (n, n) of the first with the second state where they are not independent.
     """
     change = _change(before, after, directions, cross)
     begin = _numbers(names, options.reference)
@@ -113,7 +111,9 @@ def compare(
         raise SurveyError("no point of the reference is free in either epoch; there is nothing to test")
     first_test = _global(change, kept, pooled, options.alpha)
     steps, stable, last = _search(change, kept, first_test, pooled, options)
-    motions = _motions(change, before, stable, pooled, options)
+    level = sidak(options.alpha, len(np.unique(change.owner)))
+    judging = Judging(change, before, frozenset(stable), pooled, level, options.alpha, options.levels.power)
+    motions = judging.of(change.displaced(stable))
     moved = tuple(m.name for m in motions if m.significant)
     return Congruence(
         options.names, options.alpha, options.scaled, pooled[0], pooled[1], pooled[2], first_test, last, tuple(steps),
@@ -130,7 +130,7 @@ def _numbers(names: Sequence[ParameterName], reference: Sequence[ParameterName] 
     return [names.index(n) for n in reference]
 
 
-def _pooled(first: Adjustment, second: Adjustment, scaled: bool) -> tuple[float, float, float]:
+def _pooled(first: Adjustment, second: Adjustment, scaled: bool) -> Pooled:
     """Sigma0, redundancy, and p of the two-sided F-test of equal variance factors."""
     f1, f2 = first.redundancy, second.redundancy
     p = float("nan")
@@ -168,24 +168,15 @@ def _change(before: Epoch, after: Epoch, directions: FloatArray, cross: FloatArr
     raise TypeError("both epochs are known by their covariance matrices, or independent and by their normal equations")
 
 
-def _test(statistic: float, freedom: int, pooled: tuple[float, float, float], level: float) -> CongruenceTest:
-    sigma0, f, _ = pooled
-    if freedom == 0:
-        return CongruenceTest(float("nan"), 0, f, float("nan"), True)
-    F = statistic / freedom / sigma0**2
-    p = float(fisher.sf(F, freedom, f) if np.isfinite(f) else chi2.sf(F * freedom, freedom))
-    return CongruenceTest(F, freedom, f, p, p >= level)
-
-
-def _global(change: Change, stable: Sequence[int], pooled: tuple[float, float, float], alpha: float) -> CongruenceTest:
+def _global(change: Change, stable: Sequence[int], pooled: Pooled, alpha: float) -> CongruenceTest:
     statistic, rank = change.square(stable)
     # what the datum takes away is no information, whatever rounding leaves of it
     rank = min(rank, max(0, len(change.rows(stable)) - change.G.shape[1]))
-    return _test(statistic, rank, pooled, alpha)
+    return tests_of(np.array([statistic]), np.array([rank]), pooled, alpha)[0]
 
 
 def _search(
-    change: Change, begin: list[int], test: CongruenceTest, pooled: tuple[float, float, float],
+    change: Change, begin: list[int], test: CongruenceTest, pooled: Pooled,
     options: CongruenceOptions,
 ) -> tuple[list[CongruenceStep], list[int], CongruenceTest]:  # fmt: skip
     """Take out the worst until the rest is congruent, and back what then fits.
@@ -211,11 +202,12 @@ def _search(
 
 def _readmitted(
     change: Change, begin: list[int], stable: list[int], test: CongruenceTest, steps: list[CongruenceStep],
-    pooled: tuple[float, float, float], options: CongruenceOptions,
+    pooled: Pooled, options: CongruenceOptions,
 ) -> tuple[list[CongruenceStep], list[int], CongruenceTest]:  # fmt: skip
     level = sidak(options.alpha, len(begin))
     for i in [i for i in begin if i not in stable] if test.passed else []:
-        single = _single(change, change.displaced(stable), i, pooled, level)
+        statistic, rank = squares_in_sigmas(*change.displaced(stable)(change.rows([i])[None]))
+        single = tests_of(statistic, rank, pooled, level)[0]
         more = sorted([*stable, i])
         together = _global(change, more, pooled, options.alpha)
         if single.passed and together.passed:
@@ -224,59 +216,7 @@ def _readmitted(
     return steps, stable, test
 
 
-def _single(
-    change: Change, displaced: Displaced, i: int, pooled: tuple[float, float, float], level: float
-) -> CongruenceTest:
-    statistic, rank, _ = pseudo_square(*displaced(change.rows([i])))
-    return _test(statistic, rank, pooled, level)
-
-
-def _motions(
-    change: Change, before: Epoch, stable: list[int], pooled: tuple[float, float, float], options: CongruenceOptions
-) -> tuple[Motion, ...]:
-    displaced, inside = change.displaced(stable), set(stable)
-    present = np.unique(change.owner).tolist()
-    level = sidak(options.alpha, len(present))
-    rows = np.split(np.arange(len(change.owner)), np.flatnonzero(np.diff(change.owner)) + 1)
-    out = [_motion(change, displaced, mine, before, i in inside, pooled, level, options)
-           for i, mine in zip(present, rows, strict=True)]  # fmt: skip
-    return tuple(sorted(out, key=lambda m: (m.stable, m.test.p if np.isfinite(m.test.p) else 2.0)))
-
-
-def _motion(
-    change: Change, displaced: Displaced, rows: IntArray, before: Epoch, stable: bool,
-    pooled: tuple[float, float, float], level: float, options: CongruenceOptions,
-) -> Motion:  # fmt: skip
-    name = change.names[int(change.owner[rows[0]])]
-    d, Q = displaced(rows)
-    place, axes = change.component[rows], before.axes(name)
-    full, cov = np.zeros(6), np.zeros((6, 6))
-    full[place] = d
-    cov[np.ix_(place, place)] = Q
-    shift, cov_shift = axes @ full[3:], axes @ cov[3:, 3:] @ axes.T
-    statistic, rank, _ = pseudo_square(d, Q)
-    test = _test(statistic, rank, pooled, level)
-    turn, rotation_test = np.zeros(3), None
-    if isinstance(before.value(name), Pose3):
-        turning = np.flatnonzero(place < 3)
-        statistic, rank, _ = pseudo_square(d[turning], Q[np.ix_(turning, turning)])
-        turn, rotation_test = full[:3], _test(statistic, rank, pooled, level)
-    if name in change.nowhere:
-        nan = np.full((3, 3), np.nan)
-        region = Ellipsoid(np.zeros(0), np.zeros((3, 0)), 1.0 - options.alpha, np.isfinite(pooled[1]))
-        return Motion(name, nan[0], nan, region, test, turn, cov[:3, :3], rotation_test, stable, bool(test.p < level),
-                      float("nan"))  # fmt: skip
-    q = max(1, test.freedom)
-    size = noncentrality(level, options.levels.power, q) * float(np.linalg.eigvalsh(cov_shift)[-1])
-    scale = (pooled[0], int(pooled[1])) if np.isfinite(pooled[1]) else (None, 0)
-    return Motion(
-        name, shift, cov_shift, ellipsoid(cov_shift, 1.0 - options.alpha, *scale), test,
-        turn if rotation_test else None, cov[:3, :3] if rotation_test else None, rotation_test, stable,
-        bool(test.p < level), pooled[0] * float(np.sqrt(max(0.0, size))),
-    )  # fmt: skip
-
-
-def _warnings(pooled: tuple[float, float, float], last: CongruenceTest, options: CongruenceOptions) -> tuple[str, ...]:
+def _warnings(pooled: Pooled, last: CongruenceTest, options: CongruenceOptions) -> tuple[str, ...]:
     out = []
     if pooled[2] < options.alpha:
         out.append(
