@@ -5,7 +5,6 @@ import unicodedata
 
 from adjust.model.errors import SurveyError
 
-
 _UNUSUAL = re.compile(r"[^\n\t -~]")
 
 
