@@ -7,14 +7,14 @@ contributes most is taken out of the datum, until what is left is congruent.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from gtsam import Pose3
 
-from adjust.epochs.change import Change, Displaced, MatrixChange
-from adjust.epochs.congruence_result import Congruence, CongruenceStep, CongruenceTest, Motion
+from adjust.epochs.change import Change, MatrixChange
+from adjust.epochs.congruence_result import Congruence, CongruenceStep, CongruenceTest
 from adjust.epochs.joined import JoinedChange
+from adjust.epochs.judging import Judging, Pooled, tests_of
 from adjust.epochs.states import (
     MOTIONS,
     Epoch,
@@ -27,12 +27,10 @@ from adjust.epochs.states import (
 )
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
-from adjust.model.survey import FloatArray, IntArray
-from adjust.statistics.relative_precision import ellipsoid
-from adjust.statistics.result import Ellipsoid
-from adjust.testing.criteria import LevelOptions, noncentrality, sidak
-from adjust.testing.distributions import chi2, fisher
-from adjust.testing.quadratic_forms import pseudo_square
+from adjust.model.survey import FloatArray
+from adjust.testing.criteria import LevelOptions, sidak
+from adjust.testing.distributions import fisher
+from adjust.testing.quadratic_forms import squares_in_sigmas
 
 MOST_IN_MATRIX = 600
 """Components up to which epochs are compared by one covariance matrix; more, by their normal equations."""
@@ -68,14 +66,6 @@ def congruence(
     both = common(first, second, options)
     after = aligned(both.before, both.after, both.directions, _numbers(both.names, options.reference))
     return compare(replace(both, after=after), options)
-
-
-class Pooled(NamedTuple):
-    """Sigma0 of both epochs together, its redundancy, and p of the test of equal variances."""
-
-    sigma0: float
-    redundancy: float
-    ratio_p: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,13 +106,15 @@ def compare(both: Common, options: CongruenceOptions, cross: FloatArray | None =
     """
     names, pooled = both.names, both.pooled
     change = _change(both.before, both.after, both.directions, cross)
-    tests = _Tests(change, both.before, pooled, options)
+    tests = _Tests(change, pooled, options)
     begin = [i for i in _numbers(names, options.reference) if (change.owner == i).any()]
     if not begin:
         raise SurveyError("no point of the reference is free in either epoch; there is nothing to test")
     first_test = tests.of_all(begin)
     steps, stable, last = tests.search(begin, first_test)
-    motions = tests.motions(stable)
+    level = sidak(options.alpha, len(np.unique(change.owner)))
+    judging = Judging(change, both.before, frozenset(stable), pooled, level, options.alpha, options.levels.power)
+    motions = judging.of(change.displaced(stable))
     moved = tuple(m.name for m in motions if m.significant)
     return Congruence(
         options.names, options.alpha, options.scaled, *pooled, first_test, last, tuple(steps),
@@ -181,29 +173,15 @@ class _Tests:
     """Tests of what lies between two epochs."""
 
     change: Change
-    before: Epoch
     pooled: Pooled
     options: CongruenceOptions
-
-    def test(self, statistic: float, freedom: int, level: float) -> CongruenceTest:
-        """Of d' Q^+ d with its rank."""
-        f = self.pooled.redundancy
-        if freedom == 0:
-            return CongruenceTest(float("nan"), 0, f, float("nan"), True)
-        F = statistic / freedom / self.pooled.sigma0**2
-        p = float(fisher.sf(F, freedom, f) if np.isfinite(f) else chi2.sf(F * freedom, freedom))
-        return CongruenceTest(F, freedom, f, p, p >= level)
-
-    def single(self, d: FloatArray, Q: FloatArray, level: float) -> CongruenceTest:
-        """Of displacements (k,) with their covariance (k, k)."""
-        return self.test(*pseudo_square(d, Q)[:2], level)
 
     def of_all(self, stable: Sequence[int]) -> CongruenceTest:
         """The global test of these names."""
         statistic, rank = self.change.square(stable)
         # what the datum takes away is no information, whatever rounding leaves of it
         rank = min(rank, max(0, len(self.change.rows(stable)) - self.change.G.shape[1]))
-        return self.test(statistic, rank, self.options.alpha)
+        return tests_of(np.array([statistic]), np.array([rank]), self.pooled, self.options.alpha)[0]
 
     def search(
         self, begin: list[int], test: CongruenceTest
@@ -229,42 +207,13 @@ class _Tests:
         level = sidak(self.options.alpha, len(begin))
         for i in [i for i in begin if i not in stable] if test.passed else []:
             more = sorted([*stable, i])
-            alone = self.single(*self.change.displaced(stable)(self.change.rows([i])), level)
+            square = squares_in_sigmas(*self.change.displaced(stable)(self.change.rows([i])[None]))
+            alone = tests_of(*square, self.pooled, level)[0]
             together = self.of_all(more)
             if alone.passed and together.passed:
                 stable, test = more, together
                 steps = [s for s in steps if s.name != self.change.names[i]]
         return steps, stable, test
-
-    def motions(self, stable: list[int]) -> tuple[Motion, ...]:
-        """Of every name in the datum of the stable ones, these last."""
-        displaced, owner = self.change.displaced(stable), self.change.owner
-        level = sidak(self.options.alpha, len(np.unique(owner)))
-        rows = np.split(np.arange(len(owner)), np.flatnonzero(np.diff(owner)) + 1)
-        out = [self._motion(displaced, mine, int(owner[mine[0]]) in stable, level) for mine in rows]
-        return tuple(sorted(out, key=lambda m: (m.stable, m.test.p if np.isfinite(m.test.p) else 2.0)))
-
-    def _motion(self, displaced: Displaced, rows: IntArray, stable: bool, level: float) -> Motion:
-        name, place = self.change.names[self.change.owner[rows[0]]], self.change.component[rows]
-        (d, Q), axes, (sigma0, f, _) = displaced(rows), self.before.axes(name), self.pooled
-        full, cov = np.zeros(6), np.zeros((6, 6))
-        full[place], cov[np.ix_(place, place)] = d, Q
-        shift, cov_shift = axes @ full[3:], axes @ cov[3:, 3:] @ axes.T
-        test = self.single(d, Q, level)
-        turn, cov_turn, turn_test = None, None, None
-        if isinstance(self.before.value(name), Pose3):
-            t = np.flatnonzero(place < 3)
-            turn, cov_turn, turn_test = full[:3], cov[:3, :3], self.single(d[t], Q[np.ix_(t, t)], level)
-        confidence, known_sigma0 = 1.0 - self.options.alpha, not np.isfinite(f)
-        if name in self.change.nowhere:
-            shift, cov_shift, smallest = np.full(3, np.nan), np.full((3, 3), np.nan), float("nan")
-            region = Ellipsoid(np.zeros(0), np.zeros((3, 0)), confidence, not known_sigma0)
-        else:
-            region = ellipsoid(cov_shift, confidence, *((None, 0) if known_sigma0 else (sigma0, int(f))))
-            size = noncentrality(level, self.options.levels.power, max(1, test.freedom))
-            smallest = sigma0 * float(np.sqrt(max(0.0, size * float(np.linalg.eigvalsh(cov_shift)[-1]))))
-        return Motion(name, shift, cov_shift, region, test, turn, cov_turn, turn_test, stable,
-                      bool(test.p < level), smallest)  # fmt: skip
 
 
 def _warnings(pooled: Pooled, last: CongruenceTest, options: CongruenceOptions) -> tuple[str, ...]:

@@ -29,17 +29,24 @@ def ellipsoid(
 
     With sigma0 (and its redundancy) the covariance is scaled by it and Fisher's F stands for chi-square.
     """
-    values, vectors = np.linalg.eigh(0.5 * (cov + cov.T))
-    kept = values > _HELD
-    values, vectors = values[kept][::-1], vectors[:, kept][:, ::-1]
-    axes = np.zeros((3, len(values)))
-    axes[: len(cov)] = vectors
-    k = max(1, len(values))
+    return ellipsoids(cov[None], level, sigma0, redundancy)[0]
+
+
+def ellipsoids(
+    cov: FloatArray, level: float = 0.95, sigma0: float | None = None, redundancy: int = 0
+) -> list[Ellipsoid]:
+    """The same of many positions, (p, 3, 3) or (p, 2, 2)."""
+    values, vectors = np.linalg.eigh(0.5 * (cov + np.swapaxes(cov, 1, 2)))
+    scaled, k = sigma0 is not None and redundancy > 0, np.arange(1, 4)
     if sigma0 is not None and redundancy > 0:
-        quantile = k * float(fisher.ppf(level, k, redundancy)) * sigma0**2
+        quantiles = k * fisher.ppf(level, k, redundancy) * sigma0**2
     else:
-        quantile = float(chi2.ppf(level, k))
-    return Ellipsoid(np.sqrt(quantile * values), axes, level, sigma0 is not None and redundancy > 0)
+        quantiles = chi2.ppf(level, k)
+    n_kept = (values > _HELD).sum(axis=1)
+    semi_axes = np.sqrt(quantiles[np.maximum(1, n_kept) - 1, None] * np.where(values > _HELD, values, 0.0))[:, ::-1]
+    axes = np.zeros((len(cov), 3, cov.shape[1]))
+    axes[:, : cov.shape[1]] = vectors[:, :, ::-1]
+    return [Ellipsoid(a[:n], x[:, :n], level, scaled) for n, a, x in zip(n_kept.tolist(), semi_axes, axes, strict=True)]
 
 
 def relative_precision(
