@@ -30,6 +30,7 @@ from survey.project.declared.poses import flat_point, read_point
 from survey.project.declared.targets import read_targets
 from survey.project.detected import DetectedImage, ImageKey, ImageNews, image_news, read_detected
 from survey.project.exclusions import EXCLUSIONS, EXCLUSIONS_FILE, Exclusion, in_force, read_exclusions
+from survey.project.finding import near
 from survey.project.images import find_images, sought_in
 from survey.project.observed import Observed, union
 from survey.project.omitting import without
@@ -110,7 +111,7 @@ def leaving_out(project: Project, exclusions: Iterable[Exclusion]) -> Project:
             hits.append(hit)
         else:
             notes.append(f"{path}:{one.line}: {one.name} is left out, but nothing has that name; "
-                         f"{observed.near(one.name)}")  # fmt: skip
+                         f"{near(observed, one.name)}")  # fmt: skip
         found.append(hit.left_out(one))
     every = union(hits)
     survey, spots = without(project.survey, project.spots, every)
