@@ -171,7 +171,7 @@ class _Linearised:
         forward = right_jacobian(self.r)
         self.Q = forward @ network.cov @ np.swapaxes(forward, -1, -2)
         self.B = condition_matrix(basis, blocks)
-        by_tree = basis.chord_idx is not None and 2 * len(basis) > len(np.unique(basis.pair_idx))
+        by_tree = basis.tree is not None and 2 * len(basis) > len(np.unique(basis.pair_idx))
         self.normals: NormalEquations = (TreeNormals if by_tree else SparseNormals)(basis, blocks, self.Q)
 
     def joint(self, pair_idx: Sequence[int]) -> FloatArray:
