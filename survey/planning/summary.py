@@ -44,7 +44,7 @@ class Met:
 
 
 @dataclass(frozen=True, eq=False)
-class PlanningOutcome:
+class PlanResult:
     """All that is known of a plan."""
 
     folder: Path
@@ -71,18 +71,8 @@ class PlanningOutcome:
         return tuple(Met(c, r, s, *sigma_unit_for_people(c.unit))
                      for (c, r), s in zip(self.required.items(), planned, strict=self.budget is not None))  # fmt: skip
 
-    def summary(self) -> dict[str, object]:
-        """As plain values."""
-        return plan_summary(self)
 
-    def text(self) -> str:
-        """For people."""
-        from survey.planning.text import plan_text  # here: it is about what stands here
-
-        return plan_text(self)
-
-
-def expected_sigmas(o: PlanningOutcome) -> Iterator[tuple[ParameterName, list[tuple[str, float, str]]]]:
+def expected_sigmas(o: PlanResult) -> Iterator[tuple[ParameterName, list[tuple[str, float, str]]]]:
     """Of every unknown: its components, their sigmas for people and the units of these."""
     for name, unknown in precision_of(o.expected).unknowns.by_name.items():
         estimate = o.expected.estimates[name]
@@ -91,7 +81,7 @@ def expected_sigmas(o: PlanningOutcome) -> Iterator[tuple[ParameterName, list[tu
         yield name, [(c, factor * s[c], unit) for c, unit, factor in shown]
 
 
-def plan_summary(o: PlanningOutcome) -> dict[str, object]:
+def plan_summary(o: PlanResult) -> dict[str, object]:
     """All figures by name, units in the keys."""
     out: dict[str, object] = {
         "folder": str(o.folder),
@@ -152,7 +142,7 @@ def _selection(s: Selection) -> dict[str, object]:
     }
 
 
-def _tolerances(o: PlanningOutcome) -> dict[str, object]:
+def _tolerances(o: PlanResult) -> dict[str, object]:
     return {
         "met": all(r.met for r in o.requirements),
         "groups": {t.group: {"factor_alone": plain(t.alone), "factor_together": plain(t.together),

@@ -3,13 +3,13 @@
 import numpy as np
 
 from adjust.design import Component, group_redundancy
-from survey.planning.summary import PlanningOutcome, expected_sigmas, meets, pose_sigmas, tolerance_values
+from survey.planning.summary import PlanResult, expected_sigmas, meets, pose_sigmas, tolerance_values
 from survey.solution.quantities import sigma_unit_for_people
 
 _MOST = 8
 
 
-def plan_text(o: PlanningOutcome) -> str:
+def plan_text(o: PlanResult) -> str:
     """For the terminal, problems first."""
     e = o.expected
     name = o.title or str(o.folder)
@@ -35,7 +35,7 @@ def _sigma_of(component: Component, sigma: float) -> str:
     return f"{factor * sigma:.3g} {unit}".strip()
 
 
-def _sigma_lines(o: PlanningOutcome) -> list[str]:
+def _sigma_lines(o: PlanResult) -> list[str]:
     out = ["  expected sigmas (a priori)"]
     lasting = [(name, sigmas) for name, sigmas in expected_sigmas(o) if len(name) < 3]
     for name, sigmas in lasting[: 4 * _MOST]:
@@ -49,7 +49,7 @@ def _sigma_lines(o: PlanningOutcome) -> list[str]:
     return out
 
 
-def _selection_lines(o: PlanningOutcome) -> list[str]:
+def _selection_lines(o: PlanResult) -> list[str]:
     s = o.selection
     if s is None:
         return []
@@ -63,7 +63,7 @@ def _selection_lines(o: PlanningOutcome) -> list[str]:
     return out
 
 
-def _tolerance_lines(o: PlanningOutcome) -> list[str]:
+def _tolerance_lines(o: PlanResult) -> list[str]:
     if o.budget is None:
         return []
     out = ["", "  required precision"]
@@ -83,7 +83,7 @@ def _factor(value: float) -> str:
     return "any" if value > 1e6 else f"{value:.3g}"
 
 
-def _trial_lines(o: PlanningOutcome) -> list[str]:
+def _trial_lines(o: PlanResult) -> list[str]:
     t = o.trials
     if t is None:
         return []
@@ -97,7 +97,7 @@ def _trial_lines(o: PlanningOutcome) -> list[str]:
     ]
 
 
-def _navigation_lines(o: PlanningOutcome) -> list[str]:
+def _navigation_lines(o: PlanResult) -> list[str]:
     n = o.navigation
     if n is None:
         return []
