@@ -51,25 +51,16 @@ class Case:
 
     def run(self, survey: Survey) -> Adjustment:
         """A survey like this one, or a part of it, adjusted from its own start. SurveyError where that fails."""
-        blocks = len(survey.image_blocks), len(self.survey.image_blocks)
-        share = blocks[0] / blocks[1] if blocks[0] and blocks[1] else 1.0
-        if blocks[0] or survey.pairs:
-            return self._adjusted(survey, None, _OWN, (START + REST) * share, STEP * share)
-        return self._adjusted(survey, find_start(survey), _OWN, START + REST)
+        n, whole = len(survey.image_blocks), len(self.survey.image_blocks)
+        share, start = n / whole if n and whole else 1.0, None if n or survey.pairs else find_start(survey)
+        lost = _LOST * _nothing(survey)
+        return self.budget.adjusted(survey, start, _OWN, (START + REST) * share, STEP * share, lost=lost)
 
-    def _near(
-        self, survey: Survey, result: Adjustment, most: float = np.inf, options: AdjustOptions = _NEAR
-    ) -> Adjustment:
+    def _near(self, survey: Survey, result: Adjustment, most: float, options: AdjustOptions) -> Adjustment:
         """From the values of another adjustment. most: v'Pv that it has to come below."""
-        rest = REST if survey.image_blocks else START + REST
-        return self._adjusted(survey, completed(survey, values_of(result, survey)), options, rest, most=most)
-
-    def _adjusted(
-        self, survey: Survey, start: StartValues | None, options: AdjustOptions, first: float, step: float = STEP,
-        most: float = np.inf,
-    ) -> Adjustment:  # fmt: skip
+        rest, start = REST if survey.image_blocks else START + REST, completed(survey, values_of(result, survey))
         lost = _LOST * _nothing(survey) if options is _OWN else np.inf
-        return self.budget.adjusted(survey, start, options, first, step, most, lost)
+        return self.budget.adjusted(survey, start, options, rest, most=most, lost=lost)
 
     def warm(self, survey: Survey) -> Adjustment:
         """A survey that is much like this one, with all images, adjusted from the values of this one.
@@ -81,7 +72,7 @@ class Case:
             return known
         if self.linear is None:
             raise SurveyError("there are no values to begin with")
-        result = self._near(survey, self.linear.result, self.linear.result.omega)
+        result = self._near(survey, self.linear.result, self.linear.result.omega, _NEAR)
         self._last[:] = [*self._last[-1:], (survey, result)]
         return result
 
@@ -184,10 +175,9 @@ class Case:
                 survey = self.survey
                 start = None if survey.pairs or (given_starts(survey) and survey.image_blocks) else self.start
                 most = _LOST * _nothing(survey)
-                first = START * (start is None) + REST
-                result = self._adjusted(survey, start, _NEAR, first, most=most)
+                result = self.budget.adjusted(survey, start, _NEAR, START * (start is None) + REST, most=most)
             elif not self.is_whole:
-                result = self._near(self.survey, result, options=_OWN)
+                result = self._near(self.survey, result, np.inf, _OWN)
             self.budget.spend(SCORES)
             return Linear(result)
         except SurveyError:

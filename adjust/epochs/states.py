@@ -14,8 +14,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.precision.precision import Precision, precision_of, rotations_only
-from adjust.spatial.motions import point_motions
-from adjust.spatial.rigid import skew
+from adjust.spatial.motions import point_motions, poses_motions
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.system import LinearSystem
 
@@ -264,12 +263,8 @@ def value_motions(value: Pose3 | FloatArray) -> FloatArray:
     """How the components (3 or 6, 7) of a point or pose move with the whole."""
     if not isinstance(value, Pose3):
         return point_motions(value)
-    R, t = value.rotation().matrix(), np.asarray(value.translation())
-    out = np.zeros((6, 7))
-    out[:3, 3:6] = R.T
-    if np.isfinite(t).all():
-        out[3:, :3], out[3:, 3:6], out[3:, 6] = R.T, -R.T @ skew(t), R.T @ t
-    return out
+    R, t = value.rotation().matrix(), np.nan_to_num(value.translation())
+    return np.asarray(poses_motions(R[None], t[None], np.ones(1, dtype=np.bool_))[0])
 
 
 def differences(before: Sequence[Pose3 | FloatArray], after: Sequence[Pose3 | FloatArray]) -> FloatArray:

@@ -4,6 +4,10 @@ import re
 from collections.abc import Hashable, Iterable
 from typing import TypeVar
 
+import numpy as np
+
+from adjust.model.arrays import IntArray
+
 _PARTS = re.compile(r"\d+|\D+")
 _Key = TypeVar("_Key", bound=Hashable)
 _Value = TypeVar("_Value")
@@ -15,6 +19,13 @@ def grouped(items: Iterable[tuple[_Key, _Value]]) -> dict[_Key, list[_Value]]:
     for key, value in items:
         out.setdefault(key, []).append(value)
     return out
+
+
+def numbered(names: Iterable[_Key]) -> tuple[list[_Key], IntArray]:
+    """The different ones in the order in which they come, and (n,) of each its number among them."""
+    number: dict[_Key, int] = {}
+    of = np.fromiter((number.setdefault(name, len(number)) for name in names), np.int64)
+    return list(number), of
 
 
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:

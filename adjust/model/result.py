@@ -363,6 +363,10 @@ class JointCovariances(Protocol):
         """Of quantities that follow from unknowns: each (n, dim) by key; n of each in ``sizes``."""
         ...
 
+    def whole_pairs(self, pairs: Sequence[tuple[ParameterName, ParameterName]], size: int) -> FloatArray:
+        """As ``whole`` of many pairs of parameters of so many components each, (p, 2 size, 2 size)."""
+        return np.array([self.whole(pair, (size, size)) for pair in pairs]).reshape(-1, 2 * size, 2 * size)
+
     def bring_together(self, pairs: Iterable[tuple[ParameterName, ParameterName]]) -> None:
         """Work out many pairs at once, before they are asked for one by one; nothing where that is no cheaper."""
         return None

@@ -1,10 +1,10 @@
 """Pairs with every loop closed: eyes without a place of their own get one, mounts their play, and the conditions hold.
 
-An eye is a camera or marker block of which nothing is known but pairs: no image shows it, and its pose on what carries
-it is free. Its loops close in the same graph as cameras and readings once it is a frame of its own: a station named
-after it. A survey of nothing but pairs is solved in the condition form (Chao et al. 2011;
-:mod:`adjust.relay.conditions`), any other one by the poses of all frames, whose loops close by themselves: the same
-numbers and covariances.
+An eye is a camera or marker block of which nothing is known but pairs: no image shows it, its pose on what carries it
+is free, and it does not keep one pose through several epochs on a body that moves. Its loops close in the same graph as
+cameras and readings once it is a frame of its own: a station named after it. A survey of nothing but pairs between
+stations is solved in the condition form (Chao et al. 2011; :mod:`adjust.relay.conditions`), any other one by the poses
+of all frames, whose loops close by themselves: the same numbers and covariances.
 
 A mount's play is one more motion at end a of its pair. With the pair's covariance C and that of the play S both act as
 one with C + S, in the condition form as in the parametric one; of the residual v the play's share is S (C + S)^-1 v.
@@ -67,20 +67,28 @@ def _with_stations_for_eyes(survey: Survey) -> Survey:
 
 
 def _eye_names(survey: Survey) -> dict[FrameRef, str]:
-    """The station that each eye becomes."""
-    cameras, targets = survey.cameras_by_id, survey.targets_by_id
+    """The station that each eye becomes: none, where that would lose what is said of its pose, or that it is rigid."""
     seen = {(f.kind, f.frame_id) for f in _frames_of(survey)}
     out: dict[FrameRef, str] = {}
-    for ref in (r for p in survey.pairs for r in (p.a, p.b)):
-        pose = None
-        if ref.kind == "camera" and ref.frame_id in cameras:
-            pose = cameras[ref.frame_id].station_from_camera
-        elif ref.kind == "target" and ref.frame_id in targets:
-            pose = targets[ref.frame_id].carrier_from_target
-        if pose is not None and pose.treatment == "free" and (ref.kind, ref.frame_id) not in seen:
-            ref = _of_epoch(ref, survey)
-            out[ref] = f"{ref.kind} {ref.frame_id}" + (f" {ref.epoch_id}" if ref.epoch_id else "")
-    return out
+    tied, epochs = set[tuple[str, str]](), dict[tuple[str, str], set[str | None]]()
+    for ref in (r for p in survey.pairs for r in (p.a, p.b) if r.kind in ("camera", "target")):
+        eye, pose = (ref.kind, ref.frame_id), _pose_of(ref, survey)
+        if pose.treatment != "free" or pose.held or eye in seen:
+            tied.add(eye)
+        at = _of_epoch(ref, survey)
+        out[at] = f"{ref.kind} {ref.frame_id}" + (f" {at.epoch_id}" if at.epoch_id else "")
+        if not (ref.kind == "target" and survey.targets_by_id[ref.frame_id].motion == "epoch"):
+            epochs.setdefault(eye, set()).add(at.epoch_id)
+    tied |= {eye for eye, of in epochs.items() if len(of) > 1}  # one pose on a body that moves
+    return {ref: name for ref, name in out.items() if (ref.kind, ref.frame_id) not in tied}
+
+
+def _pose_of(ref: FrameRef, survey: Survey) -> PoseParameter:
+    """Of a camera or target, on what carries it."""
+    if ref.kind == "camera":
+        return survey.cameras_by_id[ref.frame_id].station_from_camera
+    target = survey.targets_by_id[ref.frame_id]
+    return target.epochs.get(ref.epoch_id or "", target.carrier_from_target)
 
 
 def _of_epoch(ref: FrameRef, survey: Survey) -> FrameRef:
@@ -188,14 +196,16 @@ def in_condition_form(result: Adjustment) -> Adjustment:
 
     ``result``: by the poses of its stations, screened. What it says of stations stays; what it says of pairs is then
     from the conditions, and a warning tells where the two forms differ. Where something else is observed too, where
-    priors or several given stations close loops as well, where rotations and poses are mixed, or where there is no
-    loop, ``result`` is returned as it is.
+    priors, several given stations, or cameras and targets whose poses on a body are given close loops as well, where
+    rotations and poses are mixed, or where there is no loop, ``result`` is returned as it is.
     """
     survey = result.survey
     if len(result.image_residuals.used) or any(o.kind != "pair" for o in result.other_residuals):
         return result
+    if not survey.pairs_join_fixed_stations:
+        return result
     used = [p for p in survey.pairs if p.used]
-    given = [s for s in survey.stations if s.world_from_station.treatment != "free"]
+    given = [s for s in survey.stations if s.world_from_station.treatment != "free" or s.world_from_station.held]
     kinds = {isinstance(p.b_from_a, Rot3) for p in used}
     if len(given) > 1 or len(kinds) != 1:
         return result

@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from adjust.model.names import numbered
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
 from adjust.statistics.changes import ChangeSearch
@@ -30,9 +31,7 @@ _EXACT = 400
 _ESTIMATED = ("estimated", "unseparable")
 
 
-def consistency(
-    adjustment: Adjustment, condensed: CondensedSystem | None, alpha: float = 0.05, changes: bool = True
-) -> Consistency:
+def consistency(adjustment: Adjustment, condensed: CondensedSystem | None, alpha: float = 0.05) -> Consistency:
     """Test every part, and look for changes; ``alpha`` is the error probability of all of it together.
 
     condensed: the system of this adjustment; None for a large network of pairs, of which the groups are tested. Where
@@ -52,7 +51,7 @@ def consistency(
     fitted = {c.group for c in known.components if c.status in _ESTIMATED} if known is not None else set()
     parts = tuple(p for p in parts if not (p.kind == "group" and p.name in fitted))
     search = None
-    if changes and condensed is not None and len(condensed.e):
+    if condensed is not None and len(condensed.e):
         search = ChangeSearch(adjustment, condensed)
     n_changes = search.n_tests if search is not None else 0
     n = len(parts) + n_changes
@@ -96,15 +95,15 @@ def parts_of(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> 
     found, out = contributions(adjustment, system, blocks), list[Part]()
     total = int(np.count_nonzero(found.n))
     for kind, names in _labels(adjustment, system, blocks).items():
-        number = {name: i for i, name in enumerate(dict.fromkeys((None, *names)))}
-        of = np.fromiter(map(number.__getitem__, names), np.int64, len(names))
+        called, of = numbered((None, *names))
+        of = of[1:]
         every = np.flatnonzero((of > 0) & (found.n != 0.0))
         every = every[np.argsort(of[every], kind="stable")]
         if not len(every):
             continue
         first = np.flatnonzero(np.diff(of[every], prepend=0))
         sums = (np.add.reduceat(x[every], first).tolist() for x in (found.n, found.redundancy, found.omega))
-        called, edges = list(number), pairwise([*first.tolist(), len(every)])
+        edges = pairwise([*first.tolist(), len(every)])
         out += [
             Part(kind, str(called[i]), every[a:b], n, r, omega)
             for i, (a, b), n, r, omega in zip(of[every[first]].tolist(), edges, *sums, strict=True)

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from adjust.model.arrays import largest
+from adjust.model.names import numbered
 from adjust.model.result import Adjustment, ReadingResiduals
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.point_tests import AdjustedPoints, controlled_directions, point_tests
@@ -160,15 +161,12 @@ def _table(
     readings = adjustment.reading_residuals
     if readings is not None:  # of joint readings: the shares of the degrees of freedom, not of a bias that shows
         columns["redundancy"][M - len(readings.used) :] = readings.redundancy
-    blocks = adjustment.survey.image_blocks
-    groups, counts = [b.group for b in blocks], [len(b.uv) for b in blocks]
-    others = groups_of_others(precision_of(adjustment).graph)
-    groups, counts = groups + others, counts + [1] * len(others)
-    names = tuple(dict.fromkeys(g for g, n in zip(groups, counts, strict=True) if n))
-    number = {g: i for i, g in enumerate(names)}
+    blocks, others = adjustment.survey.image_blocks, groups_of_others(precision_of(adjustment).graph)
+    counts = [*(n for b in blocks if (n := len(b.uv))), *[1] * len(others)]
+    names, group = numbered([*(b.group for b in blocks if len(b.uv)), *others])
     return ObservationTests(
-        n_image=n_image, ptr=ptr, group=np.repeat(np.array([number.get(g, 0) for g in groups], dtype=np.int64), counts),
-        group_names=names, used=used, n_components=np.diff(ptr), freedom=freedom, criteria=found,
+        n_image=n_image, ptr=ptr, group=np.repeat(group, counts), group_names=tuple(names), used=used,
+        n_components=np.diff(ptr), freedom=freedom, criteria=found,
         omega=adjustment.omega, total_redundancy=adjustment.redundancy, sigma0=adjustment.sigma0, **columns,
     )  # fmt: skip
 

@@ -19,7 +19,7 @@ from adjust.statistics.normal import DENSE
 from adjust.statistics.system import LinearSystem, linear_system
 from adjust.testing.distributions import chi2, fisher
 from adjust.testing.quadratic_forms import pseudo_half
-from adjust.testing.significance import LEVEL, Significance
+from adjust.testing.significance import Significance, level_of
 
 _SEEN = 1e-7
 """Share of a change's column that no unknown takes over, below which it does not show."""
@@ -260,8 +260,7 @@ def shared_lenses(result: Adjustment, estimated_sigma0: bool) -> tuple[SharedLen
     shared = lenders(result.survey)
     if not shared or result.precision is None:
         return ()
-    linear, out = LinearScores(result), []
-    level = LEVEL if result.global_test is None else result.global_test.alpha
+    linear, level, out = LinearScores(result), level_of(result), []
     for camera, (lender, parameters) in shared.items():
         found = result.estimates["lens", camera]
         names = tuple(x for x in found.components if x in parameters)

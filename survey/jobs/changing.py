@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from adjust.model.errors import SurveyError
-from survey.folder.replacing import complete, place_for, replace_parts
+from survey.folder.replacing import place_for, replace_parts
+from survey.folder.whole import complete
 from survey.jobs.adjusting.outcome import AdjustOutcome, made
 from survey.jobs.adjusting.warm_start import warm_adjustment
 from survey.project import Project, read

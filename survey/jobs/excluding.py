@@ -89,8 +89,7 @@ def _add(folder: Path, place: Path, rows: Sequence[Row]) -> None:
 def _outcome(folder: Path, project: Project, rows: Sequence[Row], excluded: bool) -> ExcludeOutcome:
     observed = Observed(project.survey, project.spots)
     hits = [observed.hits(row.exclusion.name, row.exclusion.at) for row in rows]
-    done = tuple(LeftOut(row.exclusion, len(h.images), h.n_image_points, h.n_spots, h.n_readings)
-                 for row, h in zip(rows, hits, strict=True))  # fmt: skip
+    done = tuple(h.left_out(row.exclusion) for row, h in zip(rows, hits, strict=True))
     now = in_force(read_exclusions(folder / OBSERVATIONS_FOLDER)[0])
     return ExcludeOutcome(folder, excluded, done, tuple(h.text() for h in hits), folder / FILE, len(now))
 

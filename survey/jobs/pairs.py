@@ -17,7 +17,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, Pair, frame_text
 from adjust.model.survey import FloatArray, PoseParameter, Station, Survey
 from adjust.relay.eyes.drift import sequences
-from adjust.relay.eyes.eyes import adjust_eye_motions
+from adjust.relay.eyes.eyes import adjust_eyes
 from adjust.relay.eyes.pairs import EyePairs, triangle_misclosure
 from adjust.relay.network import gtsam_motion
 from adjust.testing.criteria import sidak
@@ -125,7 +125,7 @@ def _from_trajectories(folder: Path, station: str | None) -> RelayPairs:
         )
     trackers = relay_trackers(read_trajectories(by_id))
     eyes = tracker_pairs(trackers)
-    joint = adjust_eye_motions(sequences(one_metre(trackers), trackers.drift))
+    joint = adjust_eyes(sequences(one_metre(trackers), trackers.drift))
     return RelayPairs(eyes, looped(eyes), joint)
 
 

@@ -16,8 +16,8 @@ from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.result import ParameterName
 from adjust.model.survey import Survey
 from adjust.statistics.outliers.supported import supported
-from survey.folder.replacing import copy_folder
 from survey.folder.text import atomic_write
+from survey.folder.whole import copy_folder
 from survey.jobs.changing import Change, ChangeOutcome, changed_project
 from survey.jobs.excluding import FILE, new_rows
 from survey.project import Project
@@ -71,7 +71,7 @@ def _require_nothing_lost(survey: Survey, reduced: Survey, names: Sequence[Name]
     """What stands in survey.toml goes only where it was named itself: a station by its last pair is an oversight."""
     known = set(supported(survey)[1])
     lost = [name for name in supported(reduced)[1] if name not in known and _is_declared(reduced, name)]
-    named = {name.parts[-1] for name in names if name.what in ("camera", "target", "point")}
+    named = {name.id.split("/")[-1] for name in names if name.what in ("camera", "target", "point")}
     stations = {c.station_id for c in reduced.cameras if c.camera_id in named}
     lost = [name for name in lost if name[1] not in named | stations]
     if lost:

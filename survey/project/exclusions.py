@@ -36,7 +36,11 @@ EXCLUSIONS_FILE = "exclusions.csv"
 WHAT = ("image_point", "image", "target", "point", "epoch", "camera", "reading", "spot")
 EXCLUDED, INCLUDED = "excluded", "included"
 EXCLUSIONS = Layout("exclusions", ("what", "id"), (), ("state", "reason", "author", "time"), ("u_px", "v_px"))
-_PARTS = {"image_point": (3, 4), "image": (2,), "target": (1, 3), "epoch": (1,), "camera": (1,), "spot": (3,)}
+_FORMS = {
+    "image_point": ("camera/epoch/target/point", "camera/epoch/point"), "image": ("camera/epoch",),
+    "target": ("target", "camera/epoch/target"), "point": ("target/point", "point"), "epoch": ("epoch",),
+    "camera": ("camera",), "spot": ("camera/epoch/spot",),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -51,9 +55,11 @@ class Name:
         return self.id if self.what == "reading" else f"{self.what}:{self.id}"
 
     @property
-    def parts(self) -> tuple[str, ...]:
-        """The ids that make up the id; a reading has its table and its id."""
-        return tuple(self.id.split(":", 1) if self.what == "reading" else self.id.split("/"))
+    def meant(self) -> dict[str, str]:
+        """The ids that make up the id, by what they are; of any but a reading."""
+        forms = [form.split("/") for form in _FORMS[self.what]]
+        parts = self.id.rsplit("/", max(map(len, forms)) - 1)
+        return dict(zip(next(form for form in forms if len(form) == len(parts)), parts, strict=True))
 
 
 @dataclass(frozen=True)
@@ -91,11 +97,9 @@ def name_problem(what: str, text: str) -> str | None:
     if what == "point":
         return None if text else "id: is blank; fill it in"
     parts = text.split("/")
-    if all(parts) and len(parts) in _PARTS[what]:
+    if all(parts) and any(form.count("/") + 1 == len(parts) for form in _FORMS[what]):
         return None
-    forms = {"image_point": "camera/epoch/target/point", "image": "camera/epoch", "spot": "camera/epoch/spot",
-             "target": "target or camera/epoch/target"}  # fmt: skip
-    return f"id: found {text!r}; {what.replace('_', ' ')} is written {forms.get(what, what)}"
+    return f"id: found {text!r}; {what.replace('_', ' ')} is written {' or '.join(_FORMS[what])}"
 
 
 def read_exclusions(folder: Path) -> tuple[tuple[Row, ...], str]:

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from adjust.model.errors import SurveyError
-from survey.folder.replacing import copy_folder
 from survey.folder.text import atomic_write, csv_text, read_text, suggestion
+from survey.folder.whole import copy_folder
 from survey.project.declared.node import read_toml
 from survey.project.declared.toml_text import KeyPath, key_lines, toml_text
 from survey.project.detected import ImageKey, file_of

@@ -39,12 +39,11 @@ from survey.project.project import (
     IMAGES_FOLDER,
     OBSERVATIONS_FOLDER,
     Definition,
-    LeftOut,
     Project,
     Sigmas,
     SpotsRequest,
 )
-from survey.project.tables.files import Begun, begin_tables, read_table
+from survey.project.tables.files import Begun, begun_table, large_tables, read_table
 from survey.project.tables.image_points import read_image_blocks, read_spots, world_names
 from survey.project.tables.kinds import GROUPS, KINDS, LAYOUTS, with_observations
 from survey.project.tables.reading import Layout, Table
@@ -76,17 +75,19 @@ def read_all(
     texts: what is to stand in files of the folder, not yet written, by their paths in it.
     """
     place = Path(folder) / OBSERVATIONS_FOLDER
-    with settled(Path(folder)), Beside() as beside:
-        begun = begin_tables(place, LAYOUTS, beside) if not texts else {}
-        if begun:
-            meanwhile(any(path.stem == "image_points" for path in begun))
-        definition, root = _read_definition(Path(folder), texts.get(DEFINITION_FILE))
-        tables = _read_tables(place, {Path(folder) / name: text for name, text in texts.items()}, begun)
-        begun.clear()
-        _, digest = read_exclusions(place)
-        known = read_detected(place)
-        images = _image_news(definition, tables, known)
-    project = _observed(definition, root, tables)
+    with settled(Path(folder)), Beside() as loading:
+        large = [] if texts or loading.alone else large_tables(place, LAYOUTS)
+        if large:
+            loading.of(lambda: meanwhile(any(path.stem == "image_points" for path in large)))
+        with Beside() as reading:
+            begun = {path: begun_table(path, reading) for path in large}
+            definition, root = _read_definition(Path(folder), texts.get(DEFINITION_FILE))
+            tables = _read_tables(place, {Path(folder) / name: text for name, text in texts.items()}, begun)
+            begun.clear()
+            _, digest = read_exclusions(place)
+            known = read_detected(place)
+            images = _image_news(definition, tables, known)
+        project = _observed(definition, root, tables)
     hashes = dict(sorted({**project.inputs, f"{OBSERVATIONS_FOLDER}/{EXCLUSIONS_FILE}": digest}.items()))
     if digest:
         project = dataclasses.replace(project, inputs=hashes)
@@ -110,9 +111,9 @@ def leaving_out(project: Project, exclusions: Iterable[Exclusion]) -> Project:
         else:
             notes.append(f"{path}:{one.line}: {one.name} is left out, but nothing has that name; "
                          f"{observed.near(one.name)}")  # fmt: skip
-        found.append(LeftOut(one, len(hit.images), hit.n_image_points, hit.n_spots, hit.n_readings))
-    survey, spots = without(project.survey, project.spots, hits)
+        found.append(hit.left_out(one))
     every = union(hits)
+    survey, spots = without(project.survey, project.spots, every)
     in_files = _n_unused(survey) - (every.n - every.n_spots)
     return dataclasses.replace(
         project, survey=survey, spots=spots, left_out=tuple(found), n_left_out=every.n, n_unused_in_files=in_files,

@@ -17,7 +17,7 @@ from adjust.model.names import natural_key
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, PoseParameter, Survey
-from adjust.observations.pairs import PairArrays, pair_arrays
+from adjust.observations.pair_arrays import PairArrays, pair_arrays
 from adjust.pose_network.loops import loop_vectors
 from adjust.pose_network.network import Topology
 from adjust.relay.closed import play

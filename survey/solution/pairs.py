@@ -8,7 +8,7 @@ from gtsam import Pose3
 from adjust.model.observations import frame_text
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.survey import FloatArray, IntArray
-from adjust.observations.pairs import pair_arrays
+from adjust.observations.pair_arrays import pair_arrays
 from adjust.precision.precision import Precision
 from adjust.spatial.rigid_motions import Motions
 from adjust.testing.distributions import chi2

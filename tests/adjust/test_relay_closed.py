@@ -206,6 +206,57 @@ def test_what_images_show_or_is_held_is_no_eye() -> None:
     assert "relay" in {s.station_id for s in held.stations}
 
 
+def given_rig(known: PoseParameter, epochs: tuple[str, ...]) -> Survey:
+    """Two cameras on one body, the first of which is its frame; pairs from both to one station, and one seen twice."""
+    rng, two = np.random.default_rng(8), known.value or Pose3()
+    body = {e: Pose3.Expmap(rng.normal(size=6)) for e in epochs}
+    station, far = FrameRef("station", "A"), Pose3.Expmap(rng.normal(size=6))
+    pairs = []
+    for epoch in epochs:
+        at = epoch if len(epochs) > 1 else None
+        for camera, on in (("C1", Pose3()), ("C2", two)):
+            for k in range(2 if camera == "C1" else 1):
+                cov = h.random_cov(rng, [20.0 * ARCSEC] * 3 + [3e-4] * 3)
+                error = np.linalg.cholesky(cov) @ rng.normal(size=6)
+                seen = far.between(body[epoch] * on).retract(error)
+                pairs.append(Pair(f"{camera}{epoch}{k}", FrameRef("camera", camera, at), station, seen, cov))
+    poses = PoseParameter(Pose3(), "held"), known
+    cameras = (Camera(c, "R", (640, 480), LensParameter("brown", (), np.array([500.0, 500, 0, 320, 240] + [0] * 8)),
+                      station_from_camera=pose) for c, pose in zip(("C1", "C2"), poses, strict=True))  # fmt: skip
+    held = Station("A", world_from_station=PoseParameter(far, "held"))
+    return Survey(cameras=tuple(cameras), pairs=tuple(pairs),
+                  stations=(held, Station("R", "epoch" if len(epochs) > 1 else "fixed")))  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("known", "epochs", "redundancy"),
+    [
+        (PoseParameter(Pose3.Expmap(np.full(6, 0.1)), "held"), ("e1",), 6 + 6),
+        (PoseParameter(Pose3.Expmap(np.full(6, 0.1)), held=("rx", "ry", "rz")), ("e1",), 6 + 3),
+        (PoseParameter(), ("e1", "e2"), 6 + 6 + 6),
+    ],
+)  # fmt: skip
+def test_loops_over_a_rig_count_as_they_do_by_poses(
+    known: PoseParameter, epochs: tuple[str, ...], redundancy: int
+) -> None:
+    """A pose on a body that is held, in part or whole, or one and the same at several epochs, closes loops too."""
+    survey = given_rig(known, epochs)
+    found, expected = (adjust_cleaned(s, UNSCREENED) for s in (closed(survey), survey))
+    assert expected.redundancy == redundancy
+    check_equal(found, expected)
+    assert not any("differ" in w for w in found.warnings)
+
+
+def test_held_components_of_a_second_station_close_loops_too() -> None:
+    survey = as_stations(eyes(1))
+    pose = adjust_cleaned(survey, UNSCREENED).estimates["world_from_station", "M2"].value
+    tilted = PoseParameter(pose.retract(np.array([0.0, 0.0, 50.0 * ARCSEC, 0.0, 0.0, 0.0])), held=("rz",))
+    stations = tuple(replace(s, world_from_station=tilted) if s.station_id == "M2" else s for s in survey.stations)
+    found, expected = (adjust_cleaned(s, UNSCREENED) for s in (
+        closed(replace(survey, stations=stations)), replace(survey, stations=stations)))  # fmt: skip
+    check_equal(found, expected)
+
+
 def test_parts_of_nothing_but_eyes_each_have_their_place() -> None:
     survey = eyes(1)
     apart = tuple(p for p in survey.pairs if (p.a.kind == "camera") == (p.b.kind == "camera"))

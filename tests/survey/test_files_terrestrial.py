@@ -283,6 +283,17 @@ def test_mount_of_a_table_is_a_frame(tmp_path: Path) -> None:
 ROW = "height_difference,A,B,,,,,,0.1,,,1"
 
 
+def test_directions_of_a_set_up_are_from_one_place(tmp_path: Path) -> None:
+    """With ends swapped a free network would fit as well, mirrored at a point."""
+    swapped = "direction,B,A,S1,,10,,,,,5,", "direction,C,A,S1,,20,,,,,5,"
+    said = "from_id: 'C', but set-up 'S1' stands on 'B' in line 2; .* correct from_id and to_id"
+    with pytest.raises(SurveyError, match=rf"terrestrial.csv:3: {said}"):
+        readings(tmp_path, *swapped)
+    kept = readings(tmp_path, "direction,A,B,S1,,10,,,,,5,", "direction,A,C,S1,,20,,,,,5,",
+                    "slope_distance,B,C,S1,,,,,3,,,1")  # fmt: skip
+    assert len(kept) == 3
+
+
 @pytest.mark.parametrize(
     ("row", "line", "message"),
     [

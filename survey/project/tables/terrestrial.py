@@ -86,7 +86,22 @@ def read_readings(table: Table, names: Names, sigmas: Sigmas) -> tuple[Reading, 
                     setup_id, second, float(heights[0][row]), float(heights[1][row]), float(heights[2][row]),
                     float(plumbing), group, used[row])
         )  # fmt: skip
+    _check_places(table, readings)
     return tuple(sorted(readings, key=lambda reading: natural_key(reading.reading_id)))
+
+
+def _check_places(table: Table, readings: Sequence[Reading]) -> None:
+    """Directions of one set-up share an orientation, so they are from one place: with ends swapped they look sound."""
+    first: dict[str, int] = {}
+    for row, reading in enumerate(readings):
+        if reading.kind != "direction":
+            continue
+        other = first.setdefault(reading.setup_id, row)
+        if reading.at != readings[other].at:
+            here, there = position_text(reading.at), position_text(readings[other].at)
+            raise table.error(row, f"from_id: {here!r}, but set-up {reading.setup_id!r} stands on {there!r} in line "
+                              f"{table.lines[other]}; an instrument is set up on one point: correct from_id and to_id, "
+                              "or give it a set-up of its own")  # fmt: skip
 
 
 def _kinds(table: Table) -> list[ReadingKind]:
