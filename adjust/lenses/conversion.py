@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.lenses.compared import Optics, image_derivatives
-from adjust.lenses.models import LensModel, lens_derivatives, project
+from adjust.lenses.models import LensModel, lens_derivatives, principal_components, project
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
 from adjust.native import lenses as kernels
@@ -162,17 +162,16 @@ def _start(old: Optics, model_to: LensModel, constants_to: FloatArray, columns: 
     (fx, skew, _), (_, fy, _) = image_derivatives(old, axis, centre)[1][0]
     if not (fx > 0 and fy > 0):
         raise SurveyError(f"the {old.model.name} lens turns its image over (fx {fx:.3g}, fy {fy:.3g} px)")
-    s, centre_u, centre_v, _ = constants_to
-    u0, v0 = centre[0]
-    start = np.zeros(model_to.n)
+    start, (at, per_px, origin) = np.zeros(model_to.n), principal_components(model_to, constants_to)
+    start[at] = per_px * (centre[0] - origin)
     if not model_to.in_mm:
-        start[:5] = fx, fy, skew, u0, v0
-    elif model_to.kind == kernels.BROWN_BACKWARD_DBAT:
-        start[:4] = fy * s, u0 * s, v0 * s, fy / fx - 1.0
+        start[:3] = fx, fy, skew
     else:
-        start[:3] = fy * s, (u0 - centre_u) * s, (centre_v - v0) * s
-        affinity = (fy / fx - 1.0, skew / fx) if model_to.backward else (fx / fy - 1.0, -skew / fy)
-        start[8:10] = affinity
+        start[0] = fy * constants_to[0]
+        if model_to.kind == kernels.BROWN_BACKWARD_DBAT:
+            start[3] = fy / fx - 1.0
+        else:
+            start[8:10] = (fy / fx - 1.0, skew / fx) if model_to.backward else (fx / fy - 1.0, -skew / fy)
     start[np.setdiff1d(np.arange(model_to.n), columns)] = 0.0
     for name, value in zip(model_to.names[: 1 if model_to.in_mm else 2], start.tolist(), strict=False):
         if value == 0.0:  # there is no image without it
