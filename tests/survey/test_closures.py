@@ -103,7 +103,8 @@ def test_a_mount_takes_what_it_may(tmp_path: Path, capsys: pytest.CaptureFixture
     ("text", "form", "message"),
     [
         ('[closures.plate]\npairs = ["C1-C2", "C2-C3", "C1-C3"]\nsigma_arcsec = 3', "poses", 'pairs = "closed"'),
-        ('[closures.plate]\npairs = ["C1-C2", "C9-C3", "C1-C3"]\nsigma_arcsec = 3', "closed", "no pair 'C9-C3'"),
+        ('[closures.plate]\npairs = ["C1-C2", "C9-C3", "C1-C3"]\nsigma_arcsec = 3', "closed",
+         "survey.toml: closure 'plate': there is no pair 'C9-C3'"),
         ('[closures.plate]\npairs = ["C1-C2", "C2-C3", "C1-C3"]\nsigma_arcsec = 0', "closed", "sigma_arcsec"),
         ('[closures.plate]\npairs = ["C1-C2", "C2-C3"]\nsigma_arcsec = 1\nsigma_mm = -1', "closed", "not negative"),
         ('[closures.plate]\npairs = ["C1-C2"]\nsigma = 1', "closed", "sigma"),

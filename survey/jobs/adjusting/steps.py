@@ -23,6 +23,7 @@ from survey.jobs.adjusting.symmetric_boards import consistent_turns
 from survey.jobs.identify import identify_spots, without_points
 from survey.project import Project
 from survey.project.detected import DetectedImage
+from survey.project.project import DEFINITION_FILE
 
 Begin = Callable[[Survey], StartValues | None]
 Progress = Callable[[int, float], None]
@@ -70,7 +71,10 @@ def _options(project: Project) -> CleanOptions:
 def _loops_closed(work: Work) -> Work:
     from adjust.relay.closed import closed  # here: a survey without pairs starts without it
 
-    return work.of(closed(work.survey, work.project.options.closures))
+    try:
+        return work.of(closed(work.survey, work.project.options.closures))
+    except SurveyError as error:
+        raise SurveyError(f"{work.project.folder}/{DEFINITION_FILE}: {error}") from error
 
 
 def _boards_turned(work: Work) -> Work:
