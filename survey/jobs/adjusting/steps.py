@@ -68,13 +68,20 @@ def _options(project: Project) -> CleanOptions:
     return CleanOptions(said.reject_pairs, how, said.variance_components)
 
 
-def _loops_closed(work: Work) -> Work:
+def with_loops_closed(project: Project) -> Project:
+    """With the loops of its pairs to be closed, where it asks for that. Raises SurveyError."""
+    if project.options.pairs != "closed" or not project.survey.pairs:
+        return project
     from adjust.relay.closed import closed  # here: a survey without pairs starts without it
 
     try:
-        return work.of(closed(work.survey, work.project.options.closures))
+        return replace(project, survey=closed(project.survey, project.options.closures))
     except SurveyError as error:
-        raise SurveyError(f"{work.project.folder}/{DEFINITION_FILE}: {error}") from error
+        raise SurveyError(f"{project.folder}/{DEFINITION_FILE}: {error}") from error
+
+
+def _loops_closed(work: Work) -> Work:
+    return work.of(with_loops_closed(work.project).survey)
 
 
 def _boards_turned(work: Work) -> Work:
@@ -121,7 +128,7 @@ def _causes_named(work: Work) -> Work:
 
 
 STEPS = (
-    Step("loops", lambda w: w.project.options.pairs == "closed" and bool(w.survey.pairs), _loops_closed),
+    Step("loops", lambda w: w.project.options.pairs == "closed", _loops_closed),
     Step("symmetric boards", lambda w: bool(w.survey.image_blocks), _boards_turned),
     Step("spots", lambda w: bool(w.project.spots), _spots_identified),
     Step("unobserved", lambda _: True, _unobserved_left_out),
