@@ -496,6 +496,7 @@ def test_the_network_of_readings_is_where_the_solution_is(tmp_path):
 
 @pytest.mark.parametrize(("said", "places"), [
     ("detection: images/R4/q01: blurred", ["#image=R4/q01"]),
+    ("detection: images/R4/5.12.png: failed: lab/images/R4/5.12.png: no image", ["#image=R4/5.12"]),
     ("camera 'X', epoch 'hX05': half of its points do not fit", ["#image=X/hX05"]),
     ("table turntable, epoch t09: read twice", ["#reading=table_angles:turntable/t09"]),
 ])  # fmt: skip
