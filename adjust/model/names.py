@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Hashable, Iterable
+from functools import lru_cache
 from typing import TypeVar
 
 _PARTS = re.compile(r"\d+|\D+")
@@ -17,6 +18,7 @@ def grouped(items: Iterable[tuple[_Key, _Value]]) -> dict[_Key, list[_Value]]:
     return out
 
 
+@lru_cache(maxsize=2**15)
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
     """Key that sorts ``e2`` before ``e10``; different names have different keys."""
     # 4000: the interpreter refuses to take longer numbers apart

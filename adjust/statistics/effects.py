@@ -5,6 +5,7 @@ of uncertainty (GUM, JCGM 100:2008) is ``Q = sum of Q N_g Q``, N_g the normal ma
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
@@ -15,12 +16,15 @@ from adjust.model.result import Adjustment, ParameterName, VarianceComponents
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import side_by_side
 from adjust.statistics.condensed import CondensedSystem
+from adjust.statistics.normal import Inverse
 from adjust.statistics.result import BudgetEntry, BudgetLine, Influence
 from adjust.statistics.system import LinearSystem, linear_system
 from adjust.statistics.weakness import covariance_columns
 from adjust.testing.distributions import norm, student
 
 _CHUNK = 64
+_ROUNDING = 1e-12
+_COORDINATES = frozenset(("x", "y", "z", "tx", "ty", "tz"))
 
 
 def shifts(condensed: CondensedSystem, rows: Sequence[int], bias: Mapping[int, FloatArray]) -> FloatArray:
@@ -28,6 +32,12 @@ def shifts(condensed: CondensedSystem, rows: Sequence[int], bias: Mapping[int, F
 
     rows: image points first, then all others.
     """
+    system, right = condensed.system, _right(condensed, rows, bias)
+    return system.times_covariance(right.toarray() if system.structured is None or system.motions.shape[1] else right)
+
+
+def _right(condensed: CondensedSystem, rows: Sequence[int], bias: Mapping[int, FloatArray]) -> sparse.csc_matrix:
+    """The right-hand sides (n, k) of the normal equations for these biases."""
     system, parts = condensed.system, list[tuple[IntArray, FloatArray]]()
     for row in rows:
         if row < condensed.n_points:
@@ -37,8 +47,7 @@ def shifts(condensed: CondensedSystem, rows: Sequence[int], bias: Mapping[int, F
             parts.append(system.bias_column(row - condensed.n_points + system.n_image, bias[row]))
     places, values = (np.concatenate(x) for x in zip(*parts, strict=True))
     ptr = np.cumsum([0, *(len(x) for x, _ in parts)])
-    right = sparse.csc_matrix((values, places, ptr), (len(system.columns), len(rows)))
-    return system.times_covariance(right.toarray() if system.structured is None or system.motions.shape[1] else right)
+    return sparse.csc_matrix((values, places, ptr), (len(system.columns), len(rows)))
 
 
 def influences(
@@ -48,34 +57,79 @@ def influences(
     system = condensed.system
     c, sigmas = system.columns, np.where(system.sigmas > 0.0, system.sigmas, np.inf)
     places, coordinates = _positions(system)
+    shared = None if system.structured is None or system.motions.shape[1] else system.structured
+    reach = None if shared is None else _Reach.of(shared, sigmas, coordinates)
 
     def of(first: int) -> list[Influence]:
         part, out = rows[first : first + _CHUNK], list[Influence]()
-        dx = shifts(condensed, part, bias)
+        if reach is None:
+            which, among, dx = np.arange(len(c)), coordinates, shifts(condensed, part, bias)
+        else:
+            which, dx = reach.shifts(_right(condensed, part, bias))
+            among = coordinates[:, which]
         ratio = np.abs(dx)
-        ratio /= sigmas[:, None]
-        length, furthest = _furthest(dx, coordinates)
+        ratio /= sigmas[which, None]
+        length, furthest = _furthest(dx, among)
         for i, (row, j) in enumerate(zip(part, _first_largest(ratio).tolist(), strict=True)):
-            name = places[int(furthest[i])] if places else ()
-            out.append(Influence(row, c.names[j], c.components[j], c.units[j], float(dx[j, i]), float(ratio[j, i]),
+            name, at = places[int(furthest[i])] if places else (), int(which[j])
+            out.append(Influence(row, c.names[at], c.components[at], c.units[at], float(dx[j, i]), float(ratio[j, i]),
                                  name, float(length[i])))  # fmt: skip
         return out
 
     return tuple(x for part in side_by_side(of, range(0, len(rows), _CHUNK)) for x in part)
 
 
+@dataclass(frozen=True, eq=False)
+class _Reach:
+    """How far biases reach where Q = own + U' U. The set of an unknown that a bias touches moves by own and by U' U.
+
+    All others by U' y alone, y = U b: no further than the length of y times that of their column of U. sigmas: (n,);
+    coordinates: (p, n). of_unknowns, of_positions: (n,) and (p,) these lengths, over the sigmas and in m.
+    """
+
+    Q: Inverse
+    sigmas: FloatArray
+    coordinates: sparse.csr_matrix
+    of_unknowns: FloatArray
+    of_positions: FloatArray
+
+    @staticmethod
+    def of(Q: Inverse, sigmas: FloatArray, coordinates: sparse.csr_matrix) -> "_Reach":
+        """Of unknowns with these sigmas, and positions with these coordinates."""
+        squares = np.einsum("cn,cn->n", Q.U, Q.U)
+        return _Reach(Q, sigmas, coordinates, np.sqrt(squares) / sigmas, np.sqrt(coordinates @ squares))
+
+    def shifts(self, right: sparse.csc_matrix) -> tuple[IntArray, FloatArray]:
+        """Unknowns (s,) among which, for each right-hand side (n, k), is what moves furthest; how these move (s, k)."""
+        own, y = (self.Q.own @ right).tocsr(), np.asarray((right.T @ self.Q.U.T).T)
+        near = np.union1d(np.flatnonzero(np.diff(own.indptr)), np.flatnonzero(self.Q.member < 0))
+        dx, size = self._shifts(near, own, y), np.linalg.norm(y, axis=0)
+        far = [near, self._beyond(self.of_unknowns, size, (np.abs(dx) / self.sigmas[near, None]).max(axis=0))]
+        if len(self.of_positions):
+            place = self._beyond(self.of_positions, size, _furthest(dx, self.coordinates[:, near])[0])
+            far.append(self.coordinates[place].indices)
+        which = np.unique(np.concatenate(far))
+        return which, dx if len(which) == len(near) else self._shifts(which, own, y)
+
+    def _shifts(self, which: IntArray, own: sparse.csr_matrix, y: FloatArray) -> FloatArray:
+        return np.asarray(own[which].toarray() + self.Q.U[:, which].T @ y)
+
+    @staticmethod
+    def _beyond(lengths: FloatArray, size: FloatArray, found: FloatArray) -> IntArray:
+        """Which of these may move further than what was found (k,), where y has these lengths (k,)."""
+        return np.flatnonzero(lengths * (1.0 + _ROUNDING) >= (found / np.maximum(size, 1e-300)).min())
+
+
 def _positions(system: LinearSystem) -> tuple[list[ParameterName], sparse.csr_matrix]:
     """Unknowns that are positions in the world, and (p, n) which unknowns are the coordinates of each: ones."""
-    names, columns, ptr = list[ParameterName](), list[int](), [0]
-    components = system.columns.components
-    for name, at in system.columns.at.items():
-        if name[0] == "point" or in_world(system.precision.graph.survey, name):
-            mine = [c for c in at.tolist() if components[c] in ("x", "y", "z", "tx", "ty", "tz")]
-            if mine:
-                names.append(name)
-                columns += mine
-                ptr.append(len(columns))
-    return names, sparse.csr_matrix((np.ones(len(columns)), columns, ptr), (len(names), len(components)))
+    survey, c = system.precision.graph.survey, system.columns
+    names = [name for name in c.at if name[0] == "point" or in_world(survey, name)]
+    sizes = [len(c.at[name]) for name in names]
+    columns, owner = c.of(names), np.repeat(np.arange(len(names)), sizes)
+    kept = np.array([x in _COORDINATES for x in c.components], dtype=np.bool_)[columns]
+    some, row = np.unique(owner[kept], return_inverse=True)
+    entries = np.ones(len(row)), (row, columns[kept])
+    return [names[i] for i in some.tolist()], sparse.csr_matrix(entries, (len(some), len(c)))
 
 
 def _furthest(dx: FloatArray, coordinates: sparse.csr_matrix) -> tuple[FloatArray, IntArray]:

@@ -85,7 +85,7 @@ def observation_name(adjustment: Adjustment, row: int) -> tuple[str, tuple[str, 
 
 def _others(precision: Precision) -> list[_Batch]:
     """All other observations, those with the same number of components together."""
-    n_image = sum(len(b.uv) for b in precision.graph.survey.image_blocks)
+    n_image = len(precision.graph.survey.image_points.uv)
     found: dict[int, list[tuple[int, FloatArray, FloatArray, FloatArray, FloatArray, bool]]] = {}
     for i, item in zip(precision.graph.single, precision.graph.singles, strict=True):
         x = precision.rows(item)
@@ -161,7 +161,7 @@ def _table(
     if readings is not None:  # of joint readings: the shares of the degrees of freedom, not of a bias that shows
         columns["redundancy"][M - len(readings.used) :] = readings.redundancy
     blocks = adjustment.survey.image_blocks
-    groups, counts = [b.group for b in blocks], [len(b.uv) for b in blocks]
+    groups, counts = [b.group for b in blocks], np.diff(adjustment.image_residuals.block_ptr).tolist()
     others = groups_of_others(precision_of(adjustment).graph)
     groups, counts = groups + others, counts + [1] * len(others)
     names = tuple(dict.fromkeys(g for g, n in zip(groups, counts, strict=True) if n))

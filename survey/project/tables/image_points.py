@@ -89,19 +89,28 @@ def _arranged(table: Table, column: str, seen: IntArray, item: IntArray, group: 
 
     Raises SurveyError where the same item of ``column`` was seen twice.
     """
-    every = one_code(seen, item)
-    order = np.argsort(every, kind="stable")  # of what is in order already, as this program writes it, next to nothing
-    same = np.flatnonzero(np.diff(every[order]) == 0)
+    every, order = one_code(seen, item), np.arange(len(seen))
+    if (every[1:] <= every[:-1]).any():  # not in order already, as this program writes it
+        order = np.argsort(every, kind="stable")
+        _check_once(table, column, every[order], order)
+    block = seen
+    if group.any():
+        block = one_code(seen, group)
+        order = order[np.argsort(block[order], kind="stable")]
+    block = block[order]
+    ends = np.flatnonzero(block[1:] != block[:-1]) + 1
+    return order, np.concatenate([[0], ends, [len(block)]] if len(block) else [[0]])
+
+
+def _check_once(table: Table, column: str, every: IntArray, order: IntArray) -> None:
+    """Raises SurveyError where two of the rows in this order have the same code."""
+    same = np.flatnonzero(every[1:] == every[:-1])
     if len(same):
         i = same[np.argmin(order[same + 1])]
         name = table.text(column).values()[order[i]]
         line = table.lines[order[i]]
         problem = f"{name!r} stands already in line {line} for this camera, epoch and target; remove one"
         raise table.error(int(order[i + 1]), f"{column}: {problem}")
-    block = one_code(seen, group)
-    order = order[np.argsort(block[order], kind="stable")] if group.any() else order
-    ends = np.flatnonzero(np.diff(block[order], append=-1))
-    return order, np.concatenate([[0], ends + 1])
 
 
 def _groups(table: Table) -> TextColumn:
