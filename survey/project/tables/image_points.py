@@ -1,6 +1,7 @@
 """Tables of image points into one block per camera, epoch and target, without a step per row."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -42,14 +43,16 @@ def read_image_blocks(table: Table, names: Names, sigmas: Sigmas) -> tuple[Image
     cameras, epochs = table.ids("camera_id"), table.ids("epoch_id")
     targets, groups = table.text("target_id"), _groups(table)
     uv, cov = _measured(table, cameras, names, sigmas, groups)
-    point_idx = _point_positions(table, targets, names)
-    seen = one_code(_ranks(cameras), _ranks(epochs), _ranks(targets, blank_last=True))
-    order, ptr = _arranged(table, "point_id", seen, point_idx, _ranks(groups))
+    columns = (cameras, False), (epochs, False), (targets, True), (groups, False)
+    parts: list[Callable[[], IntArray]] = [partial(_point_positions, table, targets, names)]
+    parts += [partial(_ranks, *column) for column in columns]
+    point_idx, *ranks, of_group = side_by_side(lambda part: part(), parts)
+    order, ptr = _arranged(table, "point_id", one_code(*ranks), point_idx, of_group)
     first, used = order[ptr[:-1]], table.flags("used")
     texts = [TextColumn(c.names, c.codes[first]).values() for c in (cameras, epochs, targets, groups)]
     if (order != np.arange(len(order))).any():
         point_idx, uv, cov, used = point_idx[order], uv[order], cov[order], used[order]
-    all_used = np.logical_and.reduceat(used, ptr[:-1]).tolist() if len(first) else []
+    all_used = [True] * len(first) if used.all() else np.logical_and.reduceat(used, ptr[:-1]).tolist()
     blocks = []
     ranges = pairwise(ptr.tolist())
     for (i, j), whole, camera, epoch, target_id, group_name in zip(ranges, all_used, *texts, strict=True):
