@@ -6,6 +6,7 @@ of uncertainty (GUM, JCGM 100:2008) is ``Q = sum of Q N_g Q``, N_g the normal ma
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -23,7 +24,6 @@ from adjust.statistics.weakness import covariance_columns
 from adjust.testing.distributions import norm, student
 
 _CHUNK = 64
-_ROUNDING = 1e-12
 _COORDINATES = frozenset(("x", "y", "z", "tx", "ty", "tz"))
 
 
@@ -58,66 +58,121 @@ def influences(
     c, sigmas = system.columns, np.where(system.sigmas > 0.0, system.sigmas, np.inf)
     places, coordinates = _positions(system)
     shared = None if system.structured is None or system.motions.shape[1] else system.structured
-    reach = None if shared is None else _Reach.of(shared, sigmas, coordinates)
+    reach = None if shared is None else Reach.of(shared, sigmas, coordinates)
 
     def of(first: int) -> list[Influence]:
-        part, out = rows[first : first + _CHUNK], list[Influence]()
+        part = rows[first : first + _CHUNK]
         if reach is None:
-            which, among, dx = np.arange(len(c)), coordinates, shifts(condensed, part, bias)
+            found = furthest_of(shifts(condensed, part, bias), sigmas, coordinates)
         else:
-            which, dx = reach.shifts(_right(condensed, part, bias))
-            among = coordinates[:, which]
-        ratio = np.abs(dx)
-        ratio /= sigmas[which, None]
-        length, furthest = _furthest(dx, among)
-        for i, (row, j) in enumerate(zip(part, _first_largest(ratio).tolist(), strict=True)):
-            name, at = places[int(furthest[i])] if places else (), int(which[j])
-            out.append(Influence(row, c.names[at], c.components[at], c.units[at], float(dx[j, i]), float(ratio[j, i]),
-                                 name, float(length[i])))  # fmt: skip
-        return out
+            found = reach.furthest(_right(condensed, part, bias))
+        return [
+            Influence(row, c.names[i], c.components[i], c.units[i], shift, ratio, places[p] if places else (), length)
+            for row, i, shift, ratio, p, length in zip(part, *(x.tolist() for x in found), strict=True)
+        ]
 
     return tuple(x for part in side_by_side(of, range(0, len(rows), _CHUNK)) for x in part)
 
 
-@dataclass(frozen=True, eq=False)
-class _Reach:
-    """How far biases reach where Q = own + U' U. The set of an unknown that a bias touches moves by own and by U' U.
+class Furthest(NamedTuple):
+    """What moves furthest for each of k biases: unknown, its shift and that in its sigmas; position, how far (k,)."""
 
-    All others by U' y alone, y = U b: no further than the length of y times that of their column of U. sigmas: (n,);
-    coordinates: (p, n). of_unknowns, of_positions: (n,) and (p,) these lengths, over the sigmas and in m.
+    unknown: IntArray
+    shift: FloatArray
+    ratio: FloatArray
+    position: IntArray
+    length: FloatArray
+
+
+def furthest_of(dx: FloatArray, sigmas: FloatArray, coordinates: sparse.csr_matrix) -> Furthest:
+    """Of unknowns with these sigmas (n,) that move by dx (n, k), and positions with these coordinates (p, n)."""
+    k = np.arange(dx.shape[1])
+    ratio = np.abs(dx)
+    ratio /= sigmas[:, None]
+    at = _first_largest(ratio)
+    if not coordinates.shape[0]:
+        return Furthest(at, dx[at, k], ratio[at, k], np.zeros_like(k), np.zeros(len(k)))
+    squares = np.asarray(coordinates @ np.square(dx))
+    place = _first_largest(squares)
+    return Furthest(at, dx[at, k], ratio[at, k], place, np.sqrt(squares[place, k]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Shared:
+    """How far things move by what all unknowns share, ``U' y``: at most the length of y times that of their own part.
+
+    Those with the longest part come first: number (t,) of each, U (c, r) of their components, which begin by ptr
+    (t + 1,), and lengths (t,). place: (t,) where each stands.
+    """
+
+    number: IntArray
+    U: FloatArray
+    ptr: IntArray
+    lengths: FloatArray
+    place: IntArray
+
+    @staticmethod
+    def of(U: FloatArray, components: sparse.csr_matrix) -> "_Shared":
+        """Of things with these components (t, n), one of each row of the unknowns at most."""
+        lengths = np.sqrt(components @ np.einsum("cn,cn->n", U, U))
+        number = np.argsort(-lengths, kind="stable")
+        mine = components[number]
+        place = np.empty_like(number)
+        place[number] = np.arange(len(number))
+        return _Shared(number, U[:, mine.indices], mine.indptr.astype(np.int64), lengths[number], place)
+
+    def beyond(self, y: FloatArray, found: float, others: IntArray) -> tuple[int, float] | None:
+        """The first that moves further than ``found``, and how far; None of those that are not ``others``."""
+        most = np.searchsorted(-self.lengths, -found / max(float(np.linalg.norm(y)), 1e-300), side="right")
+        if not most:
+            return None
+        squares = np.add.reduceat(np.square(y @ self.U[:, : self.ptr[most]]), self.ptr[:most])
+        place = self.place[others]
+        squares[place[place < most]] = 0.0
+        at = int(squares.argmax())
+        return (int(self.number[at]), float(np.sqrt(squares[at]))) if squares[at] > found**2 else None
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """What biases move where Q = own + U' U: the sets of unknowns that one touches by both, all others by U' U alone.
+
+    sigmas: (n,). coordinates: (p, n). unknowns, positions: by what they share. position: (n,) of coordinates, else -1.
     """
 
     Q: Inverse
     sigmas: FloatArray
     coordinates: sparse.csr_matrix
-    of_unknowns: FloatArray
-    of_positions: FloatArray
+    unknowns: _Shared
+    positions: _Shared
+    position: IntArray
 
     @staticmethod
-    def of(Q: Inverse, sigmas: FloatArray, coordinates: sparse.csr_matrix) -> "_Reach":
+    def of(Q: Inverse, sigmas: FloatArray, coordinates: sparse.csr_matrix) -> "Reach":
         """Of unknowns with these sigmas, and positions with these coordinates."""
-        squares = np.einsum("cn,cn->n", Q.U, Q.U)
-        return _Reach(Q, sigmas, coordinates, np.sqrt(squares) / sigmas, np.sqrt(coordinates @ squares))
+        position = np.full(len(sigmas), -1)
+        position[coordinates.indices] = np.repeat(np.arange(coordinates.shape[0]), np.diff(coordinates.indptr))
+        each = sparse.identity(len(sigmas), format="csr")
+        return Reach(Q, sigmas, coordinates, _Shared.of(Q.U / sigmas, each), _Shared.of(Q.U, coordinates), position)
 
-    def shifts(self, right: sparse.csc_matrix) -> tuple[IntArray, FloatArray]:
-        """Unknowns (s,) among which, for each right-hand side (n, k), is what moves furthest; how these move (s, k)."""
-        own, y = (self.Q.own @ right).tocsr(), np.asarray((right.T @ self.Q.U.T).T)
-        near = np.union1d(np.flatnonzero(np.diff(own.indptr)), np.flatnonzero(self.Q.member < 0))
-        dx, size = self._shifts(near, own, y), np.linalg.norm(y, axis=0)
-        far = [near, self._beyond(self.of_unknowns, size, (np.abs(dx) / self.sigmas[near, None]).max(axis=0))]
-        if len(self.of_positions):
-            place = self._beyond(self.of_positions, size, _furthest(dx, self.coordinates[:, near])[0])
-            far.append(self.coordinates[place].indices)
-        which = np.unique(np.concatenate(far))
-        return which, dx if len(which) == len(near) else self._shifts(which, own, y)
-
-    def _shifts(self, which: IntArray, own: sparse.csr_matrix, y: FloatArray) -> FloatArray:
-        return np.asarray(own[which].toarray() + self.Q.U[:, which].T @ y)
-
-    @staticmethod
-    def _beyond(lengths: FloatArray, size: FloatArray, found: FloatArray) -> IntArray:
-        """Which of these may move further than what was found (k,), where y has these lengths (k,)."""
-        return np.flatnonzero(lengths * (1.0 + _ROUNDING) >= (found / np.maximum(size, 1e-300)).min())
+    def furthest(self, right: sparse.csc_matrix) -> Furthest:
+        """For right-hand sides (n, k) of the normal equations."""
+        own, y = (self.Q.own @ right).tocsc(), np.asarray((right.T @ self.Q.U.T).T)
+        near = np.union1d(own.indices, np.flatnonzero(self.Q.member < 0))
+        dx = own[near].toarray() + self.Q.U[:, near].T @ y
+        out = furthest_of(dx, self.sigmas[near], self.coordinates[:, near])
+        out.unknown[:] = near[out.unknown]
+        for j in range(len(out.ratio)):
+            touched = own.indices[own.indptr[j] : own.indptr[j + 1]]
+            further = self.unknowns.beyond(y[:, j], out.ratio[j], touched)
+            if further is not None:
+                out.unknown[j], out.ratio[j] = further
+                out.shift[j] = self.Q.U[:, further[0]] @ y[:, j]
+            positions = self.position[touched]
+            further = self.positions.beyond(y[:, j], out.length[j], positions[positions >= 0])
+            if further is not None:
+                out.position[j], out.length[j] = further
+        return out
 
 
 def _positions(system: LinearSystem) -> tuple[list[ParameterName], sparse.csr_matrix]:
@@ -130,15 +185,6 @@ def _positions(system: LinearSystem) -> tuple[list[ParameterName], sparse.csr_ma
     some, row = np.unique(owner[kept], return_inverse=True)
     entries = np.ones(len(row)), (row, columns[kept])
     return [names[i] for i in some.tolist()], sparse.csr_matrix(entries, (len(some), len(c)))
-
-
-def _furthest(dx: FloatArray, coordinates: sparse.csr_matrix) -> tuple[FloatArray, IntArray]:
-    """How far the position moves that moves most, and which that is; of every column of dx (n, k)."""
-    if not coordinates.shape[0]:
-        return np.zeros(dx.shape[1]), np.zeros(dx.shape[1], dtype=np.int64)
-    squares = np.asarray(coordinates @ np.square(dx))
-    at = _first_largest(squares)
-    return np.sqrt(squares[at, np.arange(len(at))]), at
 
 
 def _first_largest(values: FloatArray) -> IntArray:

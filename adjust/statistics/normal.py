@@ -55,7 +55,7 @@ def structured_inverse(N: sparse.csc_matrix, scale: FloatArray) -> Inverse | Non
         return None
     N = N.tocsr()
     own, across = N[rest][:, rest], N[rest][:, core]
-    label = _components(own)
+    label = sets_apart(own)
     sizes = np.bincount(label)
     if sizes.max() > _SMALL_SET:
         return None
@@ -84,7 +84,7 @@ def structured_inverse(N: sparse.csc_matrix, scale: FloatArray) -> Inverse | Non
     return Inverse(sparse.csr_matrix((values, (i, j)), (n, n)), U, member)
 
 
-def _components(N: sparse.csr_matrix) -> IntArray:
+def sets_apart(N: sparse.csr_matrix) -> IntArray:
     """Number (n,) of the set of unknowns that each belongs to, where those of different sets have nothing in common.
 
     ``scipy.sparse.csgraph`` takes longer to load than this to run.

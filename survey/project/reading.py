@@ -77,8 +77,7 @@ def read_all(
     place = Path(folder) / OBSERVATIONS_FOLDER
     with settled(Path(folder)), Beside() as loading:
         large = [] if texts or loading.alone else large_tables(place, LAYOUTS)
-        if large:
-            loading.of(meanwhile)
+        loaded = loading.of(meanwhile if large else lambda: None)
         with Beside() as reading:
             begun = {path: begun_table(path, reading) for path in large}
             definition, root = _read_definition(Path(folder), texts.get(DEFINITION_FILE))
@@ -88,6 +87,7 @@ def read_all(
             known = read_detected(place)
             images = _image_news(definition, tables, known)
         project = _observed(definition, root, tables)
+        loaded()
     hashes = dict(sorted({**project.inputs, f"{OBSERVATIONS_FOLDER}/{EXCLUSIONS_FILE}": digest}.items()))
     if digest:
         project = dataclasses.replace(project, inputs=hashes)
