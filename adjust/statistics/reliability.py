@@ -80,7 +80,7 @@ def observation_name(adjustment: Adjustment, row: int) -> tuple[str, tuple[str, 
 
 def _others(precision: Precision) -> list[_Batch]:
     """All other observations, those with the same number of components together."""
-    n_image = sum(len(b.uv) for b in precision.graph.survey.image_blocks)
+    n_image = len(precision.graph.survey.image_points.uv)
     found: dict[int, list[tuple[int, FloatArray, FloatArray, FloatArray, FloatArray, bool]]] = {}
     for i, item in zip(precision.graph.single, precision.graph.singles, strict=True):
         x = precision.rows(item)
@@ -153,9 +153,10 @@ def _table(
     readings = adjustment.reading_residuals
     if readings is not None:  # of joint readings: the shares of the degrees of freedom, not of a bias that shows
         columns["redundancy"][M - len(readings.used) :] = readings.redundancy
-    blocks, others = adjustment.survey.image_blocks, groups_of_others(precision_of(adjustment).graph)
-    counts = [*(n for b in blocks if (n := len(b.uv))), *[1] * len(others)]
-    names, group = numbered([*(b.group for b in blocks if len(b.uv)), *others])
+    sizes, others = np.diff(adjustment.image_residuals.block_ptr), groups_of_others(precision_of(adjustment).graph)
+    blocks = [(b.group, n) for b, n in zip(adjustment.survey.image_blocks, sizes.tolist(), strict=True) if n]
+    counts = [*(n for _, n in blocks), *[1] * len(others)]
+    names, group = numbered([*(g for g, _ in blocks), *others])
     return ObservationTests(
         n_image=n_image, ptr=ptr, group=np.repeat(group, counts), group_names=tuple(names), used=used,
         n_components=np.diff(ptr), freedom=freedom, criteria=found,

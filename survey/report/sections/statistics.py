@@ -198,7 +198,7 @@ def normality(c: Context) -> Markup:
 
 
 def standardized_by_group(adjustment: Adjustment) -> dict[str, FloatArray]:
-    """Standardized residuals of every group's used observations in ascending order; none that is no number."""
+    """Standardized residuals of every group's used observations; none that is no number."""
     found, readings = adjustment.image_residuals, adjustment.reading_residuals
     out: dict[str, list[FloatArray]] = {}
 
@@ -216,4 +216,4 @@ def standardized_by_group(adjustment: Adjustment) -> dict[str, FloatArray]:
     if readings is not None:
         add([r.group for r in adjustment.survey.readings], 1, readings.used, readings.standardized)
     joint = {name: np.concatenate(parts) for name, parts in out.items()}
-    return {name: np.sort(w[np.isfinite(w)]) for name, w in joint.items()}
+    return {name: w[np.isfinite(w)] for name, w in joint.items()}
