@@ -6,7 +6,7 @@ rig the cameras and targets whose poses on their station are held or have a full
 of its frames, each joined to the station.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,7 +29,6 @@ from survey.solution.quantities import ARCSEC_PER_RAD
 
 ALPHA = 0.001
 """Error probability of the test of all loops together."""
-_MOST_LOOPS = 1000
 _Ends = list[tuple[str, str, str]]
 _GIVEN = "given:"  # no station's id holds a colon
 _WORLD = "world"
@@ -249,11 +248,17 @@ def loops_dict(
     sigma_misclosure: along the direction of the misclosure. after: misclosures (L, dim) by the adjusted pairs. form:
     "poses" or "closed", as asked for. solved_by: "poses" or "conditions", how the pairs were adjusted.
     """
-    failed = set(loops.failed(ALPHA).tolist())
-    order = np.argsort(loops.p_value, kind="stable")[:_MOST_LOOPS].tolist()
+    failed = np.zeros(len(loops.test), dtype=np.bool_)
+    failed[loops.failed(ALPHA)] = True
+    order, out = np.argsort(loops.p_value, kind="stable"), set(left_out)
+    columns = misclosure_columns(loops.vector, loops.cov)
+    columns |= {"test": loops.test, "p_value": loops.p_value}
+    if after is not None:
+        columns |= {key: size for key, _, size in _lengths("misclosure_after", after)}
+    rows = zip(*(column[order].tolist() for column in columns.values()), strict=True)
     return {
-        "n_loops": len(loops.test),
-        "n_failed": len(failed),
+        "n_loops": len(order),
+        "n_failed": int(failed.sum()),
         "n_listed": len(order),
         "minimal": loops.basis.minimal,
         "note": loops.basis.note,
@@ -261,14 +266,11 @@ def loops_dict(
         "form": form,
         "solved_by": solved_by,
         "worst_first": [
-            _loop(loops, k, k in failed, set(left_out)) | ({} if after is None else _after(after[k])) for k in order
+            _walk(loops, k, out) | {"freedom": loops.vector.shape[1], "closes": not failed[k]}
+            | dict(zip(columns, row, strict=True))
+            for k, row in zip(order.tolist(), rows, strict=True)
         ],
-    }
-
-
-def _after(w: FloatArray) -> dict[str, Any]:
-    out = {"misclosure_after_arcsec": float(ARCSEC_PER_RAD * np.linalg.norm(w[:3]))}
-    return out if len(w) == 3 else out | {"misclosure_after_mm": float(1e3 * np.linalg.norm(w[3:]))}
+    }  # fmt: skip
 
 
 def closures_dict(adjustment: Adjustment) -> dict[str, Any]:
@@ -287,7 +289,7 @@ def closures_dict(adjustment: Adjustment) -> dict[str, Any]:
         loop = loop_misclosures(MeasuredPairs(topology(_ends(pairs)), motions, every.cov[rows, :dim, :dim]))
         entry: dict[str, Any] = {"pairs": list(closure.pair_ids), "used": pairs[-1].used}
         entry |= {"sigma_arcsec": ARCSEC_PER_RAD * closure.rotation_sigma, "sigma_mm": 1e3 * closure.translation_sigma}
-        entry |= misclosure_dict(loop.vector[0], loop.cov[0])
+        entry |= {key: float(of[0]) for key, of in misclosure_columns(loop.vector, loop.cov).items()}
         entry |= {"test": loop.test[0], "freedom": dim, "p_value": loop.p_value[0]}
         v = found.get(closure.pair_ids[-1])
         if v is not None:
@@ -300,21 +302,27 @@ def closures_dict(adjustment: Adjustment) -> dict[str, Any]:
     return out
 
 
-def _loop(loops: LoopMisclosures, k: int, failed: bool, left_out: set[str]) -> dict[str, Any]:
+def _walk(loops: LoopMisclosures, k: int, left_out: set[str]) -> dict[str, Any]:
     pairs = _real(loops.basis.pairs(k))
-    return {
-        "stations": list(loops.basis.stations(k)), "pairs": list(pairs),
-        **misclosure_dict(loops.vector[k], loops.cov[k]), "test": loops.test[k], "freedom": len(loops.vector[k]),
-        "p_value": loops.p_value[k], "closes": not failed, "pairs_not_used": [p for p in pairs if p in left_out],
-    }  # fmt: skip
+    return {"stations": list(loops.basis.stations(k)), "pairs": list(pairs),
+            "pairs_not_used": [p for p in pairs if p in left_out]}  # fmt: skip
 
 
-def misclosure_dict(w: FloatArray, cov: FloatArray) -> dict[str, float]:
-    """Lengths of a misclosure (3 or 6,), and their sigmas along it."""
+def _lengths(name: str, w: FloatArray) -> Iterator[tuple[str, slice, FloatArray]]:
+    """Of the parts of misclosures (L, 3 or 6): key with its unit, components, lengths (L,) in that unit."""
     parts = (("arcsec", slice(3), ARCSEC_PER_RAD), ("mm", slice(3, 6), 1e3))
-    out: dict[str, float] = {}
-    for unit, of, factor in parts[: len(w) // 3]:
-        size = float(np.linalg.norm(w[of]))
-        sigma = np.sqrt(w[of] @ cov[of, of] @ w[of]) / size if size > 0.0 else np.sqrt(np.trace(cov[of, of]) / 3.0)
-        out |= {f"misclosure_{unit}": factor * size, f"sigma_misclosure_{unit}": factor * float(sigma)}
+    for unit, of, factor in parts[: w.shape[1] // 3]:
+        yield f"{name}_{unit}", of, factor * np.linalg.norm(w[:, of], axis=1)
+
+
+def misclosure_columns(w: FloatArray, cov: FloatArray) -> dict[str, FloatArray]:
+    """Lengths (L,) of misclosures (L, 3 or 6), and their sigmas along them; of none at all, the mean sigma."""
+    out: dict[str, FloatArray] = {}
+    for key, of, size in _lengths("misclosure", w):
+        part, C = w[:, of], cov[:, of, of]
+        length = np.linalg.norm(part, axis=1)
+        along = np.einsum("li,lij,lj->l", part, C, part) / np.where(length > 0.0, length, 1.0) ** 2
+        variance = np.where(length > 0.0, along, np.trace(C, axis1=1, axis2=2) / 3.0)
+        factor = ARCSEC_PER_RAD if key.endswith("_arcsec") else 1e3
+        out |= {key: size, f"sigma_{key}": factor * np.sqrt(variance)}
     return out

@@ -1,7 +1,7 @@
 """What the views of the workbench show, as plain values: state, findings, parameters, scene, exclusions."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from gtsam import Pose3
@@ -29,8 +29,7 @@ from survey.workbench.jobs import Jobs
 from survey.workbench.places import Places, refs_of
 from survey.workbench.rows import columns, reading_rows
 
-if TYPE_CHECKING:
-    pass
+_MOST_LOOPS = 1000
 
 
 def limits(bench: Jobs) -> tuple[float, float]:
@@ -169,11 +168,14 @@ def scene(bench: Jobs) -> dict[str, Any]:
 
 
 def loops(bench: Jobs) -> dict[str, Any]:
-    """Loops of measured pairs and how they close, the worst first; None where there are none."""
+    """The loops of measured pairs that close worst, and how many there are; None where there are none."""
     from survey.solution.dictionary import solution_dict
 
     solution = solution_dict(bench.adjustment, bench.run(), None)
-    return {"version": bench.version, "loops": solution.get("loops"), "network": solution.get("network")}
+    found = solution.get("loops")
+    if found is not None:
+        found = found | {"worst_first": found["worst_first"][:_MOST_LOOPS]}
+    return {"version": bench.version, "loops": found, "network": solution.get("network")}
 
 
 def table_residuals(bench: Jobs) -> dict[str, Any]:
