@@ -11,7 +11,7 @@ from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyErr
 from survey.batch.common_datum import FreeDatum, Place, free_datum
 from survey.folder.locking import BusyError
 from survey.folder.shapes import NUMBER, POSITIVE, REAL, WHOLE, Each, Either, misfit
-from survey.solution.quantities import Status
+from survey.solution.quantities import Status, components_of
 from survey.solution.verdict import misfits
 
 DONE, TEST_FAILED, FAILED = "done", "test_failed", "failed"
@@ -43,7 +43,6 @@ _SINGLE_POSES = (
 _VECTORS = (("cameras", "lens"), ("tables", "geometry"), ("targets", "warp"), ("cameras", "clock"), ("tables", "clock"),
             ("stations", "clock"))  # fmt: skip
 _ROTATION = POSE_COMPONENTS[:3]
-_UNIT = re.compile(r"px|mm|deg|arcsec|ppm|ms|us|intervals|m|1|per_\w+|")
 
 
 _SUMMARY = {
@@ -218,19 +217,10 @@ def _free(status: Status, components: tuple[str, ...]) -> tuple[str, ...]:
 
 def _components(path: str, entry: Mapping[str, Any]) -> Iterator[Number]:
     """Number and sigma of every free component of a lens, table, warp or clock, whose keys end with their units."""
-    for component in _free(entry["status"], ()):
-        value_key, sigma_key = _key(entry, component), _key(entry, f"sigma_{component}")
-        if value_key and sigma_key and entry[value_key] is not None and entry[sigma_key] is not None:
-            unit = value_key[len(component) + 1 :]
-            factor = 3600.0 if unit == "deg" and sigma_key.endswith("_arcsec") else 1.0
-            yield Number(f"{path}/{component}", unit, entry[value_key], entry[sigma_key] / factor)
-
-
-def _key(entry: Mapping[str, Any], component: str) -> str:
-    for key in entry:
-        if key == component or (key.startswith(f"{component}_") and _UNIT.fullmatch(key[len(component) + 1 :])):
-            return key
-    return ""
+    for c in components_of(entry):
+        if c.status == "free" and c.value is not None and c.sigma is not None:
+            factor = 3600.0 if (c.unit, c.sigma_unit) == ("deg", "arcsec") else 1.0
+            yield Number(f"{path}/{c.name}", c.unit, c.value, c.sigma / factor)
 
 
 def _turns(solution: Mapping[str, Any]) -> Iterator[Turn]:

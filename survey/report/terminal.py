@@ -11,6 +11,7 @@ from survey.project.observed import name_of_residual
 from survey.report.anchors import anchor, anchors_in
 from survey.report.sections.published import head_rows, worst_pairs
 from survey.solution.dictionary import RunInfo, solution_dict
+from survey.solution.quantities import components_of
 from survey.solution.records import having
 
 _WIDTH = 100
@@ -123,7 +124,7 @@ def _cameras(solution: dict[str, Any]) -> Iterator[str]:
 def _lens(lens: dict[str, Any] | None) -> str:
     if lens is None:
         return ""
-    sigmas = {k[6:-3]: v for k, v in lens.items() if k.startswith("sigma_") and k.endswith("_px") and v}
+    sigmas = {c.name: c.sigma for c in components_of(lens) if c.sigma_unit == "px" and c.sigma}
     parts = []
     if sigmas:
         name = max(sigmas, key=lambda k: sigmas[k])

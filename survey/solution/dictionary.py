@@ -177,7 +177,8 @@ def _network(adjustment: Adjustment) -> dict[str, Any]:
     if not survey.pairs:
         return {}
     # here: a survey without pairs is reported without it
-    from survey.solution.loops import closures_dict, loops_after, loops_dict, network_dict, pair_loops, pair_network
+    from survey.solution.loops import closures_dict, loops_after, loops_dict, pair_loops
+    from survey.solution.pair_network import network_dict, pair_network
 
     loops = pair_loops(survey)
     if loops is None:

@@ -4,10 +4,10 @@ Everything that a report or a result file says about the precision of an unknown
 """
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gtsam import Pose3
@@ -152,6 +152,26 @@ def vector_entry(estimate: Estimate, scale: Scale) -> dict[str, Any]:
         entry[key_of(name, value_unit)] = float(value * value_factor)
         entry[key_of(f"sigma_{name}", sigma_unit)] = float(sigma * sigma_factor)
     return entry | {"status": dict(zip(estimate.components, estimate.status, strict=True))}
+
+
+class Written(NamedTuple):
+    """A component as it is written down."""
+
+    name: str
+    value: float | None
+    unit: str
+    sigma: float | None
+    sigma_unit: str
+    status: str
+
+
+def components_of(entry: Mapping[str, Any]) -> Iterator[Written]:
+    """The components of a :func:`vector_entry`, their units read off its keys."""
+    keys = iter(entry)  # in the order of the components, each followed by that of its sigma
+    for name, status in entry["status"].items():
+        key = next(k for k in keys if k == name or k.startswith(f"{name}_"))
+        of_sigma = next(keys)
+        yield Written(name, entry[key], key[len(name) + 1 :], entry[of_sigma], of_sigma[len(name) + 7 :], status)
 
 
 def motion_columns(rotations: FloatArray, translations: FloatArray) -> dict[str, FloatArray]:

@@ -1,13 +1,12 @@
 """Tables of the components of lenses, tables, warps and clocks, with what is significant about them."""
 
-from collections.abc import Iterator
 from typing import Any
 
 from markupsafe import Markup
 
 from survey.report import markup as m
 from survey.report.language import known, t
-from survey.solution.quantities import Status
+from survey.solution.quantities import Status, components_of
 
 
 def status_pill(status: Status) -> Markup:
@@ -17,15 +16,6 @@ def status_pill(status: Status) -> Markup:
     return m.pill(
         {"free": "quiet", "held": "plain", "prior": "soft", "tied": "soft"}.get(status, "quiet"), known(status)
     )
-
-
-def components_of(entry: dict[str, Any]) -> Iterator[tuple[str, float | None, str, float | None, str, str]]:
-    """Name, value, unit, sigma, its unit and status of every component of a vector entry."""
-    for name, status in entry["status"].items():
-        value_key = next(k for k in entry if k == name or k.startswith(f"{name}_"))
-        sigma_key = next(k for k in entry if k == f"sigma_{name}" or k.startswith(f"sigma_{name}_"))
-        unit, sigma_unit = value_key[len(name) + 1 :], sigma_key[len(name) + 7 :]
-        yield name, entry[value_key], unit, entry[sigma_key], sigma_unit, status
 
 
 def value_in(unit: str, value: float | None, sigma: float | None, sigma_unit: str) -> str:

@@ -11,7 +11,8 @@ from survey.report import charts
 from survey.report import markup as m
 from survey.report.context import Context
 from survey.report.language import known, t
-from survey.report.sections.components import components_of, status_pill, tests_of, value_in, vector_table
+from survey.report.sections.components import status_pill, tests_of, value_in, vector_table
+from survey.solution.quantities import components_of
 from survey.solution.records import having, keys_of
 
 _MOST_ROWS, _MOST_CAMERAS, _MOST_BLOCKS = 250, 40, 100
