@@ -13,11 +13,11 @@ class AbortedError(SurveyError):
 class Control:
     """Flags between the session's thread and whoever watches it. ``on_stop`` is called once, in the caller's thread."""
 
-    def __init__(self, on_stop: Callable[[], None] | None = None) -> None:
+    def __init__(self) -> None:
         self._stop = threading.Event()
         self._go = threading.Event()
         self._go.set()
-        self.on_stop = on_stop
+        self.on_stop: Callable[[], None] = lambda: None
         self.reason = ""
 
     @property
@@ -43,8 +43,7 @@ class Control:
             return
         self.reason = reason
         self._stop.set()
-        if self.on_stop is not None:
-            self.on_stop()
+        self.on_stop()
         self._go.set()
 
     def checkpoint(self) -> None:

@@ -15,14 +15,13 @@ from contextlib import ExitStack, contextmanager
 
 from capture.devices.turntables.moving import MovingTable
 from capture.plan.plan import CapturePlan, check_plan_limits
-from capture.plan.table import make_table
 from capture.session.cameras import PlannedCameras
 from capture.session.control import Control
 from capture.session.folder import session_lock
 from capture.session.progress import Progress
 from capture.session.quality_thread import QualityWatch
-from capture.session.resume import last_readback
 from capture.session.run_session import Outcome, Session, Taken
+from capture.session.table_jobs import opened_table
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 _LOOK_S = 0.05
@@ -36,25 +35,14 @@ def run_plan(plan: CapturePlan, *, shown: bool = True) -> Outcome:
     """
     check_plan_limits(plan)
     with ExitStack() as stack:
-        lock = session_lock(plan.project)
-        lock.acquire()
-        stack.callback(lock.release)
+        stack.enter_context(session_lock(plan.project))
         progress = Progress(plan.project, len(plan.shots), shown)
         stack.callback(progress.close)
         control = stack.enter_context(_signals_blocked(Control()))
-        table = _open_table(plan, stack)
+        table = stack.enter_context(opened_table(plan.table, plan.project)) if plan.table is not None else None
         cameras = stack.enter_context(PlannedCameras(plan.cameras, plan.options.trigger))
         watch = stack.enter_context(QualityWatch(plan)) if plan.options.quality else None
         return run_session(plan, table, cameras, control, progress, watch)
-
-
-def _open_table(plan: CapturePlan, stack: ExitStack) -> MovingTable | None:
-    if plan.table is None:
-        return None
-    table = make_table(plan.table, last_readback(plan.project))
-    table.open()
-    stack.callback(table.close)
-    return table
 
 
 def run_session(

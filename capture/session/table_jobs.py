@@ -1,7 +1,8 @@
 """The jobs behind ``labcapture table``: list, status, jog, home, stop."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from adjust.model.survey import FloatArray
 from capture.devices.turntables.dialect import read_dialect, shipped_dialects
 from capture.devices.turntables.moving import MovingTable
 from capture.plan.plan import CapturePlan, read_plan
-from capture.plan.table import DRIVERS, make_table
+from capture.plan.table import DRIVERS, TablePlan, make_table
 from capture.session.folder import session_lock
 from capture.session.resume import last_readback
 from survey.folder.text import suggestion
@@ -32,36 +33,31 @@ def table_job(
     plan = read_plan(path)
     if plan.table is None:
         raise SurveyError(f"{path}: the plan has no [table]")
-    if stop:  # also while a session runs: whoever says stop means it
-        return _with_table(plan, lambda table: table.stop())
-    lock = session_lock(plan.project)
-    if jog is not None or home:
-        lock.acquire()
-    try:
-        if jog is not None:
-            return _with_table(plan, lambda table: _jog(table, jog))
-        return _with_table(plan, (lambda table: table.home().result()) if home else lambda table: None)
-    finally:
-        lock.release()
+    moves = (jog is not None or home) and not stop  # a stop also while a session runs: whoever says stop means it
+    lock = session_lock(plan.project) if moves else nullcontext()
+    with lock, opened_table(plan.table, plan.project) as table:
+        try:
+            if stop:
+                table.stop()
+            elif jog is not None:
+                table.set(jog_target(table, jog)).result()
+            elif home:
+                table.home().result()
+            return table_status(table, plan)
+        except KeyboardInterrupt:
+            table.emergency_stop()
+            raise
 
 
-def _with_table(plan: CapturePlan, action: Any) -> dict[str, Any]:
-    if plan.table is None:
-        raise SurveyError(f"{plan.file}: the plan has no [table]")
-    table = make_table(plan.table, last_readback(plan.project))
+@contextmanager
+def opened_table(plan: TablePlan, project: Path) -> Iterator[MovingTable]:
+    """The table of a plan, connected, where the last session of its project left it; at the end it stops and goes."""
+    table = make_table(plan, last_readback(project))
     table.open()
     try:
-        action(table)
-        return table_status(table, plan)
-    except KeyboardInterrupt:
-        table.emergency_stop()
-        raise
+        yield table
     finally:
         table.close()
-
-
-def _jog(table: MovingTable, words: Sequence[str]) -> None:
-    table.set(jog_target(table, words)).result()
 
 
 def jog_target(table: MovingTable, words: Sequence[str]) -> FloatArray:

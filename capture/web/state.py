@@ -2,7 +2,7 @@
 
 import threading
 import time
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Any, Protocol
 
 import cv2
@@ -12,12 +12,10 @@ import numpy.typing as npt
 from adjust.model.errors import SurveyError
 from capture.devices.turntables.moving import MovingTable
 from capture.plan.plan import CapturePlan
-from capture.plan.table import make_table
 from capture.session.cameras import PlannedCameras
 from capture.session.folder import session_lock
 from capture.session.quality_thread import Judge
-from capture.session.resume import last_readback
-from capture.session.table_jobs import jog_target, table_status
+from capture.session.table_jobs import jog_target, opened_table, table_status
 from survey.workbench.pages.capturing import FolderView, Shown, coverage_dict
 
 _LIVE_S = 0.3
@@ -73,19 +71,14 @@ class LiveView:
         self._shown: dict[str, Shown] = {}
         self._quality: dict[str, Any] = {}
         self._message, self._ending = "", threading.Event()
-        self._lock = session_lock(plan.project)
-        self._lock.acquire()
-        self._table: MovingTable | None = None
         trigger = "free" if plan.options.trigger == "hardware" else plan.options.trigger
-        self._cameras = PlannedCameras(plan.cameras, trigger)
-        try:
+        self._table: MovingTable | None = None
+        with ExitStack() as held:
+            held.enter_context(session_lock(plan.project))
             if with_table and plan.table is not None:
-                self._table = make_table(plan.table, last_readback(plan.project))
-                self._table.open()
-            self._cameras.open()
-        except BaseException:
-            self.close()
-            raise
+                self._table = held.enter_context(opened_table(plan.table, plan.project))
+            self._cameras = held.enter_context(PlannedCameras(plan.cameras, trigger))
+            self._held = held.pop_all()
         self._worker = threading.Thread(target=self._look, name="live images", daemon=True)
         self._worker.start()
 
@@ -140,12 +133,8 @@ class LiveView:
     def close(self) -> None:
         """See ``View``."""
         self._ending.set()
-        if hasattr(self, "_worker"):
-            self._worker.join(10.0)
-        self._cameras.close()
-        if self._table is not None:
-            self._table.close()
-        self._lock.release()
+        self._worker.join(10.0)
+        self._held.close()
 
 
 def png_of(image: npt.NDArray[np.generic], longest_px: int | None) -> bytes:

@@ -45,6 +45,11 @@ class Hits:
         if mask.any():
             self.masks[place] = self.masks[place] | mask if place in self.masks else mask
 
+    def add_whole(self, place: Place, n: int) -> None:
+        """All n rows of an observation."""
+        if n:
+            self.masks[place] = np.ones(n, dtype=np.bool_)
+
     def of(self, field_name: str) -> dict[int, BoolArray]:
         """The masks of one field, by position."""
         return {i: mask for (name, i), mask in self.masks.items() if name == field_name}
@@ -109,7 +114,7 @@ class Observed:
             return found
         if name.what == "reading":
             for which, i in self.readings.get(name.id, []):
-                found.add((which, i), np.ones(len(_rows(getattr(self.survey, which)[i])), dtype=np.bool_))
+                found.add_whole((which, i), len(_rows(getattr(self.survey, which)[i])))
             return found
         meant = name.meant
         if name.what != "spot":
@@ -130,9 +135,12 @@ class Observed:
         index = None if point is None else self.points.get(target, {}).get(point, -1)
         for i in self._at(self._blocks, camera, epoch, len(self.survey.image_blocks)):
             block = self.survey.image_blocks[i]
-            if _is_of(block, camera, epoch) and (of_any or block.target_id == target):
-                mask = np.ones(len(block.uv), dtype=np.bool_) if index is None else block.point_idx == index
-                found.add((IMAGES, i), mask)
+            if not _is_of(block, camera, epoch) or not (of_any or block.target_id == target):
+                continue
+            if index is None:
+                found.add_whole((IMAGES, i), len(block.uv))
+            else:
+                found.add((IMAGES, i), block.point_idx == index)
 
     def _in_spots(self, found: Hits, meant: Mapping[str, str], at: tuple[float, float] | None) -> None:
         """Spots of a camera, an epoch; or the one of a name, by where it was if that is known."""
@@ -142,13 +150,12 @@ class Observed:
             if not _is_of(block, camera, epoch):
                 continue
             if spot is None:
-                mask = np.ones(len(block.uv), dtype=np.bool_)
+                found.add_whole((SPOTS, i), len(block.uv))
             elif at is None:
-                mask = np.array([one == spot for one in block.spot_ids], dtype=np.bool_)
+                found.add((SPOTS, i), np.array([one == spot for one in block.spot_ids], dtype=np.bool_))
             else:
                 far = np.linalg.norm(block.uv - np.array(at), axis=1)
-                mask = np.asarray(far <= min(_NEAR_PX, far.min(initial=np.inf)))
-            found.add((SPOTS, i), mask)
+                found.add((SPOTS, i), np.asarray(far <= min(_NEAR_PX, far.min(initial=np.inf))))
 
     @staticmethod
     def _at(by_image: Mapping[ImageKey, list[int]], camera: str | None, epoch: str | None, n: int) -> Sequence[int]:

@@ -232,6 +232,24 @@ def test_home_goes_to_the_reference():
     assert np.allclose(np.degrees(table.locate().setpoint), [3, 3], atol=1e-6)
 
 
+def test_a_reference_search_that_is_refused_stops_all_axes_and_may_be_tried_again(monkeypatch):
+    table, controller = make(AxisPhysics(200 * DEG, 4000 * DEG, home_at=3 * DEG))
+    search = controller.home
+
+    def refused(axis):
+        if axis == 1:
+            raise ControllerError("axis 2 has no switch")
+        search(axis)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(controller, "home", refused)
+        with pytest.raises(ControllerError, match="no switch"):
+            table.home()
+    assert [word for _, word in controller.received] == ["home 0", "stop"]
+    table.home().result(3.0)
+    assert np.allclose(np.degrees(table.locate().setpoint), [3, 3], atol=1e-6)
+
+
 def test_trapezoid_has_its_closed_form():
     """x = v t - v^2 / 2a after the ramp; total time way / v + v / a."""
     axis = SimulatedAxis(AxisPhysics(speed=2.0, acceleration=4.0), np.random.default_rng(1))

@@ -22,6 +22,7 @@ from survey.jobs.navigating.task import NavigateRequest, observed_epochs
 from survey.jobs.removing import remove_job
 from survey.project import read
 from survey.project.exclusions import Exclusion, Name
+from survey.project.finding import find
 from survey.project.observed import Observed
 from survey.project.reading import leaving_out, read_all
 from survey.solution.earlier.previous import read_previous
@@ -58,12 +59,12 @@ def test_every_kind_of_name_means_what_it_says(mine):
         int((b.point_idx == first.point_idx[list(first.point_idx).index(7)]).sum())
         for b in survey.image_blocks if b.target_id == "board"
     )  # fmt: skip
-    assert str(seen.find(place)) == f"image:{place}"
-    assert str(seen.find("r1c1")) == "point:board/r1c1"
-    assert str(seen.find("left")) == "camera:left"
-    assert str(seen.find(first.epoch_id)) == f"epoch:{first.epoch_id}"
+    assert str(find(seen, place)) == f"image:{place}"
+    assert str(find(seen, "r1c1")) == "point:board/r1c1"
+    assert str(find(seen, "left")) == "camera:left"
+    assert str(find(seen, first.epoch_id)) == f"epoch:{first.epoch_id}"
     with pytest.raises(SurveyError, match="did you mean 'r1c1'"):
-        seen.find("r11c1")
+        find(seen, "r11c1")
 
 
 def test_excluded_adjusted_listed_and_taken_back(mine, capsys, monkeypatch):

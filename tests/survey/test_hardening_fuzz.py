@@ -31,8 +31,6 @@ NO_READERS = {
     "survey/batch/worker.py:_listen": "a pipe",
     "survey/commands/common.py:run_command": "the null device",
     "survey/examples/simulated.py:_files": "tables that it has just written",
-    "survey/project/exclusions.py:_header_of": "read by read_exclusions before",
-    "survey/project/tables/rows.py:row_table": "read by read_table before",
     "survey/project/merging.py:read_copy": "the copy of a project that was read before",
     "survey/project/tables/files.py:_last_start": "the line of what could not be read, for the message",
     "survey/jobs/starting.py:start_project": "copies images that read_image has read before",
@@ -54,13 +52,11 @@ NO_READERS = {
     "capture/devices/turntables/moving.py:MovingTable.stop": "a device",
     "capture/session/folder.py:prepare": "copies a template, read by definition_of before",
     "capture/session/quality_thread.py:QualityWatch._judge_one": "opens to write",
-    "capture/session/run.py:_open_table": "a device",
     "capture/simulated/controller.py:SimulatedTable.__init__": "opens to write",
     "capture/simulated/pylon_camera.py:LabPylonCamera.open": "a device",
-    "capture/session/table_jobs.py:_with_table": "a device",
+    "capture/session/table_jobs.py:opened_table": "a device",
     "capture/web/serve.py:_file": "the program's own page",
     "capture/web/serve.py:Pages._command": "a request; tests/capture/test_web.py",
-    "capture/web/state.py:LiveView.__init__": "a device",
 }
 """Functions that open or parse something, and why nothing that a stranger has written comes through them."""
 

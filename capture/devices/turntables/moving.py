@@ -3,7 +3,7 @@
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 
 import numpy as np
@@ -114,38 +114,35 @@ class MovingTable:
     def set(self, angles: Sequence[float] | FloatArray) -> Future[None]:
         """Start to turn to angles (n,) rad. Raises LimitError before the first axis is told anything."""
         self.check(angles)
-        if self._locked_out:
-            raise StoppedError(f"{self.name}: stopped in an emergency; it moves again after release")
-        current = self.position
-        targets = self._targets(angles, current)
         self._begin()
-        self._setpoint = targets
-        status = Future[None]()
-        self._status = status
+        current = self.position
+        self._setpoint = targets = self._targets(angles, current)
+        return self._sent(
+            lambda i: self._controller.move(i, float(targets[i]), float(targets[i] - current[i])), targets
+        )
+
+    def home(self) -> Future[None]:
+        """Look for the references; the readback afterwards is the setpoint."""
+        self._begin()
+        return self._sent(self._controller.home, None)
+
+    def _sent(self, send: Callable[[int], None], targets: FloatArray | None) -> Future[None]:
+        """All axes sent off, and a thread that watches them; where one is not, all are stopped."""
+        self._status = status = Future[None]()
         try:
             for i in range(len(self.axes)):
                 with self._io:
                     self._require_released()
-                    self._controller.move(i, float(targets[i]), float(targets[i] - current[i]))
+                    send(i)
         except BaseException as error:
             self._fail(status, error)
             raise
         threading.Thread(target=self._watch, args=(status, targets), name=f"{self.name} moves", daemon=True).start()
         return status
 
-    def home(self) -> Future[None]:
-        """Look for the references; the readback afterwards is the setpoint."""
-        self._begin()
-        status = Future[None]()
-        self._status = status
-        for i in range(len(self.axes)):
-            with self._io:
-                self._require_released()
-                self._controller.home(i)
-        threading.Thread(target=self._watch, args=(status, None), name=f"{self.name} homes", daemon=True).start()
-        return status
-
     def _begin(self) -> None:
+        if self._locked_out:
+            raise StoppedError(f"{self.name}: stopped in an emergency; it moves again after release")
         if self._status is not None and not self._status.done():
             raise TurntableError(f"{self.name}: it is still moving; wait for the move before, or stop it")
         self._stopped.clear()
