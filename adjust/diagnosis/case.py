@@ -135,29 +135,23 @@ class Case:
         Of the few targets or cameras with the largest misfit, or with most images where nothing is adjusted. Each is
         started when it is asked for, as long as there is time to try what that shows.
         """
-        if field_name not in self._without:
-            ids = [t for t in dict.fromkeys(getattr(b, field_name) for b in self.survey.image_blocks) if t is not None]
-            self._without[field_name] = dict.fromkeys(self._worst(field_name, ids)[: _LEFT_OUT * (len(ids) > 1)], ())
-        for owner, known in self._without[field_name].items():
-            if not known:
+        share = dict[str, float]()
+        for block, squares in zip(self.survey.image_blocks, block_squares(self.survey, self.result), strict=True):
+            if (owner := getattr(block, field_name)) is not None:
+                share[owner] = share.get(owner, 0.0) + float(np.minimum(squares, 2.0 * CAP).sum())
+        for owner in sorted(share, key=lambda o: -share[o])[: _LEFT_OUT * (len(share) > 1)]:
+            key = field_name, owner
+            if key not in self._without:
                 if not self.budget.lasts:
                     self.budget.refused = True
                     return
-                known = self._without[field_name][owner] = (self.rough(without(self.survey, field_name, owner)),)
-            if known[0] is not None:
-                yield owner, known[0]
+                self._without[key] = self.rough(without(self.survey, field_name, owner))
+            if (values := self._without[key]) is not None:
+                yield owner, values
 
     @cached_property
-    def _without(self) -> dict[str, dict[str, tuple[Altered | None, ...]]]:
+    def _without(self) -> dict[tuple[str, str], Altered | None]:
         return {}
-
-    def _worst(self, field_name: str, ids: list[str]) -> list[str]:
-        share = dict.fromkeys(ids, 0.0)
-        for block, value in zip(self.survey.image_blocks, self.block_misfit, strict=True):
-            owner = getattr(block, field_name)
-            if owner in share:
-                share[owner] += float(value)
-        return sorted(ids, key=lambda owner: -share[owner])
 
     @cached_property
     def linear(self) -> Linear | None:
@@ -211,19 +205,6 @@ class Case:
         given = sum(int(b.mask.sum()) for b in self.survey.image_blocks)
         images = given == int(self.result.image_residuals.used.sum())
         return images and self.survey.n_others_used == self.result.survey.n_others_used
-
-    @cached_property
-    def block_misfit(self) -> FloatArray:
-        """(b,) bounded sum of squares of the image points of each block over their sigmas; all of it, unadjusted."""
-        return np.array([np.minimum(s, 2.0 * CAP).sum() for s in block_squares(self.survey, self.result)])
-
-    @cached_property
-    def error_px(self) -> FloatArray:
-        """(b,) rms of what each block shows against its own best pose, px; nan where it has none."""
-        out = np.full(len(self.survey.image_blocks), np.nan)
-        for i, view in self.views.items():
-            out[i] = view.error_px[0]
-        return out
 
 
 def _nothing(survey: Survey) -> float:

@@ -1,6 +1,6 @@
 """One hypothesis, tried: its survey adjusted, and what is left unexplained."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -185,19 +185,14 @@ def _at_best_scale(squares: FloatArray) -> float:
 
 
 def n_other_components(survey: Survey, used_only: bool = True) -> int:
-    """Observed components in use, or all, that are no image points."""
-    return sum(_n_components([o for o in kind if o.used or not used_only]) for kind in survey.others.values())
+    """Observed components in use, or all, that are no image points: the finite variances of covariances, else one."""
+    observed = [o for kind in survey.others.values() for o in kind if o.used or not used_only]
+    covs = [cov for o in observed if (cov := getattr(o, "cov", None)) is not None]
+    variances = np.concatenate([np.zeros(0), *(cov.diagonal() for cov in covs)])
+    return len(observed) - len(covs) + int(np.isfinite(variances).sum())
 
 
 def _left_out(survey: Survey) -> set[tuple[str, ...]]:
     """Ids of the pairs and table readings that the survey itself does not use."""
     pairs = {(p.pair_id,) for p in survey.pairs if not p.used}
     return pairs | {(r.table_id, r.epoch_id) for r in survey.table_readings if not r.used}
-
-
-def _n_components(observed: Sequence[object]) -> int:
-    """Of observations of a kind: the finite variances of their covariances, one each where they have sigmas."""
-    covs = [cov for o in observed if (cov := getattr(o, "cov", None)) is not None]
-    variances = np.concatenate([np.zeros(0), *(cov.diagonal() for cov in covs)])
-    return len(observed) - len(covs) + int(np.isfinite(variances).sum())
-

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Hashable, Iterable
+from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
@@ -28,6 +29,7 @@ def numbered(names: Iterable[_Key]) -> tuple[list[_Key], IntArray]:
     return list(number), of
 
 
+@lru_cache(maxsize=2**15)
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
     """Key that sorts ``e2`` before ``e10``; different names have different keys."""
     # 4000: the interpreter refuses to take longer numbers apart

@@ -11,7 +11,7 @@ one with C + S, in the condition form as in the parametric one; of the residual 
 """
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from copy import copy
 from dataclasses import fields, is_dataclass, replace
 
@@ -59,7 +59,8 @@ def _with_stations_for_eyes(survey: Survey) -> Survey:
     kept = tuple(s for s in survey.stations if s.station_id not in carriers or s.station_id in needed
                  or ("station", s.station_id) in seen)  # fmt: skip
     pairs = tuple(replace(p, a=_renamed(p.a, names, survey), b=_renamed(p.b, names, survey)) for p in survey.pairs)
-    held = set() if survey.datum.kind == "inner" else _one_of_each_part(pairs, set(names.values()))
+    loose = set(names.values()) | _loose_stations(replace(survey, cameras=cameras, targets=targets), seen)
+    held = set() if survey.datum.kind == "inner" else _one_of_each_part(pairs, set(names.values()), loose)
     own = dict.fromkeys(names.values())
     stations = tuple(Station(i, world_from_station=PoseParameter(Pose3(), "held") if i in held else PoseParameter())
                      for i in own)  # fmt: skip
@@ -133,13 +134,25 @@ def _frames_in(value: object) -> Iterator[FrameRef]:
             yield from _frames_in(getattr(value, f.name))
 
 
-def _one_of_each_part(pairs: Sequence[Pair], eyes: set[str]) -> set[str]:
-    """The first eye of every part of the pairs in use that has nothing but eyes: their places are relative to it."""
+def _loose_stations(survey: Survey, seen: Set[tuple[str, str]]) -> set[str]:
+    """Stations of which nothing is known but pairs, neither."""
+    carriers = {c.station_id for c in survey.cameras} | {t.station_id for t in survey.targets}
+    return {s.station_id for s in survey.stations if s.motion == "fixed" and s.world_from_station.treatment == "free"
+            and not s.world_from_station.held and s.station_id not in carriers
+            and ("station", s.station_id) not in seen}  # fmt: skip
+
+
+def _one_of_each_part(pairs: Sequence[Pair], eyes: set[str], loose: set[str]) -> set[str]:
+    """The first eye of every part of the pairs that nothing ties to the datum: its places are relative to it.
+
+    loose: stations, eyes among them, of which pairs alone tell.
+    """
     number = {ref: i for i, ref in enumerate(dict.fromkeys(r for p in pairs for r in (p.a, p.b)))}
     ends = np.array([(number[p.a], number[p.b]) for p in pairs], dtype=np.int64).reshape(-1, 2)
     part = dict(zip(number, connected_parts(len(number), *ends.T).tolist(), strict=True))
-    first = {part[ref]: ref.frame_id for ref in reversed(number)}
-    anchored = {part[r] for r in number if not (r.kind == "station" and r.frame_id in eyes)}
+    own = (r for r in reversed(number) if r.kind == "station" and r.frame_id in eyes)
+    first = {part[ref]: ref.frame_id for ref in own}
+    anchored = {part[r] for r in number if not (r.kind == "station" and r.frame_id in loose)}
     return {frame_id for p, frame_id in first.items() if p not in anchored}
 
 

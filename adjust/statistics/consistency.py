@@ -64,15 +64,6 @@ def consistency(adjustment: Adjustment, condensed: CondensedSystem | None, alpha
 
 
 @dataclass(frozen=True, eq=False)
-class Contributions:
-    """Of every observation of a condensed system (M,): components in use, redundancy, weighted square sum."""
-
-    n: FloatArray
-    redundancy: FloatArray
-    omega: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
 class Part:
     """A part: the observations (k,) of the condensed system that belong to it; none where only its sums are known."""
 
@@ -93,16 +84,17 @@ def parts_of_network(adjustment: Adjustment) -> tuple[Part, ...]:
 def parts_of(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> tuple[Part, ...]:
     """All parts that are neither the whole nor without redundancy. blocks: the image block of each observation."""
     found, out = contributions(adjustment, system, blocks), list[Part]()
-    total = int(np.count_nonzero(found.n))
+    counted = found[0] != 0.0
+    total = int(np.count_nonzero(counted))
     for kind, names in _labels(adjustment, system, blocks).items():
         called, of = numbered((None, *names))
         of = of[1:]
-        every = np.flatnonzero((of > 0) & (found.n != 0.0))
+        every = np.flatnonzero((of > 0) & counted)
         every = every[np.argsort(of[every], kind="stable")]
         if not len(every):
             continue
         first = np.flatnonzero(np.diff(of[every], prepend=0))
-        sums = (np.add.reduceat(x[every], first).tolist() for x in (found.n, found.redundancy, found.omega))
+        sums = np.add.reduceat(found[:, every], first, axis=1).tolist()
         edges = pairwise([*first.tolist(), len(every)])
         out += [
             Part(kind, str(called[i]), every[a:b], n, r, omega)
@@ -112,24 +104,19 @@ def parts_of(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> 
     return tuple(out)
 
 
-def contributions(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> Contributions:
-    """What every observation of a condensed system contributes."""
-    graph = system.precision.graph
-    k, M = len(blocks), len(system.used)
-    n, r, omega = np.zeros(M), np.zeros(M), np.zeros(M)
+def contributions(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> FloatArray:
+    """Of every observation of a condensed system (3, M): components in use, redundancy, weighted square sum."""
+    arrays, readings, k = adjustment.other_arrays, adjustment.reading_residuals, len(blocks)
+    out = np.zeros((3, len(system.used)))
     if k:
         sums = system.precision.image_sums
         shares = sums / np.maximum(np.bincount(blocks, minlength=len(sums)), 1)[:, None]  # each part its share
-        n[:k], r[:k], omega[:k] = shares[blocks].T
-    np.add.at(omega, system.row_of, np.where(system.row_of >= k, system.e**2, 0.0))
-    others = adjustment.other_residuals[: graph.n_others]
-    first = k + len(others)
-    n[k:first] = [len(o.residual) for o in others]
-    r[k:first] = [o.redundancy.sum() for o in others]
-    readings = adjustment.reading_residuals
+        out[:, :k] = shares[blocks].T
+    out[:2, k:] = arrays.n_components, np.bincount(arrays.observation, arrays.redundancies, len(arrays.used))
+    np.add.at(out[2], system.row_of, np.where(system.row_of >= k, system.e**2, 0.0))
     if readings is not None:
-        n[first:], r[first:], omega[first:] = 1.0, readings.redundancy, readings.weighted_square
-    return Contributions(*(np.where(system.used, x, 0.0) for x in (n, r, omega)))
+        out[2, len(out[2]) - len(readings.used) :] = readings.weighted_square
+    return np.where(system.used, out, 0.0)
 
 
 def _labels(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> dict[str, list[str | None]]:

@@ -34,13 +34,16 @@ class Significance:
     significant: bool
 
 
-def zero_test(x: FloatArray, cov: FloatArray, redundancy: int | None) -> tuple[float, tuple[int, ...], float]:
-    """Statistic, degrees of freedom and p-value that x (k,) is zero; redundancy: of the sigma0^2 that is in ``cov``."""
-    k = len(x)
-    statistic = float(x @ np.linalg.solve(cov, x))
+def significance(
+    adjustment: Adjustment, term: str, components: tuple[str, ...], square: float, k: int, redundancy: int | None
+) -> Significance:
+    """Of ``x' inv(C) x``, k degrees of freedom; redundancy: of the sigma0^2 that is in C, None where it is known."""
+    level = LEVEL if adjustment.global_test is None else adjustment.global_test.alpha
     if redundancy is None:
-        return statistic, (k,), float(chi2.sf(statistic, k))
-    return statistic / k, (k, redundancy), float(fisher.sf(statistic / k, k, redundancy))
+        p = float(chi2.sf(square, k))
+        return Significance(term, components, square, (k,), p, p < level)
+    p = float(fisher.sf(square / k, k, redundancy))
+    return Significance(term, components, square / k, (k, redundancy), p, p < level)
 
 
 def terms_of(estimate: Estimate) -> Mapping[str, Sequence[str]]:
@@ -77,13 +80,8 @@ def _judged(
 ) -> Significance:
     """Whether x (k,) with this covariance a priori is zero."""
     factor, redundancy = (adjustment.sigma0**2, adjustment.redundancy) if estimated_sigma0 else (1.0, None)
-    statistic, freedom, p = zero_test(x, factor * cov, redundancy)
-    return Significance(term, names, statistic, freedom, p, p < level_of(adjustment))
-
-
-def level_of(adjustment: Adjustment) -> float:
-    """The error probability of single tests beside its global one."""
-    return LEVEL if adjustment.global_test is None else adjustment.global_test.alpha
+    square = float(x @ np.linalg.solve(factor * cov, x))
+    return significance(adjustment, term, names, square, len(x), redundancy)
 
 
 def significance_of_changes(

@@ -81,7 +81,7 @@ class PlannedCameras:
             self.recover(reopen=self._set is None)
         if self._set is None:
             raise SurveyError("the cameras are not open; open them first")
-        return self._set.take(timeout_s).frames
+        return self._set.take(timeout_s)
 
     def values(self, camera_id: str, names: Sequence[str]) -> Mapping[str, Any]:
         """Features as they are now; those that a camera does not know or tell are left out."""

@@ -18,6 +18,7 @@ from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write, suggestion, time_text
 from survey.project import Project
 from survey.project.exclusions import EXCLUSIONS_FILE, Exclusion, Name, Row, appended, in_force, read_exclusions
+from survey.project.finding import by_member, find
 from survey.project.observed import Observed
 from survey.project.project import OBSERVATIONS_FOLDER, LeftOut
 from survey.project.reading import leaving_out, read_all
@@ -120,9 +121,9 @@ def new_rows(project: Project, names: Sequence[str], reason: str, author: str = 
     rows: dict[Name, Row] = {}
     for text in dict.fromkeys(names):
         try:
-            name = observed.find(text)
+            name = find(observed, text)
         except SurveyError as error:
-            member = observed.by_member(text)
+            member = by_member(observed, text)
             advice = f"; its coordinates belong to {member}: name the set by its id" if member else ""
             raise SurveyError(f"{place}: {error}{advice}") from error
         if name in there:
@@ -163,7 +164,7 @@ def _ends_in(name: str, text: str) -> bool:
 def _as_found(path: Path, observed: Observed, there: dict[Name, Exclusion], text: str) -> Name:
     """What a text means among the observations, where that is excluded by its own name."""
     try:
-        name = observed.find(text)
+        name = find(observed, text)
     except SurveyError:
         name = None
     if name in there and name is not None:

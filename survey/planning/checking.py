@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from adjust.diagnosis.beforehand import Beforehand, Finding, coverage, look_beforehand
 from adjust.model.errors import SurveyError
 from adjust.model.survey import Survey
+from survey.jobs.adjusting.steps import with_loops_closed
 from survey.jobs.detecting.image_defects import defective
 from survey.jobs.navigating.task import with_known_points
 from survey.project import Project, read
@@ -73,7 +74,7 @@ class CheckOutcome:
 
 def check_job(folder: Path) -> CheckOutcome:
     """Look at a project without adjusting it; writes nothing. Raises SurveyError where it cannot be read."""
-    project = read(Path(folder))
+    project = with_loops_closed(read(Path(folder)))
     notes = project.notes + project.image_notes
     waiting = len(project.images) and not project.survey.image_blocks
     if waiting:

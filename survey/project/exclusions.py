@@ -20,16 +20,14 @@ spot         ``camera/epoch/spot``; u_px and v_px tell which one it was when it 
 ===========  ========================================================================================
 """
 
-import csv
-import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from adjust.model.errors import SurveyError
 from survey.folder.plain import attributes
-from survey.folder.text import csv_text, decode, read_bytes, read_text, suggestion
+from survey.folder.text import csv_rows, csv_text, decode, read_bytes, read_text, suggestion
 from survey.project.tables.reading import LARGEST_ROWS, Layout, check_header
 
 EXCLUSIONS_FILE = "exclusions.csv"
@@ -113,28 +111,22 @@ def read_exclusions(folder: Path) -> tuple[tuple[Row, ...], str]:
     if not path.is_file():
         return (), ""
     data, digest = read_bytes(path)
-    text = decode(path, data)
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    header: list[str] | None = None
-    rows: list[Row] = []
-    begin = 1
-    try:
-        for cells in reader:
-            line, begin = begin, reader.line_num + 1
-            if not any(cells) or cells[0].lstrip().startswith("#"):
-                continue
-            if header is None:
-                header = cells
-                check_header(path, header, EXCLUSIONS)
-                continue
-            rows.append(_row(path, line, header, cells))
-            if len(rows) > LARGEST_ROWS:
-                raise SurveyError(f"{path}:{line}: more than {LARGEST_ROWS} rows; exclude whole images or epochs")
-    except csv.Error as error:
-        raise SurveyError(f"{path}:{begin}: not a CSV line ({error}); correct the quotes") from error
+    lines = _lines(path, decode(path, data))
+    _, header = next(lines, (1, None))
     if header is None:
         raise SurveyError(f"{path}:1: the file is empty; the first line names the columns: what,id,state,reason")
+    check_header(path, header, EXCLUSIONS)
+    rows: list[Row] = []
+    for line, cells in lines:
+        rows.append(_row(path, line, header, cells))
+        if len(rows) > LARGEST_ROWS:
+            raise SurveyError(f"{path}:{line}: more than {LARGEST_ROWS} rows; exclude whole images or epochs")
     return tuple(rows), digest
+
+
+def _lines(path: Path, text: str) -> Iterator[tuple[int, list[str]]]:
+    """The header and the rows, each with its line."""
+    return ((n, cells) for n, cells in csv_rows(path, text) if any(cells) and not cells[0].lstrip().startswith("#"))
 
 
 def _row(path: Path, line: int, header: Sequence[str], cells: Sequence[str]) -> Row:
@@ -186,7 +178,7 @@ def appended(path: Path, rows: Sequence[Row]) -> str:
     if not text.strip():
         header, text = list(EXCLUSIONS.columns), text + ",".join(EXCLUSIONS.columns) + "\n"
     else:
-        header, line = _header_of(text)
+        line, header = next(_lines(path, text))
         needed = [name for name in EXCLUSIONS.columns
                   if name not in header and any(c[name] not in ("", EXCLUDED) for c in cells)]  # fmt: skip
         lines = text.splitlines(keepends=True)
@@ -195,13 +187,6 @@ def appended(path: Path, rows: Sequence[Row]) -> str:
         header, text = [*header, *needed], "".join(lines)
     text += "" if text.endswith("\n") else "\n"
     return text + csv_text([one[name] for name in header] for one in cells)
-
-
-def _header_of(text: str) -> tuple[list[str], int]:
-    """The names of the columns, and the line on which they stand."""
-    lines = csv.reader(io.StringIO(text, newline=""), strict=True)
-    header = next(cells for cells in lines if any(cells) and not cells[0].lstrip().startswith("#"))
-    return header, lines.line_num
 
 
 def _cells(row: Row) -> dict[str, str]:

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from adjust.model.errors import SurveyError
 from adjust.model.observations import (
     CoordinateDifferences,
     Coordinates,
@@ -13,13 +12,11 @@ from adjust.model.observations import (
     ImageBlock,
     Observation,
     PositionRef,
-    position_text,
 )
 from adjust.model.result import ObservationResidual
 from adjust.model.survey import BoolArray, Survey
-from survey.folder.text import suggestion
 from survey.project.detected import ImageKey
-from survey.project.exclusions import WHAT, Exclusion, Name, name_problem
+from survey.project.exclusions import Exclusion, Name, name_problem
 from survey.project.project import LeftOut, SpotBlock
 from survey.project.tables.kinds import KINDS
 
@@ -28,7 +25,8 @@ Ref = PositionRef | FrameRef | str
 Place = tuple[str, int]
 """An observation: field of the survey, or ``SPOTS``, and position in it."""
 IMAGES, SPOTS = "image_blocks", "spots"
-_KINDS = {name: kind for kind in KINDS for name in (kind.layout.name, *kind.called)}  # as tables and reports call them
+CALLED = {name: kind for kind in KINDS for name in (kind.layout.name, *kind.called)}
+"""The kinds of observations as tables and reports call them."""
 _NEAR_PX = 3.0  # detection may move a spot by noise and a new threshold, but not onto another one
 
 
@@ -87,7 +85,10 @@ class Hits:
 
 
 class Observed:
-    """All observations of a project, by name. ``spots``: those that have no name yet."""
+    """All observations of a project, by name. ``spots``: those that have no name yet.
+
+    readings: the places of each name ``table:id``. points: positions of points by target, None for the world.
+    """
 
     def __init__(self, survey: Survey, spots: Sequence[SpotBlock]) -> None:
         self.survey, self.spots = survey, tuple(spots)
@@ -95,10 +96,10 @@ class Observed:
         for kind in KINDS:
             for i, item in enumerate(getattr(survey, kind.field)):
                 self.readings.setdefault(f"{kind.layout.name}:{kind.id_of(item)}", []).append((kind.field, i))
-        self._points: dict[str | None, dict[str, int]] = {
+        self.points: dict[str | None, dict[str, int]] = {
             t.target_id: {p: i for i, p in enumerate(t.point_ids)} for t in survey.targets
         }
-        self._points[None] = {p.point_id: i for i, p in enumerate(survey.points)}
+        self.points[None] = {p.point_id: i for i, p in enumerate(survey.points)}
         self._blocks, self._spots = _by_image(survey.image_blocks), _by_image(self.spots)
 
     def hits(self, name: Name, at: tuple[float, float] | None = None) -> Hits:
@@ -117,7 +118,7 @@ class Observed:
             self._in_spots(found, meant, at)
         if name.what == "epoch":
             self._others_where(found, lambda ref: ref == name.id or _frame(ref).epoch_id == name.id)
-        if name.what == "point" and "target" not in meant and name.id in self._points[None]:
+        if name.what == "point" and "target" not in meant and name.id in self.points[None]:
             self._others_where(found, lambda ref: isinstance(ref, PositionRef) and ref.frame is None
                                and ref.point_id == name.id)  # fmt: skip
         return found
@@ -126,7 +127,7 @@ class Observed:
         """Image points of a camera, an epoch, a target; of one point of a target, or of the world where it has none."""
         camera, epoch, target, point = (meant.get(key) for key in ("camera", "epoch", "target", "point"))
         of_any = target is None and point is None
-        index = None if point is None else self._points.get(target, {}).get(point, -1)
+        index = None if point is None else self.points.get(target, {}).get(point, -1)
         for i in self._at(self._blocks, camera, epoch, len(self.survey.image_blocks)):
             block = self.survey.image_blocks[i]
             if _is_of(block, camera, epoch) and (of_any or block.target_id == target):
@@ -184,103 +185,6 @@ class Observed:
         wanted = {place for place, mask in hit.masks.items() if mask.all()}
         return [name for name, places in self.readings.items() if wanted.intersection(places)]
 
-    def known(self, what: str) -> list[str]:
-        """Ids that there are of a kind; for messages."""
-        blocks, world = self.survey.image_blocks, self._points[None]
-        targets = {t: points for t, points in self._points.items() if t is not None}
-        if what == "reading":
-            return list(self.readings)
-        if what == "image_point":
-            return [f"{b.camera_id}/{b.epoch_id}/{f'{b.target_id}/' if b.target_id else ''}{p}"
-                    for b in blocks for p in self._names_in(b)]  # fmt: skip
-        places = [*((b.camera_id, b.epoch_id) for b in blocks), *((s.camera_id, s.epoch_id) for s in self.spots)]
-        found: dict[str, Iterable[str]] = {
-            "image": (f"{c}/{e}" for c, e in places),
-            "target": (*targets, *(f"{b.camera_id}/{b.epoch_id}/{b.target_id}" for b in blocks if b.target_id)),
-            "point": (*world, *(f"{t}/{p}" for t, points in targets.items() for p in points)),
-            "epoch": (*(e for _, e in places), *(r.epoch_id for r in self.survey.table_readings)),
-            "camera": (c.camera_id for c in self.survey.cameras),
-            "spot": (f"{s.camera_id}/{s.epoch_id}/{one}" for s in self.spots for one in s.spot_ids),
-        }
-        return list(dict.fromkeys(found[what]))
-
-    def _names_in(self, block: ImageBlock) -> list[str]:
-        names = list(self._points[block.target_id])
-        return [names[int(i)] for i in block.point_idx]
-
-    def near(self, name: Name) -> str:
-        """What to do about a name that means nothing: the nearest that does."""
-        known = self.known(name.what)
-        if name.what == "image_point":  # of the same image or point first: there are too many to compare
-            parts = name.id.split("/")
-            known = [k for k in known if k.split("/")[:2] == parts[:2] or k.split("/")[-1] == parts[-1]][:2000]
-        return suggestion(name.id, known)
-
-    def find(self, text: str) -> Name:
-        """The name that a person means: with its kind (``image:X/h05``), as reports call it, or bare where one fits.
-
-        A reading goes before a point, an epoch before the readings of a table at that epoch. Raises SurveyError for
-        what is unknown or may mean several things.
-        """
-        prefix, colon, rest = text.partition(":")
-        names = [Name("reading", text)] if text in self.readings else []
-        if colon and not names:
-            names = [n for n in self._with_kind(prefix, rest) if self.hits(n)]
-        bare = () if names else self._bare(text)
-        for group in bare:
-            names = [n for n in group if self.hits(n)]
-            if names:
-                break
-        if len(names) == 1:
-            return names[0]
-        if names:
-            raise SurveyError(f"{text!r} stands for {' and '.join(map(str, names[:6]))}"
-                              f"{' and more' if len(names) > 6 else ''}; name one of them so")  # fmt: skip
-        raise SurveyError(f"nothing that was observed has the name {text!r}; {self._meant(prefix, colon, rest, text)}")
-
-    def _with_kind(self, prefix: str, rest: str) -> list[Name]:
-        if prefix == "reading":
-            return [Name("reading", rest)]
-        if prefix in WHAT:
-            return [Name(prefix, rest)] if name_problem(prefix, rest) is None else []
-        kind = _KINDS.get(prefix)
-        return [] if kind is None else [Name("reading", f"{kind.layout.name}:{rest}")]
-
-    def _bare(self, text: str) -> tuple[list[Name], ...]:
-        """Groups of names that a bare text may stand for; the first group in which any means something counts."""
-        named = (f"{kind.layout.name}:{text}" for kind in KINDS)
-        readings = [Name("reading", name) for name in named if name in self.readings]
-        n = text.count("/") + 1
-        if n > 1:
-            shapes = {2: ("image", "point"), 3: ("image_point", "target", "spot"), 4: ("image_point",)}.get(n, ())
-            return readings, [Name(what, text) for what in shapes]
-        wide = [Name(what, text) for what in ("epoch", "camera", "target")]
-        points = [Name("point", f"{t}/{text}" if t else text)
-                  for t, known in sorted(self._points.items(), key=lambda item: item[0] is not None) if text in known]
-        return readings, wide, points
-
-    def _meant(self, prefix: str, colon: str, rest: str, text: str) -> str:
-        if colon and (named := self._with_kind(prefix, rest)):
-            if named[0].what != "reading":
-                return self.near(named[0])
-            table = named[0].id.partition(":")[0]
-            return suggestion(rest, (k.partition(":")[2] for k in self.readings if k.startswith(f"{table}:")))
-        if colon and prefix in WHAT:
-            return str(name_problem(prefix, rest)).removeprefix("id: ")
-        bare = [k.partition(":")[2] for k in self.readings]
-        for what in ("epoch", "camera", "target", "image", "point"):
-            bare += self.known(what)
-        bare += [p for target, points in self._points.items() if target for p in points]
-        return suggestion(text, bare)
-
-    def by_member(self, text: str) -> str | None:
-        """The set of coordinates to which a position belongs that is no observation by itself; None for others."""
-        name = text.removeprefix("coordinates:")
-        for item in self.survey.coordinates:
-            if item.set_id and name in map(position_text, item.positions):
-                return str(item.set_id)
-        return None
-
 
 def _frame(ref: Ref) -> FrameRef:
     """The frame of a reference; the world for what is none."""
@@ -292,7 +196,7 @@ def _frame(ref: Ref) -> FrameRef:
 def name_of_residual(residual: ObservationResidual) -> str:
     """The name of an observation of ``Adjustment.other_residuals``: ``table:id``."""
     whole = residual.kind in ("table", "coordinates", "surface")  # the others carry their id in front of what they join
-    table = _KINDS[residual.kind].layout.name if residual.kind in _KINDS else residual.kind
+    table = CALLED[residual.kind].layout.name if residual.kind in CALLED else residual.kind
     return f"{table}:{'/'.join(residual.ids) if whole else residual.ids[0]}"
 
 

@@ -30,6 +30,7 @@ from survey.project.declared.poses import flat_point, read_point
 from survey.project.declared.targets import read_targets
 from survey.project.detected import DetectedImage, ImageKey, ImageNews, image_news, read_detected
 from survey.project.exclusions import EXCLUSIONS, EXCLUSIONS_FILE, Exclusion, in_force, read_exclusions
+from survey.project.finding import near
 from survey.project.images import find_images, sought_in
 from survey.project.observed import Observed, union
 from survey.project.omitting import without
@@ -56,19 +57,18 @@ def read_definition(folder: Path) -> Definition:
         return _read_definition(Path(folder))[0]
 
 
-def read(folder: Path, meanwhile: Callable[[bool], object] = lambda _: None) -> Project:
+def read(folder: Path, meanwhile: Callable[[], object] = lambda: None) -> Project:
     """Read a whole project folder; tables of observations that are not there yet are empty. Raises SurveyError.
 
     What ``exclusions.csv`` leaves out is not used. ``notes`` say which of its rows name nothing, ``image_notes``
-    which images are not those any more that the points come from. meanwhile: called while large tables are being read,
-    with whether that of image points is one of them.
+    which images are not those any more that the points come from. meanwhile: called while large tables are being read.
     """
     project = read_all(folder, meanwhile=meanwhile)
     return leaving_out(project, in_force(read_exclusions(project.folder / OBSERVATIONS_FOLDER)[0]).values())
 
 
 def read_all(
-    folder: Path, texts: Mapping[str, str] = MappingProxyType({}), meanwhile: Callable[[bool], object] = lambda _: None
+    folder: Path, texts: Mapping[str, str] = MappingProxyType({}), meanwhile: Callable[[], object] = lambda: None
 ) -> Project:
     """:func:`read`, with what is excluded as if it were not.
 
@@ -77,8 +77,7 @@ def read_all(
     place = Path(folder) / OBSERVATIONS_FOLDER
     with settled(Path(folder)), Beside() as loading:
         large = [] if texts or loading.alone else large_tables(place, LAYOUTS)
-        if large:
-            loading.of(lambda: meanwhile(any(path.stem == "image_points" for path in large)))
+        loaded = loading.of(meanwhile if large else lambda: None)
         with Beside() as reading:
             begun = {path: begun_table(path, reading) for path in large}
             definition, root = _read_definition(Path(folder), texts.get(DEFINITION_FILE))
@@ -88,6 +87,7 @@ def read_all(
             known = read_detected(place)
             images = _image_news(definition, tables, known)
         project = _observed(definition, root, tables)
+        loaded()
     hashes = dict(sorted({**project.inputs, f"{OBSERVATIONS_FOLDER}/{EXCLUSIONS_FILE}": digest}.items()))
     if digest:
         project = dataclasses.replace(project, inputs=hashes)
@@ -110,7 +110,7 @@ def leaving_out(project: Project, exclusions: Iterable[Exclusion]) -> Project:
             hits.append(hit)
         else:
             notes.append(f"{path}:{one.line}: {one.name} is left out, but nothing has that name; "
-                         f"{observed.near(one.name)}")  # fmt: skip
+                         f"{near(observed, one.name)}")  # fmt: skip
         found.append(hit.left_out(one))
     every = union(hits)
     survey, spots = without(project.survey, project.spots, every)

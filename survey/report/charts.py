@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
+from adjust.model.arrays import ranked
 from adjust.model.result import Adjustment
 from adjust.model.survey import BoolArray, Camera, FloatArray, IntArray
 from adjust.testing.distributions import beta, norm
@@ -176,7 +177,7 @@ def heat_map(m: CorrelationMatrix) -> Markup:
 
 
 def quantiles(name: str, w: FloatArray) -> Markup:
-    """A Q-Q plot of sorted values; the band is that of order statistics (beta distribution)."""
+    """A Q-Q plot of values; the band is that of order statistics (beta distribution)."""
     n, side, pad = len(w), 240.0, 26.0
     keep = np.unique(np.concatenate([np.arange(min(n, 40)), np.linspace(0, n - 1, 160).astype(int),
                                      np.arange(max(0, n - 40), n)]))  # fmt: skip
@@ -195,7 +196,7 @@ def quantiles(name: str, w: FloatArray) -> Markup:
         d.polygon(band, d.BAND, "none"),
         d.polyline(at(np.array([-reach, reach]), np.array([-reach, reach])), d.GREY, 0.9),
     ]
-    parts += [d.dot(a, b, 1.7, d.BLUE) for a, b in at(x, w[keep])]
+    parts += [d.dot(a, b, 1.7, d.BLUE) for a, b in at(x, ranked(w, keep))]
     for tick in range(-int(reach) + 1, int(reach), 2 if reach > 4 else 1):
         parts.append(d.text(middle + unit * tick, side - 4, f"{tick}".replace("-", MINUS), "middle", 9))
         parts.append(d.text(4, middle + 11 - unit * tick, f"{tick}".replace("-", MINUS), "start", 9))

@@ -4,7 +4,7 @@ Also the view in space, to be turned around on the screen: lines, points and ell
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, TypeVar
 
@@ -213,20 +213,8 @@ def space(adjustment: Adjustment, scale: Scale, scene: Scene) -> Markup:
     if not len(everything):
         return Markup()
     extent = float(np.linalg.norm(np.ptp(everything, axis=0)))
-    places, covs = _seven_digits(scene.spot_places()), _seven_digits(scene.spot_covs())
-    spots = [replace(s, x=x, cov=cov) for s, x, cov in zip(scene.spots, places, covs, strict=True)]
-    data = scene_values(adjustment, scale, replace(scene, spots=spots))
-    data |= {"enlarged": enlargement(scene, scale.ellipsoid, extent)}
-    short = {key: value if key == "spots" else _short(value) for key, value in data.items()}
-    return part("space", of="report.html") + json_script("space-data", json_of(short))
-
-
-def _seven_digits(x: FloatArray) -> FloatArray:
-    """As :func:`_short` has them, of many numbers at once."""
-    size = np.abs(x)
-    places = 6.0 - np.floor(np.log10(size, out=np.zeros_like(size), where=size > 0.0))
-    power = 10.0 ** np.abs(places)
-    return np.where(places >= 0.0, np.rint(x * power) / power, np.rint(x / power) * power)
+    data = scene_values(adjustment, scale, scene) | {"enlarged": enlargement(scene, scale.ellipsoid, extent)}
+    return part("space", of="report.html") + json_script("space-data", json_of(_short(data)))
 
 
 def _short(value: object) -> object:

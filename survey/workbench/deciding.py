@@ -13,6 +13,7 @@ from survey.jobs.adjusting.edits import changed_files, kept_name, left_out
 from survey.jobs.excluding import FILE, author_name, included_rows, new_rows
 from survey.project.declared.editing import with_datum, with_sigma_scale, with_treatment
 from survey.project.exclusions import Exclusion, Name, Row, appended, in_force, read_exclusions
+from survey.project.finding import find
 from survey.project.observed import IMAGES, Observed, union
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER, Project
 from survey.project.reading import leaving_out, read_all
@@ -255,4 +256,4 @@ class Deciding(Resident):
         for name in self.situation.exclusions:
             if str(name) == text:
                 return name
-        return observed.find(text)
+        return find(observed, text)

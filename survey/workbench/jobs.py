@@ -28,8 +28,7 @@ if TYPE_CHECKING:  # detection brings in OpenCV, planning much else
     from survey.detection import ImageReport
     from survey.jobs.adjusting.outcome import AdjustOutcome
     from survey.jobs.cross_validation import CrossValidation
-    from survey.planning.job import PlanRequest
-    from survey.planning.summary import PlanningOutcome
+    from survey.planning.job import PlanningOutcome, PlanRequest
     from survey.solution.dictionary import RunInfo
 
 _MOST_LINES = 300

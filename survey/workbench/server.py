@@ -331,7 +331,7 @@ class Server:
 
     async def _save(self, _request: Request) -> Response:
         said = (await self._run("save", self.bench.save)).summary()
-        from survey.workbench.views import in_words
+        from survey.workbench.views.project import in_words
 
         told = {"summary": in_words(said["summary"]), "warnings": [*map(message, said["warnings"])]}
         return JSONResponse(said | told)

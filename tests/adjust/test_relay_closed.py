@@ -265,6 +265,17 @@ def test_parts_of_nothing_but_eyes_each_have_their_place() -> None:
     assert len(held) == 2
 
 
+def test_a_free_station_ties_nothing_to_the_datum() -> None:
+    """An eye is where the others are counted from, also where a station hangs on it of which pairs alone tell."""
+    survey = eyes(1)
+    more = Pair("C1-N", FrameRef("camera", "C1"), FrameRef("station", "N"), Pose3(), np.eye(6) * 1e-8)
+    with_station = replace(survey, stations=(*survey.stations, Station("N")), pairs=(more, *survey.pairs))
+    check_equal(adjust_cleaned(closed(with_station), UNSCREENED), adjust_cleaned(closed(survey), UNSCREENED))
+    at_home = PoseParameter(Pose3(), "held")
+    given = replace(with_station, stations=(*survey.stations, Station("N", world_from_station=at_home)))
+    assert [s.station_id for s in closed(given).stations if s.world_from_station.treatment == "held"] == ["N"]
+
+
 @pytest.mark.parametrize(
     ("pairs", "message"),
     [

@@ -10,6 +10,7 @@ from gtsam import Pose3
 
 from adjust.model.observations import Closure
 from survey.cli import main
+from survey.planning.checking import check_job
 from survey.project import AdjustmentOptions, read, write_project
 from tests.adjust.test_relay_closed import ARCSEC, eyes, rig
 
@@ -103,7 +104,8 @@ def test_a_mount_takes_what_it_may(tmp_path: Path, capsys: pytest.CaptureFixture
     ("text", "form", "message"),
     [
         ('[closures.plate]\npairs = ["C1-C2", "C2-C3", "C1-C3"]\nsigma_arcsec = 3', "poses", 'pairs = "closed"'),
-        ('[closures.plate]\npairs = ["C1-C2", "C9-C3", "C1-C3"]\nsigma_arcsec = 3', "closed", "no pair 'C9-C3'"),
+        ('[closures.plate]\npairs = ["C1-C2", "C9-C3", "C1-C3"]\nsigma_arcsec = 3', "closed",
+         "survey.toml: closure 'plate': there is no pair 'C9-C3'"),
         ('[closures.plate]\npairs = ["C1-C2", "C2-C3", "C1-C3"]\nsigma_arcsec = 0', "closed", "sigma_arcsec"),
         ('[closures.plate]\npairs = ["C1-C2", "C2-C3"]\nsigma_arcsec = 1\nsigma_mm = -1', "closed", "not negative"),
         ('[closures.plate]\npairs = ["C1-C2"]\nsigma = 1', "closed", "sigma"),
@@ -117,6 +119,14 @@ def test_wrong_closures_are_told(
     said = capsys.readouterr().err
     assert message in said
     assert "Traceback" not in said
+
+
+def test_what_will_be_adjusted_is_checked(tmp_path: Path) -> None:
+    """Eyes without images are no problem where their loops are closed, as the adjustment does."""
+    said = check_job(project(tmp_path / "lab")).summary()
+    assert said["problems"] == 0
+    assert said["redundancy"] == 30
+    assert check_job(project(tmp_path / "poses", form="poses")).n_problems > 0
 
 
 def test_options_are_written_as_they_are_read(tmp_path: Path) -> None:

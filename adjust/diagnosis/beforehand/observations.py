@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping
 
 from adjust.diagnosis.hypothesis import Finding
 from adjust.model.errors import listed
+from adjust.model.names import grouped
 from adjust.model.observations import CoordinateDifferences, Coordinates
 from adjust.model.result import Adjustment
 from adjust.model.subsets import positions_of
@@ -72,16 +73,14 @@ def _epochs(survey: Survey) -> Iterator[Finding]:
     """Epochs that join nothing: one camera alone sees something that is there at this epoch alone."""
     movers = {s.station_id for s in survey.stations if s.motion == "epoch"}
     hand_held = {t.target_id for t in survey.targets if t.motion == "epoch"}
-    seen: dict[str, set[str]] = {}
-    alone: dict[str, bool] = {}
     station_of = {c.camera_id: c.station_id for c in survey.cameras}
-    for b in survey.image_blocks:
-        seen.setdefault(b.epoch_id, set()).add(b.camera_id)
-        loose = b.target_id in hand_held or (station_of[b.camera_id] in movers)
-        alone[b.epoch_id] = alone.get(b.epoch_id, True) and loose
+    seen = grouped((b.epoch_id, b) for b in survey.image_blocks)
+    loose = {e for e, of in seen.items()
+             if all(b.target_id in hand_held or station_of[b.camera_id] in movers for b in of)}  # fmt: skip
     tied = {r.epoch_id for p in survey.pairs for r in (p.a, p.b)}
-    lonely = [e for e, cameras in seen.items() if len(cameras) == 1 and alone[e] and e not in tied]
-    rig = len({station_of[c] for cs in seen.values() for c in cs}) < len({c for cs in seen.values() for c in cs})
+    lonely = [e for e, of in seen.items() if e in loose - tied and len({b.camera_id for b in of}) == 1]
+    cameras = {b.camera_id for b in survey.image_blocks}
+    rig = len({station_of[c] for c in cameras}) < len(cameras)
     if rig and lonely and len(lonely) > 0.5 * len(seen):
         yield Finding("weak", "epochs without partners", tuple(lonely),
                       f"{len(lonely)} of {len(seen)} epochs are seen by one camera alone: {listed(lonely, 6)}",

@@ -118,16 +118,11 @@ def _evidence(scale: float, batch: TerrestrialBatch, constant: _Constant) -> tup
     weight = np.abs(constant.by) / sigma
     if not (weight > 0).any() or not np.isfinite(miss).all():
         return 0.0, 0.0
-    metres = _weighted_median(miss[weight > 0] / constant.by[weight > 0], weight[weight > 0])
+    some = weight > 0
+    metres = float(np.quantile(miss[some] / constant.by[some], 0.5, weights=weight[some], method="inverted_cdf"))
     old = np.minimum((miss / sigma) ** 2 / scale, CAP).sum()
     new = np.minimum(((miss - constant.by * metres) / sigma) ** 2 / scale, CAP).sum()
     return float(old / (new + 0.1 * len(rows) + 1.0)), metres
-
-
-def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
-    order = np.argsort(values)
-    total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
 
 
 def _changed(survey: Survey, constant: _Constant, metres: float) -> Survey:

@@ -6,8 +6,6 @@ file) are rotation, then translation, perturbed on the left of cam_from_world, o
 the numbers are the same but for the sign of the tangent. A model holds no weights, tables, pairs or distances.
 """
 
-import csv
-import io
 import re
 from pathlib import Path, PurePosixPath
 
@@ -26,7 +24,7 @@ from adjust.model.survey import (
     Station,
     Survey,
 )
-from survey.folder.text import id_problem
+from survey.folder.text import csv_rows, id_problem
 from survey.interop.cameras.colmap_model import ColmapCamera, ColmapModel, read_model
 from survey.interop.cameras.rig import lens_of
 from survey.interop.networks.foreign import ForeignNetwork, Where, safe_ids, text_of
@@ -143,15 +141,11 @@ def _point_names(path: Path, model: ColmapModel) -> dict[int, str]:
     """Names of the points: as the file beside the model says, else P and the id."""
     names = {p: f"P{p}" for p in model.points}
     if path.is_file():
-        rows = csv.reader(io.StringIO(text_of(path)), strict=True)
-        try:
-            for row in list(rows)[1:]:
-                if len(row) != 2 or re.fullmatch(r"\d{1,18}", row[0]) is None:
-                    raise Where(path, rows.line_num).error("expected point3D_id,name; correct the line")
-                if int(row[0]) in names:
-                    names[int(row[0])] = row[1]
-        except csv.Error as error:
-            raise Where(path, rows.line_num).error(f"this is no CSV ({error}); correct it") from None
+        for line, row in list(csv_rows(path, text_of(path)))[1:]:
+            if len(row) != 2 or re.fullmatch(r"\d{1,18}", row[0]) is None:
+                raise Where(path, line).error("expected point3D_id,name; correct the line")
+            if int(row[0]) in names:
+                names[int(row[0])] = row[1]
     if len(set(names.values())) < len(names):
         raise Where(path, 1).error("two points have one name; make them differ")
     changed = safe_ids(list(names.values()), {"world"})

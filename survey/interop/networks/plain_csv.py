@@ -7,8 +7,6 @@ names the axes that keep them, ``datum`` is yes for the points of inner constrai
 counterclockwise as ``to_id``; ``adjusted`` rows are results and not read. Covariances between rows are not held.
 """
 
-import csv
-import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import get_args
@@ -17,7 +15,7 @@ import numpy as np
 
 from adjust.model.observations import Reading, ReadingKind
 from adjust.model.survey import Bearings, FloatArray, Survey
-from survey.folder.text import csv_text, suggestion
+from survey.folder.text import csv_rows, csv_text, suggestion
 from survey.interop.networks.draft import AXES, NetworkDraft, Vectors
 from survey.interop.networks.foreign import (
     ARCSEC,
@@ -48,23 +46,15 @@ _SIGMAS = {"sigma_mm": MM, "sigma_cc": CC, "sigma_arcsec": ARCSEC}
 def read_plain_csv(path: Path) -> ForeignNetwork:
     """A network from one table. Raises SurveyError with file and line for what cannot be read."""
     reader = _Reader()
-    rows = csv.reader(io.StringIO(text_of(path)), strict=True)
-    names: list[str] = []
-    try:
-        for words in rows:
-            where = Where(path, rows.line_num)
-            if not any(word.strip() for word in words):
-                continue
-            if not names:
-                names = _header(words, where)
-                continue
-            if len(words) != len(names):
-                raise where.error(f"found {len(words)} cells, the header has {len(names)}; correct the row")
-            reader.row({k: w.strip() for k, w in zip(names, words, strict=True) if w.strip()}, where)
-    except csv.Error as error:
-        raise Where(path, rows.line_num).error(f"this is no CSV ({error}); correct it") from None
-    if not names:
+    rows = ((Where(path, line), words) for line, words in csv_rows(path, text_of(path)) if any(map(str.strip, words)))
+    first = next(rows, None)
+    if first is None:
         raise Where(path, 1).error(f"the table is empty; its first line names the columns, as {', '.join(COLUMNS[:4])}")
+    names = _header(first[1], first[0])
+    for where, words in rows:
+        if len(words) != len(names):
+            raise where.error(f"found {len(words)} cells, the header has {len(names)}; correct the row")
+        reader.row({k: w.strip() for k, w in zip(names, words, strict=True) if w.strip()}, where)
     survey = reader.draft.survey(reader.bearings)
     return ForeignNetwork(survey, path.stem, reject=True, notes=tuple(reader.draft.notes))
 

@@ -71,9 +71,7 @@ def adjust_job(
     return outcome.at(target)
 
 
-def _load(images: bool) -> None:
+def _load() -> None:
     """What large tables are read with, and their project adjusted and tested."""
-    algebra = ("scipy.linalg",) if images else ()
-    jobs = ("survey.jobs.adjusting.outcome", "survey.jobs.adjusting.steps")
-    for name in ("pyarrow.csv", "scipy.special", *algebra, *jobs):
+    for name in ("pyarrow.csv", "scipy.special", "survey.jobs.adjusting.outcome", "survey.jobs.adjusting.steps"):
         import_module(name)

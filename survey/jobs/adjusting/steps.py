@@ -22,6 +22,7 @@ from survey.jobs.detecting.image_defects import blurred, defect_warnings
 from survey.jobs.identify import identify_spots, without_points
 from survey.project import Project
 from survey.project.detected import DetectedImage
+from survey.project.project import DEFINITION_FILE
 
 Begin = Callable[[Survey], StartValues | None]
 Progress = Callable[[int, float], None]
@@ -66,10 +67,20 @@ def _options(project: Project) -> CleanOptions:
     return CleanOptions(said.reject_pairs, how, said.variance_components)
 
 
-def _loops_closed(work: Work) -> Work:
+def with_loops_closed(project: Project) -> Project:
+    """With the loops of its pairs to be closed, where it asks for that. Raises SurveyError."""
+    if project.options.pairs != "closed" or not project.survey.pairs:
+        return project
     from adjust.relay.closed import closed  # here: a survey without pairs starts without it
 
-    return work.of(closed(work.survey, work.project.options.closures))
+    try:
+        return replace(project, survey=closed(project.survey, project.options.closures))
+    except SurveyError as error:
+        raise SurveyError(f"{project.folder}/{DEFINITION_FILE}: {error}") from error
+
+
+def _loops_closed(work: Work) -> Work:
+    return work.of(with_loops_closed(work.project).survey)
 
 
 def _boards_turned(work: Work) -> Work:
@@ -116,7 +127,7 @@ def _causes_named(work: Work) -> Work:
 
 
 STEPS = (
-    Step("loops", lambda w: w.project.options.pairs == "closed" and bool(w.survey.pairs), _loops_closed),
+    Step("loops", lambda w: w.project.options.pairs == "closed", _loops_closed),
     Step("symmetric boards", lambda w: bool(w.survey.image_blocks), _boards_turned),
     Step("spots", lambda w: bool(w.project.spots), _spots_identified),
     Step("unobserved", lambda _: True, _unobserved_left_out),
