@@ -10,9 +10,11 @@ from typing import Any, TypeVar
 from adjust.model.clocks import clocks_of
 from adjust.model.result import ParameterName
 from adjust.model.survey import (
+    Beam,
     Camera,
     Clock,
     ImageCrop,
+    Instrument,
     LensParameter,
     PointParameter,
     PoseParameter,
@@ -25,6 +27,7 @@ from adjust.model.survey import (
 )
 
 Vector = TypeVar("Vector", LensParameter, VectorParameter)
+Owner = TypeVar("Owner", Beam, Clock, ImageCrop, Instrument)
 Fields = dict[str, Any]
 """Fields of a value by their names, as ``dataclasses.replace`` takes them: of any type, for each field has its own."""
 
@@ -59,14 +62,15 @@ class Rewriting:
             tables=tuple(map(self._table, survey.tables)),
             targets=tuple(map(self._target, survey.targets)),
             points=tuple(replace(p, x_in_world=self.point(("point", p.point_id), p.x_in_world)) for p in survey.points),
-            instruments=tuple(
-                replace(x, parameters=self.vector(("instrument", x.instrument_id), x.parameters))
-                for x in survey.instruments
-            ),
-            beams=tuple(replace(x, parameters=self.vector(("beam", x.beam_id), x.parameters)) for x in survey.beams),
+            instruments=tuple(self._parameters(("instrument", x.instrument_id), x) for x in survey.instruments),
+            beams=tuple(self._parameters(("beam", x.beam_id), x) for x in survey.beams),
             surfaces=tuple(map(self._surface, survey.surfaces)),
             vertical=replace(survey.vertical, tilt=self.vector(("vertical",), survey.vertical.tilt)),
         )
+
+    def _parameters(self, name: ParameterName, owner: Owner) -> Owner:
+        new = self.vector(name, owner.parameters)
+        return owner if new is owner.parameters else replace(owner, parameters=new)
 
     def _surface(self, s: Surface) -> Surface:
         name = ("surface", s.surface_id)
@@ -75,29 +79,24 @@ class Rewriting:
     def _camera(self, c: Camera) -> Camera:
         lens = self.vector(("lens", c.camera_id), c.lens)
         if lens.crops:
-            lens = replace(lens, crops={e: self._crop(("lens_crop", c.camera_id, e), x) for e, x in lens.crops.items()})
+            crops = {e: self._parameters(("lens_crop", c.camera_id, e), x) for e, x in lens.crops.items()}
+            lens = replace(lens, crops=crops)
         pose = self.pose(("station_from_camera", c.camera_id), c.station_from_camera)
-        clock = self._clock("camera_clock", c.camera_id, c.clock)
+        clock = c.clock and self._parameters(("camera_clock", c.camera_id), c.clock)
         return replace(c, lens=lens, station_from_camera=pose, clock=clock)
-
-    def _crop(self, name: ParameterName, crop: ImageCrop) -> ImageCrop:
-        return replace(crop, parameters=self.vector(name, crop.parameters))
 
     def _station(self, s: Station) -> Station:
         name = ("world_from_station", s.station_id)
         pose, mount = self.pose(name, s.world_from_station), ("mount_from_station", s.station_id)
         return replace(s, world_from_station=pose, mount_from_station=self.pose(mount, s.mount_from_station),
                        epochs=self.epochs(name, s.epochs, s.world_from_station),
-                       clock=self._clock("pose_clock", s.station_id, s.clock))  # fmt: skip
+                       clock=s.clock and self._parameters(("pose_clock", s.station_id), s.clock))  # fmt: skip
 
     def _table(self, t: Table) -> Table:
         geometry = self.vector(("table_geometry", t.table_id), t.geometry)
         pose = self.pose(("world_from_table", t.table_id), t.world_from_table)
-        clock = self._clock("table_clock", t.table_id, t.clock)
+        clock = t.clock and self._parameters(("table_clock", t.table_id), t.clock)
         return replace(t, geometry=geometry, world_from_table=pose, clock=clock)
-
-    def _clock(self, kind: str, owner: str, clock: Clock | None) -> Clock | None:
-        return None if clock is None else replace(clock, parameters=self.vector((kind, owner), clock.parameters))
 
     def _target(self, t: Target) -> Target:
         warp = None if t.warp is None else self.vector(("warp", t.target_id), t.warp)
