@@ -12,9 +12,10 @@ from adjust.frames.lens_times import whole_images
 from adjust.graph.assembly import StartValues
 from adjust.model.errors import SurveyError
 from adjust.model.names import grouped
-from adjust.model.survey import Camera, FloatArray, Survey
+from adjust.model.observations import ImageBlock
+from adjust.model.survey import Camera, FloatArray, PoseParameter, Station, Survey
 from adjust.spatial.averaging import mean_pose
-from adjust.spatial.rigid import inverse
+from adjust.spatial.rigid import inverse, skew
 from adjust.start.lens.start import start_lens
 from adjust.start.views import Sighting, View, Views, make_views, sightings, sights_of
 
@@ -62,9 +63,41 @@ def squares_of(survey: Survey, views: Iterable[View]) -> FloatArray:
     out = np.zeros(len(survey.image_blocks))
     for view in views:
         block = survey.image_blocks[view.block_idx]
-        variance = float(np.mean(np.trace(block.cov, axis1=1, axis2=2))) / 2.0
-        out[view.block_idx] = len(view.x) * float(view.error_px[0]) ** 2 / variance
+        out[view.block_idx] = len(view.x) * float(view.error_px[0]) ** 2 / _variance(block)
     return out
+
+
+def _variance(block: ImageBlock) -> float:
+    """px^2, of a coordinate of the typical point."""
+    return float(np.mean(np.trace(block.cov, axis1=1, axis2=2))) / 2.0
+
+
+def single_camera_survey(survey: Survey, camera_id: str) -> Survey:
+    """The calibration of one camera alone: every image of a target has a pose of its own."""
+    held = PoseParameter(Pose3(), "held")
+    camera = survey.cameras_by_id[camera_id]
+    blocks = [b for b in survey.image_blocks if b.camera_id == camera_id and b.target_id is not None]
+    alone = tuple(replace(b, epoch_id=f"{b.epoch_id}/{b.target_id}") for b in blocks)
+    targets = [t for t in survey.targets if t.target_id in {b.target_id for b in blocks}]
+    return Survey(
+        cameras=(replace(camera, station_id="alone", station_from_camera=held),),
+        stations=(Station("alone", "epoch"),),
+        targets=tuple(
+            replace(t, station_id=None, motion="fixed", carrier_from_target=held, epochs={}) for t in targets
+        ),
+        image_blocks=alone,
+    )
+
+
+def view_covariance(block: ImageBlock, view: View) -> FloatArray:
+    """Covariance (6, 6) of camera_from_target, a small motion on its left, from the points' noise."""
+    p = view.x @ view.poses[0][:3, :3].T + view.poses[0][:3, 3]
+    depth = np.linalg.norm(p, axis=1)
+    across = np.eye(3) - p[:, :, None] * p[:, None, :] / (depth**2)[:, None, None]
+    J = np.concatenate([-across @ skew(p), across], axis=2) * (view.focal_px / depth)[:, None, None]
+    N = np.einsum("nij,nik->jk", J, J) / _variance(block)
+    d = 1.0 / np.sqrt(np.diag(N))
+    return np.asarray(np.linalg.inv(N * np.outer(d, d) + 1e-10 * np.eye(6)) * np.outer(d, d))
 
 
 def completed(survey: Survey, start: StartValues) -> StartValues:

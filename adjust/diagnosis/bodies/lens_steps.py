@@ -6,11 +6,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from adjust.diagnosis.alone import own_lenses, single_views, squares_alone, squares_of
+from adjust.diagnosis.alone import own_lenses, single_camera_survey, single_views, squares_alone, squares_of
 from adjust.diagnosis.bodies.series import Step
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.sequences import costs_of_cuts
-from adjust.diagnosis.table.views import single_camera_survey
 from adjust.diagnosis.trial import misfit_of
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, Survey

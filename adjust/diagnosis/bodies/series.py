@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from adjust.diagnosis.alone import view_covariance
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.prediction import Altered, Prediction
-from adjust.diagnosis.table.views import view_covariance
 from adjust.model.names import grouped
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, IntArray

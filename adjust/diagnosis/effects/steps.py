@@ -175,12 +175,11 @@ def _altered(result: Adjustment, course: Course, theta: FloatArray) -> Pose3 | F
         return estimate.value.compose(Pose3.Expmap(xi))
     value = np.array(estimate.value)
     chosen = [i for i in free if not course.components or estimate.components[i] in course.components]
-    untied = [i for i in chosen if estimate.status[i] != "tied"]
-    before = value.copy()
+    tied = [i for i in chosen if estimate.status[i] == "tied"]
+    untied = [i for i in chosen if i not in tied]
     value[untied] += theta
-    for i in chosen:
-        if i not in untied:  # tied components keep their ratio
-            value[i] *= value[untied[0]] / before[untied[0]]
+    if tied:  # they keep their ratio
+        value[tied] *= value[untied[0]] / np.asarray(estimate.value)[untied[0]]
     return value
 
 

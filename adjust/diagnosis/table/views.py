@@ -4,17 +4,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from gtsam import Pose3
 
 from adjust.adjustment import adjust
-from adjust.diagnosis.alone import own_lens, single_views
+from adjust.diagnosis.alone import own_lens, single_camera_survey, single_views, view_covariance
 from adjust.frames.tables import table_motions
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Estimate, ParameterName
 from adjust.model.rewriting import with_rows
-from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, Station, Survey, Table, Target
-from adjust.spatial.rigid import adjoint, inverse, rigid, rotation_exp, skew
+from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey, Table, Target
+from adjust.spatial.rigid import adjoint, inverse, rigid, rotation_exp
 from adjust.start.views import View, untrustworthy
 
 
@@ -141,23 +140,6 @@ def with_lenses(survey: Survey, estimates: Mapping[ParameterName, Estimate]) -> 
     return with_rows(survey, "cameras", new)
 
 
-def single_camera_survey(survey: Survey, camera_id: str) -> Survey:
-    """The calibration of one camera alone: every image of a target has a pose of its own."""
-    held = PoseParameter(Pose3(), "held")
-    camera = survey.cameras_by_id[camera_id]
-    blocks = [b for b in survey.image_blocks if b.camera_id == camera_id and b.target_id is not None]
-    alone = tuple(replace(b, epoch_id=f"{b.epoch_id}/{b.target_id}") for b in blocks)
-    targets = [t for t in survey.targets if t.target_id in {b.target_id for b in blocks}]
-    return Survey(
-        cameras=(replace(camera, station_id="alone", station_from_camera=held),),
-        stations=(Station("alone", "epoch"),),
-        targets=tuple(
-            replace(t, station_id=None, motion="fixed", carrier_from_target=held, epochs={}) for t in targets
-        ),
-        image_blocks=alone,
-    )
-
-
 def poses_of_views(survey: Survey) -> dict[int, View]:
     """Every block of a target that a pose explains, as rays and poses, each from its own image alone.
 
@@ -191,15 +173,3 @@ def _gathered(
         np.array([epoch_ids.index(b.epoch_id) for b in blocks]), poses, cov,
         np.array([readings[e].angles for e in epoch_ids]), survey.targets_by_id,
     )  # fmt: skip
-
-
-def view_covariance(block: ImageBlock, view: View) -> FloatArray:
-    """Covariance (6, 6) of camera_from_target, a small motion on its left, from the points' noise."""
-    p = view.x @ view.poses[0][:3, :3].T + view.poses[0][:3, 3]
-    depth = np.linalg.norm(p, axis=1)
-    across = np.eye(3) - p[:, :, None] * p[:, None, :] / (depth**2)[:, None, None]
-    J = np.concatenate([-across @ skew(p), across], axis=2) * (view.focal_px / depth)[:, None, None]
-    variance = float(np.mean(np.trace(block.cov, axis1=1, axis2=2))) / 2.0
-    N = np.einsum("nij,nik->jk", J, J) / variance
-    d = 1.0 / np.sqrt(np.diag(N))
-    return np.asarray(np.linalg.inv(N * np.outer(d, d) + 1e-10 * np.eye(6)) * np.outer(d, d))
