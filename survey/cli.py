@@ -10,18 +10,18 @@ from collections.abc import Sequence
 from functools import partial
 from typing import NoReturn
 
-from survey.commands.adjusting import declare_adjust, declare_report
+from survey.commands.adjusting import adjust, report
 from survey.commands.common import DONE, FAILED, INTERRUPTED, TEST_FAILED, USAGE, run_as_program, run_command
-from survey.commands.comparing import declare_compare, declare_cross_validate
+from survey.commands.comparing import compare, cross_validate
 from survey.commands.completion import declare_completion
-from survey.commands.converting import declare_convert
-from survey.commands.excluding import declare_exclude, declare_include
-from survey.commands.navigating import declare_align, declare_navigate
-from survey.commands.networks import declare_add, declare_pairs, declare_remove, declare_trackers
-from survey.commands.opening import declare_open, declare_runs
+from survey.commands.converting import convert
+from survey.commands.excluding import exclude, include
+from survey.commands.navigating import align, navigate
+from survey.commands.networks import add, pairs, remove, trackers
+from survey.commands.opening import open_project, runs
 from survey.commands.parser import program_parser
-from survey.commands.planning import declare_check, declare_plan
-from survey.commands.starting import declare_detect, declare_example, declare_init, declare_schema
+from survey.commands.planning import check, plan
+from survey.commands.starting import detect, example, init, schema
 
 __all__ = ["DONE", "FAILED", "INTERRUPTED", "TEST_FAILED", "USAGE", "build_parser", "main"]
 
@@ -38,27 +38,27 @@ Help for one command: labsurvey adjust --help
 Exit codes: 0 done, 1 error in the project, 2 wrong usage, 3 solved, but something does not fit.
 """
 _COMMANDS = (
-    declare_adjust,
-    declare_init,
-    declare_open,
-    declare_detect,
-    declare_report,
-    declare_check,
-    declare_plan,
-    declare_add,
-    declare_remove,
-    declare_exclude,
-    declare_include,
-    declare_runs,
-    declare_convert,
-    declare_pairs,
-    declare_trackers,
-    declare_navigate,
-    declare_align,
-    declare_compare,
-    declare_cross_validate,
-    declare_example,
-    declare_schema,
+    adjust,
+    init,
+    open_project,
+    detect,
+    report,
+    check,
+    plan,
+    add,
+    remove,
+    exclude,
+    include,
+    runs,
+    convert,
+    pairs,
+    trackers,
+    navigate,
+    align,
+    compare,
+    cross_validate,
+    example,
+    schema,
 )
 
 

@@ -111,7 +111,7 @@ class _Board:
         camera, beacon = in_view(system, pose)
         if not len(camera):
             return
-        _, H, M, _ = evaluate(system, pose, camera, beacon, np.zeros((len(camera), 2)))
+        _, H, M = evaluate(system, pose, camera, beacon)
         J = np.hstack([H, M]).reshape(len(camera), 2, self.dim)
         # px/m by the beacon: moving the head by d in its own frame is moving the beacon by -R d
         by_point = -J[:, :, 3:6] @ pose[:3, :3].T

@@ -69,7 +69,7 @@ def pose_budget(head: Head, beacons: Beacons, poses: Sequence[Pose3]) -> PoseBud
     full = np.empty((len(poses), len(SOURCES), 6, 6))
     for k, pose in enumerate(poses):
         camera, beacon = in_view(system, pose.matrix())
-        _, H, M, _ = evaluate(system, pose.matrix(), camera, beacon, np.zeros((len(camera), 2)))
+        _, H, M = evaluate(system, pose.matrix(), camera, beacon)
         N = H.T @ H
         scale = np.sqrt(np.diag(N)) + 1e-300
         if len(H) < 6 or np.linalg.eigvalsh(N / np.outer(scale, scale))[0] < _OPEN:
@@ -79,8 +79,8 @@ def pose_budget(head: Head, beacons: Beacons, poses: Sequence[Pose3]) -> PoseBud
             )
         G = np.linalg.solve(N, H.T)
         by = M @ system.F_inverse  # derivatives by the calibration, then by the beacons
-        turns = (system.lens_at + system.n_lens)[:, None] + np.arange(3)
-        parts = (np.eye(len(H)), by[:, system.beacon_at :], by[:, (turns + 3).ravel()], by[:, turns.ravel()])
+        turns = (system.arrays.lens_at + system.arrays.n_lens)[:, None] + np.arange(3)
+        parts = (np.eye(len(H)), by[:, system.arrays.beacon_at :], by[:, (turns + 3).ravel()], by[:, turns.ravel()])
         full[k] = [G @ F @ F.T @ G.T for F in parts]
     unit = np.diagonal(full, axis1=2, axis2=3).copy()
     return PoseBudget(head, tuple(poses), x, unit, full)
@@ -123,7 +123,7 @@ def simulate_poses(found: PoseBudget, sigmas: FloatArray, n_trials: int, seed: i
         spots = _disturbed_spots(found, true, camera, beacon, sigmas, n_trials, rng)
         for i, uv in enumerate(spots):
             seen = sightings_of(system, camera, beacon, uv, 1.0)
-            fit = fit_pose(system, seen, np.arange(len(camera)), beacon, true)
+            fit = fit_pose(seen, np.arange(len(camera)), beacon, true)
             if fit is None:
                 raise SurveyError(f"pose {k + 1}: spots with errors of these sizes lead to no pose; ask for less")
             out[k, i] = local(true, fit.pose)

@@ -68,7 +68,7 @@ def causes_between(
         for cause, after, directions in make(both, found):
             try:
                 after = aligned(both.before, after, directions, range(len(both.names)))
-                test = compare(both.names, both.before, after, directions, both.pooled, whole).before
+                test = compare(replace(both, after=after, directions=directions), whole).before
             except SurveyError:  # a motion more than the common points can carry
                 continue
             if test.p > _FITS:

@@ -51,25 +51,16 @@ class Case:
 
     def run(self, survey: Survey) -> Adjustment:
         """A survey like this one, or a part of it, adjusted from its own start. SurveyError where that fails."""
-        blocks = len(survey.image_blocks), len(self.survey.image_blocks)
-        share = blocks[0] / blocks[1] if blocks[0] and blocks[1] else 1.0
-        if blocks[0] or survey.pairs:
-            return self._adjusted(survey, None, _OWN, (START + REST) * share, STEP * share)
-        return self._adjusted(survey, find_start(survey), _OWN, START + REST)
+        n, whole = len(survey.image_blocks), len(self.survey.image_blocks)
+        share, start = n / whole if n and whole else 1.0, None if n or survey.pairs else find_start(survey)
+        lost = _LOST * _nothing(survey)
+        return self.budget.adjusted(survey, start, _OWN, (START + REST) * share, STEP * share, lost=lost)
 
-    def _near(
-        self, survey: Survey, result: Adjustment, most: float = np.inf, options: AdjustOptions = _NEAR
-    ) -> Adjustment:
+    def _near(self, survey: Survey, result: Adjustment, most: float, options: AdjustOptions) -> Adjustment:
         """From the values of another adjustment. most: v'Pv that it has to come below."""
-        rest = REST if survey.image_blocks else START + REST
-        return self._adjusted(survey, completed(survey, values_of(result, survey)), options, rest, most=most)
-
-    def _adjusted(
-        self, survey: Survey, start: StartValues | None, options: AdjustOptions, first: float, step: float = STEP,
-        most: float = np.inf,
-    ) -> Adjustment:  # fmt: skip
+        rest, start = REST if survey.image_blocks else START + REST, completed(survey, values_of(result, survey))
         lost = _LOST * _nothing(survey) if options is _OWN else np.inf
-        return self.budget.adjusted(survey, start, options, first, step, most, lost)
+        return self.budget.adjusted(survey, start, options, rest, most=most, lost=lost)
 
     def warm(self, survey: Survey) -> Adjustment:
         """A survey that is much like this one, with all images, adjusted from the values of this one.
@@ -81,7 +72,7 @@ class Case:
             return known
         if self.linear is None:
             raise SurveyError("there are no values to begin with")
-        result = self._near(survey, self.linear.result, self.linear.result.omega)
+        result = self._near(survey, self.linear.result, self.linear.result.omega, _NEAR)
         self._last[:] = [*self._last[-1:], (survey, result)]
         return result
 
@@ -144,29 +135,23 @@ class Case:
         Of the few targets or cameras with the largest misfit, or with most images where nothing is adjusted. Each is
         started when it is asked for, as long as there is time to try what that shows.
         """
-        if field_name not in self._without:
-            ids = [t for t in dict.fromkeys(getattr(b, field_name) for b in self.survey.image_blocks) if t is not None]
-            self._without[field_name] = dict.fromkeys(self._worst(field_name, ids)[: _LEFT_OUT * (len(ids) > 1)], ())
-        for owner, known in self._without[field_name].items():
-            if not known:
+        share = dict[str, float]()
+        for block, squares in zip(self.survey.image_blocks, block_squares(self.survey, self.result), strict=True):
+            if (owner := getattr(block, field_name)) is not None:
+                share[owner] = share.get(owner, 0.0) + float(np.minimum(squares, 2.0 * CAP).sum())
+        for owner in sorted(share, key=lambda o: -share[o])[: _LEFT_OUT * (len(share) > 1)]:
+            key = field_name, owner
+            if key not in self._without:
                 if not self.budget.lasts:
                     self.budget.refused = True
                     return
-                known = self._without[field_name][owner] = (self.rough(without(self.survey, field_name, owner)),)
-            if known[0] is not None:
-                yield owner, known[0]
+                self._without[key] = self.rough(without(self.survey, field_name, owner))
+            if (values := self._without[key]) is not None:
+                yield owner, values
 
     @cached_property
-    def _without(self) -> dict[str, dict[str, tuple[Altered | None, ...]]]:
+    def _without(self) -> dict[tuple[str, str], Altered | None]:
         return {}
-
-    def _worst(self, field_name: str, ids: list[str]) -> list[str]:
-        share = dict.fromkeys(ids, 0.0)
-        for block, value in zip(self.survey.image_blocks, self.block_misfit, strict=True):
-            owner = getattr(block, field_name)
-            if owner in share:
-                share[owner] += float(value)
-        return sorted(ids, key=lambda owner: -share[owner])
 
     @cached_property
     def linear(self) -> Linear | None:
@@ -184,10 +169,9 @@ class Case:
                 survey = self.survey
                 start = None if survey.pairs or (given_starts(survey) and survey.image_blocks) else self.start
                 most = _LOST * _nothing(survey)
-                first = START * (start is None) + REST
-                result = self._adjusted(survey, start, _NEAR, first, most=most)
+                result = self.budget.adjusted(survey, start, _NEAR, START * (start is None) + REST, most=most)
             elif not self.is_whole:
-                result = self._near(self.survey, result, options=_OWN)
+                result = self._near(self.survey, result, np.inf, _OWN)
             self.budget.spend(SCORES)
             return Linear(result)
         except SurveyError:
@@ -221,19 +205,6 @@ class Case:
         given = sum(int(b.mask.sum()) for b in self.survey.image_blocks)
         images = given == int(self.result.image_residuals.used.sum())
         return images and self.survey.n_others_used == self.result.survey.n_others_used
-
-    @cached_property
-    def block_misfit(self) -> FloatArray:
-        """(b,) bounded sum of squares of the image points of each block over their sigmas; all of it, unadjusted."""
-        return np.array([np.minimum(s, 2.0 * CAP).sum() for s in block_squares(self.survey, self.result)])
-
-    @cached_property
-    def error_px(self) -> FloatArray:
-        """(b,) rms of what each block shows against its own best pose, px; nan where it has none."""
-        out = np.full(len(self.survey.image_blocks), np.nan)
-        for i, view in self.views.items():
-            out[i] = view.error_px[0]
-        return out
 
 
 def _nothing(survey: Survey) -> float:

@@ -13,6 +13,7 @@ import numpy as np
 from adjust.diagnosis.alone import squares_alone
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import ChangeColumns, Edit, Hypothesis, Place
+from adjust.model.names import numbered
 from adjust.model.observations import ImageBlock
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, Survey
@@ -147,9 +148,9 @@ def turned_alone(case: Case) -> Iterator[Hypothesis]:
     now, then = squares_alone(alone, lenses), squares_alone(back, lenses)
     for camera in lenses:
         rows = [i for i, b in enumerate(alone.image_blocks) if b.camera_id == camera]
-        at = [alone.image_blocks[i].epoch_id for i in rows]
-        epochs, gain = list(dict.fromkeys(at)), now[rows] - then[rows]
-        since = np.array([gain[[e in set(epochs[k:]) for e in at]].sum() for k in range(1, len(epochs))])
+        epochs, at = numbered(alone.image_blocks[i].epoch_id for i in rows)
+        gain = np.bincount(at, weights=now[rows] - then[rows], minlength=len(epochs))
+        since = np.cumsum(gain[::-1])[::-1][1:]
         if len(since) and since.max() > float(chi2.isf(sidak(_ALPHA, len(since)), 1)):
             later = tuple(epochs[int(np.argmax(since)) + 1 :])
             ratio = 1.0 + float(since.max() / max(then[rows][-len(later) :].sum(), 1.0))

@@ -1,7 +1,8 @@
 """Clocks as unknowns: the survey in which they are, what of a project says so, and what they were found to be."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -105,11 +106,13 @@ def as_unknowns(
     noted: is told of every trial whether it takes most of the misfit away.
     """
     survey = with_clocks(case.survey, freed, jitter)
-    return replace(
-        keyed(case.survey, of, freed, jitter), survey=survey if survey is not None else lambda: None,
-        parameters=sum(map(len, freed.values())) + _n_own(survey, freed, jitter),
-        follow=_told(case, of, freed, jitter, survey, noted),
-    )  # fmt: skip
+    free, own = sum(map(len, freed.values())), 0
+    if survey is not None and jitter > 0.0:  # times of single epochs
+        seen = ((b.camera_id, b.epoch_id) for b in survey.image_blocks)
+        own = len({(c, e) for c, e in seen if ("camera_clock", c) in freed})
+    tried: Survey | Callable[[], None] = survey or (lambda: None)
+    hypothesis = replace(keyed(case.survey, of, freed, jitter), survey=tried, parameters=free + own)
+    return replace(hypothesis, follow=partial(_followed, case, hypothesis, of, freed, jitter, noted))
 
 
 def keyed(survey: Survey, of: Hypothesis, freed: Freed, jitter: float = 0.0) -> Hypothesis:
@@ -121,30 +124,20 @@ def keyed(survey: Survey, of: Hypothesis, freed: Freed, jitter: float = 0.0) -> 
     return replace(of, edits=new, change=change)
 
 
-def _n_own(survey: Survey | None, freed: Freed, jitter: float) -> int:
-    """Times of single epochs that are unknown."""
-    if survey is None or jitter == 0.0:
-        return 0
-    return len({(b.camera_id, b.epoch_id) for b in survey.image_blocks if ("camera_clock", b.camera_id) in freed})
-
-
 def _toml(value: object) -> str:
     return "[" + ", ".join(f'"{x}"' for x in value) + "]" if isinstance(value, tuple) else str(value)
 
 
-def _told(
-    case: Case, of: Hypothesis, freed: Freed, jitter: float, survey: Survey | None, noted: list[bool] | None
-) -> Callable[[Adjustment], Sequence[Hypothesis]]:
-    def told(result: Adjustment) -> list[Hypothesis]:
-        own = "" if jitter == 0.0 else ", and each epoch at a time of its own about that"
-        here = replace(as_unknowns(case, of, freed, jitter), survey=survey or (lambda: None), follow=None,
-                       cause=f"{of.cause} ({found(result, freed)}{own})")  # fmt: skip
-        images = any(name[0] == "camera_clock" and "offset" in free for name, free in freed.items())
-        left = misfit_of(result, survey or case.survey)
-        if noted is not None:
-            noted.append(left.excess < _ENOUGH * misfit_of(case.result, case.survey).excess)
-        if jitter > 0.0 or not images or left.is_noise():
-            return [here]
-        return [here, as_unknowns(case, of, freed, _JITTER, noted)]
-
-    return told
+def _followed(
+    case: Case, tried: Hypothesis, of: Hypothesis, freed: Freed, jitter: float, noted: list[bool] | None,
+    result: Adjustment,
+) -> list[Hypothesis]:  # fmt: skip
+    own = "" if jitter == 0.0 else ", and each epoch at a time of its own about that"
+    here = replace(tried, follow=None, cause=f"{of.cause} ({found(result, freed)}{own})")
+    images = any(name[0] == "camera_clock" and "offset" in free for name, free in freed.items())
+    left = misfit_of(result, tried.survey if isinstance(tried.survey, Survey) else case.survey)
+    if noted is not None:
+        noted.append(left.excess < _ENOUGH * misfit_of(case.result, case.survey).excess)
+    if jitter > 0.0 or not images or left.is_noise():
+        return [here]
+    return [here, as_unknowns(case, of, freed, _JITTER, noted)]

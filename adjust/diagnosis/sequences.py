@@ -125,13 +125,25 @@ def _hands(survey: Survey, seen: _Views, error: float) -> Iterator[Link]:
             on_hand, held = station_of[camera] == station, carrier_of[target] == station
             epochs = tuple(e for e in views if e in poses)
             if on_hand != held and len(epochs) >= _FEWEST:
-                second = np.array([poses[e][1].matrix() for e in epochs])
-                second = second if on_hand else inverse(second)
-                first = np.array([views[e] for e in epochs])
-                turns = [np.diag(survey.pairs[poses[e][0]].cov)[:3].max() for e in epochs]
-                yield Link("hand_eye", (camera, station), epochs, first, second, target,
-                           float(np.hypot(error, np.sqrt(np.median(turns)))),
-                           tuple(poses[e][0] for e in epochs))  # fmt: skip
+                rows, first = tuple(poses[e][0] for e in epochs), np.array([views[e] for e in epochs])
+                turns = [np.diag(survey.pairs[i].cov)[:3].max() for i in rows]
+                own = float(np.hypot(error, np.sqrt(np.median(turns))))
+                second = hand(survey, camera, station, rows, {})
+                yield Link("hand_eye", (camera, station), epochs, first, second, target, own, rows)
+
+
+def hand(survey: Survey, camera: str, station: str, rows: Sequence[int], new: Mapping[int, Pose3 | Rot3]) -> FloatArray:
+    """Poses (n, 4, 4) of the hand by these pairs: in its base where the camera is on it, else of the base in it.
+
+    new: other motions of some of them.
+    """
+    on_hand, out = any((c.camera_id, c.station_id) == (camera, station) for c in survey.cameras), []
+    for i in rows:
+        pair, motion = survey.pairs[i], new.get(i, survey.pairs[i].b_from_a)
+        pose = motion.matrix() if isinstance(motion, Pose3) else np.eye(4)
+        forwards = pair.b.frame_id == station and bool(pair.b.epoch_id)
+        out.append(pose if forwards == on_hand else inverse(pose))
+    return np.array(out)
 
 
 def hand_poses(survey: Survey) -> dict[str, dict[str, tuple[int, Pose3]]]:

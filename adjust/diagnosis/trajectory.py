@@ -99,23 +99,35 @@ def _misfit(pose: EpochPose) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """The rows of a project that these epochs are."""
+    """The rows of a project that these epochs are: how each change is made there, and what it does to an epoch."""
 
     epochs: Sequence[NavigationEpoch]
 
-    def renamed(self, column: str, other: Mapping[str, str]) -> tuple[Edit, ...]:
-        """Ids of a column called otherwise."""
-        return (Rename(self._spots, column, other, self._where()),)
+    def cameras(self, other: Mapping[str, str]) -> tuple[tuple[Edit, ...], Change]:
+        """Cameras called otherwise."""
+        edit = Rename(self._spots, "camera_id", other, self._where())
+        return _of_spots(edit, lambda s: replace(s, camera_id=other.get(s.camera_id, s.camera_id)))
 
-    def mapped(self, camera: str, how: ImageMap, size: tuple[int, int]) -> tuple[Edit, ...]:
+    def beacons(self, other: Mapping[str, str]) -> tuple[tuple[Edit, ...], Change]:
+        """Beacons called otherwise."""
+
+        def renamed(s: Spots) -> Spots:
+            ids = s.beacon_ids
+            return s if ids is None else replace(s, beacon_ids=tuple(other.get(str(i), i) for i in ids))
+
+        return _of_spots(Rename(self._spots, "point_id", other, self._where()), renamed)
+
+    def mapped(self, camera: str, how: ImageMap, size: tuple[int, int]) -> tuple[tuple[Edit, ...], Change]:
         """Image points of a camera mapped back."""
         where = self._where(camera_id=(camera,))
-        return (ChangeColumns(self._spots, ("u_px", "v_px"), how.matrix, how.offset(size), where),)
+        edit = ChangeColumns(self._spots, ("u_px", "v_px"), how.matrix, how.offset(size), where)
+        return _of_spots(edit, lambda s: how.back(s, size) if s.camera_id == camera else s)
 
-    def angles(self, by: FloatArray) -> tuple[Edit, ...]:
+    def angles(self, by: FloatArray) -> tuple[tuple[Edit, ...], Change]:
         """Readings of the table times a matrix (k, k)."""
         columns = tuple(f"axis{i + 1}_deg" for i in range(len(by)))
-        return (ChangeColumns("table_angles", columns, by, np.zeros(len(by)), self._where()),)
+        edit = ChangeColumns("table_angles", columns, by, np.zeros(len(by)), self._where())
+        return (edit,), lambda e: e if e.table_angles is None else replace(e, table_angles=by @ e.table_angles)
 
     @property
     def _spots(self) -> str:
@@ -126,8 +138,8 @@ class _Rows:
         return {**more, "epoch_id": tuple(e.epoch_id for e in self.epochs)}
 
 
-def _spots(of: Callable[[Spots], Spots]) -> Change:
-    return lambda epoch: replace(epoch, spots=tuple(map(of, epoch.spots)))
+def _of_spots(edit: Edit, of: Callable[[Spots], Spots]) -> tuple[tuple[Edit, ...], Change]:
+    return (edit,), lambda epoch: replace(epoch, spots=tuple(map(of, epoch.spots)))
 
 
 def _of_images(
@@ -137,33 +149,18 @@ def _of_images(
     cameras = list(dict.fromkeys(s.camera_id for e in some for s in e.spots))
     for camera in cameras:
         for what, how in (*(("mirrored", m) for m in MIRRORED), *(("turned", t) for t in TURNED.values())):
+            edits, change = rows.mapped(camera, how, image_sizes[camera])
             yield OfTrajectory(
                 f"images {what}", f"camera {camera}: its images of the epochs navigated are {what}: {how.text}",
                 f"bring them back as they were when camera {camera} was calibrated, and detect them again", "camera",
-                (camera,), rows.mapped(camera, how, image_sizes[camera]),
-            ), _mapped(camera, how, image_sizes[camera])  # fmt: skip
+                (camera,), edits,
+            ), change  # fmt: skip
     for a, b in combinations(cameras, 2):
+        edits, change = rows.cameras({a: b, b: a})
         yield OfTrajectory(
             "cameras exchanged", f"cameras {a} and {b} have each other's images at the epochs navigated",
-            f"exchange them between images/{a} and images/{b}", "camera", (a, b),
-            rows.renamed("camera_id", {a: b, b: a}),
-        ), _cameras_renamed({a: b, b: a})  # fmt: skip
-
-
-def _mapped(camera: str, how: ImageMap, size: tuple[int, int]) -> Change:
-    return _spots(lambda s: how.back(s, size) if s.camera_id == camera else s)
-
-
-def _cameras_renamed(other: Mapping[str, str]) -> Change:
-    return _spots(lambda s: replace(s, camera_id=other.get(s.camera_id, s.camera_id)))
-
-
-def _beacons_renamed(other: Mapping[str, str]) -> Change:
-    def spots(s: Spots) -> Spots:
-        ids = s.beacon_ids
-        return s if ids is None else replace(s, beacon_ids=tuple(other.get(str(i), i) for i in ids))
-
-    return _spots(spots)
+            f"exchange them between images/{a} and images/{b}", "camera", (a, b), edits,
+        ), change  # fmt: skip
 
 
 def _of_beacons(some: Sequence[NavigationEpoch], told: Trajectory, rows: _Rows) -> Iterator[_Trial]:
@@ -176,11 +173,11 @@ def _of_beacons(some: Sequence[NavigationEpoch], told: Trajectory, rows: _Rows) 
                     a, b = sorted((name, label))
                     meant[a, b] += 1
     for (a, b), _ in meant.most_common(_MOST_BEACONS):
-        other = {a: b, b: a}
+        edits, change = rows.beacons({a: b, b: a})
         yield OfTrajectory(
             "points exchanged", f"points {a} and {b} are called by each other's names at the epochs navigated",
-            "exchange them in point_id of image_points.csv", "point", (a, b), rows.renamed("point_id", other),
-        ), _beacons_renamed(other)  # fmt: skip
+            "exchange them in point_id of image_points.csv", "point", (a, b), edits,
+        ), change  # fmt: skip
 
 
 def _forgotten(epoch: NavigationEpoch, pose: EpochPose) -> NavigationEpoch:
@@ -202,11 +199,8 @@ def _of_tables(some: Sequence[NavigationEpoch], rows: _Rows) -> Iterator[_Trial]
     ways += [(factor * np.eye(k), f"its readings {said}") for said, factor in ANGLE_RATIOS.items()
              if said.endswith("read as degrees")] if k else []  # fmt: skip
     for A, said in ways:
+        edits, change = rows.angles(A)
         yield OfTrajectory(
             "table readings", f"table: at the epochs navigated {said}",
-            "correct them in table_angles.csv, or navigate with --no-table", "table", (), rows.angles(A),
-        ), _read_as(A)  # fmt: skip
-
-
-def _read_as(by: FloatArray) -> Change:
-    return lambda e: e if e.table_angles is None else replace(e, table_angles=by @ e.table_angles)
+            "correct them in table_angles.csv, or navigate with --no-table", "table", (), edits,
+        ), change  # fmt: skip

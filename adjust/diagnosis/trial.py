@@ -1,6 +1,6 @@
 """One hypothesis, tried: its survey adjusted, and what is left unexplained."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,6 +8,7 @@ import numpy as np
 from adjust.diagnosis.case import CAP, Case, block_squares
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.model.errors import SurveyError
+from adjust.model.names import numbered
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 
@@ -143,28 +144,18 @@ def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:
     n_others = n_other_components(survey)
     if result is None:
         return Misfit(CAP * (points + n_others), points + n_others, points + n_others, 0)
-    images = result.image_residuals
-    groups: dict[str, list[FloatArray]] = {}
-    arrays, out = result.other_arrays, _left_out(survey)
-    told = list(_told(result))
-    kept = arrays.used | np.array([not (out and out & {ids, ids[:1]}) for ids, _ in told], dtype=np.bool_)
-    joint = _joint_squares(result) if result.survey.reading_covariances else {}
-    alone: dict[str, list[int]] = {}
-    for i in np.flatnonzero(kept).tolist():
-        ids, group = told[i]
-        if ids[:1] in joint:
-            groups.setdefault(group, []).append(joint[ids[:1]])
-        else:
-            alone.setdefault(group, []).append(i)
-    squares_of = _squares(arrays.residual, arrays.sigma)
-    for group, same in alone.items():
-        mine = np.isin(arrays.observation, same)
-        groups.setdefault(group, []).append(squares_of[mine])
+    arrays, out, single = result.other_arrays, _left_out(survey), result.single_residuals
+    readings = () if result.reading_residuals is None else result.survey.readings
+    ids: list[tuple[str, ...]] = [*(o.ids for o in single), *((r.reading_id,) for r in readings)]
+    names, number = numbered([*(o.group for o in single), *(r.group for r in readings)])
+    kept = arrays.used | np.array([not (out and out & {i, i[:1]}) for i in ids], dtype=np.bool_)
+    of_others = _squares_of_others(result)
+    groups = {name: [of_others[(kept & (number == k))[arrays.observation]]] for k, name in enumerate(names)}
     n_adjusted = sum(len(s) for of in groups.values() for s in of)
     for block, squares in zip(survey.image_blocks, block_squares(survey, result), strict=True):
         groups.setdefault(block.group, []).append(np.repeat(0.5 * squares, 2))
     gone = max(0, n_others - n_other_components(result.survey, used_only=False))
-    unused = points - 2 * int(images.used.sum()) + gone
+    unused = points - 2 * int(result.image_residuals.used.sum()) + gone
     unused += int(arrays.n_components[kept & ~arrays.used].sum())
     every = [np.concatenate(of) for of in groups.values()]
     omega = float(sum(np.minimum(s, CAP).sum() for s in every)) + CAP * gone
@@ -172,23 +163,17 @@ def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:
     return Misfit(omega, unused, points + max(n_adjusted, n_others), result.redundancy, fitted=fitted)
 
 
-def _told(result: Adjustment) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Ids and group of all other observations; of readings nothing is made for that."""
-    yield from ((o.ids, o.group) for o in result.single_residuals)
+def _squares_of_others(result: Adjustment) -> FloatArray:
+    """(K,) over sigmas, 0 of what is none; whitened where readings share a covariance: their sigmas say too little."""
+    arrays, readings = result.other_arrays, result.survey.readings
+    with np.errstate(invalid="ignore", divide="ignore"):
+        squares = (arrays.residual / arrays.sigma) ** 2
     if result.reading_residuals is not None:
-        yield from (((r.reading_id,), r.group) for r in result.survey.readings)
-
-
-def _joint_squares(result: Adjustment) -> dict[tuple[str, ...], FloatArray]:
-    """By id the whitened squares (1,) of readings that share a covariance: their sigmas alone say too little."""
-    if result.reading_residuals is None:
-        return {}
-    v = dict(zip([r.reading_id for r in result.survey.readings], result.reading_residuals.residual, strict=True))
-    out: dict[tuple[str, ...], FloatArray] = {}
-    for block in result.survey.reading_covariances:
-        white = np.linalg.solve(np.linalg.cholesky(block.cov), np.array([v[i] for i in block.reading_ids]))
-        out.update({(i,): np.array([w**2]) for i, w in zip(block.reading_ids, white.tolist(), strict=True)})
-    return out
+        at = {r.reading_id: i for i, r in enumerate(readings, start=len(squares) - len(readings))}
+        for block in result.survey.reading_covariances:
+            rows = [at[i] for i in block.reading_ids]
+            squares[rows] = np.linalg.solve(np.linalg.cholesky(block.cov), arrays.residual[rows]) ** 2
+    return np.where(np.isnan(squares), 0.0, squares)
 
 
 def _at_best_scale(squares: FloatArray) -> float:
@@ -200,24 +185,14 @@ def _at_best_scale(squares: FloatArray) -> float:
 
 
 def n_other_components(survey: Survey, used_only: bool = True) -> int:
-    """Observed components in use, or all, that are no image points."""
-    return sum(_n_components([o for o in kind if o.used or not used_only]) for kind in survey.others.values())
+    """Observed components in use, or all, that are no image points: the finite variances of covariances, else one."""
+    observed = [o for kind in survey.others.values() for o in kind if o.used or not used_only]
+    covs = [cov for o in observed if (cov := getattr(o, "cov", None)) is not None]
+    variances = np.concatenate([np.zeros(0), *(cov.diagonal() for cov in covs)])
+    return len(observed) - len(covs) + int(np.isfinite(variances).sum())
 
 
 def _left_out(survey: Survey) -> set[tuple[str, ...]]:
     """Ids of the pairs and table readings that the survey itself does not use."""
     pairs = {(p.pair_id,) for p in survey.pairs if not p.used}
     return pairs | {(r.table_id, r.epoch_id) for r in survey.table_readings if not r.used}
-
-
-def _n_components(observed: Sequence[object]) -> int:
-    """Of observations of a kind: the finite variances of their covariances, one each where they have sigmas."""
-    covs = [cov for o in observed if (cov := getattr(o, "cov", None)) is not None]
-    variances = np.concatenate([np.zeros(0), *(cov.diagonal() for cov in covs)])
-    return len(observed) - len(covs) + int(np.isfinite(variances).sum())
-
-
-def _squares(residual: FloatArray, sigma: FloatArray) -> FloatArray:
-    with np.errstate(invalid="ignore", divide="ignore"):
-        squares = (residual / sigma) ** 2
-    return np.where(np.isnan(squares), 0.0, squares)

@@ -15,7 +15,7 @@ from adjust.precision.s_transformation import transformed
 from adjust.testing.quadratic_forms import pseudo_precision, pseudo_square, pseudo_square_beside
 
 Displaced = Callable[[IntArray], tuple[FloatArray, FloatArray]]
-"""Of some components (k,) of one name: displacements (k,) and their covariance (k, k)."""
+"""Of components (p, k), those of a name in a row: displacements (p, k) and the covariances (p, k, k) of each name."""
 Between = tuple[
     tuple[tuple[ParameterName, ...], FloatArray, FloatArray, IntArray, IntArray, frozenset[ParameterName]], BoolArray
 ]
@@ -141,4 +141,4 @@ class MatrixChange(Change):
     def displaced(self, stable: Sequence[int]) -> Displaced:
         """See :class:`Change`."""
         d, Q, _ = self._in_datum(stable)
-        return lambda rows: (d[rows], Q[np.ix_(rows, rows)])
+        return lambda rows: (d[rows], Q[rows[:, :, None], rows[:, None]])

@@ -11,9 +11,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from gtsam import Pose3
 
-from adjust.epochs.change import Change, Displaced, MatrixChange
-from adjust.epochs.congruence_result import Congruence, CongruenceStep, CongruenceTest, Motion
+from adjust.epochs.change import Change, MatrixChange
+from adjust.epochs.congruence_result import Congruence, CongruenceStep, CongruenceTest
 from adjust.epochs.joined import JoinedChange
+from adjust.epochs.judging import Judging, Pooled, tests_of
 from adjust.epochs.states import (
     MOTIONS,
     Epoch,
@@ -26,12 +27,10 @@ from adjust.epochs.states import (
 )
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
-from adjust.model.survey import FloatArray, IntArray
-from adjust.statistics.relative_precision import ellipsoid
-from adjust.statistics.result import Ellipsoid
-from adjust.testing.criteria import LevelOptions, noncentrality, sidak
-from adjust.testing.distributions import chi2, fisher
-from adjust.testing.quadratic_forms import pseudo_square
+from adjust.model.survey import FloatArray
+from adjust.testing.criteria import LevelOptions, sidak
+from adjust.testing.distributions import fisher
+from adjust.testing.quadratic_forms import squares_in_sigmas
 
 MOST_IN_MATRIX = 600
 """Components up to which epochs are compared by one covariance matrix; more, by their normal equations."""
@@ -66,30 +65,33 @@ def congruence(
     """
     both = common(first, second, options)
     after = aligned(both.before, both.after, both.directions, _numbers(both.names, options.reference))
-    return compare(both.names, both.before, after, both.directions, both.pooled, options)
+    return compare(replace(both, after=after), options)
 
 
 @dataclass(frozen=True, eq=False)
 class Common:
-    """What two epochs have in common, not aligned; directions and pooled as :func:`compare` takes them."""
+    """What two epochs have in common; directions (7, k): motions that do not count."""
 
-    names: tuple[ParameterName, ...]
     before: Epoch
     after: Epoch
     directions: FloatArray
-    pooled: tuple[float, float, float]
+    pooled: Pooled
+
+    @property
+    def names(self) -> tuple[ParameterName, ...]:
+        """The points and stations."""
+        return self.before.names
 
 
 def common(first: Adjustment, second: Adjustment, options: CongruenceOptions = DEFAULT_CONGRUENCE) -> Common:
-    """The points and fixed stations that both epochs have; raises SurveyError where there are none."""
+    """The points and fixed stations that both epochs have, not aligned; raises SurveyError where there are none."""
     epoch = epoch_state if min(map(_size, (first, second))) <= MOST_IN_MATRIX else epoch_normals
     before, after = epoch(first), epoch(second)
     names = tuple(n for n in before.names if n in after.index)
     if not names:
         raise SurveyError("the epochs have no point and no fixed station in common; use the same ids in both")
     before, after = before.part(names), after.part(names)
-    directions = _open_motions(before, after)
-    return Common(names, before, after, directions, _pooled(first, second, options.scaled))
+    return Common(before, after, _open_motions(before, after), _pooled(first, second, options.scaled))
 
 
 def _size(adjustment: Adjustment) -> int:
@@ -97,27 +99,26 @@ def _size(adjustment: Adjustment) -> int:
     return sum(6 if isinstance(v, Pose3) else 3 for v in known(adjustment)[1])
 
 
-def compare(
-    names: tuple[ParameterName, ...], before: Epoch, after: Epoch, directions: FloatArray,
-    pooled: tuple[float, float, float], options: CongruenceOptions, cross: FloatArray | None = None,
-) -> Congruence:  # fmt: skip
-    """Of two states of the same names, aligned. directions (7, k): motions that do not count.
+def compare(both: Common, options: CongruenceOptions, cross: FloatArray | None = None) -> Congruence:
+    """Of two states of the same names, aligned.
 
-    pooled: sigma0, its redundancy, p of the test of equal variances. cross: covariance (n, n) of the first with the
-    second state where they are not independent.
+    cross: covariance (n, n) of the first with the second state where they are not independent.
     """
-    change = _change(before, after, directions, cross)
-    begin = _numbers(names, options.reference)
-    kept = [i for i in begin if (change.owner == i).any()]
-    if not kept:
+    names, pooled = both.names, both.pooled
+    change = _change(both.before, both.after, both.directions, cross)
+    tests = _Tests(change, pooled, options)
+    begin = [i for i in _numbers(names, options.reference) if (change.owner == i).any()]
+    if not begin:
         raise SurveyError("no point of the reference is free in either epoch; there is nothing to test")
-    first_test = _global(change, kept, pooled, options.alpha)
-    steps, stable, last = _search(change, kept, first_test, pooled, options)
-    motions = _motions(change, before, stable, pooled, options)
+    first_test = tests.of_all(begin)
+    steps, stable, last = tests.search(begin, first_test)
+    level = sidak(options.alpha, len(np.unique(change.owner)))
+    judging = Judging(change, both.before, frozenset(stable), pooled, level, options.alpha, options.levels.power)
+    motions = judging.of(change.displaced(stable))
     moved = tuple(m.name for m in motions if m.significant)
     return Congruence(
-        options.names, options.alpha, options.scaled, pooled[0], pooled[1], pooled[2], first_test, last, tuple(steps),
-        tuple(names[i] for i in stable), moved, _named(directions), motions, _warnings(pooled, last, options),
+        options.names, options.alpha, options.scaled, *pooled, first_test, last, tuple(steps),
+        tuple(names[i] for i in stable), moved, _named(both.directions), motions, _warnings(pooled, last, options),
     )  # fmt: skip
 
 
@@ -130,8 +131,7 @@ def _numbers(names: Sequence[ParameterName], reference: Sequence[ParameterName] 
     return [names.index(n) for n in reference]
 
 
-def _pooled(first: Adjustment, second: Adjustment, scaled: bool) -> tuple[float, float, float]:
-    """Sigma0, redundancy, and p of the two-sided F-test of equal variance factors."""
+def _pooled(first: Adjustment, second: Adjustment, scaled: bool) -> Pooled:
     f1, f2 = first.redundancy, second.redundancy
     p = float("nan")
     if f1 > 0 and f2 > 0:
@@ -139,8 +139,8 @@ def _pooled(first: Adjustment, second: Adjustment, scaled: bool) -> tuple[float,
         with np.errstate(divide="ignore", invalid="ignore"):
             p = float(2.0 * min(fisher.sf(b / a, f2, f1), fisher.sf(a / b, f1, f2)))
     if not scaled or f1 + f2 <= 0:
-        return 1.0, float("inf"), p
-    return float(np.sqrt((first.omega + second.omega) / (f1 + f2))), float(f1 + f2), p
+        return Pooled(1.0, float("inf"), p)
+    return Pooled(float(np.sqrt((first.omega + second.omega) / (f1 + f2))), float(f1 + f2), p)
 
 
 def _open_motions(before: Epoch, after: Epoch) -> FloatArray:
@@ -168,120 +168,60 @@ def _change(before: Epoch, after: Epoch, directions: FloatArray, cross: FloatArr
     raise TypeError("both epochs are known by their covariance matrices, or independent and by their normal equations")
 
 
-def _test(statistic: float, freedom: int, pooled: tuple[float, float, float], level: float) -> CongruenceTest:
-    sigma0, f, _ = pooled
-    if freedom == 0:
-        return CongruenceTest(float("nan"), 0, f, float("nan"), True)
-    F = statistic / freedom / sigma0**2
-    p = float(fisher.sf(F, freedom, f) if np.isfinite(f) else chi2.sf(F * freedom, freedom))
-    return CongruenceTest(F, freedom, f, p, p >= level)
+@dataclass(frozen=True, eq=False)
+class _Tests:
+    """Tests of what lies between two epochs."""
+
+    change: Change
+    pooled: Pooled
+    options: CongruenceOptions
+
+    def of_all(self, stable: Sequence[int]) -> CongruenceTest:
+        """The global test of these names."""
+        statistic, rank = self.change.square(stable)
+        # what the datum takes away is no information, whatever rounding leaves of it
+        rank = min(rank, max(0, len(self.change.rows(stable)) - self.change.G.shape[1]))
+        return tests_of(np.array([statistic]), np.array([rank]), self.pooled, self.options.alpha)[0]
+
+    def search(
+        self, begin: list[int], test: CongruenceTest
+    ) -> tuple[list[CongruenceStep], list[int], CongruenceTest]:
+        """Take out the worst until the rest is congruent, and back what then fits.
+
+        No search for gross errors: not single points are judged but what is left, as a whole and by F, and every step
+        is told with the test after it (Niemeier 2008, 13.3).
+        """
+        stable, steps = list(begin), list[CongruenceStep]()
+        while self.options.search and not test.passed:
+            shares = self.change.shares(stable)
+            worst = max(shares, key=lambda i: shares[i])
+            rest = [i for i in stable if i != worst]
+            try:
+                now = self.of_all(rest) if rest else None
+            except SurveyError:
+                now = None
+            if now is None or now.freedom == 0:
+                break
+            stable, test = rest, now
+            steps.append(CongruenceStep(self.change.names[worst], shares[worst], test))
+        level = sidak(self.options.alpha, len(begin))
+        for i in [i for i in begin if i not in stable] if test.passed else []:
+            more = sorted([*stable, i])
+            square = squares_in_sigmas(*self.change.displaced(stable)(self.change.rows([i])[None]))
+            alone = tests_of(*square, self.pooled, level)[0]
+            together = self.of_all(more)
+            if alone.passed and together.passed:
+                stable, test = more, together
+                steps = [s for s in steps if s.name != self.change.names[i]]
+        return steps, stable, test
 
 
-def _global(change: Change, stable: Sequence[int], pooled: tuple[float, float, float], alpha: float) -> CongruenceTest:
-    statistic, rank = change.square(stable)
-    # what the datum takes away is no information, whatever rounding leaves of it
-    rank = min(rank, max(0, len(change.rows(stable)) - change.G.shape[1]))
-    return _test(statistic, rank, pooled, alpha)
-
-
-def _search(
-    change: Change, begin: list[int], test: CongruenceTest, pooled: tuple[float, float, float],
-    options: CongruenceOptions,
-) -> tuple[list[CongruenceStep], list[int], CongruenceTest]:  # fmt: skip
-    """Take out the worst until the rest is congruent, and back what then fits.
-
-    No search for gross errors: not single points are judged but what is left, as a whole and by F, and every step is
-    told with the test after it (Niemeier 2008, 13.3).
-    """
-    stable, steps = list(begin), list[CongruenceStep]()
-    while options.search and not test.passed:
-        shares = change.shares(stable)
-        worst = max(shares, key=lambda i: shares[i])
-        rest = [i for i in stable if i != worst]
-        try:
-            now = _global(change, rest, pooled, options.alpha) if rest else None
-        except SurveyError:
-            now = None
-        if now is None or now.freedom == 0:
-            break
-        stable, test = rest, now
-        steps.append(CongruenceStep(change.names[worst], shares[worst], test))
-    return _readmitted(change, begin, stable, test, steps, pooled, options)
-
-
-def _readmitted(
-    change: Change, begin: list[int], stable: list[int], test: CongruenceTest, steps: list[CongruenceStep],
-    pooled: tuple[float, float, float], options: CongruenceOptions,
-) -> tuple[list[CongruenceStep], list[int], CongruenceTest]:  # fmt: skip
-    level = sidak(options.alpha, len(begin))
-    for i in [i for i in begin if i not in stable] if test.passed else []:
-        single = _single(change, change.displaced(stable), i, pooled, level)
-        more = sorted([*stable, i])
-        together = _global(change, more, pooled, options.alpha)
-        if single.passed and together.passed:
-            stable, test = more, together
-            steps = [s for s in steps if s.name != change.names[i]]
-    return steps, stable, test
-
-
-def _single(
-    change: Change, displaced: Displaced, i: int, pooled: tuple[float, float, float], level: float
-) -> CongruenceTest:
-    statistic, rank, _ = pseudo_square(*displaced(change.rows([i])))
-    return _test(statistic, rank, pooled, level)
-
-
-def _motions(
-    change: Change, before: Epoch, stable: list[int], pooled: tuple[float, float, float], options: CongruenceOptions
-) -> tuple[Motion, ...]:
-    displaced, inside = change.displaced(stable), set(stable)
-    present = np.unique(change.owner).tolist()
-    level = sidak(options.alpha, len(present))
-    rows = np.split(np.arange(len(change.owner)), np.flatnonzero(np.diff(change.owner)) + 1)
-    out = [_motion(change, displaced, mine, before, i in inside, pooled, level, options)
-           for i, mine in zip(present, rows, strict=True)]  # fmt: skip
-    return tuple(sorted(out, key=lambda m: (m.stable, m.test.p if np.isfinite(m.test.p) else 2.0)))
-
-
-def _motion(
-    change: Change, displaced: Displaced, rows: IntArray, before: Epoch, stable: bool,
-    pooled: tuple[float, float, float], level: float, options: CongruenceOptions,
-) -> Motion:  # fmt: skip
-    name = change.names[int(change.owner[rows[0]])]
-    d, Q = displaced(rows)
-    place, axes = change.component[rows], before.axes(name)
-    full, cov = np.zeros(6), np.zeros((6, 6))
-    full[place] = d
-    cov[np.ix_(place, place)] = Q
-    shift, cov_shift = axes @ full[3:], axes @ cov[3:, 3:] @ axes.T
-    statistic, rank, _ = pseudo_square(d, Q)
-    test = _test(statistic, rank, pooled, level)
-    turn, rotation_test = np.zeros(3), None
-    if isinstance(before.value(name), Pose3):
-        turning = np.flatnonzero(place < 3)
-        statistic, rank, _ = pseudo_square(d[turning], Q[np.ix_(turning, turning)])
-        turn, rotation_test = full[:3], _test(statistic, rank, pooled, level)
-    if name in change.nowhere:
-        nan = np.full((3, 3), np.nan)
-        region = Ellipsoid(np.zeros(0), np.zeros((3, 0)), 1.0 - options.alpha, np.isfinite(pooled[1]))
-        return Motion(name, nan[0], nan, region, test, turn, cov[:3, :3], rotation_test, stable, bool(test.p < level),
-                      float("nan"))  # fmt: skip
-    q = max(1, test.freedom)
-    size = noncentrality(level, options.levels.power, q) * float(np.linalg.eigvalsh(cov_shift)[-1])
-    scale = (pooled[0], int(pooled[1])) if np.isfinite(pooled[1]) else (None, 0)
-    return Motion(
-        name, shift, cov_shift, ellipsoid(cov_shift, 1.0 - options.alpha, *scale), test,
-        turn if rotation_test else None, cov[:3, :3] if rotation_test else None, rotation_test, stable,
-        bool(test.p < level), pooled[0] * float(np.sqrt(max(0.0, size))),
-    )  # fmt: skip
-
-
-def _warnings(pooled: tuple[float, float, float], last: CongruenceTest, options: CongruenceOptions) -> tuple[str, ...]:
+def _warnings(pooled: Pooled, last: CongruenceTest, options: CongruenceOptions) -> tuple[str, ...]:
     out = []
-    if pooled[2] < options.alpha:
+    if pooled.ratio_p < options.alpha:
         out.append(
-            f"the epochs have different variance factors (p {pooled[2]:.2g}); estimate variance components or look for "
-            "gross errors before believing the tests"
+            f"the epochs have different variance factors (p {pooled.ratio_p:.2g}); estimate variance components or "
+            "look for gross errors before believing the tests"
         )
     if not last.passed:
         out.append("no set of stable points was found; what is shown as motion depends on the datum")
@@ -297,8 +237,8 @@ def joint_congruence(
     """
     state = epoch_state(adjustment)
     ends = tuple(f"@{e}" for e in epochs)
-    both = [{n[1][: -len(end)] for n in state.names if n[0] == "point" and n[1].endswith(end)} for end in ends]
-    ids = sorted(both[0] & both[1])
+    there = [{n[1][: -len(end)] for n in state.names if n[0] == "point" and n[1].endswith(end)} for end in ends]
+    ids = sorted(there[0] & there[1])
     if not ids:
         raise SurveyError(f"no point was adjusted for both epochs {epochs[0]} and {epochs[1]}; see adjust.epochs.joint")
     named = [[("point", f"{i}{end}") for i in ids] for end in ends]
@@ -306,7 +246,8 @@ def joint_congruence(
     n = 3 * len(ids)
     names: tuple[ParameterName, ...] = tuple(("point", i) for i in ids)
     first, second = (replace(state.part(part), names=names, directions=np.zeros((7, 0))) for part in named)
-    sigma0 = adjustment.sigma0 if options.scaled and adjustment.redundancy > 0 else 1.0
-    freedom = float(adjustment.redundancy) if options.scaled and adjustment.redundancy > 0 else float("inf")
-    return compare(names, first, second, np.zeros((7, 0)), (sigma0, freedom, float("nan")),
-                   replace(options, names=epochs), joined.cov[:n, n:])  # fmt: skip
+    pooled = Pooled(1.0, float("inf"), float("nan"))
+    if options.scaled and adjustment.redundancy > 0:
+        pooled = pooled._replace(sigma0=adjustment.sigma0, redundancy=float(adjustment.redundancy))
+    both = Common(first, second, np.zeros((7, 0)), pooled)
+    return compare(both, replace(options, names=epochs), joined.cov[:n, n:])

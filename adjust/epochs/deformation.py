@@ -8,7 +8,7 @@ nothing moved.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -18,11 +18,12 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import FloatArray
 from adjust.precision.precision import rotations_only
-from adjust.spatial.rigid_motions import right_jacobian_inverse
+from adjust.spatial.rigid import rotation_log
+from adjust.spatial.rigid_motions import Motions, right_jacobian_inverse
 from adjust.spatial.rotation_forms import euler_cov_from_tangent, euler_from_matrix
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
-from adjust.testing.quadratic_forms import pseudo_square
+from adjust.testing.quadratic_forms import squares_in_sigmas
 
 
 @dataclass(frozen=True)
@@ -71,16 +72,24 @@ def relative_pose(adjustment: Adjustment, a: str, b: str) -> tuple[Pose3, FloatA
     Neither depends on the datum. Held stations have no error. In networks of rotations the translation and its rows of
     the covariance are nan. Raises SurveyError for stations that were not adjusted as fixed ones.
     """
-    if a == b:
-        raise SurveyError(f"a relative pose of station {a!r} to itself was asked for; name two stations")
-    of_a, of_b = _station(adjustment, a), _station(adjustment, b)
-    b_from_a = _pose(of_b).inverse() * _pose(of_a)
-    dim = 3 if rotations_only(adjustment) else 6
-    J = np.hstack([np.eye(6), -b_from_a.inverse().AdjointMap()])[:dim]
-    cov = np.full((6, 6), np.nan)
-    cov[:dim, :dim] = J @ adjustment.joint([of_a.name, of_b.name]) @ J.T
-    if dim == 3:
-        b_from_a = Pose3(b_from_a.rotation(), np.full(3, np.nan))
+    b_from_a, cov = _relative_poses(adjustment, [(a, b)])
+    return Pose3(Rot3(b_from_a.rotation[0]), b_from_a.shifts[0]), cov[0]
+
+
+def _relative_poses(adjustment: Adjustment, pairs: Sequence[tuple[str, str]]) -> tuple[Motions, FloatArray]:
+    """The same of many pairs, and their covariances (p, 6, 6)."""
+    same = next((a for a, b in pairs if a == b), None)
+    if same is not None:
+        raise SurveyError(f"a relative pose of station {same!r} to itself was asked for; name two stations")
+    ends = [(_station(adjustment, a), _station(adjustment, b)) for a, b in pairs]
+    of_a, of_b = (Motions.of(np.array([_pose(e[i]).matrix() for e in ends]).reshape(-1, 4, 4)) for i in (0, 1))
+    b_from_a = of_b.inverse() @ of_a
+    joint = adjustment.precision.whole_pairs([(a.name, b.name) for a, b in ends], 6)
+    J = np.concatenate([np.broadcast_to(np.eye(6), (len(pairs), 6, 6)), -b_from_a.inverse().adjoint()], axis=2)
+    cov = J @ joint @ np.swapaxes(J, 1, 2)
+    if rotations_only(adjustment):
+        cov[:, 3:], cov[:, :, 3:] = np.nan, np.nan
+        b_from_a = Motions(b_from_a.rotation, np.full((len(pairs), 3), np.nan))
     return b_from_a, cov
 
 
@@ -98,13 +107,7 @@ def station_deformations(
     """
     chosen = _consecutive(first, second) if pairs is None else tuple(pairs)
     factors = [_factor(x, s) for x, s in zip((first, second), scale, strict=True)]
-    for x in (first, second):
-        ends = [[_station(x, s) for s in pair] for pair in chosen]
-        x.precision.bring_together((a.name, b.name) for a, b in ends if all({*e.status} - {"held"} for e in (a, b)))
-    found = [_deformation(first, second, a, b, factors) for a, b in chosen]
-    tested = max(1, sum(d.test.freedom > 0 for d in found))
-    level = sidak(alpha, tested)
-    return tuple(replace(d, significant=bool(d.test.p < level)) for d in found)
+    return _deformations(chosen, _relative_poses(first, chosen), _relative_poses(second, chosen), factors, alpha)
 
 
 def _station(adjustment: Adjustment, station_id: str) -> Estimate:
@@ -144,36 +147,42 @@ def _factor(adjustment: Adjustment, scaled: bool) -> float:
     return float(adjustment.sigma0) ** 2 if scaled and known else 1.0
 
 
-def _deformation(first: Adjustment, second: Adjustment, a: str, b: str, factors: Sequence[float]) -> Deformation:
-    """One pair, not yet judged."""
-    (before, cov_before), (after, cov_after) = relative_pose(first, a, b), relative_pose(second, a, b)
-    undo = before.rotation().matrix().T
-    R, t = undo @ after.rotation().matrix(), undo @ (after.translation() - before.translation())
-    rotation = np.asarray(Rot3.Logmap(Rot3(R)))
-    tangent_cov = _tangent_cov(R, t, factors[0] * cov_before, factors[1] * cov_after)
-    dim = len(tangent_cov)
-    by_tangent = np.zeros((dim, dim))
-    by_tangent[:3, :3] = right_jacobian_inverse(rotation)
-    by_tangent[3:, 3:] = R[: dim - 3, : dim - 3]
-    cov = np.full((6, 6), np.nan)
-    cov[:dim, :dim] = by_tangent @ tangent_cov @ by_tangent.T
-    d, euler = np.concatenate([rotation, t]), euler_from_matrix(R)
-    turned, moved, both = (_test(d[k], cov[k, k]) for k in (slice(0, 3), slice(3, dim), slice(0, dim)))
-    euler_cov = euler_cov_from_tangent(euler, tangent_cov[:3, :3])
-    return Deformation(a, b, rotation, t, cov, euler, euler_cov, turned, moved, both, False)
+def _deformations(
+    pairs: Sequence[tuple[str, str]], first: tuple[Motions, FloatArray], second: tuple[Motions, FloatArray],
+    factors: Sequence[float], alpha: float,
+) -> tuple[Deformation, ...]:  # fmt: skip
+    """Of pairs with their relative poses and covariances (p, 6, 6) in two epochs."""
+    D = first[0].inverse() @ second[0]
+    R, t, rotation = D.rotation, D.shifts, rotation_log(D.rotation)
+    tangent_cov = _tangent_cov(D, factors[0] * first[1], factors[1] * second[1])
+    dim = tangent_cov.shape[1]
+    by_tangent = np.zeros((len(pairs), dim, dim))
+    by_tangent[:, :3, :3] = right_jacobian_inverse(rotation)
+    by_tangent[:, 3:, 3:] = R[:, : dim - 3, : dim - 3]
+    cov = np.full((len(pairs), 6, 6), np.nan)
+    cov[:, :dim, :dim] = by_tangent @ tangent_cov @ np.swapaxes(by_tangent, 1, 2)
+    d, euler = np.concatenate([rotation, t], axis=1), euler_from_matrix(R)
+    turned, moved, both = (_tests(d[:, k], cov[:, k, k]) for k in (slice(0, 3), slice(3, dim), slice(0, dim)))
+    euler_cov = euler_cov_from_tangent(euler, tangent_cov[:, :3, :3])
+    level = sidak(alpha, max(1, sum(test.freedom > 0 for test in both)))
+    real = [test.p < level for test in both]
+    ends = ([pair[i] for pair in pairs] for i in (0, 1))
+    return tuple(map(Deformation, *ends, rotation, t, cov, euler, euler_cov, turned, moved, both, real))
 
 
-def _tangent_cov(R: FloatArray, t: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of D in the tangent on the right, (3, 3) where either epoch measured rotations only."""
-    if not np.isfinite(t).all():
-        return np.asarray(R.T @ before[:3, :3] @ R + after[:3, :3])
-    back = Pose3(Rot3(R), t).inverse().AdjointMap()
-    return np.asarray(back @ before @ back.T + after)
+def _tangent_cov(D: Motions, before: FloatArray, after: FloatArray) -> FloatArray:
+    """Covariances (p, 6, 6) of D in the tangent on the right, (p, 3, 3) where either epoch measured rotations only."""
+    if not np.isfinite(D.shifts).all():
+        return np.asarray(np.swapaxes(D.rotation, 1, 2) @ before[:, :3, :3] @ D.rotation + after[:, :3, :3])
+    back = D.inverse().adjoint()
+    return np.asarray(back @ before @ np.swapaxes(back, 1, 2) + after)
 
 
-def _test(d: FloatArray, cov: FloatArray) -> DeformationTest:
-    """Of (k,) components with their covariance (k, k), in the directions that have any."""
-    statistic, freedom, _ = pseudo_square(d, cov) if np.isfinite(cov).all() else (np.nan, 0, cov)
-    if freedom == 0:
-        return DeformationTest(float("nan"), 0, float("nan"))
-    return DeformationTest(statistic, freedom, float(chi2.sf(statistic, freedom)))
+def _tests(d: FloatArray, cov: FloatArray) -> list[DeformationTest]:
+    """Of (p, k) components with their covariances (p, k, k), in the directions that have any."""
+    known = np.isfinite(cov).all(axis=(1, 2))
+    statistic, freedom = np.full(len(d), np.nan), np.zeros(len(d), dtype=np.int64)
+    statistic[known], freedom[known] = squares_in_sigmas(d[known], cov[known])
+    p = chi2.sf(statistic, np.maximum(freedom, 1))
+    rows = np.where(freedom > 0, [statistic, p], np.nan).T.tolist()
+    return [DeformationTest(x, n, of_x) for (x, of_x), n in zip(rows, freedom.tolist(), strict=True)]

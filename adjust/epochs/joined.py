@@ -235,9 +235,11 @@ class JoinedChange(Change):
             d = d - G @ (right[self.place].T @ d)
 
         def of(rows: IntArray) -> tuple[FloatArray, FloatArray]:
-            i = int(self.owner[rows[0]])
-            inside = self.place[rows] - first[i]
-            across = G[rows] @ W[rows].T
-            return d[rows], self._own[i][np.ix_(inside, inside)] - across - across.T + G[rows] @ C @ G[rows].T
+            names = self.owner[rows[:, 0]]
+            inside = self.place[rows] - first[names, None]
+            own = np.array([self._own[i] for i in names.tolist()])
+            own = own[np.arange(len(names))[:, None, None], inside[:, :, None], inside[:, None]]
+            across, back = G[rows] @ np.swapaxes(W[rows], 1, 2), np.swapaxes(G[rows], 1, 2)
+            return d[rows], own - across - np.swapaxes(across, 1, 2) + G[rows] @ C @ back
 
         return of

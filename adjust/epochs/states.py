@@ -12,10 +12,9 @@ from scipy import sparse
 
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
-from adjust.model.survey import FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.precision.precision import Precision, precision_of, rotations_only
-from adjust.spatial.motions import point_motions
-from adjust.spatial.rigid import skew
+from adjust.spatial.motions import point_motions, poses_motions
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.system import LinearSystem
 
@@ -264,12 +263,8 @@ def value_motions(value: Pose3 | FloatArray) -> FloatArray:
     """How the components (3 or 6, 7) of a point or pose move with the whole."""
     if not isinstance(value, Pose3):
         return point_motions(value)
-    R, t = value.rotation().matrix(), np.asarray(value.translation())
-    out = np.zeros((6, 7))
-    out[:3, 3:6] = R.T
-    if np.isfinite(t).all():
-        out[3:, :3], out[3:, 3:6], out[3:, 6] = R.T, -R.T @ skew(t), R.T @ t
-    return out
+    R, t = value.rotation().matrix(), np.nan_to_num(value.translation())
+    return np.asarray(poses_motions(R[None], t[None], np.ones(1, dtype=np.bool_))[0])
 
 
 def differences(before: Sequence[Pose3 | FloatArray], after: Sequence[Pose3 | FloatArray]) -> FloatArray:
@@ -305,10 +300,21 @@ def aligned(before: Epoch, after: SomeEpoch, directions: FloatArray, reference: 
     """The second epoch moved along ``directions`` (7, k) until the reference lies on the first as well as it can."""
     if not directions.shape[1]:
         return after
-    kept = np.isin(before.owner, list(reference))
-    along, L, scale, values = gauge_rows(before) @ directions, np.eye(3), 1.0, after.values
+    values, L, scale = laid_onto(before.values, after.values, directions, np.isin(before.owner, list(reference)))
+    return after.mapped(values, L, scale)
+
+
+Values = tuple[Pose3 | FloatArray, ...]
+
+
+def laid_onto(
+    target: Sequence[Pose3 | FloatArray], values: Values, directions: FloatArray, kept: BoolArray
+) -> tuple[Values, FloatArray, float]:
+    """Values moved as a whole until the kept components (n,) lie on the target; L and scale took them there."""
+    along = np.concatenate([value_motions(v) for v in target]) @ directions
+    L, scale = np.eye(3), 1.0
     for _ in range(20):
-        d = differences(before.values, values)
+        d = differences(target, values)
         rows = kept & np.isfinite(d)
         step = np.linalg.lstsq(along[rows], -d[rows], rcond=1e-10)[0]
         motion = directions @ step
@@ -316,4 +322,4 @@ def aligned(before: Epoch, after: SomeEpoch, directions: FloatArray, reference: 
         L = float(np.exp(motion[6])) * Rot3.Expmap(motion[3:6]).matrix() @ L
         if np.abs(along[rows] @ step).max(initial=0.0) < 1e-12:
             break
-    return after.mapped(values, L, scale)
+    return values, L, scale

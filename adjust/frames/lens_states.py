@@ -1,11 +1,12 @@
 """Which lens an image was taken with: that of its camera, as it had changed by then and as the image was cropped."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
-from adjust.frames.lens_times import block_starts, changed, crop_starts
+from adjust.frames.lens_times import LensTimes, block_starts, changed
 from adjust.frames.unknowns import Unknowns, VectorMap, vector_map
 from adjust.lenses.crops import UNITS, CroppedLens, cropped_lens
 from adjust.lenses.models import MODELS, LensModel, camera_constants
@@ -36,10 +37,10 @@ class CropState:
 
 @dataclass(frozen=True, eq=False)
 class LensState:
-    """The lens of a camera (its number), what is added to it (changes, each times a factor), and how it is cropped."""
+    """The lens of a camera (its number), what is added to it, times a factor, and how it is cropped."""
 
     camera: int
-    changes: tuple[tuple[VectorMap, float], ...] = ()
+    change: tuple[VectorMap, float] | None = None
     crop: CropState | None = None
 
 
@@ -97,9 +98,10 @@ class LensStates:
         self.priors: list[tuple[ParameterName, ParameterName | None, FloatArray]] = []
         """Steps of random walks: of the second change (of none) to the first, with their sigmas."""
         self._at: dict[tuple[str, str], int] = {}
+        times = LensTimes(survey)
         for i, camera in enumerate(survey.cameras):
             if camera.lens.drift is not None or camera.lens.crops:
-                self._add(survey, i, camera, unknowns)
+                self._add(times, i, camera, unknowns)
         self._cameras = {c.camera_id: i for i, c in enumerate(survey.cameras)}
 
     def of(self, camera_id: str, epoch_id: str) -> int:
@@ -119,10 +121,11 @@ class LensStates:
         """All parameters (n,) of state i, of the whole image."""
         state = self.states[i]
         out = self.maps[state.camera].full(values)
-        for change, factor in state.changes:
-            by = (factor * change.full(values)).tolist()
-            out = changed(self._lenses[state.camera], out, dict(zip(change.names, by, strict=True)))
-        return out
+        if state.change is None:
+            return out
+        change, factor = state.change
+        by = (factor * change.full(values)).tolist()
+        return changed(self._lenses[state.camera], out, dict(zip(change.names, by, strict=True)))
 
     def parts(self, i: int) -> list[LensPart]:
         """Where the free parameters of state i come from."""
@@ -130,9 +133,9 @@ class LensStates:
         out = [] if own.key is None else [LensPart(own.key, 0, 0, len(own.free), 1.0)]
         if own.borrowed:
             out = [LensPart(key, first, within, 1, 1.0) for first, (key, within) in enumerate(own.sources)]
-        for change, factor in state.changes:
-            if change.key is not None:
-                out += [LensPart(change.key, own.free.index(x), j, 1, factor) for j, x in enumerate(change.names)]
+        if state.change is not None and (key := state.change[0].key) is not None:
+            change, factor = state.change
+            out += [LensPart(key, own.free.index(x), j, 1, factor) for j, x in enumerate(change.names)]
         if state.crop is not None and state.crop.vector.key is not None:
             out.append(LensPart(state.crop.vector.key, len(own.free), 0, len(state.crop.vector.free), 1.0))
         return out
@@ -158,57 +161,55 @@ class LensStates:
             by_key[:, p.within : p.within + p.n] += p.factor * J[:, p.first : p.first + p.n]
         return out
 
-    def _add(self, survey: Survey, i: int, camera: Camera, unknowns: Unknowns) -> None:
-        changes, crops = self._changes(survey, camera, unknowns), self._crops(survey, camera, unknowns)
-        numbers: dict[tuple[int | str, ...], int] = {}
-        for epoch in block_starts(survey, camera):
-            named, change = changes.get(epoch, ("", ()))
-            start, crop = crops.get(epoch, ("", None))
-            if (named, start) not in numbers:
-                numbers[named, start] = len(self.states) if named or start else i
-                self.states += [LensState(i, change, crop)] if named or start else []
-            self._at[camera.camera_id, epoch] = numbers[named, start]
+    def _add(self, times: LensTimes, i: int, camera: Camera, unknowns: Unknowns) -> None:
+        """The states in which the images of a camera were taken; unknowns of changes first, then of crops."""
+        epochs, own, vectors = list(block_starts(times.survey, camera)), camera.camera_id, unknowns.vectors
+        changes, crops = [times.change(camera, e) for e in epochs], [times.crop(camera, e) for e in epochs]
+        if camera.lens.drift is not None:
+            _check_drift(times.survey, camera, camera.lens.drift, epochs)
+            self._register_changes(camera, camera.lens.drift, dict.fromkeys(c[0] for c in changes if c), unknowns)
+        for start in dict.fromkeys(c[0] for c in crops if c is not None):
+            given, name = camera.lens.crops[start].parameters, ("lens_crop", own, start)
+            if name not in vectors:
+                _check_crop(camera, given, len(vectors["lens", own].free))
+                vectors[name] = vector_map(given, UNITS, unknowns, name)
+        numbers: dict[tuple[tuple[ParameterName, float] | None, str | None], int] = {(None, None): i}
+        for epoch, by, crop in zip(epochs, changes, crops, strict=True):
+            place = by, None if crop is None else crop[0]
+            if place not in numbers:
+                numbers[place] = len(self.states)
+                change, cropped = None if by is None else (vectors[by[0]], by[1]), None
+                if crop is not None:
+                    vector = vectors["lens_crop", own, crop[0]]
+                    cropped = CropState(vector, MODELS[camera.lens.model], camera_constants(camera))
+                self.states.append(LensState(i, change, cropped))
+            self._at[own, epoch] = numbers[place]
 
-    def _changes(
-        self, survey: Survey, camera: Camera, unknowns: Unknowns
-    ) -> dict[str, tuple[str, tuple[tuple[VectorMap, float], ...]]]:
-        """By epoch what is added to the lens, and a name of it."""
-        drift, starts = camera.lens.drift, block_starts(survey, camera)
-        if drift is None:
-            return {}
-        if wrong := [x for x in drift.parameters if x not in camera.lens.free]:
-            raise SurveyError(f"camera {camera.camera_id!r}: {wrong[0]} is to change, but is not free; add it to free")
-        if drift.reference_temperature is not None:
-            rates = _registered(camera, drift, ("lens_drift", camera.camera_id), unknowns)
-            if cold := [e for e in starts if e not in survey.temperatures]:
-                raise SurveyError(f"camera {camera.camera_id!r} changes with temperature, but epoch {cold[0]!r} has "
-                                  "none; give it under temperatures_degC")  # fmt: skip
-            warming = {e: survey.temperatures[e] - drift.reference_temperature for e in starts}
-            return {e: (e, ((rates, by),)) for e, by in warming.items()}
-        out: dict[str, tuple[str, tuple[tuple[VectorMap, float], ...]]] = {}
-        before: ParameterName | None = None
-        for start in dict.fromkeys(s for s in starts.values() if s is not None):
-            name: ParameterName = ("lens_drift", camera.camera_id, start)
-            change = _registered(camera, drift, name, unknowns)
-            out |= {e: (start, ((change, 1.0),)) for e, s in starts.items() if s == start}
-            if drift.step_sigmas is not None:
+    def _register_changes(
+        self, camera: Camera, drift: LensDrift, names: Iterable[ParameterName], unknowns: Unknowns
+    ) -> None:
+        model, n, before = MODELS[camera.lens.model], len(drift.parameters), None
+        per = "" if drift.reference_temperature is None else "/K"
+        units = tuple(model.units[model.names.index(x)] + per for x in drift.parameters)
+        status = ("free" if drift.step_sigmas is None else "prior",) * n
+        for name in names:
+            if name not in unknowns.vectors:
+                key = unknowns.add(name, "vector", drift.parameters, units).key
+                unknowns.vectors[name] = VectorMap(
+                    drift.parameters, units, np.zeros(n), np.eye(n), key, drift.parameters, status
+                )
+            if drift.step_sigmas is not None and drift.reference_temperature is None:
                 self.priors.append((name, before, drift.step_sigmas))
             before = name
-        return out
 
-    @staticmethod
-    def _crops(survey: Survey, camera: Camera, unknowns: Unknowns) -> dict[str, tuple[str, CropState]]:
-        """By epoch how the image is cropped, and since when."""
-        out, model = dict[str, tuple[str, CropState]](), MODELS[camera.lens.model]
-        for epoch, start in crop_starts(survey, camera).items():
-            if start is None:
-                continue
-            given, name = camera.lens.crops[start].parameters, ("lens_crop", camera.camera_id, start)
-            if name not in unknowns.vectors:
-                _check_crop(camera, given, len(unknowns.vectors["lens", camera.camera_id].free))
-                unknowns.vectors[name] = vector_map(given, UNITS, unknowns, name)
-            out[epoch] = start, CropState(unknowns.vectors[name], model, camera_constants(camera))
-        return out
+
+def _check_drift(survey: Survey, camera: Camera, drift: LensDrift, epochs: Sequence[str]) -> None:
+    if wrong := [x for x in drift.parameters if x not in camera.lens.free]:
+        raise SurveyError(f"camera {camera.camera_id!r}: {wrong[0]} is to change, but is not free; add it to free")
+    cold = [e for e in epochs if e not in survey.temperatures] if drift.reference_temperature is not None else []
+    if cold:
+        raise SurveyError(f"camera {camera.camera_id!r} changes with temperature, but epoch {cold[0]!r} has none; give "
+                          "it under temperatures_degC")  # fmt: skip
 
 
 def _check_crop(camera: Camera, crop: VectorParameter, n_lens: int) -> None:
@@ -221,16 +222,3 @@ def _check_crop(camera: Camera, crop: VectorParameter, n_lens: int) -> None:
     if ("scale" in free or crop.values[0] != 1.0) and camera.lens.balance_radius_mm:
         raise SurveyError(f"{what}: a lens with a balance radius holds for one scale of images; set balance_radius_mm "
                           "= 0, or make another camera of those of another size")  # fmt: skip
-
-
-def _registered(camera: Camera, drift: LensDrift, name: ParameterName, unknowns: Unknowns) -> VectorMap:
-    if name not in unknowns.vectors:
-        model, n = MODELS[camera.lens.model], len(drift.parameters)
-        per = "" if drift.reference_temperature is None else "/K"
-        units = tuple(model.units[model.names.index(x)] + per for x in drift.parameters)
-        key = unknowns.add(name, "vector", drift.parameters, units).key
-        status = ("free" if drift.step_sigmas is None else "prior",) * n
-        unknowns.vectors[name] = VectorMap(
-            drift.parameters, units, np.zeros(n), np.eye(n), key, drift.parameters, status
-        )
-    return unknowns.vectors[name]

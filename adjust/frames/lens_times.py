@@ -10,7 +10,7 @@ from adjust.lenses.models import MODELS, camera_constants
 from adjust.model.errors import SurveyError
 from adjust.model.names import natural_key
 from adjust.model.result import ParameterName
-from adjust.model.survey import Camera, FloatArray, ImageCrop, LensDrift, Survey
+from adjust.model.survey import Camera, FloatArray, ImageCrop, Survey
 
 
 def block_starts(survey: Survey, camera: Camera) -> dict[str, str | None]:
@@ -78,27 +78,26 @@ class LensTimes:
         own, model = value(("lens", camera.camera_id)), MODELS[camera.lens.model]
         if own is None:
             raise SurveyError(f"camera {camera.camera_id!r}: its lens has no values yet; adjust the project first")
-        out, drift = own, camera.lens.drift
-        if drift is not None and (change := self._change(camera, drift, epoch_id, value)) is not None:
-            out = changed(camera, out, dict(zip(drift.parameters, change, strict=True)))
+        out, change = own, self.change(camera, epoch_id)
+        if camera.lens.drift is not None and change is not None and (found := value(change[0])) is not None:
+            by = (change[1] * found).tolist()
+            out = changed(camera, out, dict(zip(camera.lens.drift.parameters, by, strict=True)))
         if (crop := self.crop(camera, epoch_id)) is None:
             return out.copy()
-        found = value(("lens_crop", camera.camera_id, crop[0]))
+        cropped = value(("lens_crop", camera.camera_id, crop[0]))
         given = np.asarray(crop[1].parameters.values, dtype=float)
-        return cropped_lens(model, out, camera_constants(camera), given if found is None else found).values
+        return cropped_lens(model, out, camera_constants(camera), given if cropped is None else cropped).values
 
-    def _change(
-        self, camera: Camera, drift: LensDrift, epoch_id: str | None,
-        value: Callable[[ParameterName], FloatArray | None],
-    ) -> FloatArray | None:  # fmt: skip
-        reference = drift.reference_temperature
-        if reference is not None:
-            last = next(reversed(self._blocks[camera.camera_id]), "")
-            now = self.survey.temperatures.get(last if epoch_id is None else epoch_id, reference)
-            rates = value(("lens_drift", camera.camera_id))
-            return None if rates is None else (now - reference) * rates
-        start = _at(self._blocks[camera.camera_id], epoch_id)
-        return None if start is None else value(("lens_drift", camera.camera_id, start))
+    def change(self, camera: Camera, epoch_id: str | None) -> tuple[ParameterName, float] | None:
+        """The parameters that are added to a camera's lens, and what they are multiplied with."""
+        drift, starts = camera.lens.drift, self._blocks.get(camera.camera_id, {})
+        if drift is None:
+            return None
+        if (reference := drift.reference_temperature) is not None:
+            now = self.survey.temperatures.get(next(reversed(starts), "") if epoch_id is None else epoch_id, reference)
+            return ("lens_drift", camera.camera_id), now - reference
+        start = _at(starts, epoch_id)
+        return None if start is None else (("lens_drift", camera.camera_id, start), 1.0)
 
 
 def _at(starts: Mapping[str, str | None], epoch_id: str | None) -> str | None:

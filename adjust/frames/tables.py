@@ -40,7 +40,7 @@ def table_motions(
         for parameter, derivative in step.by:
             D[:, :, parameter] += derivative[:, None] * _moved(R, t, step)
         if step.turn:
-            turned = _turns(step.axis, step.q)
+            turned = turns(step.axis, step.q)
             R, t = turned @ R, (turned @ t[:, :, None])[:, :, 0]
         else:
             t = t + step.q[:, None] * np.eye(3)[step.axis]
@@ -109,13 +109,13 @@ def _waves(
             if by[kind]}  # fmt: skip
 
 
-def _turns(axis: int, angle: FloatArray) -> FloatArray:
-    """Rotations (n, 3, 3) about an axis by angles (n,) rad."""
-    out, i, j = np.zeros((len(angle), 3, 3)), (axis + 1) % 3, (axis + 2) % 3
-    out[:, axis, axis] = 1.0
-    out[:, i, i] = out[:, j, j] = np.cos(angle)
-    out[:, j, i] = np.sin(angle)
-    out[:, i, j] = -out[:, j, i]
+def turns(axis: int, angle: FloatArray) -> FloatArray:
+    """Right-handed rotations (..., 3, 3) about a coordinate axis by angles (...,) rad."""
+    out, i, j = np.zeros((*np.shape(angle), 3, 3)), (axis + 1) % 3, (axis + 2) % 3
+    out[..., axis, axis] = 1.0
+    out[..., i, i] = out[..., j, j] = np.cos(angle)
+    out[..., j, i] = np.sin(angle)
+    out[..., i, j] = -out[..., j, i]
     return out
 
 

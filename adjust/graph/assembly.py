@@ -13,7 +13,7 @@ from adjust.frames.state import State
 from adjust.frames.unknowns import Unknowns
 from adjust.model.clocks import CLOCKS
 from adjust.model.observations import ImageBlock, Pair
-from adjust.model.result import Adjustment, ParameterName
+from adjust.model.result import Estimated, ParameterName
 from adjust.model.rewriting import vector_parameters
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey, VectorParameter
 from adjust.observations.factors import ObservationFactor
@@ -40,7 +40,7 @@ class StartValues:
     vectors: Mapping[ParameterName, FloatArray] = field(default_factory=dict)
 
 
-def values_of(adjustment: Adjustment, survey: Survey | None = None) -> StartValues:
+def values_of(adjustment: Estimated, survey: Survey | None = None) -> StartValues:
     """Adjusted values as start values; for another survey, whose tables, boards, clocks may have other components."""
     estimates = adjustment.estimates
     poses = {n: e.value for n, e in estimates.items() if isinstance(e.value, Pose3)}
@@ -53,7 +53,7 @@ def values_of(adjustment: Adjustment, survey: Survey | None = None) -> StartValu
     )
 
 
-def _by_component(adjustment: Adjustment, survey: Survey | None) -> dict[ParameterName, FloatArray]:
+def _by_component(adjustment: Estimated, survey: Survey | None) -> dict[ParameterName, FloatArray]:
     """Of tables, boards, clocks, in the order of their components in the survey: adjusted, else as given."""
     if survey is None:
         return {}

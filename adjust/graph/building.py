@@ -35,7 +35,8 @@ from adjust.observations.terrestrial.building import build_batch, reading_refs
 from adjust.observations.terrestrial.parameters import collect_terrestrial
 
 if TYPE_CHECKING:
-    from adjust.observations.pairs import PairArrays, PairBatch
+    from adjust.observations.pair_arrays import PairArrays
+    from adjust.observations.pairs import PairBatch
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +218,8 @@ class GraphBuilder:
         """The pairs between fixed stations."""
         if not self.simple or not len(self.simple[0]):
             return None
-        from adjust.observations.pairs import PairBatch, pair_arrays  # here: as above
+        from adjust.observations.pair_arrays import pair_arrays  # here: as above
+        from adjust.observations.pairs import PairBatch
 
         rows, a_slot, b_slot = self.simple
         measured = self.measured or pair_arrays(tuple(self.survey.pairs[i] for i in rows.tolist()))

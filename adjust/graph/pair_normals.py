@@ -1,19 +1,30 @@
 """Normal equations of surveys of nothing but pairs and priors, in the compiled core.
 
 A view of the one graph: the same system as GTSAM's factors give, eliminated in the same order. What is analysed once
-serves every step, and near the solution one factor serves several of them.
+serves every step, and near the solution one factor serves several of them. Eigenvalues of a corridor's normal matrix
+differ by the fourth power of its length, as those of a clamped beam: long ones are eliminated by their rows.
 """
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
+from gtsam import Pose3
+from scipy import sparse
 
 from adjust.graph.assembly import AdjustmentGraph, Evaluation
 from adjust.graph.elimination import numbers, pose_cliques
-from adjust.model.survey import FloatArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.native.elimination import PoseFactor, PoseTree, pair_gradient
+from adjust.native.pairs import compose_poses
+from adjust.spatial.motions import poses_at
+from adjust.spatial.rigid import rigid
+from adjust.spatial.rigid_motions import Motions
+
+_EXACT = 1e-6
+"""Share of its variance that the weakest motion may lose before rows are eliminated instead of their squares."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +49,21 @@ class PairLinear:
 
     def damped(self, damping: float) -> "PairLinear":
         """With Marquardt's damping: every unknown held with ``damping`` times its own diagonal."""
+        return replace(self, own=self.own + damping * np.maximum(self.diagonal(), 1e-12)[:, :, None] * np.eye(6))
+
+    def diagonal(self) -> FloatArray:
+        """Of the normal matrix (N, 6)."""
         diagonal = np.einsum("nii->ni", self.own).copy()
         for nodes, J in ((self.normals.b, self.by_b), (self.normals.a, self.by_a)):
             np.add.at(diagonal, nodes[nodes >= 0], (J[nodes >= 0] ** 2).sum(axis=1))
-        return replace(self, own=self.own + damping * np.maximum(diagonal, 1e-12)[:, :, None] * np.eye(6))
+        return np.asarray(diagonal)
+
+    def square(self, x: FloatArray) -> float:
+        """``x' N x`` of the normal matrix N and x (N, 6), by the rows whose squares it is."""
+        white, last = np.zeros(self.white.shape), np.vstack([x, np.zeros(6)])  # of what is held
+        for nodes, J in ((self.normals.b, self.by_b), (self.normals.a, self.by_a)):
+            white += np.einsum("eij,ej->ei", J, last[nodes])
+        return float((white**2).sum() + np.einsum("ni,nij,nj->", x, self.own, x, optimize=True))
 
     def gradient(self) -> FloatArray:
         """Right hand side (N, 6) of the normal equations."""
@@ -73,6 +95,8 @@ class PairNormals:
         self.factor = PoseFactor(pattern)
         self.kept = False
         """Whether the factor of the step before serves the next one."""
+        self.by_rows: bool | None = None
+        """Whether the normal matrix has too few digits; not known before the first factor."""
 
     def linearized(self, at: Evaluation) -> PairLinear:
         """The system at what was evaluated, once more where something else was in between."""
@@ -84,6 +108,48 @@ class PairNormals:
             found = factor.linearize(at.values)
             linear.add(factor.keys()[0], *found.jacobian(), gtsam.noiseModel.Unit.Create(6))
         return linear
+
+    def bent(self, values: gtsam.Values, delta: gtsam.VectorValues) -> gtsam.Values:
+        """Where a step leads if every pair along a tree turns and shifts by its share: ends of long corridors swing.
+
+        Moved each for itself, neighbours end up apart by the product of what both move and what they move apart.
+        """
+        keys, (order, parent) = self.keys.tolist(), self._along_tree
+        at = Motions(*poses_at(values, keys))
+        x, below = np.array([delta.at(key) for key in keys]), np.flatnonzero(parent >= 0)
+        inside = at[parent[below]].inverse() @ at[below]
+        x[below] -= (inside.inverse().adjoint() @ x[parent[below], :, None])[..., 0]
+        R, t = at.rotation.copy(), at.shifts.copy()
+        R[below], t[below] = inside.rotation, inside.shifts
+        new = Motions(R, t).retract(x)
+        R, t = (np.ascontiguousarray(a) for a in (new.rotation, new.shifts))
+        compose_poses(order, parent, R, t)
+        out = gtsam.Values()
+        for key, pose in zip(keys, rigid(R, t), strict=True):
+            out.insert(key, Pose3(pose))
+        return out
+
+    @cached_property
+    def _along_tree(self) -> tuple[IntArray, IntArray]:
+        """Poses in the order, and (N,) from which each, that they are reached by few pairs from what is held.
+
+        Of those that would reach it alike the one that reaches most others: where the others hang on a spine, loops
+        close over few of its pairs.
+        """
+        from scipy.sparse.csgraph import dijkstra  # here: small surveys start without it
+
+        n, held = len(self.keys), (self.a < 0) | (self.b < 0)
+        near = np.append(np.maximum(self.a, self.b)[held], [self.number[f.keys()[0]] for f in self.priors])
+        near = np.unique(near.astype(np.int64)) if len(near) else np.zeros(1, dtype=np.int64)
+        a, b = np.append(self.a[~held], near), np.append(self.b[~held], np.full(len(near), n))
+        a, b = np.append(a, b), np.append(b, a)
+        away = dijkstra(sparse.csr_array((np.ones(len(a)), (a, b)), (n + 1, n + 1)), indices=n, unweighted=True)
+        on = away[b] == away[a] + 1.0
+        a, b = a[on], b[on]
+        last = np.lexsort((np.bincount(a, minlength=n + 1)[a], b))
+        parent = np.full(n, -1)
+        parent[b[last]] = a[last]  # of several the last one
+        return np.argsort(away[:n], kind="stable"), np.where(parent == n, -1, parent)
 
     def solution(self, linear: PairLinear) -> tuple[gtsam.VectorValues, float] | None:
         """The solution and by how much it lowers chi-square; None where there is a pose without a pivot."""
@@ -98,7 +164,19 @@ class PairNormals:
         return PoseTree(self.factor.pattern, self.keys, self.factor.data), self._solved(linear)[0]
 
     def _eliminated(self, linear: PairLinear) -> bool:
-        return self.factor.eliminate(self.b, self.a, linear.by_b, linear.by_a, linear.own) < 0
+        system = self.b, self.a, linear.by_b, linear.by_a, linear.own
+        if not self.by_rows and self.factor.eliminate(*system) >= 0:
+            return False
+        if self.by_rows is None:
+            self.by_rows = not self._exact(linear)
+        return not self.by_rows or self.factor.eliminate_rows(*system) < 0
+
+    def _exact(self, linear: PairLinear) -> bool:
+        """Whether the factor knows the weakest motions of all: by them a random force moves the poses."""
+        force = np.sqrt(linear.diagonal()) * np.random.default_rng(0).choice([-1.0, 1.0], linear.right.shape)
+        x = force.copy()
+        self.factor.solve(x)
+        return bool(abs(linear.square(x) - (work := float(np.sum(force * x)))) < _EXACT * work)
 
     def _solved(self, linear: PairLinear) -> tuple[gtsam.VectorValues, float]:
         g = linear.gradient()

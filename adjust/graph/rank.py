@@ -86,8 +86,7 @@ def describe_null_space(
     graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, values: gtsam.Values
 ) -> IndeterminateError | None:
     """The error that names what is undetermined, or None where everything is determined (though perhaps weakly)."""
-    keys = visible_keys(graph, linear)
-    stack = stacking(graph, keys)
+    stack = stacking(graph, visible_keys(graph, linear))
     if stack.n > _MOST_DIMS:
         return IndeterminateError(
             "the observations and the datum leave unknowns undetermined; the survey is too large "
@@ -96,16 +95,16 @@ def describe_null_space(
     null, scale = null_space(linear, stack, graph)
     if null.shape[1] == 0:
         return None
-    scaled = _without_weak_motions(graph, linear, stack, np.linalg.qr(null * scale[:, None])[0], scale, values)
+    motions = np.concatenate([gauge(graph, graph.unknowns.by_key[k], values) for k in stack.at]) * scale[:, None]
+    scaled = _without_weak_motions(linear, stack, np.linalg.qr(null * scale[:, None])[0], motions, scale)
     if scaled.shape[1] == 0:
         return None
-    lines: list[str] = []
-    found = [_gauges(graph, keys, scaled, scale, values, lines)]
-    _station_frames(graph, keys, scaled, scale, values, lines, found)
-    rest = _complement(scaled, np.hstack(found))
-    names = _rest(graph, stack, rest / scale[:, None], lines)
+    naming = _Naming(graph, stack, scale, scaled)
+    naming.whole_survey(motions)
+    naming.station_frames(values)
+    names = naming.rest()
     head = f"the observations and the datum leave {scaled.shape[1]} directions undetermined:"
-    return IndeterminateError("\n  - ".join([head, *lines]), tuple(names) or tuple(lines))
+    return IndeterminateError("\n  - ".join([head, *naming.lines]), tuple(names) or tuple(naming.lines))
 
 
 def _rows_along(
@@ -125,12 +124,10 @@ def _rows_along(
 
 
 def _without_weak_motions(
-    graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, stack: Stacking, null: FloatArray, scale: FloatArray,
-    values: gtsam.Values,
-) -> FloatArray:  # fmt: skip
+    linear: gtsam.GaussianFactorGraph, stack: Stacking, null: FloatArray, motions: FloatArray, scale: FloatArray
+) -> FloatArray:
     """The null space (n, k) less motions of the whole survey that a weak datum does see: a bundle is blind to them."""
-    B = np.concatenate([gauge(graph, graph.unknowns.by_key[k], values) for k in stack.at]) * scale[:, None]
-    _, common = _intersection(null, B)
+    _, common = _intersection(null, motions)
     if common.shape[1] == 0:
         return null
     _, s, Vt = np.linalg.svd(times(linear, stack, common / scale[:, None]), full_matrices=False)
@@ -158,22 +155,6 @@ def _intersection(null: FloatArray, B: FloatArray) -> tuple[FloatArray, FloatArr
     coefficients = np.zeros((B.shape[1], len(inside)))
     coefficients[usable] = (back @ L[:, inside]) / lengths[usable, None]
     return coefficients, basis @ L[:, inside]
-
-
-def _gauges(
-    graph: AdjustmentGraph, keys: list[int], null: FloatArray, scale: FloatArray, values: gtsam.Values, lines: list[str]
-) -> FloatArray:
-    B = np.concatenate([gauge(graph, graph.unknowns.by_key[k], values) for k in keys]) * scale[:, None]
-    coefficients, common = _intersection(null, B)
-    if coefficients.shape[1]:
-        share = np.abs(coefficients) * np.linalg.norm(B, axis=0)[:, None]
-        involved = [i for i in range(7) if share[i].max() > 1e-3 * share.max()]
-        count = "" if len(involved) == coefficients.shape[1] else f"{coefficients.shape[1]} directions of "
-        lines.append(
-            f"the datum: {count}the {_gauge_text(involved)} of the whole survey: hold a target, a station or "
-            "coordinates, observe coordinates or a distance, or set the datum to inner constraints"
-        )
-    return common
 
 
 def _gauge_text(involved: list[int]) -> str:
@@ -205,20 +186,56 @@ def _frame_motion(graph: AdjustmentGraph, keys: list[int], station_id: str, valu
     return np.concatenate([motion.get(k, np.zeros((u.by_key[k].dim, 6))) for k in keys])
 
 
-def _station_frames(
-    graph: AdjustmentGraph, keys: list[int], null: FloatArray, scale: FloatArray, values: gtsam.Values,
-    lines: list[str], found: list[FloatArray],
-) -> None:  # fmt: skip
-    """Name the stations whose own frame is free, and add their directions to ``found`` where they are new."""
-    for station in graph.survey.stations:
-        motion = _frame_motion(graph, keys, station.station_id, values)
-        if motion is None:
-            continue
-        coefficients, common = _intersection(null, motion * scale[:, None])
-        if coefficients.shape[1] and _rank(np.hstack([*found, common])) > _rank(np.hstack(found)):
-            found.append(common)
-            length = np.linalg.norm(motion * scale[:, None], axis=0)
-            lines.append(_frame_text(station, coefficients * length[:, None]))
+class _Naming:
+    """Lines on what moves in a null space (n, k), scaled and orthonormal; found: bases of what has been named."""
+
+    def __init__(self, graph: AdjustmentGraph, stack: Stacking, scale: FloatArray, null: FloatArray) -> None:
+        self.graph, self.stack, self.scale, self.null = graph, stack, scale, null
+        self.lines: list[str] = []
+        self.found = [np.zeros((len(null), 0))]
+
+    def whole_survey(self, motions: FloatArray) -> None:
+        """Of its motions (n, 7), scaled."""
+        coefficients, common = _intersection(self.null, motions)
+        if coefficients.shape[1]:
+            share = np.abs(coefficients) * np.linalg.norm(motions, axis=0)[:, None]
+            involved = [i for i in range(7) if share[i].max() > 1e-3 * share.max()]
+            count = "" if len(involved) == coefficients.shape[1] else f"{coefficients.shape[1]} directions of "
+            self.lines.append(
+                f"the datum: {count}the {_gauge_text(involved)} of the whole survey: hold a target, a station or "
+                "coordinates, observe coordinates or a distance, or set the datum to inner constraints"
+            )
+        self.found.append(common)
+
+    def station_frames(self, values: gtsam.Values) -> None:
+        """Of stations whose own frame is free, where that is new."""
+        for station in self.graph.survey.stations:
+            motion = _frame_motion(self.graph, list(self.stack.at), station.station_id, values)
+            if motion is None:
+                continue
+            coefficients, common = _intersection(self.null, motion * self.scale[:, None])
+            if coefficients.shape[1] and _rank(np.hstack([*self.found, common])) > _rank(np.hstack(self.found)):
+                self.found.append(common)
+                length = np.linalg.norm(motion * self.scale[:, None], axis=0)
+                self.lines.append(_frame_text(station, coefficients * length[:, None]))
+
+    def rest(self) -> list[str]:
+        """Of what moves together in what is left, each direction by one component that no other one moves."""
+        null = _complement(self.null, np.hstack(self.found)) / self.scale[:, None]
+        if null.shape[1] == 0:
+            return []
+        size = np.abs(null).max(axis=1)
+        pivots = independent_rows(null / np.where(size > 0, size, 1.0)[:, None] ** 0.5)
+        names: list[str] = []
+        for vector in (null @ np.linalg.inv(null[pivots])).T:
+            texts = _moving(self.graph, self.stack, vector)
+            names += texts
+            self.lines.append(
+                f"{listed(texts, 6, '; ')}: they move together without changing any observation; measure or hold one"
+                if len(texts) > 1
+                else f"{texts[0]}: the observations do not determine it; measure or hold it"
+            )
+        return list(dict.fromkeys(names))
 
 
 def _frame_text(station: Station, coefficients: FloatArray) -> str:
@@ -245,24 +262,6 @@ def _frame_text(station: Station, coefficients: FloatArray) -> str:
 
 def _rank(basis: FloatArray) -> int:
     return int(np.linalg.matrix_rank(basis, tol=1e-6)) if basis.shape[1] else 0
-
-
-def _rest(graph: AdjustmentGraph, stack: Stacking, null: FloatArray, lines: list[str]) -> list[str]:
-    """Name what moves together in what is left, each direction by one component that no other one moves."""
-    if null.shape[1] == 0:
-        return []
-    size = np.abs(null).max(axis=1)
-    pivots = independent_rows(null / np.where(size > 0, size, 1.0)[:, None] ** 0.5)
-    names: list[str] = []
-    for vector in (null @ np.linalg.inv(null[pivots])).T:
-        texts = _moving(graph, stack, vector)
-        names += texts
-        lines.append(
-            f"{listed(texts, 6, '; ')}: they move together without changing any observation; measure or hold one"
-            if len(texts) > 1
-            else f"{texts[0]}: the observations do not determine it; measure or hold it"
-        )
-    return list(dict.fromkeys(names))
 
 
 def _moving(graph: AdjustmentGraph, stack: Stacking, vector: FloatArray) -> list[str]:

@@ -4,12 +4,11 @@ from collections.abc import Mapping
 
 import gtsam
 import numpy as np
-from gtsam import Pose3, Rot3
 
 from adjust.frames.state import State
-from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Chain, Unknowns
+from adjust.frames.unknowns import Chain, Unknowns
 from adjust.model.errors import SurveyError
-from adjust.model.observations import Coordinates, PositionRef, frame_text, position_text
+from adjust.model.observations import Coordinates, PositionRef, position_text
 from adjust.model.result import ParameterName
 from adjust.model.rewriting import vector_parameters
 from adjust.model.survey import FloatArray, PointParameter, PoseParameter, Survey, VectorPrior
@@ -22,7 +21,8 @@ from adjust.observations.factors import (
     distance_factor,
     gaussian,
     hold_factor,
-    pair_factor,
+    known_components,
+    pair_item,
     pose_prior_factor,
     step_factor,
     vector_prior_factor,
@@ -55,14 +55,8 @@ class Singles:
 
     def add_pairs(self, chains: Mapping[int, Chain]) -> None:
         """Those of these numbers, with their chains."""
-        for i, chain in chains.items():
-            pair = self.survey.pairs[i]
-            factor = pair_factor(pair, self.unknowns, self.state, chain)
-            measured = pair.b_from_a
-            observed = Pose3.Logmap(measured) if isinstance(measured, Pose3) else Rot3.Logmap(measured)
-            n = len(observed)
-            self._add(factor, "pair", pair.group, (pair.pair_id, frame_text(pair.a), frame_text(pair.b)),
-                      POSE_COMPONENTS[:n], POSE_UNITS[:n], observed, pair.used)  # fmt: skip
+        pairs = self.survey.pairs
+        self.items += [pair_item(pairs[i], self.unknowns, self.state, chain) for i, chain in chains.items()]
 
     def add_distances(self, at: Mapping[PositionRef, Position]) -> None:
         """Raises SurveyError for one between held positions."""
@@ -76,10 +70,8 @@ class Singles:
     def add_coordinates(self, at: Mapping[PositionRef, Position]) -> None:
         """Each set is one factor."""
         for c in self.survey.coordinates:
-            known = np.isfinite(np.diag(c.cov))
-            names = tuple(f"{position_text(p)} {axis}" for p in c.positions for axis in "xyz")
-            names = tuple(np.array(names)[known].tolist())
-            owners = tuple(position_text(p) for p in c.positions)
+            known, owners = known_components(c.cov), tuple(position_text(p) for p in c.positions)
+            names = tuple(np.array([f"{owner} {axis}" for owner in owners for axis in "xyz"])[known].tolist())
             self._add(coordinates_factor(c, [at[p] for p in c.positions]), "coordinates", c.group, owners, names,
                         ("m",) * len(names), c.values.ravel()[known], c.used)  # fmt: skip
 
@@ -96,7 +88,7 @@ class Singles:
     def _add_prior(self, name: ParameterName, parameter: PoseParameter | PointParameter) -> None:
         if parameter.value is None or parameter.prior_cov is None:
             raise SurveyError(f"{' '.join(name)} has a prior without value or covariance; give both")
-        unknown, known = self.unknowns.by_name[name], np.isfinite(np.diag(parameter.prior_cov))
+        unknown, known = self.unknowns.by_name[name], known_components(parameter.prior_cov)
         if isinstance(parameter, PoseParameter):
             factor, observed = pose_prior_factor(parameter, unknown.key), np.zeros(6)
         else:

@@ -33,6 +33,8 @@ _SHORTEST = 0.125
 """Share of an undamped step below which damping leads on better: the whole system bends."""
 _LEAST_GAIN = 0.1
 """Share of the promised decrease of chi-square that a step must bring."""
+_PROMISED = 0.9
+"""Share of the promised decrease from which a long corridor need not be bent instead."""
 _STATIONARY = 1e-2
 """Sigmas that a step moves at most where the rank of the system is judged."""
 _CLOSE = (1.0, 0.25), (10.0, 0.1)
@@ -269,6 +271,9 @@ class _Loop:
         except IndeterminateError:
             return None
         new = self.graph.objective(at)
+        if self.pairs is not None and self.pairs.by_rows and not new < self.omega - _PROMISED * promised:
+            bent = self._evaluated(self.pairs.bent(self.at.values, delta))
+            at, new = min((bent, self.graph.objective(bent)), (at, new), key=lambda x: x[1])
         self.waited += 1
         if not np.isfinite(new) or (self.waited >= self.options.patience and self.moved > 1e-3):
             return None
@@ -299,7 +304,8 @@ class _Loop:
         used = self.damping
         if self.pairs is not None:
             close = _CLOSE[: 1 + bool(np.isfinite(self.before))]
-            self.pairs.kept = used == 0.0 and any(self.moved < min(s, share * self.before) for s, share in close)
+            near = any(self.moved < min(s, share * self.before) for s, share in close)
+            self.pairs.kept = used == 0.0 and near and not self.pairs.by_rows
         if used == 0.0:
             self.length = min(1.0, 2.0 * self.length) if gain > 0.75 else self.length
         elif gain > 0.5:

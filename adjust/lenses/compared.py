@@ -136,11 +136,11 @@ def _shift(
     """Shifts (n, 2) px and their derivatives (n, 2, dim) by a tangent on the right of ``motion``."""
     moved = np.asarray(motion.transformFrom(np.ascontiguousarray(points.T))).T
     here = project(optics.model, optics.values, optics.constants, moved)
-    _, by_point = _derivatives(optics, moved, here)
+    _, by_point = image_derivatives(optics, moved, here)
     return here - uv, motion_derivatives(by_point @ motion.rotation().matrix(), points)[:, :, :dim]
 
 
-def _derivatives(optics: Optics, points: FloatArray, uv: FloatArray) -> tuple[FloatArray, FloatArray]:
+def image_derivatives(optics: Optics, points: FloatArray, uv: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Of image points by the lens (n, 2, n_lens) and by the point (n, 2, 3).
 
     The residual of a backward model is zero at the image point; its derivative by that point is solved for.
@@ -177,7 +177,7 @@ def projection_covariance(
     :func:`lens_difference`.
     """
     points, n = optics.points(uv, distance), len(optics.values)
-    by_lens, by_point = _derivatives(optics, points, uv)
+    by_lens, by_point = image_derivatives(optics, points, uv)
     dim = 3 if np.isinf(distance) else 6
     if len(cov) == n + 6:
         # station_from_camera * Exp(t): a point of the station moves by Exp(-t) in the camera

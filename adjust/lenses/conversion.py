@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.lenses.models import LensModel, lens_derivatives, project, unit_rays
+from adjust.lenses.compared import Optics, image_derivatives
+from adjust.lenses.models import LensModel, lens_derivatives, principal_components, project
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
 from adjust.native import lenses as kernels
@@ -68,17 +69,16 @@ def convert(
     """
     values = np.asarray(values, dtype=np.float64)
     columns = _free_columns(model_to, free)
-    uv = _grid(image_size, FIT_STEPS, radius_px)
-    rays = _rays(model_from, values, constants_from, model_to, uv)
-    if model_from.kind == model_to.kind == kernels.AICON and free is None and _same_image(constants_from, constants_to):
+    old, uv = Optics(model_from, values, constants_from), _grid(image_size, FIT_STEPS, radius_px)
+    rays, same_image = _rays(old, model_to, uv), np.array_equal(constants_from[:3], constants_to[:3])
+    if model_from.kind == model_to.kind == kernels.AICON and free is None and same_image:
         fitted = rebalance_aicon(values, constants_from[3], constants_to[3])
     else:
-        start = _start(model_from, values, constants_from, model_to, constants_to, columns)
-        fitted = _fit(model_to, start, constants_to, columns, rays, uv)
-    jacobian = _jacobian((model_from, values, constants_from), (model_to, fitted, constants_to), columns, rays, uv)
+        fitted = _fit(model_to, _start(old, model_to, constants_to, columns), constants_to, columns, rays, uv)
+    jacobian = _jacobian(old, Optics(model_to, fitted, constants_to), columns, rays, uv)
 
     check = _grid(image_size, CHECK_STEPS, radius_px)
-    seen = project(model_to, fitted, constants_to, _rays(model_from, values, constants_from, model_to, check))
+    seen = project(model_to, fitted, constants_to, _rays(old, model_to, check))
     differences = np.linalg.norm(seen - check, axis=1)
     worst = int(np.argmax(differences))
     return Conversion(
@@ -122,10 +122,6 @@ def rebalance_aicon(values: FloatArray, r0_from_mm: float, r0_to_mm: float) -> F
     raise SurveyError(f"this lens cannot be balanced at r0 = {r0_to_mm} mm: its distortion there is too large")
 
 
-def _same_image(constants_from: FloatArray, constants_to: FloatArray) -> bool:
-    return bool(np.array_equal(constants_from[:3], constants_to[:3]))
-
-
 def _free_columns(model: LensModel, free: Sequence[str] | None) -> list[int]:
     """Positions of the fitted parameters."""
     if free is None:
@@ -146,11 +142,9 @@ def _grid(image_size: tuple[int, int], steps: tuple[int, int], radius_px: float 
     return uv[np.hypot(uv[:, 0] - (width - 1) / 2, uv[:, 1] - (height - 1) / 2) <= radius_px]
 
 
-def _rays(
-    model_from: LensModel, values: FloatArray, constants: FloatArray, model_to: LensModel, uv: FloatArray
-) -> FloatArray:
+def _rays(old: Optics, model_to: LensModel, uv: FloatArray) -> FloatArray:
     """Unit rays (n, 3), all of them in front of the camera unless the new model sees behind it."""
-    directions = unit_rays(model_from, values, constants, uv)
+    directions = old.points(uv, np.inf)
     behind = directions[:, 2] <= 0
     if model_to.kind != kernels.FISHEYE and behind.any():
         u, v = uv[behind][0]
@@ -161,47 +155,28 @@ def _rays(
     return directions
 
 
-def _start(
-    model_from: LensModel,
-    values: FloatArray,
-    constants_from: FloatArray,
-    model_to: LensModel,
-    constants_to: FloatArray,
-    columns: list[int],
-) -> FloatArray:
+def _start(old: Optics, model_to: LensModel, constants_to: FloatArray, columns: list[int]) -> FloatArray:
     """Principal point, focal lengths and skew of the old lens on its axis, in the new parameters; no distortion."""
     axis = np.array([[0.0, 0.0, 1.0]])
-    centre = project(model_from, values, constants_from, axis)
-    step = 1e-6
-    around = np.array([[step, 0.0, 1.0], [-step, 0.0, 1.0], [0.0, step, 1.0], [0.0, -step, 1.0]])
-    seen = project(model_from, values, constants_from, around)
-    fx = (seen[0, 0] - seen[1, 0]) / (2 * step)
-    skew, fy = (seen[2] - seen[3]) / (2 * step)
+    centre = project(old.model, old.values, old.constants, axis)
+    (fx, skew, _), (_, fy, _) = image_derivatives(old, axis, centre)[1][0]
     if not (fx > 0 and fy > 0):
-        raise SurveyError(f"the {model_from.name} lens turns its image over (fx {fx:.3g}, fy {fy:.3g} px)")
-    s, centre_u, centre_v, _ = constants_to
-    u0, v0 = centre[0]
-    start = np.zeros(model_to.n)
+        raise SurveyError(f"the {old.model.name} lens turns its image over (fx {fx:.3g}, fy {fy:.3g} px)")
+    start, (at, per_px, origin) = np.zeros(model_to.n), principal_components(model_to, constants_to)
+    start[at] = per_px * (centre[0] - origin)
     if not model_to.in_mm:
-        start[:5] = fx, fy, skew, u0, v0
-    elif model_to.kind == kernels.BROWN_BACKWARD_DBAT:
-        start[:4] = fy * s, u0 * s, v0 * s, fy / fx - 1.0
+        start[:3] = fx, fy, skew
     else:
-        start[:3] = fy * s, (u0 - centre_u) * s, (centre_v - v0) * s
-        affinity = (fy / fx - 1.0, skew / fx) if model_to.backward else (fx / fy - 1.0, -skew / fy)
-        start[8:10] = affinity
-    held = np.setdiff1d(np.arange(model_to.n), columns)
-    start[held] = 0.0
-    _require_images(model_to, start)
+        start[0] = fy * constants_to[0]
+        if model_to.kind == kernels.BROWN_BACKWARD_DBAT:
+            start[3] = fy / fx - 1.0
+        else:
+            start[8:10] = (fy / fx - 1.0, skew / fx) if model_to.backward else (fx / fy - 1.0, -skew / fy)
+    start[np.setdiff1d(np.arange(model_to.n), columns)] = 0.0
+    for name, value in zip(model_to.names[: 1 if model_to.in_mm else 2], start.tolist(), strict=False):
+        if value == 0.0:  # there is no image without it
+            raise SurveyError(f"{name} of the {model_to.name} lens must be among the fitted parameters")
     return start
-
-
-def _require_images(model: LensModel, start: FloatArray) -> None:
-    """Raise SurveyError where what a lens cannot do without is not fitted."""
-    essential = [0] if model.in_mm else [0, 1]
-    for i in essential:
-        if start[i] == 0.0:
-            raise SurveyError(f"{model.names[i]} of the {model.name} lens must be among the fitted parameters")
 
 
 def _fit(
@@ -255,44 +230,41 @@ def _factorised(matrix: FloatArray, names: list[str]) -> _Factorised:
     return _Factorised(Q, R, scale)
 
 
-def _jacobian(
-    old: tuple[LensModel, FloatArray, FloatArray], new: tuple[LensModel, FloatArray, FloatArray], columns: list[int],
-    rays: FloatArray, uv: FloatArray,
-) -> FloatArray:  # fmt: skip
+def _jacobian(old: Optics, new: Optics, columns: list[int], rays: FloatArray, uv: FloatArray) -> FloatArray:
     """Derivative (m, n) of the fitted parameters x by the old ones.
 
     A pixel keeps its place while its ray q follows the old lens: dq = -(dr/dq)^+ (dr/dlens) dlens, across the ray. The
     fit keeps J'r = 0, so (J'J + S) dx = -(J'A + T) dlens with J = dr/dx, A = dr/dlens and, since the models differ,
     the second-order parts S = (dJ/dx)' r and T = (dJ/dlens)' r (by central differences; they vanish with the misfit).
     """
-    _, by_old, by_q_old = lens_derivatives(*old, rays, uv)
-    (model_from, *_), (model_to, values_to, constants_to) = old, new
+    _, by_old, by_q_old = lens_derivatives(old.model, old.values, old.constants, rays, uv)
+    model_to, n_old = new.model, old.model.n
     ray_by_old = -np.linalg.pinv(by_q_old) @ by_old
 
     def new_lens(values: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        residuals, by_new, by_q = lens_derivatives(model_to, values, constants_to, q, uv)
+        residuals, by_new, by_q = lens_derivatives(model_to, values, new.constants, q, uv)
         return residuals.ravel(), by_new[:, :, columns].reshape(-1, len(columns)), by_q
 
-    residuals, J, by_q = new_lens(values_to, rays)
-    A = (by_q @ ray_by_old).reshape(-1, model_from.n)
+    residuals, J, by_q = new_lens(new.values, rays)
+    A = (by_q @ ray_by_old).reshape(-1, n_old)
     fit = _factorised(J, [model_to.names[i] for i in columns])
     S = np.zeros((len(columns), len(columns)))
     for k, i in enumerate(columns):
         step = np.zeros(model_to.n)
         step[i] = _DIFFERENCE_PX / fit.scale[k] * np.sqrt(len(J))
-        change = new_lens(values_to + step, rays)[1] - new_lens(values_to - step, rays)[1]
+        change = new_lens(new.values + step, rays)[1] - new_lens(new.values - step, rays)[1]
         S[:, k] = change.T @ residuals / (2 * step[i])
-    T = np.zeros((len(columns), model_from.n))
+    T = np.zeros((len(columns), n_old))
     for i in np.flatnonzero(np.any(A != 0, axis=0)).tolist():
         size = _DIFFERENCE_PX / np.linalg.norm(A[:, i]) * np.sqrt(len(J))
         moved = size * ray_by_old[:, :, i]
-        change = new_lens(values_to, rays + moved)[1] - new_lens(values_to, rays - moved)[1]
+        change = new_lens(new.values, rays + moved)[1] - new_lens(new.values, rays - moved)[1]
         T[:, i] = change.T @ residuals / (2 * size)
 
     # multiplied by inv(R') on the left, so that the condition number is not squared
     left = np.linalg.solve(fit.R.T, S / fit.scale / fit.scale[:, None])
     normal = np.eye(len(columns)) + np.linalg.solve(fit.R.T, left.T).T
     right = fit.Q.T @ A + np.linalg.solve(fit.R.T, T / fit.scale[:, None])
-    jacobian = np.zeros((model_to.n, model_from.n))
+    jacobian = np.zeros((model_to.n, n_old))
     jacobian[columns] = -np.linalg.solve(fit.R, np.linalg.solve(normal, right)) / fit.scale[:, None]
     return jacobian

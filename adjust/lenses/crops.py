@@ -9,9 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.lenses.models import LensModel
+from adjust.lenses.models import LensModel, principal_components
 from adjust.model.survey import Camera, FloatArray, ImageCrop
-from adjust.native.lenses import AICON, BROWN_BACKWARD
 
 UNITS = ("1", "px", "px")
 """Of ``CROP``."""
@@ -42,15 +41,6 @@ def cropped_lens(model: LensModel, values: FloatArray, constants: FloatArray, cr
     by_crop[at, 0] = per_px * from_edge
     by_crop[at, [1, 2]] = -per_px * scale
     return CroppedLens(new, by_lens, by_crop)
-
-
-def principal_components(model: LensModel, constants: FloatArray) -> tuple[list[int], FloatArray, FloatArray]:
-    """Which two parameters are the principal point, in what per pixel (2,), and from which pixel (2,) they count."""
-    if not model.in_mm:
-        return [3, 4], np.ones(2), np.zeros(2)
-    if model.kind in (BROWN_BACKWARD, AICON):  # y upwards from the middle of the image
-        return [1, 2], constants[0] * np.array([1.0, -1.0]), constants[1:3]
-    return [1, 2], constants[0] * np.ones(2), np.zeros(2)
 
 
 def whole_image(uv: FloatArray, crop: FloatArray) -> FloatArray:

@@ -123,14 +123,10 @@ def default_start(
 ) -> FloatArray:
     """Values (n,) of a camera without distortion, principal point in the middle of the image."""
     model = lens_model(model)
-    s, u, v, _ = lens_constants(model, image_size, pixel_size_mm)
-    values = np.zeros(model.n)
-    if model.kind in (kernels.BROWN, kernels.FISHEYE):
-        values[:5] = focal_px, focal_px, 0.0, u, v
-    elif model.kind == kernels.BROWN_BACKWARD_DBAT:
-        values[:3] = focal_px * s, u * s, v * s
-    else:
-        values[0] = focal_px * s
+    constants, values = lens_constants(model, image_size, pixel_size_mm), np.zeros(model.n)
+    at, per_px, origin = principal_components(model, constants)
+    values[: 1 if model.in_mm else 2] = focal_px * (constants[0] if model.in_mm else 1.0)
+    values[at] = per_px * (constants[1:3] - origin)
     return values
 
 
@@ -234,12 +230,17 @@ def monotone_radius_px(model: LensModel, values: FloatArray, constants: FloatArr
 
 def principal_point_px(model: LensModel, values: FloatArray, constants: FloatArray) -> FloatArray:
     """Image point (2,) px from which the radial distortion counts."""
-    s, centre_u, centre_v, _ = constants
+    at, per_px, origin = principal_components(model, constants)
+    return np.asarray(values[at] / per_px + origin)
+
+
+def principal_components(model: LensModel, constants: FloatArray) -> tuple[list[int], FloatArray, FloatArray]:
+    """Which two parameters are the principal point, in what per pixel (2,), and from which pixel (2,) they count."""
     if not model.in_mm:
-        return np.array([values[3], values[4]])
+        return [3, 4], np.ones(2), np.zeros(2)
     if model.kind == kernels.BROWN_BACKWARD_DBAT:
-        return np.array([values[1] / s, values[2] / s])
-    return np.array([centre_u + values[1] / s, centre_v - values[2] / s])
+        return [1, 2], constants[0] * np.ones(2), np.zeros(2)
+    return [1, 2], constants[0] * np.array([1.0, -1.0]), constants[1:3]  # y upwards from the middle of the image
 
 
 def _arrays(*arrays: FloatArray) -> tuple[FloatArray, ...]:

@@ -2,7 +2,12 @@
 
 import re
 from collections.abc import Hashable, Iterable
+from functools import lru_cache
 from typing import TypeVar
+
+import numpy as np
+
+from adjust.model.arrays import IntArray
 
 _PARTS = re.compile(r"\d+|\D+")
 _Key = TypeVar("_Key", bound=Hashable)
@@ -17,6 +22,14 @@ def grouped(items: Iterable[tuple[_Key, _Value]]) -> dict[_Key, list[_Value]]:
     return out
 
 
+def numbered(names: Iterable[_Key]) -> tuple[list[_Key], IntArray]:
+    """The different ones in the order in which they come, and (n,) of each its number among them."""
+    number: dict[_Key, int] = {}
+    of = np.fromiter((number.setdefault(name, len(number)) for name in names), np.int64)
+    return list(number), of
+
+
+@lru_cache(maxsize=2**15)
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
     """Key that sorts ``e2`` before ``e10``; different names have different keys."""
     # 4000: the interpreter refuses to take longer numbers apart

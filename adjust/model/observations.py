@@ -1,6 +1,6 @@
 """What was observed: values with their covariance and the group they belong to, as frozen values."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, Self
@@ -242,6 +242,11 @@ class ReadingCovariance:
 
     reading_ids: tuple[str, ...]
     cov: FloatArray
+
+    def of(self, ids: Container[str]) -> "ReadingCovariance":
+        """That of some of the readings."""
+        rows = [k for k, name in enumerate(self.reading_ids) if name in ids]
+        return ReadingCovariance(tuple(self.reading_ids[k] for k in rows), self.cov[np.ix_(rows, rows)])
 
 
 @dataclass(frozen=True, eq=False)

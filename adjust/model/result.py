@@ -39,6 +39,14 @@ class Estimate:
     status: tuple[str, ...]
 
 
+class Estimated(Protocol):
+    """What has estimates by name: an adjustment, or what is kept of one."""
+
+    @property
+    def estimates(self) -> Mapping[ParameterName, Estimate]:
+        """Every parameter."""
+
+
 def adjusted_pose(
     estimates: Mapping[ParameterName, Estimate], name: ParameterName, parameter: PoseParameter
 ) -> Pose3 | None:
@@ -354,6 +362,10 @@ class JointCovariances(Protocol):
     def following(self, spreads: Sequence[Mapping[int, FloatArray]], sizes: Sequence[int]) -> FloatArray:
         """Of quantities that follow from unknowns: each (n, dim) by key; n of each in ``sizes``."""
         ...
+
+    def whole_pairs(self, pairs: Sequence[tuple[ParameterName, ParameterName]], size: int) -> FloatArray:
+        """As ``whole`` of many pairs of parameters of so many components each, (p, 2 size, 2 size)."""
+        return np.array([self.whole(pair, (size, size)) for pair in pairs]).reshape(-1, 2 * size, 2 * size)
 
     def bring_together(self, pairs: Iterable[tuple[ParameterName, ParameterName]]) -> None:
         """Work out many pairs at once, before they are asked for one by one; nothing where that is no cheaper."""

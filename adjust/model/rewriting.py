@@ -11,6 +11,8 @@ from adjust.model.clocks import clocks_of
 from adjust.model.result import ParameterName
 from adjust.model.survey import (
     Camera,
+    Clock,
+    ImageCrop,
     LensParameter,
     PointParameter,
     PoseParameter,
@@ -31,7 +33,7 @@ class Rewriting:
     """What becomes of every parameter; a method that is not written anew leaves all of its kind as they are."""
 
     def vector(self, name: ParameterName, given: Vector) -> Vector:
-        """A lens, a table's geometry, a warp, what an instrument, a beam or a surface has, the tilt of the vertical."""
+        """A lens, its crops, a clock, a table's geometry, a warp, what an instrument, beam or surface has, the tilt."""
         return given
 
     def pose(self, name: ParameterName, given: PoseParameter) -> PoseParameter:
@@ -72,19 +74,30 @@ class Rewriting:
 
     def _camera(self, c: Camera) -> Camera:
         lens = self.vector(("lens", c.camera_id), c.lens)
+        if lens.crops:
+            lens = replace(lens, crops={e: self._crop(("lens_crop", c.camera_id, e), x) for e, x in lens.crops.items()})
         pose = self.pose(("station_from_camera", c.camera_id), c.station_from_camera)
-        return replace(c, lens=lens, station_from_camera=pose)
+        clock = self._clock("camera_clock", c.camera_id, c.clock)
+        return replace(c, lens=lens, station_from_camera=pose, clock=clock)
+
+    def _crop(self, name: ParameterName, crop: ImageCrop) -> ImageCrop:
+        return replace(crop, parameters=self.vector(name, crop.parameters))
 
     def _station(self, s: Station) -> Station:
         name = ("world_from_station", s.station_id)
         pose, mount = self.pose(name, s.world_from_station), ("mount_from_station", s.station_id)
         return replace(s, world_from_station=pose, mount_from_station=self.pose(mount, s.mount_from_station),
-                       epochs=self.epochs(name, s.epochs, s.world_from_station))  # fmt: skip
+                       epochs=self.epochs(name, s.epochs, s.world_from_station),
+                       clock=self._clock("pose_clock", s.station_id, s.clock))  # fmt: skip
 
     def _table(self, t: Table) -> Table:
         geometry = self.vector(("table_geometry", t.table_id), t.geometry)
-        return replace(t, geometry=geometry, world_from_table=self.pose(("world_from_table", t.table_id),
-                                                                        t.world_from_table))  # fmt: skip
+        pose = self.pose(("world_from_table", t.table_id), t.world_from_table)
+        clock = self._clock("table_clock", t.table_id, t.clock)
+        return replace(t, geometry=geometry, world_from_table=pose, clock=clock)
+
+    def _clock(self, kind: str, owner: str, clock: Clock | None) -> Clock | None:
+        return None if clock is None else replace(clock, parameters=self.vector((kind, owner), clock.parameters))
 
     def _target(self, t: Target) -> Target:
         warp = None if t.warp is None else self.vector(("warp", t.target_id), t.warp)

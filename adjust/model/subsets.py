@@ -1,18 +1,43 @@
 """Positions that observations name: other ones in their place, or a survey less what concerns some of them."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from adjust.model.observations import PositionRef, ReadingCovariance
+from adjust.model.observations import (
+    CoordinateDifferences,
+    Coordinates,
+    Distance,
+    Observation,
+    OnSurface,
+    PositionRef,
+    Reading,
+)
+from adjust.model.rewriting import Fields
 from adjust.model.survey import Survey
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 Item = TypeVar("Item", bound="DataclassInstance")
+
+
+def positions_of(o: Observation) -> tuple[PositionRef, ...]:
+    """All that an observation names; none of one that is between frames, or of a table."""
+    match o:
+        case Distance():
+            return o.a, o.b
+        case Coordinates():
+            return o.positions
+        case CoordinateDifferences():
+            return *o.at, *o.to
+        case OnSurface():
+            return (o.position,)
+        case Reading():
+            return (o.at, o.to) if o.second is None else (o.at, o.to, o.second)
+    return ()
 
 
 def with_positions(item: Item, new: Callable[[PositionRef], PositionRef]) -> Item:
@@ -28,32 +53,16 @@ def with_positions(item: Item, new: Callable[[PositionRef], PositionRef]) -> Ite
 
 
 def only_between(survey: Survey, keep: Callable[[PositionRef], bool]) -> Survey:
-    """Only the distances, coordinates, differences, readings and surfaces all of whose positions are to be kept."""
-
-    def all_kept(refs: Iterable[PositionRef | None]) -> bool:
-        return all(ref is None or keep(ref) for ref in refs)
-
-    readings = tuple(r for r in survey.readings if all_kept((r.at, r.to, r.second)))
-    left = {r.reading_id for r in readings}
-    covariances = []
-    for item in survey.reading_covariances:
-        rows = [i for i, name in enumerate(item.reading_ids) if name in left]
-        if len(rows) > 1:
-            names = tuple(item.reading_ids[i] for i in rows)
-            covariances.append(ReadingCovariance(names, item.cov[np.ix_(rows, rows)]))
+    """Only the observations, less image points, all of whose positions are to be kept."""
+    others = survey.others.items()
+    kept: Fields = {field: tuple(o for o in of if all(map(keep, positions_of(o)))) for field, of in others}
+    left = {r.reading_id for r in kept["readings"]}
+    covariances = (item.of(left) for item in survey.reading_covariances)
     vertical = survey.vertical
-    if not readings and not survey.levels:  # nothing is left that could tell its tilt
+    if not left and not survey.levels:  # nothing is left that could tell its tilt
         vertical = replace(vertical, tilt=replace(vertical.tilt, free=(), prior=None))
-    return replace(
-        survey,
-        vertical=vertical,
-        distances=tuple(d for d in survey.distances if all_kept((d.a, d.b))),
-        coordinates=tuple(c for c in survey.coordinates if all_kept(c.positions)),
-        coordinate_differences=tuple(d for d in survey.coordinate_differences if all_kept((*d.at, *d.to))),
-        on_surfaces=tuple(o for o in survey.on_surfaces if all_kept((o.position,))),
-        readings=readings,
-        reading_covariances=tuple(covariances),
-    )
+    some = tuple(c for c in covariances if len(c.reading_ids) > 1)
+    return replace(survey, vertical=vertical, reading_covariances=some, **kept)
 
 
 def with_points(survey: Survey, kept: Sequence[int]) -> Survey:
@@ -81,6 +90,6 @@ def in_use(survey: Survey) -> Survey:
 
 def points_read(survey: Survey) -> set[str]:
     """Ids of the world points that used readings and coordinate differences reach."""
-    refs = [r for x in survey.readings if x.used for r in (x.at, x.to, x.second) if r is not None]
-    refs += [r for d in survey.coordinate_differences if d.used for r in (*d.at, *d.to)]
+    observed: tuple[Observation, ...] = (*survey.readings, *survey.coordinate_differences)
+    refs = (r for o in observed if o.used for r in positions_of(o))
     return {r.point_id for r in refs if r.frame is None and r.point_id is not None}

@@ -1,10 +1,12 @@
-"""Sparse Cholesky factors of the normal equations of poses that pairs join, clique by clique; see ``elimination.h``.
+"""Sparse factors of the normal equations of poses that pairs join, clique by clique; see ``elimination.h``.
 
-Supernodal: what is eliminated in a clique is subtracted directly from those above it. The symbolic part is that of
-Davis (2005, algorithm 849).
+By Cholesky, supernodal: what is eliminated in a clique is subtracted directly from those above it. Or by reflections of
+the rows of the pairs, multifrontal (``reflections.h``): more work, and digits where Cholesky has none left. The
+symbolic part is that of Davis (2005, algorithm 849).
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -21,6 +23,11 @@ _elimination_room = Function("elimination_room", "key_ptr[C+1] n_front[C]")
 _eliminate = Function(
     "eliminate",
     f"{_CLIQUES} rank[N] first[E] second[E] by_first[E,6,6] by_second[E,6,6] own[N,6,6] work[*] where[N] diagonal[D]",
+)
+_eliminate_rows = Function(
+    "eliminate_rows",
+    f"{_CLIQUES} parents[C] order[C] pair_ptr[C+1] pairs[*] first[E] second[E] by_first[E,6,6] by_second[E,6,6] "
+    "own[N,6,6] rest[*] work[*] row[2,*] where[N] pending[C] diagonal[D]",
 )
 _pair_gradient = Function(
     "pair_gradient", "first[E] second[E] white[E,6] by_first[E,6,6] by_second[E,6,6] g[N,6]"
@@ -57,6 +64,20 @@ class CliquePattern:
     def at(self) -> IntArray:
         """Where the numbers of every clique begin (C + 1,)."""
         return np.concatenate([[0], np.cumsum(self.front * self.width)])
+
+    @cached_property
+    def leaves_first(self) -> IntArray:
+        """Cliques (C,), each after all that are below it, which stand side by side."""
+        parents, size, last = self.parents.tolist(), [1] * len(self.parents), list[int]()
+        for c in range(len(parents) - 1, -1, -1):
+            if parents[c] >= 0:
+                size[parents[c]] += size[c]
+        free = [len(parents)]  # of everything, then of every clique: above the next one below it
+        for parent, n in zip(parents, size, strict=True):
+            last.append(free[parent + 1] - 1)
+            free[parent + 1] -= n
+            free.append(last[-1])
+        return np.argsort(np.array(last, dtype=np.int64))
 
     @property
     def work(self) -> float:
@@ -114,6 +135,27 @@ class PoseFactor:
         n = len(own)
         return _eliminate(*self._cliques, self.pattern.order, first, second, by_first, by_second, own, self._work,
                           np.empty(n, dtype=np.int64), np.empty(6 * n))  # fmt: skip
+
+    def eliminate_rows(
+        self, first: IntArray, second: IntArray, by_first: FloatArray, by_second: FloatArray, own: FloatArray
+    ) -> int:
+        """The same by reflections; only a pose that nothing tells of is without a pivot."""
+        p, n, C = self.pattern, len(own), len(self.pattern.parents)
+        home = np.append(p.home, -1)
+        clique = np.maximum(home[first], home[second])
+        pairs = np.argsort(clique, kind="stable")
+        pair_ptr = np.searchsorted(clique[pairs], np.arange(C + 1))
+        left = p.width - p.front
+        m, room = p.front + 6 * np.diff(pair_ptr), left**2
+        below = np.flatnonzero(p.parents >= 0)
+        np.add.at(m, p.parents[below], left[below])
+        np.subtract.at(room, p.parents[below], left[below] ** 2)
+        rest = np.zeros(int(np.cumsum(room[p.leaves_first]).max(initial=0)))
+        work = np.empty(int(((m + 1) * p.width).max(initial=0)))
+        rows = np.empty((2, int(m.max(initial=0))), dtype=np.int64)
+        return _eliminate_rows(*self._cliques, p.parents, p.leaves_first, pair_ptr, pairs, first, second, by_first,
+                               by_second, own, rest, work, rows, np.empty(n, dtype=np.int64),
+                               np.empty(C, dtype=np.int64), np.empty(6 * n))  # fmt: skip
 
     def solve(self, x: FloatArray) -> None:
         """From the right hand side (N, 6) to the solution, in place."""

@@ -1,8 +1,8 @@
 // What Python calls of navigation from beacons, and of networks of measured pairs: their rows, elimination and loops.
-#include "elimination.h"
 #include "loops.h"
 #include "navigation.h"
 #include "pairs.h"
+#include "reflections.h"
 #include "search.h"
 
 extern "C" __attribute__((visibility("default"))) const Entry *navigation() {
@@ -13,6 +13,7 @@ extern "C" __attribute__((visibility("default"))) const Entry *navigation() {
         entry<pair_jacobians>("pair_jacobians"), entry<pair_rows>("pair_rows"), entry<pair_gradient>("pair_gradient"),
         entry<sure_forms>("sure_forms"),
         entry<elimination_tree>("elimination_tree"), entry<gather_cliques>("gather_cliques"), entry<clique_nodes>("clique_nodes"),
-        entry<elimination_room>("elimination_room"), entry<eliminate>("eliminate"), entry<solve_poses>("solve_poses"), {nullptr, nullptr, nullptr}};
+        entry<elimination_room>("elimination_room"), entry<eliminate>("eliminate"), entry<solve_poses>("solve_poses"),
+        entry<eliminate_rows>("eliminate_rows"), entry<compose_poses>("compose_poses"), {nullptr, nullptr, nullptr}};
     return table;
 }

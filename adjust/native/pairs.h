@@ -144,4 +144,28 @@ inline void sure_forms(In<double, 3> Q, In<double, 2> v, double least, Out<doubl
     }
 }
 
+// Poses R (N, 3, 3), t (N, 3) along a tree, in place: given in those of their parents, -1 where in the world. order: parents
+// first. Rotations stay so to the last digit, however long the way.
+inline void compose_poses(Ints order, Ints parent, Out<double, 3> R, Out<double, 2> t) {
+    for (int64_t index = 0; index < order.n[0]; ++index) {
+        const int64_t n = order[index], p = parent[n];
+        if (p < 0) continue;
+        Mat turned, square;
+        Vec shifted;
+        for (int i = 0; i < 3; ++i) {
+            shifted[i] = t(p, i) + R(p, i, 0) * t(n, 0) + R(p, i, 1) * t(n, 1) + R(p, i, 2) * t(n, 2);
+            for (int j = 0; j < 3; ++j) turned[i][j] = R(p, i, 0) * R(n, 0, j) + R(p, i, 1) * R(n, 1, j) + R(p, i, 2) * R(n, 2, j);
+        }
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 3; ++j) {
+                square[i][j] = i == j ? 1.5 : 0.0;
+                for (int k = 0; k < 3; ++k) square[i][j] -= 0.5 * turned[k][i] * turned[k][j];
+            }
+        for (int i = 0; i < 3; ++i) {
+            t(n, i) = shifted[i];
+            for (int j = 0; j < 3; ++j) R(n, i, j) = turned[i][0] * square[0][j] + turned[i][1] * square[1][j] + turned[i][2] * square[2][j];
+        }
+    }
+}
+
 }  // namespace

@@ -8,7 +8,7 @@ from adjust.native.library import Function
 _PAIRS = "a[E] b[E] R[S,3,3] t[S,3] measured[E,3,3] shift[E,3]"
 _pair_jacobians = Function("pair_jacobians", f"{_PAIRS} residual[E,6] by_b[E,6,6] by_a[E,6,6] turn[E,6,6]")
 _pair_rows = Function("pair_rows", f"{_PAIRS} W[E,6,6] white[E,6] by_b[E,6,6] by_a[E,6,6]")
-
+_compose_poses = Function("compose_poses", "order[N] parent[N] R[N,3,3] t[N,3]")
 _sure_forms = Function("sure_forms", "Q[E,6,6] v[E,6] least form[E]")
 
 
@@ -33,6 +33,14 @@ def pair_rows(
     white, (by_b, by_a) = np.empty((len(a), 6)), np.empty((2, len(a), 6, 6))
     _pair_rows(*map(np.ascontiguousarray, (a, b, R, t, measured, shift, whitening)), white, by_b, by_a)
     return white, by_b, by_a
+
+
+def compose_poses(order: IntArray, parent: IntArray, R: FloatArray, t: FloatArray) -> None:
+    """Poses R (N, 3, 3), t (N, 3) m, given in those of their ``parent`` (N,), in place in the world, where -1 stands.
+
+    order: (N,) parents first.
+    """
+    _compose_poses(order, parent, R, t)
 
 
 def sure_forms(Q: FloatArray, v: FloatArray, least: float) -> FloatArray:

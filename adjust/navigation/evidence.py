@@ -1,14 +1,13 @@
 """Explanations of an epoch judged: adjusted, their spots tested, compared by their evidence."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.navigation.fit import PoseFit, Prior, fit_pose, fit_without_outliers, local, log_evidence
 from adjust.navigation.model import NavigateOptions
-from adjust.navigation.precision import own_covariance
 from adjust.navigation.system import Sightings, System, evaluate, visible
 from adjust.testing.distributions import chi2
 
@@ -35,20 +34,13 @@ class Candidate:
     more: bool = False
 
 
-def allowed_namings(system: System, seen: Sightings) -> BoolArray:
+def allowed_namings(seen: Sightings) -> BoolArray:
     """(n, m): all beacons for a spot without a name, its own for one with a name."""
-    m = len(system.beacons.beacon_ids)
-    out = np.ones((len(seen.uv), m), dtype=np.bool_)
-    for row, label in zip(out, seen.label, strict=True):
-        if label >= 0:
-            row[:] = False
-            row[label] = True
-    return out
+    label = seen.label[:, None]
+    return np.asarray((label < 0) | (label == np.arange(len(seen.system.beacons.beacon_ids))))
 
 
-def gate_distances(
-    system: System, seen: Sightings, prior: Prior, options: NavigateOptions
-) -> tuple[FloatArray, FloatArray]:
+def gate_distances(seen: Sightings, prior: Prior, options: NavigateOptions) -> tuple[FloatArray, FloatArray]:
     """Squared distance (n, m) of every spot from where the prior expects every beacon, in sigmas.
 
     Infinite for a beacon far outside the field of view, where the distortion may fold it back into the image.
@@ -57,14 +49,13 @@ def gate_distances(
     position may be near everything and explains nothing. A spot that came with its name needs no such proof.
     """
     margin = _MARGIN + 4.0 * float(np.sqrt(np.diag(prior.total)[:3].max()))
-    ahead = visible(system, prior.pose, margin)
-    distance, log_det = _gates(system, seen, prior, ahead)
+    distance, log_det = _gates(seen, prior, visible(seen.system, prior.pose, margin))
     vague = distance + log_det - 2.0 * np.log(options.detection / (1.0 - options.detection))
-    by_chance = 2.0 * np.log(image_areas(system)[seen.camera] / options.false_spots)
+    by_chance = 2.0 * np.log(image_areas(seen.system)[seen.camera] / options.false_spots)
     return distance, np.where((seen.label >= 0)[:, None], np.inf, by_chance[:, None] - vague)
 
 
-def _gates(system: System, seen: Sightings, prior: Prior, ahead: BoolArray) -> tuple[FloatArray, FloatArray]:
+def _gates(seen: Sightings, prior: Prior, ahead: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Squared distance (n, m) in sigmas of spots from beacons at a pose of error ``e + B eta``; ln det(2 pi S).
 
     ahead (c, m): the others are infinitely far.
@@ -74,7 +65,7 @@ def _gates(system: System, seen: Sightings, prior: Prior, ahead: BoolArray) -> t
     near_by = ahead & (np.bincount(seen.camera, minlength=len(ahead)) > 0)[:, None]
     camera, beacon = map(np.ascontiguousarray, np.nonzero(near_by))
     n = len(beacon)
-    predicted, H, M, _ = evaluate(system, prior.pose, camera, beacon, np.zeros((n, 2)))
+    predicted, H, M = evaluate(seen.system, prior.pose, camera, beacon)
     common = H @ prior.B + M
     common = common.reshape(n, 2, common.shape[-1])  # n may be 0: nothing is ahead
     by_pose = (H @ prior.cov).reshape(n, 2, 6)
@@ -93,16 +84,19 @@ def image_areas(system: System) -> FloatArray:
     return np.array([c.image_size[0] * c.image_size[1] for c in system.head.cameras], dtype=float)
 
 
+Trial = tuple[FloatArray, IntArray]
+"""A pose (4, 4) and the beacon of every spot (n,), -1 for none."""
+
+
 def judged(
-    system: System, seen: Sightings, trials: Sequence[tuple[FloatArray, IntArray]], prior: Prior | None,
-    options: NavigateOptions,
-) -> tuple[Candidate, ...]:  # fmt: skip
+    seen: Sightings, trials: Sequence[Trial], prior: Prior | None, options: NavigateOptions
+) -> tuple[Candidate, ...]:
     """Adjust the trials, compare their evidence, and give each its probability."""
     by_naming: dict[tuple[bytes, bytes], list[Candidate]] = {}
     # three spots fit many namings exactly, and all of them are to be named
     most = 2 * MOST_NAMINGS if prior is not None else (_ADJUSTED if len(seen.uv) > 3 else KEPT)
     for pose, match in trials[:most]:
-        candidate = _adjusted(system, seen, pose, match, prior, options)
+        candidate = _adjusted(seen, (pose, match), prior, options)
         if candidate is not None:
             alike = by_naming.setdefault((candidate.fit.used.tobytes(), candidate.fit.beacon.tobytes()), [])
             if not any(np.linalg.norm(local(candidate.fit.pose, other.fit.pose)) < _SAME for other in alike):
@@ -112,38 +106,31 @@ def judged(
         return ()
     weights = np.exp(-0.5 * (np.array([c.score for c in found]) - found[0].score))
     weights /= weights.sum()
-    kept = [
-        Candidate(c.fit, c.rejected, c.score, float(w), len(trials) > most or len(trials) == KEPT)
-        for c, w in zip(found, weights, strict=True)
-        if c.score < found[0].score + _HOPELESS
-    ]
-    return tuple(kept)
+    more = len(trials) > most or len(trials) == KEPT
+    return tuple(replace(c, probability=float(w), more=more) for c, w in zip(found, weights, strict=True)
+                 if c.score < found[0].score + _HOPELESS)  # fmt: skip
 
 
-def _adjusted(
-    system: System, seen: Sightings, pose: FloatArray, match: IntArray, prior: Prior | None, options: NavigateOptions
-) -> Candidate | None:
+def _adjusted(seen: Sightings, trial: Trial, prior: Prior | None, options: NavigateOptions) -> Candidate | None:
+    pose, match = trial
     used = np.flatnonzero(match >= 0)
     if prior is None and len(used) < 3:
         return None
-    fit, rejected = fit_without_outliers(system, seen, used, match[used], pose, prior, options.alpha)
+    fit, rejected = fit_without_outliers(seen, used, match[used], pose, prior, options.alpha)
     if fit is None or not fit.in_front:
         return None
     if prior is None:
-        fit = _grown(system, seen, fit, rejected, options)
+        fit = _grown(seen, fit, rejected, options)
     if fit.redundancy > 0 and fit.chi_square > chi2.isf(1e-6, fit.redundancy):
         return None
-    return Candidate(fit, rejected, score_of(system, seen, fit, prior, options))
+    return Candidate(fit, rejected, score_of(seen, fit, prior, options))
 
 
-def _grown(
-    system: System, seen: Sightings, fit: PoseFit, rejected: tuple[int, ...], options: NavigateOptions
-) -> PoseFit:
+def _grown(seen: Sightings, fit: PoseFit, rejected: tuple[int, ...], options: NavigateOptions) -> PoseFit:
     """Name the spots that the pose explains and the coarse consensus left out."""
     for _ in range(len(seen.uv) - len(fit.used) - len(rejected)):
-        prior = Prior(fit.pose, own_covariance(seen, fit, None), fit.B, np.arange(6))
-        distance, support = gate_distances(system, seen, prior, options)
-        distance[~(allowed_namings(system, seen) & (support > 0.0))] = np.inf
+        distance, support = gate_distances(seen, fit.posterior, options)
+        distance[~(allowed_namings(seen) & (support > 0.0))] = np.inf
         distance[fit.used] = np.inf
         distance[list(rejected)] = np.inf
         for i, b in zip(fit.used, fit.beacon, strict=True):
@@ -152,14 +139,14 @@ def _grown(
         if distance[i, b] > GATE:
             return fit
         order = np.argsort(np.append(fit.used, i), kind="stable")
-        more = fit_pose(system, seen, np.append(fit.used, i)[order], np.append(fit.beacon, b)[order], fit.pose)
+        more = fit_pose(seen, np.append(fit.used, i)[order], np.append(fit.beacon, b)[order], fit.pose)
         if more is None:
             return fit
         fit = more
     return fit
 
 
-def score_of(system: System, seen: Sightings, fit: PoseFit, prior: Prior | None, options: NavigateOptions) -> float:
+def score_of(seen: Sightings, fit: PoseFit, prior: Prior | None, options: NavigateOptions) -> float:
     """-2 ln of the evidence of an explanation: fit, spots it calls false, beacons it should have seen and did not.
 
     A false spot may be anywhere in its image; what no prior knows of the pose is uniform over all rotations (8 pi^2)
@@ -171,10 +158,10 @@ def score_of(system: System, seen: Sightings, fit: PoseFit, prior: Prior | None,
     known = set() if prior is None else set(prior.rows.tolist())
     score += 2.0 * np.log(8.0 * np.pi**2) * len({0, 1, 2} - known) / 3.0
     score += 2.0 * np.log(options.room_m) * len({3, 4, 5} - known)
-    score -= 2.0 * float(np.log(options.false_spots / image_areas(system)[seen.camera[false]]).sum())
+    score -= 2.0 * float(np.log(options.false_spots / image_areas(seen.system)[seen.camera[false]]).sum())
     score -= 2.0 * len(fit.used) * np.log(options.detection)
     # only cameras that took part: the others may not have been triggered
-    view = visible(system, fit.pose) & seen.present[:, None]
+    view = visible(seen.system, fit.pose) & seen.present[:, None]
     view[seen.camera[fit.used], fit.beacon] = False
     missing = int(view.sum())
     return float(score - 2.0 * missing * np.log(1.0 - options.detection))

@@ -1,8 +1,9 @@
 """Least-squares pose from identified spots, with the errors of beacons and calibration in its covariance.
 
 The noise of an epoch's residuals is ``Sigma = R + M M'``: the spots' own and what the common errors eta of beacons and
-calibration (see :class:`System`) do to them. The pose is the generalised least-squares one for it (Koch 1999, section
-3.2), and its error is ``G noise + B eta``: B tells how the errors of all epochs hang together.
+calibration (see :class:`~adjust.navigation.system.System`) do to them. The pose is the generalised least-squares one
+for it (Koch 1999, section 3.2), and its error is ``gain noise + B eta``: B tells how the errors of all epochs hang
+together.
 """
 
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.navigation import DONE, PoseArrays, PriorArrays, SpotArrays, gauss_newton
-from adjust.navigation.system import Sightings, System
+from adjust.navigation.system import Sightings
 from adjust.spatial.rigid import inverse, rotation_exp, rotation_log
 from adjust.spatial.rigid_motions import right_jacobian_inverse
 from adjust.testing.gross_errors import Search, State, Verdicts, one_group
@@ -43,28 +44,44 @@ class Prior:
 class PoseFit:
     """A pose (4, 4) from spots ``used`` (n,) of beacons ``beacon`` (n,) and perhaps a prior.
 
-    G: (6, 2n) and G_prior (6, k): how noise of spots and prior moves the pose. B: (6, r). cov: (6, 6).
-    chi_square: v' inv(Sigma) v. log_det: ln det Sigma. log_det_cov: ln det cov.
-    residual, Sigma, H: of spots, then prior rows.
+    residual, H, M: of spots, then prior rows, with R the covariance of their own errors; gain: (6, 2n + k) how these
+    move the pose. cov: (6, 6). chi_square: v' inv(Sigma) v. log_det: ln det Sigma. log_det_cov: ln det cov.
     in_front: all beacons lie in front of their cameras.
     """
 
-    pose: FloatArray
     used: IntArray
     beacon: IntArray
-    cov: FloatArray
-    G: FloatArray
-    G_prior: FloatArray
-    B: FloatArray
-    chi_square: float
-    redundancy: int
-    log_det: float
-    log_det_cov: float
+    pose: FloatArray
     residual: FloatArray
-    Sigma: FloatArray
     H: FloatArray
     M: FloatArray
+    cov: FloatArray
+    gain: FloatArray
+    R: FloatArray
     in_front: bool
+    chi_square: float
+    log_det: float
+    log_det_cov: float
+
+    @property
+    def redundancy(self) -> int:
+        """Observations and what is known beforehand, minus six."""
+        return len(self.residual) - 6
+
+    @property
+    def B(self) -> FloatArray:
+        """(6, r) by the errors common to all epochs."""
+        return self.gain @ self.M
+
+    @property
+    def own_cov(self) -> FloatArray:
+        """Covariance (6, 6) without these errors: of the spots and of the prior's own error."""
+        return np.asarray(self.gain @ self.R @ self.gain.T)
+
+    @property
+    def posterior(self) -> Prior:
+        """What it tells of the pose."""
+        return Prior(self.pose, self.own_cov, self.B, np.arange(6))
 
 
 def local(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -81,37 +98,27 @@ def local_derivative(step: FloatArray) -> FloatArray:
 
 
 def fit_pose(
-    system: System, seen: Sightings, used: IntArray, beacon: IntArray, start: FloatArray, prior: Prior | None = None
+    seen: Sightings, used: IntArray, beacon: IntArray, start: FloatArray, prior: Prior | None = None
 ) -> PoseFit | None:
     """The pose from these spots (n,) and beacons (n,), by Gauss-Newton from ``start`` (4, 4).
 
     None where the observations leave a direction open, or the iteration does not settle.
     """
-    n, k, r = 2 * len(used), 0 if prior is None else len(prior.rows), system.F.shape[1]
-    if n + k < 6:
-        return None
-    R = np.zeros((n + k, n + k))
-    even = np.arange(0, n, 2)
-    cov = seen.cov[used]
-    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        R[even + i, even + j] = cov[:, i, j]
-    known = PriorArrays(np.ascontiguousarray(start), _NO_B, _NO_ROWS)
+    known, cov = PriorArrays(np.ascontiguousarray(start), _NO_B, _NO_ROWS), _NO_B
     if prior is not None:
         known = PriorArrays(np.ascontiguousarray(prior.pose), np.ascontiguousarray(prior.B), prior.rows)
-        R[n:, n:] = prior.cov[np.ix_(prior.rows, prior.rows)]
-    m = n + k
-    out = PoseArrays(np.empty((4, 4)), np.empty(m), np.empty((m, 6)), np.empty((m, r)), np.empty((6, 6)),
-                     np.empty((6, m)))  # fmt: skip
-    state, in_front, chi_square, log_det, log_det_cov = gauss_newton(
-        system.arrays, np.ascontiguousarray(start), SpotArrays(seen.camera[used], beacon, seen.uv[used]), R,
-        known, out,
-    )  # fmt: skip
-    if state != DONE:
+        cov = prior.cov[np.ix_(prior.rows, prior.rows)]
+    n, system = 2 * len(used), seen.system.arrays
+    m = n + len(cov)
+    if m < 6:
         return None
-    return PoseFit(
-        out.pose, used, beacon, out.C, out.gain[:, :n], out.gain[:, n:], out.gain @ out.M, float(chi_square), m - 6,
-        float(log_det), float(log_det_cov), out.residual, R + out.M @ out.M.T, out.H, out.M, bool(in_front),
-    )  # fmt: skip
+    R = np.zeros((m, m))
+    R[:n, :n], R[n:, n:] = seen.noise(used), cov
+    out = PoseArrays(np.empty((4, 4)), np.empty(m), np.empty((m, 6)), np.empty((m, system.F.shape[1])),
+                     np.empty((6, 6)), np.empty((6, m)))  # fmt: skip
+    spots = SpotArrays(seen.camera[used], beacon, seen.uv[used])
+    found = gauss_newton(system, np.ascontiguousarray(start), spots, R, known, out)
+    return PoseFit(used, beacon, *out, R, *found[1:]) if found[0] == DONE else None
 
 
 def log_evidence(fit: PoseFit) -> float:
@@ -125,8 +132,8 @@ def spot_tests(fit: PoseFit) -> FloatArray:
 
     Source: Foerstner and Wrobel 2016, Photogrammetric Computer Vision, section 4.6.4 (groups of observations).
     """
-    P = np.linalg.inv(fit.Sigma)
-    Qvv = fit.Sigma - fit.H @ fit.cov @ fit.H.T
+    Sigma = fit.R + fit.M @ fit.M.T
+    P, Qvv = np.linalg.inv(Sigma), Sigma - fit.H @ fit.cov @ fit.H.T
     Pv, PQP = P @ fit.residual, P @ Qvv @ P
     out = np.full(len(fit.used), np.nan)
     for i in range(len(fit.used)):
@@ -139,9 +146,8 @@ def spot_tests(fit: PoseFit) -> FloatArray:
 
 
 def fit_without_outliers(
-    system: System, seen: Sightings, used: IntArray, beacon: IntArray, start: FloatArray, prior: Prior | None,
-    alpha: float,
-) -> tuple[PoseFit | None, tuple[int, ...]]:  # fmt: skip
+    seen: Sightings, used: IntArray, beacon: IntArray, start: FloatArray, prior: Prior | None, alpha: float
+) -> tuple[PoseFit | None, tuple[int, ...]]:
     """The fit after spots that fail the test (family-wise level alpha) were taken out, worst first; and which.
 
     None is taken out where the residuals of all are together far smaller than their sigmas say.
@@ -149,7 +155,7 @@ def fit_without_outliers(
 
     def solve(kept: BoolArray, before: State[PoseFit] | None) -> tuple[PoseFit, Verdicts] | None:
         at = start if before is None else before.solution.pose
-        fit = fit_pose(system, seen, used[kept], beacon[kept], at, prior)
+        fit = fit_pose(seen, used[kept], beacon[kept], at, prior)
         if fit is None:
             return None
         values = np.full(len(used), np.nan)

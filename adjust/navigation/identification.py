@@ -19,6 +19,7 @@ from adjust.navigation.evidence import (
     KEPT,
     MOST_NAMINGS,
     Candidate,
+    Trial,
     allowed_namings,
     gate_distances,
     image_areas,
@@ -27,7 +28,6 @@ from adjust.navigation.evidence import (
 )
 from adjust.navigation.fit import Prior, fit_pose
 from adjust.navigation.model import NavigateOptions
-from adjust.navigation.precision import own_covariance
 from adjust.navigation.system import Sightings, System, station_rays
 from adjust.spatial.rigid import rigid
 
@@ -38,29 +38,27 @@ _CROWDED = 3.0  # beacons near a spot beyond which naming in turn is hopeless
 _MOST_TRIPLES = 400
 
 
-def without_prior(system: System, seen: Sightings, options: NavigateOptions) -> tuple[Candidate, ...]:
+def without_prior(seen: Sightings, options: NavigateOptions) -> tuple[Candidate, ...]:
     """All explanations of an epoch that are worth naming, best first; empty where fewer than three spots are there."""
     if len(seen.uv) < 3:
         return ()
-    return judged(system, seen, _hypotheses(system, seen, allowed_namings(system, seen), options), None, options)
+    return judged(seen, _hypotheses(seen, allowed_namings(seen), options), None, options)
 
 
-def _hypotheses(
-    system: System, seen: Sightings, allowed: BoolArray, options: NavigateOptions
-) -> list[tuple[FloatArray, IntArray]]:
+def _hypotheses(seen: Sightings, allowed: BoolArray, options: NavigateOptions) -> list[Trial]:
     """Poses (4, 4) and namings (n,) by the coarse consensus, best first."""
-    n, x = len(seen.uv), np.ascontiguousarray(system.beacons.x_in_world, dtype=float)
+    n, system = len(seen.uv), seen.system.arrays
     farthest = options.farthest_m
     if farthest is None:
-        farthest = 10.0 * float(np.linalg.norm(np.ptp(x, axis=0)))
+        farthest = 10.0 * float(np.linalg.norm(np.ptp(system.x_in_world, axis=0)))
     R, t = np.empty((KEPT, 3, 3)), np.empty((KEPT, 3))
     score, match = np.full(KEPT, -np.inf), np.empty((KEPT, n), dtype=np.int64)
     missed = np.where(seen.present, -np.log(1.0 - options.detection), 0.0)
-    named = np.log(_sky(system) / np.radians(options.gate_deg) ** 2)[seen.camera]
-    origin, ray = station_rays(system, seen)
+    named = np.log(_sky(seen.system) / np.radians(options.gate_deg) ** 2)[seen.camera]
+    origin, ray = station_rays(seen)
     sky = SkyArrays(
-        origin, np.ascontiguousarray(ray), seen.camera, allowed, x, system.camera_R, system.camera_t, system.field,
-        float(np.radians(options.gate_deg)), named, missed,
+        origin, np.ascontiguousarray(ray), seen.camera, allowed, system.x_in_world, system.camera_R, system.camera_t,
+        seen.system.field, float(np.radians(options.gate_deg)), named, missed,
     )  # fmt: skip
     kept = search(
         sky, _triples(ray), options.nearest_m, farthest, options.max_hypotheses, FoundArrays(R, t, score, match)
@@ -87,22 +85,22 @@ def _triples(ray: FloatArray) -> IntArray:
     return np.ascontiguousarray(every[rank][:_MOST_TRIPLES])
 
 
-def with_prior(system: System, seen: Sightings, prior: Prior, options: NavigateOptions) -> tuple[Candidate, ...]:
+def with_prior(seen: Sightings, prior: Prior, options: NavigateOptions) -> tuple[Candidate, ...]:
     """Explanations near a prior, best first. One that leaves components open needs names, or three spots."""
     if len(prior.rows) < 6:
-        return _with_partial_prior(system, seen, prior, options)
-    distance, support = gate_distances(system, seen, prior, options)
-    near = (distance < GATE) & allowed_namings(system, seen) & (support > 0.0)
+        return _with_partial_prior(seen, prior, options)
+    distance, support = gate_distances(seen, prior, options)
+    near = (distance < GATE) & allowed_namings(seen) & (support > 0.0)
     if len(seen.uv) >= 3 and near.sum() > _CROWDED * near.any(axis=1).sum():
-        trials = _doubted(_hypotheses(system, seen, near, options), support)
-        found = judged(system, seen, trials, prior, options)
+        trials = _doubted(_hypotheses(seen, near, options), support)
+        found = judged(seen, trials, prior, options)
         if found:
-            return _agreed(system, seen, prior, found, options)
-    trials = _doubted(_in_turn(system, seen, prior, near, distance, options), support)
-    return _agreed(system, seen, prior, judged(system, seen, trials, prior, options), options)
+            return _agreed(seen, prior, found, options)
+    trials = _doubted(_in_turn(seen, prior, near, distance, options), support)
+    return _agreed(seen, prior, judged(seen, trials, prior, options), options)
 
 
-def _doubted(trials: list[tuple[FloatArray, IntArray]], support: FloatArray) -> list[tuple[FloatArray, IntArray]]:
+def _doubted(trials: list[Trial], support: FloatArray) -> list[Trial]:
     """The likeliest trials, and each again without one of the spots that the prior alone does not tell from chance."""
     out = trials[: MOST_NAMINGS // 3]
     known = {match.tobytes() for _, match in out}
@@ -117,7 +115,7 @@ def _doubted(trials: list[tuple[FloatArray, IntArray]], support: FloatArray) -> 
 
 
 def _agreed(
-    system: System, seen: Sightings, prior: Prior, candidates: tuple[Candidate, ...], options: NavigateOptions
+    seen: Sightings, prior: Prior, candidates: tuple[Candidate, ...], options: NavigateOptions
 ) -> tuple[Candidate, ...]:
     """Where no candidate is certain: what all agree on that together are. Spots in doubt are not used at all.
 
@@ -133,20 +131,18 @@ def _agreed(
             break
     pairs = np.array(sorted(set.intersection(*likely)), dtype=np.int64).reshape(-1, 2)
     used, beacon = np.ascontiguousarray(pairs[:, 0]), np.ascontiguousarray(pairs[:, 1])
-    fit = fit_pose(system, seen, used, beacon, prior.pose, prior)
+    fit = fit_pose(seen, used, beacon, prior.pose, prior)
     if fit is None or not fit.in_front:
         return candidates
-    return (Candidate(fit, (), score_of(system, seen, fit, prior, options), total),)
+    return (Candidate(fit, (), score_of(seen, fit, prior, options), total),)
 
 
-def _with_partial_prior(
-    system: System, seen: Sightings, prior: Prior, options: NavigateOptions
-) -> tuple[Candidate, ...]:
+def _with_partial_prior(seen: Sightings, prior: Prior, options: NavigateOptions) -> tuple[Candidate, ...]:
     if len(seen.uv) >= 3:
-        return judged(system, seen, _hypotheses(system, seen, allowed_namings(system, seen), options), prior, options)
+        return judged(seen, _hypotheses(seen, allowed_namings(seen), options), prior, options)
     if np.any(seen.label < 0):
         return ()
-    return judged(system, seen, [(prior.pose, seen.label)], prior, options)
+    return judged(seen, [(prior.pose, seen.label)], prior, options)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,26 +155,26 @@ class _Partial:
 
 
 def _in_turn(
-    system: System, seen: Sightings, prior: Prior, near: BoolArray, distance: FloatArray, options: NavigateOptions
-) -> list[tuple[FloatArray, IntArray]]:
+    seen: Sightings, prior: Prior, near: BoolArray, distance: FloatArray, options: NavigateOptions
+) -> list[Trial]:
     """Poses (4, 4) and namings (n,): first what has no rival, each naming narrowing the choice of the next.
 
     Where only rivals are left the spot with the fewest is tried with each of them, and with none.
     """
-    allowed = allowed_namings(system, seen)
+    allowed = allowed_namings(seen)
     start = _Partial(np.full(len(near), -1, dtype=np.int64), np.logical_not(near.any(axis=1)), prior)
     open_ones = [(start, near, distance)]
-    done: list[tuple[FloatArray, IntArray]] = []
+    done: list[Trial] = []
     while open_ones and len(done) < MOST_NAMINGS:
         partial, near, distance = open_ones.pop()
         if partial.decided.all():
             done.append((partial.prior.pose, partial.match))
             continue
         for match, decided in reversed(_extensions(seen, partial, near, distance)):
-            posterior = _posterior(system, seen, match, prior) if np.any(match != partial.match) else partial.prior
+            posterior = _posterior(seen, match, prior) if np.any(match != partial.match) else partial.prior
             if posterior is None:
                 continue
-            new, support = gate_distances(system, seen, posterior, options)
+            new, support = gate_distances(seen, posterior, options)
             free = (new < GATE) & allowed & (support > 0.0) & ~decided[:, None]
             for i in np.flatnonzero(match >= 0):
                 free[seen.camera == seen.camera[i], match[i]] = False
@@ -212,10 +208,8 @@ def _extensions(
     return [*out, (match, decided)]
 
 
-def _posterior(system: System, seen: Sightings, match: IntArray, prior: Prior) -> Prior | None:
+def _posterior(seen: Sightings, match: IntArray, prior: Prior) -> Prior | None:
     """The pose after these namings, as the prior of the next."""
     used = np.flatnonzero(match >= 0)
-    fit = fit_pose(system, seen, used, match[used], prior.pose, prior)
-    if fit is None:
-        return None
-    return Prior(fit.pose, own_covariance(seen, fit, prior), fit.B, np.arange(6))
+    fit = fit_pose(seen, used, match[used], prior.pose, prior)
+    return None if fit is None else fit.posterior

@@ -15,6 +15,8 @@ from adjust.model.survey import FloatArray
 
 Status = Literal["fixed", "bridged", "ambiguous", "undetermined", "none"]
 Bridge = Literal["", "prior", "table", "motion"]
+Labels = tuple[tuple[str | None, ...], ...]
+"""One tuple per ``NavigationEpoch.spots``: the beacon of each spot or None."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,13 +156,12 @@ class Shares:
 class Solution:
     """One pose that explains an epoch.
 
-    labels: one tuple per ``NavigationEpoch.spots``, the beacon of each spot or None.
     score: -2 ln of its evidence; differences are what the test of solutions against each other uses.
     """
 
     world_from_station: Pose3
     cov: FloatArray
-    labels: tuple[tuple[str | None, ...], ...]
+    labels: Labels
     chi_square: float
     redundancy: int
     score: float
@@ -175,7 +176,7 @@ class EpochPose:
     several solutions that cannot be told apart, all in ``alternatives`` (where not all could be listed,
     ``undetermined`` says so); ``undetermined``: some directions are open, named in ``undetermined`` (their variances
     are infinite); ``none``: nothing is known (no pose).
-    labels: per ``NavigationEpoch.spots`` the beacon of each spot, None for a false spot or one that was rejected.
+    labels: None for a false spot or one that was rejected.
     rejected: (camera, spot) that had a beacon and failed the outlier test.
     """
 
@@ -184,7 +185,7 @@ class EpochPose:
     bridge: Bridge
     world_from_station: Pose3 | None
     cov: FloatArray
-    labels: tuple[tuple[str | None, ...], ...]
+    labels: Labels
     rejected: tuple[tuple[str, int], ...] = ()
     chi_square: float = float("nan")
     redundancy: int = 0

@@ -64,10 +64,10 @@ class MotionState:
         return Prior(self.pose, self.P[:6, :6], self.B[:6], np.arange(6))
 
 
-def started(fit: PoseFit, own_cov: FloatArray, time_s: float, motion: Motion) -> MotionState:
-    """At rest, as well as that is known, at a pose; ``own_cov`` (6, 6) without the common errors."""
+def started(fit: PoseFit, time_s: float, motion: Motion) -> MotionState:
+    """At rest, as well as that is known, at a pose."""
     P = np.zeros((12, 12))
-    P[:6, :6] = own_cov
+    P[:6, :6] = fit.own_cov
     P[6:9, 6:9] = np.eye(3) * motion.sigma_angular_rate**2
     P[9:, 9:] = np.eye(3) * motion.sigma_speed**2
     return MotionState(time_s, fit.pose, np.zeros(6), P, np.vstack([fit.B, np.zeros_like(fit.B)]))
@@ -88,7 +88,7 @@ def predicted(state: MotionState, time_s: float, motion: Motion) -> MotionState:
     return MotionState(time_s, state.pose @ move.matrix(), state.rate, A @ state.P @ A.T + Q, A @ state.B)
 
 
-def updated(state: MotionState, fit: PoseFit, spot_noise: FloatArray) -> MotionState:
+def updated(state: MotionState, fit: PoseFit) -> MotionState:
     """The state after a fit that had ``state.prior`` as its prior.
 
     The rates follow the pose by their correlation with it; whatever that gain, the errors pass through it exactly.
@@ -97,12 +97,13 @@ def updated(state: MotionState, fit: PoseFit, spot_noise: FloatArray) -> MotionS
     K = np.linalg.solve(state.P[:6, :6] + state.B[:6] @ state.B[:6].T,
                         (state.P[6:, :6] + state.B[6:] @ state.B[:6].T).T).T  # fmt: skip
     # the prior's rows are -(e + B eta), turned from the prior's tangent into that of the fit
-    A_pose, J = -fit.G_prior, local_derivative(step)
+    n, J = 2 * len(fit.used), local_derivative(step)
+    G, A_pose = fit.gain[:, :n], -fit.gain[:, n:]
     A = np.zeros((12, 12))
     A[:6, :6] = A_pose
     A[6:, :6] = K @ (J @ A_pose - np.eye(6))
     A[6:, 6:] = np.eye(6)
-    N = np.vstack([fit.G, K @ J @ fit.G])
+    N = np.vstack([G, K @ J @ G])
     B = np.vstack([fit.B, state.B[6:] + K @ (J @ fit.B - state.B[:6])])
-    P = A @ state.P @ A.T + N @ spot_noise @ N.T
+    P = A @ state.P @ A.T + N @ fit.R[:n, :n] @ N.T
     return MotionState(state.time_s, fit.pose, state.rate + K @ step, 0.5 * (P + P.T), B)

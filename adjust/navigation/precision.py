@@ -30,48 +30,30 @@ class Expected:
     undetermined: tuple[str, ...]
 
 
-def own_covariance(seen: Sightings, fit: PoseFit, prior: Prior | None) -> FloatArray:
-    """Covariance (6, 6) without the errors common to all epochs: of the spots and of the prior's own error."""
-    out = fit.G @ spot_noise(seen, fit.used) @ fit.G.T
-    if prior is not None:
-        out = out + fit.G_prior @ prior.cov[np.ix_(prior.rows, prior.rows)] @ fit.G_prior.T
-    return np.asarray(out)
-
-
-def spot_noise(seen: Sightings, used: IntArray) -> FloatArray:
-    """Covariance (2n, 2n) px^2 of the used spots."""
-    out = np.zeros((2 * len(used),) * 2)
-    for i, cov in enumerate(seen.cov[used]):
-        out[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = cov
-    return out
-
-
-def shares(system: System, seen: Sightings, fit: PoseFit, prior: Prior | None) -> Shares:
+def shares(fit: PoseFit, system: System) -> Shares:
     """The covariance of a fit by source; the parts add up to it.
 
     Of a prior by motion the part that beacons and calibration had in it is counted with them.
     """
-    own = fit.G @ spot_noise(seen, fit.used) @ fit.G.T
-    rest = own_covariance(seen, fit, prior) - own
+    n = 2 * len(fit.used)
+    spots, prior = (fit.gain[:, k] @ fit.R[k, k] @ fit.gain[:, k].T for k in (slice(n), slice(n, None)))
     # B = S F with S (6, p + 3m) unknown where F is rank deficient: split by the rows of F through its pseudo-inverse
-    S = fit.B @ system.F_inverse
-    at = system.beacon_at
+    S, at = fit.B @ system.F_inverse, system.arrays.beacon_at
     calibration, beacons = S[:, :at] @ system.F[:at], S[:, at:] @ system.F[at:]
     cross = calibration @ beacons.T
-    return Shares(own, beacons @ beacons.T, calibration @ calibration.T, rest, cross + cross.T)
+    return Shares(spots, beacons @ beacons.T, calibration @ calibration.T, prior, cross + cross.T)
 
 
 def open_directions(
-    system: System, seen: Sightings, used: IntArray, beacon: IntArray, pose: FloatArray, prior: Prior | None = None
+    seen: Sightings, used: IntArray, beacon: IntArray, pose: FloatArray, prior: Prior | None = None
 ) -> tuple[FloatArray, tuple[str, ...]]:
     """Covariance (6, 6) with infinite variances where observations leave a pose (4, 4) open, and those directions."""
-    _, H, M, _ = evaluate(system, pose, seen.camera[used], beacon, seen.uv[used])
-    W = np.linalg.inv(spot_noise(seen, used) + M @ M.T) if len(used) else np.zeros((0, 0))
-    N = H.T @ W @ H
+    _, H, M = evaluate(seen.system, pose, seen.camera[used], beacon)
+    N = H.T @ np.linalg.inv(seen.noise(used) + M @ M.T) @ H
     if prior is not None:
         rows = prior.rows
         N[np.ix_(rows, rows)] += np.linalg.inv(prior.total[np.ix_(rows, rows)])
-    x = system.beacons.x_in_world
+    x = seen.system.beacons.x_in_world
     lever = float(np.linalg.norm(x - pose[:3, 3], axis=1).mean())
     scale = np.array([1.0 / lever] * 3 + [1.0] * 3)  # a turn of so much moves the beacons by a metre
     values, vectors = np.linalg.eigh(N * np.outer(scale, scale))
@@ -115,11 +97,10 @@ def _named(direction: FloatArray, number: int, of: int) -> str:
     return f"open direction {number} of {of} (axes of the head): {what}"
 
 
-def some_pose(system: System, seen: Sightings, used: IntArray, beacon: IntArray, start: FloatArray) -> FloatArray:
+def some_pose(seen: Sightings, used: IntArray, beacon: IntArray, start: FloatArray) -> FloatArray:
     """One of the many poses (4, 4) that explain too few spots, nearest to a start in a way."""
-    pose = np.empty((4, 4))
-    spots = native.SpotArrays(seen.camera[used], beacon, seen.uv[used])
-    native.some_pose(system.arrays, np.ascontiguousarray(start), spots, pose)
+    pose, spots = np.empty((4, 4)), native.SpotArrays(seen.camera[used], beacon, seen.uv[used])
+    native.some_pose(seen.system.arrays, np.ascontiguousarray(start), spots, pose)
     return pose
 
 
@@ -128,19 +109,17 @@ def expected_precision(
 ) -> tuple[Expected, ...]:
     """Precision at poses ``world_from_station`` before anything is measured, with all beacons in view."""
     system = make_system(head, beacons)
-    out = []
-    for pose in poses:
-        out.append(_expected(system, pose, *in_view(system, pose.matrix()), sigma_px))
-    return tuple(out)
+    return tuple(_expected(system, pose, sigma_px) for pose in poses)
 
 
-def _expected(system: System, pose: Pose3, camera: IntArray, beacon: IntArray, sigma_px: float) -> Expected:
-    n, ids = len(camera), system.beacons.beacon_ids
-    predicted = evaluate(system, pose.matrix(), camera, beacon, np.zeros((n, 2)))[0]
-    seen = sightings_of(system, camera, beacon, predicted.reshape(n, 2), sigma_px)
-    names = tuple(ids[b] for b in sorted(set(beacon.tolist())))
-    fit = fit_pose(system, seen, np.arange(n), beacon, pose.matrix()) if n >= 3 else None
+def _expected(system: System, pose: Pose3, sigma_px: float) -> Expected:
+    at, ids = pose.matrix(), system.beacons.beacon_ids
+    camera, beacon = in_view(system, at)
+    n = len(camera)
+    seen = sightings_of(system, camera, beacon, evaluate(system, at, camera, beacon)[0].reshape(n, 2), sigma_px)
+    names = tuple(ids[b] for b in np.unique(beacon).tolist())
+    fit = fit_pose(seen, np.arange(n), beacon, at)
     if fit is None:
-        cov, undetermined = open_directions(system, seen, np.arange(n), beacon, pose.matrix())
+        cov, undetermined = open_directions(seen, np.arange(n), beacon, at)
         return Expected(pose, cov, None, names, 2 * n - 6, undetermined)
-    return Expected(pose, fit.cov, shares(system, seen, fit, None), names, fit.redundancy, ())
+    return Expected(pose, fit.cov, shares(fit, system), names, fit.redundancy, ())

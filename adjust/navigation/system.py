@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.lenses import FISHEYE, MAX_LENS
 from adjust.native.navigation import SpotArrays, SystemArrays, spot_rows
-from adjust.navigation.model import Beacons, Head, NavigationEpoch, Spots
+from adjust.navigation.model import Beacons, Head, HeadCamera, NavigationEpoch, Spots
 
 _BORDER_PX = 3.0
 
@@ -20,39 +19,25 @@ _BORDER_PX = 3.0
 class System:
     """The calibrated head and the beacons.
 
-    F: (p + 3m, r) square root of the joint covariance of calibration and beacons: errors are ``F @ eta`` with eta
-    uncorrelated of unit variance; they are common to all epochs. F_inverse: (r, p + 3m), its pseudo-inverse.
-    field: (c, 5) what a camera surely sees: smallest and largest x/z and y/z, and the cosine of the widest angle for a
-    fisheye (2 elsewhere).
+    arrays: what compiled code takes of both. table_at: row of F at which the table begins. F_inverse: (r, p + 3m), its
+    pseudo-inverse. field: (c, 5) what a camera surely sees: smallest and largest x/z and y/z, and the cosine of the
+    widest angle for a fisheye (2 elsewhere).
     """
 
     head: Head
     beacons: Beacons
-    kinds: IntArray
-    lenses: FloatArray
-    constants: FloatArray
-    camera_R: FloatArray  # noqa: N815  matrices are capital letters
-    camera_t: FloatArray
-    lens_at: IntArray
-    n_lens: IntArray
+    arrays: SystemArrays
     table_at: int
-    F: FloatArray
     F_inverse: FloatArray
     field: FloatArray
 
-    @cached_property
-    def arrays(self) -> SystemArrays:
-        """What compiled code takes."""
-        x = np.ascontiguousarray(self.beacons.x_in_world, dtype=np.float64)
-        return SystemArrays(
-            self.kinds, self.lenses, self.constants, self.camera_R, self.camera_t, x, self.lens_at, self.n_lens,
-            self.beacon_at, self.F,
-        )  # fmt: skip
-
     @property
-    def beacon_at(self) -> int:
-        """Row of F at which the beacons begin."""
-        return len(self.F) - 3 * len(self.beacons.beacon_ids)
+    def F(self) -> FloatArray:
+        """(p + 3m, r) square root of the joint covariance of calibration and beacons: errors are ``F @ eta``.
+
+        eta: uncorrelated, of unit variance, and common to all epochs.
+        """
+        return self.arrays.F
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +49,7 @@ class Sightings:
     ray: (n, 3) in the station, where they were computed beforehand.
     """
 
+    system: System
     camera: IntArray
     uv: FloatArray
     cov: FloatArray
@@ -73,6 +59,13 @@ class Sightings:
     present: BoolArray
     ray: FloatArray | None = None
 
+    def noise(self, used: IntArray) -> FloatArray:
+        """Covariance (2n, 2n) px^2 of the used spots (n,)."""
+        n, at = len(used), np.arange(len(used))
+        out = np.zeros((n, 2, n, 2))
+        out[at, :, at] = self.cov[used]
+        return out.reshape(2 * n, 2 * n)
+
 
 def make_system(head: Head, beacons: Beacons) -> System:
     """Check head and beacons against each other. Raises SurveyError."""
@@ -80,30 +73,27 @@ def make_system(head: Head, beacons: Beacons) -> System:
     p = sum(sizes) + (16 if head.table is not None else 0)
     m = len(beacons.beacon_ids)
     _check_shapes(head, beacons, p, m)
-    models = [MODELS[c.model] for c in head.cameras]
-    lenses = np.zeros((len(models), MAX_LENS))
+    lenses = np.zeros((len(sizes), MAX_LENS))
     for row, camera in zip(lenses, head.cameras, strict=True):
         row[: len(camera.lens)] = camera.lens
     joint = np.zeros((p + 3 * m,) * 2)
     joint[:p, :p], joint[p:, p:] = head.cov, beacons.cov
     if beacons.cross_cov is not None:
         joint[:p, p:], joint[p:, :p] = beacons.cross_cov, beacons.cross_cov.T
-    F = square_root(joint)
-    return System(
-        head=head,
-        beacons=beacons,
-        kinds=np.array([k.kind for k in models], dtype=np.int64),
+    arrays = SystemArrays(
+        kinds=np.array([MODELS[c.model].kind for c in head.cameras], dtype=np.int64),
         lenses=lenses,
         constants=np.array([c.constants for c in head.cameras], dtype=np.float64),
         camera_R=np.array([c.station_from_camera.rotation().matrix() for c in head.cameras]),
         camera_t=np.array([c.station_from_camera.translation() for c in head.cameras]),
+        x_in_world=np.ascontiguousarray(beacons.x_in_world, dtype=np.float64),
         lens_at=np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64),
         n_lens=np.array([len(c.lens) for c in head.cameras], dtype=np.int64),
-        table_at=sum(sizes),
-        F=F,
-        F_inverse=np.asarray(np.linalg.pinv(F), dtype=np.float64),
-        field=np.array([_field(head, i) for i in range(len(models))]),
+        beacon_at=p,
+        F=square_root(joint),
     )
+    F_inverse = np.asarray(np.linalg.pinv(arrays.F), dtype=np.float64)
+    return System(head, beacons, arrays, sum(sizes), F_inverse, np.array([_field(c) for c in head.cameras]))
 
 
 def _check_shapes(head: Head, beacons: Beacons, p: int, m: int) -> None:
@@ -137,9 +127,8 @@ def square_root(cov: FloatArray) -> FloatArray:
     return np.ascontiguousarray(out[:, values > 1e-12])
 
 
-def _field(head: Head, index: int) -> FloatArray:
+def _field(camera: HeadCamera) -> FloatArray:
     """The field of view of a camera from the rays of its border."""
-    camera = head.cameras[index]
     width, height = camera.image_size
     u, v = (np.array([_BORDER_PX, (n - 1) / 2, n - 1 - _BORDER_PX]) for n in (width, height))
     model = MODELS[camera.model]
@@ -155,78 +144,72 @@ def make_sightings(system: System, epoch: NavigationEpoch) -> Sightings:
     """The spots of an epoch. Raises SurveyError naming what is not known."""
     where = {c.camera_id: i for i, c in enumerate(system.head.cameras)}
     names = {b: i for i, b in enumerate(system.beacons.beacon_ids)}
-    camera, label, block, row = [], [], [], []
-    for k, spots in enumerate(epoch.spots):
+    for spots in epoch.spots:
         if spots.camera_id not in where:
             known = ", ".join(where)
             raise SurveyError(f"epoch {epoch.epoch_id}: camera {spots.camera_id!r} is not on the head ({known})")
-        c = where[spots.camera_id]
-        camera += [c] * len(spots.uv)
-        block += [k] * len(spots.uv)
-        row += list(range(len(spots.uv)))
-        label += _labels(spots, names, epoch.epoch_id)
+    sizes, none = [len(s.uv) for s in epoch.spots], np.zeros(0, dtype=np.int64)
+    seen_by = np.array([where[s.camera_id] for s in epoch.spots], dtype=np.int64)
+    label = np.concatenate([none, *(_labels(s, names, epoch.epoch_id) for s in epoch.spots)])
+    row = np.concatenate([none, *map(np.arange, sizes)])
     uv = np.concatenate([np.zeros((0, 2)), *(s.uv for s in epoch.spots)])
     cov = np.concatenate([np.zeros((0, 2, 2)), *(s.cov for s in epoch.spots)])
-    integers = (np.array(x, dtype=np.int64) for x in (camera, label, block, row))
-    camera_, label_, block_, row_ = integers
-    present = np.array([any(s.camera_id == c for s in epoch.spots) for c in where], dtype=np.bool_)
-    return Sightings(camera_, uv, cov, label_, block_, row_, present)
+    block, present = np.repeat(np.arange(len(sizes)), sizes), np.isin(np.arange(len(where)), seen_by)
+    return Sightings(system, seen_by[block], uv, cov, label, block, row, present)
 
 
 def sightings_of(system: System, camera: IntArray, beacon: IntArray, uv: FloatArray, sigma_px: float) -> Sightings:
     """Spots (n, 2) px of known beacons (n,) that every camera of the head might have seen."""
     n, zeros = len(camera), np.zeros(len(camera), dtype=np.int64)
     cov = np.tile(np.eye(2) * sigma_px**2, (n, 1, 1))
-    return Sightings(camera, uv, cov, beacon, zeros, zeros, np.ones(len(system.kinds), dtype=np.bool_))
+    return Sightings(system, camera, uv, cov, beacon, zeros, zeros, np.ones(len(system.head.cameras), dtype=np.bool_))
 
 
-def station_rays(system: System, seen: Sightings) -> tuple[FloatArray, FloatArray]:
+def station_rays(seen: Sightings) -> tuple[FloatArray, FloatArray]:
     """Origins and unit rays (n, 3) of the spots in the station. Raises SurveyError for pixels that have no ray."""
+    cameras, origin = seen.system.head.cameras, np.ascontiguousarray(seen.system.arrays.camera_t[seen.camera])
     if seen.ray is not None:
-        return np.ascontiguousarray(system.camera_t[seen.camera]), seen.ray
+        return origin, seen.ray
     ray = np.zeros((len(seen.uv), 3))
-    for c, given in enumerate(system.head.cameras):
-        rows = seen.camera == c
-        if rows.any():
-            own = unit_rays(MODELS[given.model], given.lens, given.constants, seen.uv[rows])
-            ray[rows] = own @ system.camera_R[c].T
-    return np.ascontiguousarray(system.camera_t[seen.camera]), ray
+    for c in np.unique(seen.camera).tolist():
+        rows, given = seen.camera == c, cameras[c]
+        own = unit_rays(MODELS[given.model], given.lens, given.constants, seen.uv[rows])
+        ray[rows] = own @ seen.system.arrays.camera_R[c].T
+    return origin, ray
 
 
-def with_rays(system: System, sequence: Sequence[Sightings]) -> list[Sightings]:
+def with_rays(sequence: Sequence[Sightings]) -> list[Sightings]:
     """The same with the rays of all, computed at once: the lens is inverted by arrays, single spots would cost more."""
     if not sequence:
         return []
     camera, uv = (np.concatenate([getattr(s, name) for s in sequence]) for name in ("camera", "uv"))
     try:
-        _, ray = station_rays(system, replace(sequence[0], camera=camera, uv=uv))
+        _, ray = station_rays(replace(sequence[0], camera=camera, uv=uv))
     except SurveyError:
         return list(sequence)  # one spot has no ray: said where its epoch needs it
     ends = np.cumsum([len(s.uv) for s in sequence])[:-1]
     return [replace(s, ray=np.ascontiguousarray(r)) for s, r in zip(sequence, np.split(ray, ends), strict=True)]
 
 
-def _labels(spots: Spots, names: dict[str, int], epoch_id: str) -> list[int]:
-    if spots.beacon_ids is None:
-        return [-1] * len(spots.uv)
-    unknown = {b for b in spots.beacon_ids if b is not None and b not in names}
-    if unknown:
+def _labels(spots: Spots, names: dict[str, int], epoch_id: str) -> IntArray:
+    ids = (None,) * len(spots.uv) if spots.beacon_ids is None else spots.beacon_ids
+    if unknown := {b for b in ids if b is not None and b not in names}:
         raise SurveyError(
             f"epoch {epoch_id}, camera {spots.camera_id}: {', '.join(sorted(unknown))} is no beacon with known "
             "coordinates; survey it, or leave its spot without a name"
         )
-    return [names[b] if b is not None else -1 for b in spots.beacon_ids]
+    return np.array([names[b] if b is not None else -1 for b in ids], dtype=np.int64)
 
 
 def evaluate(
-    system: System, pose: FloatArray, camera: IntArray, beacon: IntArray, uv: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
-    """Residual (2n,) px, H (2n, 6), M (2n, r), and whether all beacons are in front; pose (4, 4) world_from_station."""
+    system: System, pose: FloatArray, camera: IntArray, beacon: IntArray, uv: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Residual (2n,) px, H (2n, 6) and M (2n, r) at a pose (4, 4) world_from_station; without uv predicted places."""
     n = len(camera)
     residual, H, M = np.empty(2 * n), np.empty((2 * n, 6)), np.empty((2 * n, system.F.shape[1]))
-    spots = SpotArrays(camera, beacon, np.ascontiguousarray(uv))
-    in_front = spot_rows(system.arrays, np.ascontiguousarray(pose), spots, residual, H, M)
-    return residual, H, M, in_front
+    spots = SpotArrays(camera, beacon, np.zeros((n, 2)) if uv is None else np.ascontiguousarray(uv))
+    spot_rows(system.arrays, np.ascontiguousarray(pose), spots, residual, H, M)
+    return residual, H, M
 
 
 def in_view(system: System, pose: FloatArray) -> tuple[IntArray, IntArray]:
@@ -241,7 +224,7 @@ def visible(system: System, pose: FloatArray, margin: float = 0.0) -> BoolArray:
     margin: how far outside its border (tangent of the angle) counts as inside.
     """
     q = (system.arrays.x_in_world - pose[:3, 3]) @ pose[:3, :3]
-    p = np.einsum("cij,cbi->cbj", system.camera_R, q - system.camera_t[:, None])
+    p = np.einsum("cij,cbi->cbj", system.arrays.camera_R, q - system.arrays.camera_t[:, None])
     low_x, high_x, low_y, high_y, cosine = (column[:, None] for column in system.field.T)
     with np.errstate(divide="ignore", invalid="ignore"):
         x, y = p[:, :, 0] / p[:, :, 2], p[:, :, 1] / p[:, :, 2]

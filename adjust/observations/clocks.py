@@ -217,7 +217,7 @@ def moved_poses(
     Then their derivatives (s, 6, 6 n + c) by all of these and the clocks.
     """
     s, n = at.w.shape
-    first = Motions(np.repeat(own.rotation, n - 1, axis=0), np.repeat(_t(own), n - 1, axis=0))
+    first = Motions(np.repeat(own.rotation, n - 1, axis=0), np.repeat(own.shifts, n - 1, axis=0))
     logs = (first.inverse() @ others).log()
     inverse, back = (x.reshape(-1, n - 1, 6, 6)[epoch] for x in (right_jacobian_inverse(logs), exp(-logs).adjoint()))
     L = logs.reshape(-1, n - 1, 6)[epoch]
@@ -229,7 +229,7 @@ def moved_poses(
     by_nodes = np.swapaxes(np.concatenate([by_own[:, None], J], axis=1), 1, 2).reshape(s, 6, 6 * n)
     by_clock = speed[:, :, None] * at.by_clock[:, None, :]
     moved = own[epoch] @ exp(xi)
-    return moved.rotation, _t(moved), np.concatenate([by_nodes, by_clock], axis=2)
+    return moved.rotation, moved.shifts, np.concatenate([by_nodes, by_clock], axis=2)
 
 
 def shift(state: State, values: gtsam.Values, slots: Sequence[ShiftedSlot]) -> None:
@@ -263,10 +263,6 @@ def _between_readings(
     by_nodes = np.einsum("sk,sia->sika", at.w, D[:, :, :k]).reshape(len(slots), 6, -1)
     speed = D[:, :, :k] @ np.einsum("sk,ska->sa", at.by_dt, angles)[..., None]
     return R, t, np.concatenate([by_nodes, D[:, :, k:], speed * at.by_clock[:, None, :]], axis=2)
-
-
-def _t(motions: Motions) -> FloatArray:
-    return np.zeros((len(motions), 3)) if motions.translation is None else motions.translation
 
 
 def reading_residual(slot: ShiftedSlot, unknowns: Unknowns, observed: FloatArray) -> tuple[list[int], Reading]:

@@ -11,7 +11,7 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.frames.state import State
-from adjust.frames.unknowns import Chain, Unknown, Unknowns, VectorMap
+from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Chain, Unknown, Unknowns, VectorMap
 from adjust.model.observations import Coordinates, Distance, Pair
 from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, VectorPrior
 from adjust.observations.adapter import evaluated
@@ -148,26 +148,26 @@ def distance_factor(observation: Distance, a: Position, b: Position) -> gtsam.No
 
 
 def coordinates_factor(observation: Coordinates, positions: Sequence[Position]) -> gtsam.NonlinearFactor:
-    """GTSAM's prior for one world point, or coordinates of several positions with their joint covariance.
-
-    Coordinates with an infinite variance were not observed.
-    """
-    known = np.isfinite(np.diag(observation.cov))
-    if len(positions) == 1 and positions[0].point_key is not None and known.all():
-        return gtsam.PriorFactorPoint3(positions[0].point_key, observation.values[0], gaussian(observation.cov))
-    keys = list(dict.fromkeys(k for p in positions for k in p.keys))
-    residual = positions_residual([((p, 1.0),) for p in positions], observation.values, known)
-    return custom(keys, observation.cov[np.ix_(known, known)], residual)
+    """GTSAM's prior for one world point, or coordinates of several positions with their joint covariance."""
+    cov = observation.cov
+    if len(positions) == 1 and positions[0].point_key is not None and known_components(cov).all():
+        return gtsam.PriorFactorPoint3(positions[0].point_key, observation.values[0], gaussian(cov))
+    return positions_factor([((p, 1.0),) for p in positions], observation.values, cov)
 
 
-def positions_residual(
-    sums: Sequence[Sequence[tuple[Position, float]]], values: FloatArray, known: BoolArray
-) -> Residual:
-    """Sums of positions with signs minus what was observed of them (n, 3); ``known`` (3n,): which components were."""
-    wanted = values.ravel()
+def known_components(cov: FloatArray) -> BoolArray:
+    """Which components of an observation were observed: those with a finite variance."""
+    return np.asarray(np.isfinite(np.diag(cov)))
+
+
+def positions_factor(
+    sums: Sequence[Sequence[tuple[Position, float]]], observed: FloatArray, cov: FloatArray
+) -> gtsam.CustomFactor:
+    """Sums of positions with signs minus what was observed of them (n, 3), with joint covariance cov (3n, 3n)."""
+    known, keys = known_components(cov), list(dict.fromkeys(k for signed in sums for p, _ in signed for k in p.keys))
 
     def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
-        out, blocks = np.zeros(3 * len(sums)), []
+        out, blocks = -observed.ravel(), []
         for i, signed in enumerate(sums):
             rows = slice(3 * i, 3 * i + 3)
             for position, sign in signed:
@@ -177,25 +177,30 @@ def positions_residual(
                     block = np.zeros((len(out), J.shape[1]))
                     block[rows] = sign * J
                     blocks.append((key, block[known]))
-        return (out - wanted)[known], blocks
+        return out[known], blocks
 
-    return residual
+    return custom(keys, cov[np.ix_(known, known)], residual)
 
 
-def pair_factor(observation: Pair, unknowns: Unknowns, state: State, chain: Chain) -> gtsam.NonlinearFactor:
+def pair_item(pair: Pair, unknowns: Unknowns, state: State, chain: Chain) -> ObservationFactor:
     """A measured relative pose or rotation: GTSAM's between factor for two fixed bodies, else the general chain."""
-    simple = len(chain) == 2 and chain[0].inverse and not chain[1].inverse
-    keys = [unknowns.slot_key[link.slot] for link in chain]
-    measured = observation.b_from_a
-    predicted = ChainPose(unknowns, state, chain)
+    measured, keys = pair.b_from_a, [unknowns.slot_key[link.slot] for link in chain]
+    simple = len(chain) == 2 and chain[0].inverse and not chain[1].inverse and keys[0] != keys[1]
+    factor: gtsam.NonlinearFactor
     if isinstance(measured, Rot3):
-        turn = _components_residual(predicted, Pose3(measured, np.zeros(3)), np.arange(3))
-        return custom(predicted.keys, observation.cov, turn)
-    if simple and all(unknowns.derived(link.slot) is None for link in chain):
-        b, a = keys
-        if a is not None and b is not None and a != b:
-            return gtsam.BetweenFactorPose3(b, a, measured, gaussian(observation.cov))
-    return custom(predicted.keys, observation.cov, _components_residual(predicted, measured, np.arange(6)))
+        observed, given = Rot3.Logmap(measured), Pose3(measured, np.zeros(3))
+    else:
+        observed, given = Pose3.Logmap(measured), measured
+    n = len(observed)
+    free = simple and all(unknowns.derived(link.slot) is None for link in chain) and n == 6
+    if free and (b := keys[0]) is not None and (a := keys[1]) is not None:
+        factor = gtsam.BetweenFactorPose3(b, a, given, gaussian(pair.cov))
+    else:
+        predicted = ChainPose(unknowns, state, chain)
+        factor = custom(predicted.keys, pair.cov, _components_residual(predicted, given, np.arange(n)))
+    ids = pair.pair_id, pair.a.text, pair.b.text
+    return ObservationFactor(factor, "pair", pair.group, ids, POSE_COMPONENTS[:n], POSE_UNITS[:n],
+                             np.asarray(observed, dtype=float), pair.used)  # fmt: skip
 
 
 def _components_residual(predicted: PoseOf, given: Pose3, rows: IntArray) -> Residual:
@@ -246,7 +251,7 @@ def pose_prior_factor(parameter: PoseParameter, key: int) -> gtsam.NonlinearFact
     if parameter.value is None or parameter.prior_cov is None:
         raise ValueError("a pose prior needs a value and a covariance")
     mean, cov = parameter.value, parameter.prior_cov
-    known = np.isfinite(np.diag(cov))
+    known = known_components(cov)
     if known.all():
         return gtsam.PriorFactorPose3(key, mean, gaussian(cov))
     residual = _components_residual(_unknown_pose(key), mean, np.flatnonzero(known))

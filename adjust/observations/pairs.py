@@ -8,23 +8,23 @@ chi-square with the rank of Q_vv degrees of freedom (Baarda 1968; Koch 1999, sec
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache, partial
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 
 import gtsam
 import numpy as np
-from gtsam import Pose3, Rot3
+from gtsam import Pose3
 
 from adjust.frames.state import State
 from adjust.frames.tree import FrameTree
-from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Unknowns
-from adjust.model.errors import SurveyError
-from adjust.model.observations import Pair, frame_text
+from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Link, Unknowns
+from adjust.model.observations import Pair
 from adjust.model.result import Named, OtherArrays, Residuals
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.pairs import pair_jacobians, pair_rows, sure_forms
 from adjust.native.trees import KeyCovariances
-from adjust.observations.factors import Jacobians, ObservationFactor, custom
+from adjust.observations.factors import ObservationFactor, pair_item
+from adjust.observations.pair_arrays import PairArrays
 from adjust.spatial.rigid_motions import Motions, exp
 from adjust.testing.distributions import chi2
 
@@ -33,120 +33,8 @@ UNCONTROLLED = 1e-4
 _HELD = -1
 
 
-@dataclass(frozen=True, eq=False)
-class PairArrays:
-    """E measured ``b_from_a``: rotations (E, 3, 3), translations (E, 3) m, nan where only the rotation was measured.
-
-    cov: (E, 6, 6) in the tangent of the frame on the right (a), infinite variance where nothing was measured.
-    """
-
-    rotations: FloatArray
-    translations: FloatArray
-    cov: FloatArray
-    used: BoolArray
-
-    def with_used(self, used: BoolArray) -> "PairArrays":
-        """The same with other pairs in use; nothing else is computed again."""
-        out = replace(self, used=used)
-        out.__dict__.update({n: v for n, v in self.__dict__.items() if n not in out.__dict__})
-        return out
-
-    @cached_property
-    def is_pose(self) -> BoolArray:
-        """Which pairs (E,) measured a translation too."""
-        return np.isfinite(self.cov[:, 3, 3])
-
-    @cached_property
-    def whitening(self) -> FloatArray:
-        """W (E, 6, 6), upper triangular, with W'W the inverse covariance; zero rows where nothing was measured."""
-        out = np.zeros((len(self.used), 6, 6))
-        for rows, n in ((self.is_pose, 6), (~self.is_pose, 3)):
-            if rows.any():
-                info = np.linalg.inv(self.cov[rows][:, :n, :n])
-                W = np.swapaxes(np.linalg.cholesky(0.5 * (info + np.swapaxes(info, 1, 2))), 1, 2)
-                out[np.ix_(rows, np.arange(n), np.arange(n))] = W
-        return out
-
-    @cached_property
-    def doubtful(self) -> BoolArray:
-        """Which pairs (E,) have a covariance that is not finite, symmetric, positive definite, by its correlations."""
-        wrong = np.zeros(len(self.used), dtype=np.bool_)
-        for rows, k in ((self.is_pose, 6), (~self.is_pose, 3)):
-            C = self.cov[rows][:, :k, :k]
-            scale = np.sqrt(np.maximum(np.diagonal(C, axis1=1, axis2=2), 1e-300))
-            correlation = C / scale[:, :, None] / scale[:, None, :]
-            finite = np.asarray(np.isfinite(correlation).all(axis=(1, 2)), dtype=np.bool_)
-            whole = np.where(finite[:, None, None], correlation, -1.0)
-            fine = np.asarray(np.linalg.eigvalsh(whole).min(axis=1, initial=1.0) > 1e-12)
-            fine = fine & (np.abs(whole - np.swapaxes(whole, 1, 2)).max(axis=(1, 2), initial=0.0) < 1e-6)
-            wrong[np.flatnonzero(rows)[~fine]] = True
-        return wrong
-
-    @cached_property
-    def shifts(self) -> FloatArray:
-        """Translations (E, 3), zero where none was measured."""
-        return np.nan_to_num(self.translations)
-
-    @cached_property
-    def motions(self) -> Motions:
-        """All of them; translations that were not measured count as zero."""
-        return Motions(self.rotations, self.shifts)
-
-    @cached_property
-    def poses(self) -> list[Pose3]:
-        """The same one by one."""
-        return [self.pose(e) for e in range(len(self.used))]
-
-    def pose(self, e: int) -> Pose3:
-        """One of them."""
-        return Pose3(Rot3(self.rotations[e]), self.shifts[e])
-
-    @cached_property
-    def logs(self) -> FloatArray:
-        """Logarithms (E, 6), of rotations the first three components."""
-        return self.motions.log()
-
-
-@lru_cache(2)  # of a survey as it was given, and as it is solved
-def pair_arrays(pairs: tuple[Pair, ...]) -> PairArrays:
-    """Pairs as arrays, which are not to be changed: those of the same pairs are made once."""
-    cov, size = np.zeros((len(pairs), 6, 6)), np.array([len(p.cov) for p in pairs], dtype=np.int64)
-    cov[size == 3, 3:, 3:] = np.diag([np.inf] * 3)
-    for k in (3, 6):
-        alike = np.flatnonzero(size == k)
-        cov[alike, :k, :k] = np.array([pairs[e].cov for e in alike.tolist()]).reshape(-1, k, k)
-    measured = [p.b_from_a for p in pairs]
-    M = np.full((len(pairs), 4, 4), np.nan)
-    for e, m in enumerate(measured):
-        if isinstance(m, Pose3):
-            M[e] = m.matrix()
-        else:
-            M[e, :3, :3] = m.matrix()
-    return PairArrays(M[:, :3, :3].copy(), M[:, :3, 3].copy(), cov, np.array([p.used for p in pairs], dtype=np.bool_))
-
-
-def checked_arrays(pairs: Sequence[Pair]) -> PairArrays:
-    """Pairs as arrays; raises SurveyError for the first whose covariance cannot be."""
-    for p in pairs:
-        n = 3 if isinstance(p.b_from_a, Rot3) else 6
-        if np.shape(p.cov) != (n, n):
-            raise SurveyError(f"{_said(p)}: its covariance has shape {np.shape(p.cov)}, expected ({n}, {n})")
-    found = pair_arrays(tuple(pairs))
-    wrong = np.flatnonzero(found.doubtful | ~np.array([np.isfinite(p.cov).all() for p in pairs], dtype=np.bool_))
-    if len(wrong):
-        raise SurveyError(
-            f"{_said(pairs[int(wrong[0])])}: its covariance is not symmetric and positive definite; give every "
-            "direction a sigma"
-        )
-    return found
-
-
 def _ids(pair: Pair) -> tuple[str, str, str]:
     return pair.pair_id, pair.a.text, pair.b.text
-
-
-def _said(pair: Pair) -> str:
-    return f"pair {pair.pair_id!r} ({frame_text(pair.a)} to {frame_text(pair.b)})"
 
 
 class NoiseCache:
@@ -281,31 +169,8 @@ class PairBatch:
 
     def item(self, e: int, pairs: Sequence[Pair]) -> ObservationFactor:
         """What a report needs to know of one; ``pairs`` are those of the survey."""
-        pair, is_pose = pairs[int(self.rows[e])], bool(self.arrays.is_pose[e])
-        k = 6 if is_pose else 3
-        return ObservationFactor(self._exact(e, pair, is_pose), "pair", pair.group, _ids(pair), POSE_COMPONENTS[:k],
-                                 POSE_UNITS[:k], self.arrays.logs[e, :k], pair.used)  # fmt: skip
-
-    def _exact(self, e: int, pair: Pair, is_pose: bool) -> gtsam.NonlinearFactor:
-        """A factor with just the measured components as residual, in frame a."""
-        (a, b), measured = self._ends(e), self.arrays.pose(e)
-        if is_pose and not isinstance(a, Pose3):
-            factor = native_factor(a, b, measured, self.arrays.whitening[e], self.noise)
-            if factor is not None:
-                return factor
-        keys = list(dict.fromkeys(x for x in (b, a) if not isinstance(x, Pose3)))
-        k = 6 if is_pose else 3
-
-        def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
-            world_from_a, world_from_b = (x if isinstance(x, Pose3) else values.atPose3(x) for x in (a, b))
-            b_from_a, D = world_from_b.between(world_from_a), np.zeros((6, 6), order="F")
-            r = np.asarray(Pose3.Logmap(measured.between(b_from_a), D))
-            by: Jacobians = [] if isinstance(a, Pose3) else [(a, D[:k])]
-            if not isinstance(b, Pose3):
-                by.append((b, -(D @ b_from_a.inverse().AdjointMap())[:k]))
-            return r[:k], by
-
-        return custom(keys, pair.cov, residual)
+        chain = Link(int(self.b_slot[e]), inverse=True), Link(int(self.a_slot[e]))
+        return pair_item(pairs[int(self.rows[e])], self.unknowns, self.state, chain)
 
     def jacobians(self, values: gtsam.Values) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Residuals (E, 6), derivatives (E, 6, 6) by b and by a, and Ad(b_from_a^-1) (E, 6, 6), unweighted."""
@@ -339,11 +204,9 @@ class PairBatch:
         # a row of the whitening that is zero was not measured
         Qvv = sign * (W @ scatter @ np.swapaxes(W, 1, 2)) + np.any(W, axis=2)[..., None] * np.eye(6)
         white = np.einsum("nij,nj->ni", W, residual)
-        test, freedom = _quadratic(Qvv, white)
-        with np.errstate(invalid="ignore"):
-            p = np.where(freedom > 0, chi2.sf(test, np.maximum(freedom, 1)), np.nan)
         redundancy = np.where(used[:, None], np.diagonal(Qvv, axis1=1, axis2=2), 0.0)
-        return PairStatistics(residual, white, redundancy, test, freedom, p, own, arrays.cov + sign * scatter)
+        tests = pair_tests(Qvv, white, UNCONTROLLED)
+        return PairStatistics(residual, white, redundancy, *tests, own, arrays.cov + sign * scatter)
 
     def residuals(self, stats: PairStatistics, pairs: Sequence[Pair]) -> Residuals:
         """As reports take them; ``pairs`` are those of the survey."""
@@ -368,16 +231,22 @@ def _named(pairs: Sequence[Pair], sizes: Sequence[int], e: int) -> Named:
     return "pair", pairs[e].group, _ids(pairs[e]), POSE_COMPONENTS[: sizes[e]], POSE_UNITS[: sizes[e]]
 
 
-def _quadratic(Q: FloatArray, v: FloatArray) -> tuple[FloatArray, IntArray]:
-    """The forms v' Q^+ v (E,) and the rank of Q, eigenvalues below ``UNCONTROLLED`` counting as zero."""
-    test, freedom = sure_forms(Q, v, UNCONTROLLED), np.full(len(v), 6, dtype=np.int64)
+def pair_tests(Q: FloatArray, v: FloatArray, least: float) -> tuple[FloatArray, IntArray, FloatArray]:
+    """The forms v' Q^+ v (E,), the rank of Q, and p: whitened residuals v (E, k) with their covariances Q (E, k, k).
+
+    Eigenvalues below ``least`` count as zero; nan where all do.
+    """
+    n, k = v.shape
+    test, freedom = sure_forms(Q, v, least) if k == 6 else np.full(n, -1.0), np.full(n, k, dtype=np.int64)
     rest = np.flatnonzero(test < 0.0)
     w, U = np.linalg.eigh(Q[rest])
-    kept = w > UNCONTROLLED
+    kept = w > least
     y = np.einsum("nij,ni->nj", U, v[rest])
     test[rest] = (np.where(kept, y * y, 0.0) / np.where(kept, w, 1.0)).sum(axis=1)
     freedom[rest] = kept.sum(axis=1)
-    return np.where(freedom > 0, test, np.nan), freedom
+    test = np.where(freedom > 0, test, np.nan)
+    with np.errstate(invalid="ignore"):
+        return test, freedom, np.where(freedom > 0, chi2.sf(test, np.maximum(freedom, 1)), np.nan)
 
 
 def simple_pairs(survey: Survey, frames: FrameTree) -> tuple[IntArray, IntArray, IntArray]:

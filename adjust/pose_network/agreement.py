@@ -117,21 +117,13 @@ def _tests(network: PoseNetwork, loops: Loops) -> tuple[FloatArray, IntArray]:
     return _tested(loops, network.arrays.motions, network.cov, network.sizes, network.dim)
 
 
-def _tested(
-    loops: Loops, motions: Motions, cov: FloatArray, sizes: IntArray, d: int
-) -> tuple[FloatArray, IntArray]:  # fmt: skip
-    motions = motions if d == 6 else Motions(motions.rotation)
-    w, C = misclosures(loops, motions, np.nan_to_num(cov[:, :d, :d], posinf=0.0))
+def _tested(loops: Loops, motions: Motions, cov: FloatArray, sizes: IntArray, d: int) -> tuple[FloatArray, IntArray]:
+    w, C = misclosures(loops, motions.in_dim(d), np.nan_to_num(cov[:, :d, :d], posinf=0.0))
     test, freedom = np.zeros(len(loops)), np.minimum.reduceat(sizes[loops.pair_idx], loops.ptr[:-1])
     for k in np.unique(freedom).tolist():
         of = np.flatnonzero(freedom == k)
         test[of] = np.einsum("li,li->l", w[of, :k], np.linalg.solve(C[of, :k, :k], w[of, :k, None])[..., 0])
     return test, freedom
-
-
-def _measured(network: PoseNetwork) -> Motions:
-    motions = network.arrays.motions
-    return motions if network.dim == 6 else Motions(motions.rotation)
 
 
 def agreeing_poses(survey: Survey) -> dict[ParameterName, Pose3]:
@@ -171,8 +163,8 @@ def disagreeing(
 
 def _squares(network: PoseNetwork, R: FloatArray, t: FloatArray) -> FloatArray:
     """Whitened squares (E,) of all pairs with the stations there."""
-    here = Motions(R, None if network.rotation_only else t)
-    residual = (_measured(network).inverse() @ here[network.b_idx].inverse() @ here[network.a_idx]).log()
+    here, measured = (motions.in_dim(network.dim) for motions in (Motions(R, t), network.arrays.motions))
+    residual = (measured.inverse() @ here[network.b_idx].inverse() @ here[network.a_idx]).log()
     return np.asarray(np.square(np.einsum("nij,nj->ni", network.whitening, residual)).sum(axis=1))
 
 

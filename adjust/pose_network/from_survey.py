@@ -6,7 +6,7 @@ import numpy as np
 
 from adjust.model.errors import IndeterminateError, SurveyError, listed
 from adjust.model.survey import FloatArray, PoseParameter, Survey
-from adjust.observations.pairs import pair_arrays
+from adjust.observations.pair_arrays import pair_arrays
 from adjust.pose_network.network import PoseNetwork, Topology, check_determined, network_of
 
 _BESIDE = ("distances", "coordinates", "coordinate_differences", "levels", "alignments")

@@ -11,7 +11,7 @@ from gtsam import Pose3, Rot3
 from adjust.model.errors import IndeterminateError, SurveyError, listed
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import BoolArray, Datum, FloatArray, IntArray, PoseParameter, Station, Survey, Treatment
-from adjust.observations.pairs import PairArrays
+from adjust.observations.pair_arrays import PairArrays
 from adjust.pose_network.cycles import connected_parts
 from adjust.spatial.rigid import nearest_rotation
 
@@ -175,18 +175,16 @@ def pose_network(
     measured = PairArrays(np.array(rotations, dtype=float).reshape(n_pairs, 3, 3), t, Q, use)
     a, b = (np.asarray(x, dtype=np.int64).ravel() for x in (a_idx, b_idx))
     who = Topology(tuple(station_ids), tuple(pair_ids), a, b)
-    return network_of(who, measured, held, start, prior, inner)
+    return network_of(who, measured, held or {}, start or {}, prior or {}, inner)
 
 
 def network_of(
-    who: Topology, measured: PairArrays, held: Mapping[int, FloatArray] | None = None,
-    start: Mapping[int, FloatArray] | None = None, prior: Mapping[int, tuple[FloatArray, FloatArray]] | None = None,
-    inner: Sequence[int] | None = None, survey: Survey | None = None,
+    who: Topology, measured: PairArrays, held: Mapping[int, FloatArray], start: Mapping[int, FloatArray],
+    prior: Mapping[int, tuple[FloatArray, FloatArray]], inner: Sequence[int] | None, survey: Survey | None = None,
 ) -> PoseNetwork:  # fmt: skip
     """The same from pairs as arrays."""
     n = who.n_stations
     R, T = np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan)
-    held, start, prior = dict(held or {}), dict(start or {}), dict(prior or {})
     known = {**start, **{k: p for k, (p, _) in prior.items()}, **held}
     if known:
         poses = np.array(list(known.values()), dtype=float)

@@ -163,18 +163,13 @@ def _moved(graph: AdjustmentGraph, estimate: Estimate, values: gtsam.Values, new
     unknown = graph.unknowns.by_name.get(estimate.name)
     if unknown is None:
         return estimate
-    status = tuple("free" if s == "held" and estimate.name[0] == "point" else s for s in estimate.status)
-    held = graph.unknowns.held.get(unknown.key, ())
-    status = tuple("held" if i in held else s for i, s in enumerate(status))
-    cov = new.whole([estimate.name], [len(estimate.components)])
-    if unknown.kind == "pose":
-        free = tuple("free" if s == "held" and i not in held else s for i, s in enumerate(estimate.status))
-        return replace(estimate, value=values.atPose3(unknown.key), cov=cov, status=free)
-    if unknown.kind == "point":
-        x = np.asarray(values.atPoint3(unknown.key))
-        return replace(estimate, value=x, cov=cov, status=status)
+    cov, held = new.whole([estimate.name], [len(estimate.components)]), graph.unknowns.held.get(unknown.key, ())
+    if unknown.kind != "vector":
+        value = values.atPose3(unknown.key) if unknown.kind == "pose" else np.asarray(values.atPoint3(unknown.key))
+        status = tuple("free" if s == "held" and i not in held else s for i, s in enumerate(estimate.status))
+        return replace(estimate, value=value, cov=cov, status=status)
     vector = graph.unknowns.vectors.get(estimate.name)
     if vector is not None and vector.borrowed:  # a lens, which no datum changes
         return estimate
-    value = np.asarray(values.atVector(unknown.key)) if vector is None else vector.full(values)
-    return replace(estimate, value=value, cov=cov)
+    full = np.asarray(values.atVector(unknown.key)) if vector is None else vector.full(values)
+    return replace(estimate, value=full, cov=cov)

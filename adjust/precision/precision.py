@@ -37,14 +37,11 @@ from adjust.observations.factors import ObservationFactor
 from adjust.observations.images.bundle_hidden import BundleHidden
 from adjust.precision.s_transformation import STransformation, s_transformation
 from adjust.precision.stacked import Stacked
-from adjust.precision.tree import TreeCovariance, unit_rows
+from adjust.precision.tree import TreeCovariance
 from adjust.testing.distributions import chi2
 
 if TYPE_CHECKING:
     from adjust.observations.pairs import PairStatistics
-
-_PAIRS = 200
-"""Pairs of unknowns that are brought together in one go."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +107,7 @@ class Precision(Covariances):
         self.tree = TreeCovariance(solved.tree, dims, solved.leaves)
         self.hidden: dict[int, FloatArray] = {}
         self._together: dict[tuple[int, int], FloatArray] = {}
-        """Joint covariances, as solved, of pairs of keys that were brought together, which share no clique."""
+        """Joint covariances, as solved, of pairs of keys that were brought together."""
         self.bundle_influence: list[FloatArray] = []
         """Whitened A Q A' (K, 3) of the image points of every bundle, in its sorted order."""
         self._hidden = [BundleHidden(bundle) for bundle in graph.bundles]
@@ -164,24 +161,20 @@ class Precision(Covariances):
 
     def bring_together(self, pairs: Iterable[tuple[ParameterName, ParameterName]]) -> None:
         """See :class:`Covariances`."""
-        by_name = self.graph.unknowns.by_name
+        by_name = self.unknowns.by_name
         keys = [(by_name[a].key, by_name[b].key) for a, b in pairs]
-        in_tree = [pair for pair in keys if not self.hidden.keys() & pair]
-        apart = [pair for pair in in_tree if self.tree.shared(*pair) is None]
-        if apart:
-            of_pairs = [self.tree.rows(pair) for pair in apart]
-            A = unit_rows(np.concatenate(of_pairs), self.tree.n)
-            found = self.tree.each_among(A, np.cumsum([0, *map(len, of_pairs)]))
-            self._together |= dict(zip(apart, found, strict=True))
-        below = [pair for pair in keys if self.hidden.keys() & pair]
-        for k in range(0, len(below), _PAIRS):
-            some = list(dict.fromkeys(key for pair in below[k : k + _PAIRS] for key in pair))
-            ends = np.cumsum([0, *(self.unknowns.by_key[key].dim for key in some)])
-            at = {key: np.arange(*ends[i : i + 2]) for i, key in enumerate(some)}
-            Q = self.stacked.joint(some)
-            for a, b in below[k : k + _PAIRS]:
-                rows = np.concatenate([at[a], at[b]])
-                self._together[a, b] = Q[np.ix_(rows, rows)]
+        self._together |= dict(zip(keys, self.stacked.each_joint(keys), strict=True))
+
+    def whole_pairs(self, pairs: Sequence[tuple[ParameterName, ParameterName]], size: int) -> FloatArray:
+        """See :class:`Covariances`."""
+        plain = {n: u.key for n, u in self.unknowns.by_name.items() if u.dim == size and n not in self.unknowns.vectors}
+        mine = np.array([a in plain and b in plain for a, b in pairs], dtype=np.bool_)
+        out = np.empty((len(pairs), 2 * size, 2 * size))
+        out[~mine] = super().whole_pairs(list(compress(pairs, ~mine)), size)
+        keys = [(plain[a], plain[b]) for a, b in compress(pairs, mine)]
+        found = np.array(self.stacked.each_joint(keys)).reshape(-1, 2 * size, 2 * size)
+        out[mine] = self._moved(np.array(keys, dtype=np.int64).reshape(-1, 2), found, size)
+        return out
 
     def rows(self, item: ObservationFactor) -> ObservationRows:
         """An observation that is neither image point nor reading, linearised at the solution: built once, and kept."""
@@ -232,15 +225,21 @@ class Precision(Covariances):
         below = np.isin(keys, list(self.hidden))
         Q[below] = np.array([self.hidden[k] for k in keys[below].tolist()]).reshape(-1, dim, dim)
         Q[~below] = self.tree.marginals(keys[~below], dim)
-        t = self.transformation
-        if t is not None:
-            G, W = (np.array([of[k] for k in keys.tolist()]) for of in (t.motions, t.spread))
+        return self._moved(keys[:, None], Q, dim)
+
+    def _moved(self, keys: IntArray, Q: FloatArray, dim: int) -> FloatArray:
+        """Covariances Q (n, k, k) as solved, of sets of unknowns (n, m), in the datum; zero of what is held."""
+        t, shape = self.transformation, Q.shape[:2]
+        if t is not None and keys.size:
+            every = keys.ravel().tolist()
+            G, W = (np.array([of[k] for k in every]).reshape(*shape, -1) for of in (t.motions, t.spread))
             across = G @ np.swapaxes(W, 1, 2)
-            Q += G @ t.core @ np.swapaxes(G, 1, 2) - across - np.swapaxes(across, 1, 2)
+            Q = Q + (G @ t.core @ np.swapaxes(G, 1, 2) - across - np.swapaxes(across, 1, 2))
+        free = np.ones((keys.size, dim), dtype=np.bool_)
         for i in np.flatnonzero(np.isin(keys, list(self.unknowns.held))).tolist():
-            held = list(self.unknowns.held[int(keys[i])])
-            Q[i, held], Q[i, :, held] = 0.0, 0.0
-        return Q
+            free[i, list(self.unknowns.held[int(keys.flat[i])])] = False
+        kept = free.reshape(shape)
+        return np.asarray(np.where(kept[:, :, None] & kept[:, None], Q, 0.0))
 
     def every_cov(self) -> dict[int, FloatArray]:
         """Covariance (dim, dim) of every unknown."""

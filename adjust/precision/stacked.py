@@ -15,6 +15,8 @@ from adjust.precision.tree import Half, TreeCovariance, squares, squares_of_sums
 
 AT_ONCE = 64
 """Columns that the matrix is multiplied by in one go."""
+_PAIRS = 200
+"""Pairs of unknowns of which some are hidden that are brought together in one go."""
 
 
 class Stacked:
@@ -77,6 +79,28 @@ class Stacked:
         """Joint covariance of any unknowns, as solved, stacked in this order."""
         rows = np.concatenate([self.rows(k) for k in keys])
         return self.among(unit_rows(rows, self.n))
+
+    def each_joint(self, pairs: Sequence[tuple[int, int]]) -> list[FloatArray]:
+        """The same of many pairs of unknowns."""
+        hidden = {key for below in self.hidden for key in below.keys}
+        apart = [pair for pair in pairs if not hidden.isdisjoint(pair)]
+        in_tree = [pair for pair in pairs if hidden.isdisjoint(pair)] if apart else pairs
+        ends = np.array([(p.start, p.stop) for pair in in_tree for p in map(self.places.__getitem__, pair)],
+                        dtype=np.int64).reshape(-1, 2)  # fmt: skip
+        sizes = np.diff(ends).ravel()
+        rows = np.arange(sizes.sum()) + np.repeat(ends[:, 1] - np.cumsum(sizes), sizes)
+        ptr = np.append(0, np.cumsum(sizes)[1::2])
+        found = iter(self.tree.each_among(unit_rows(rows, self.tree.n), ptr))
+        below = (Q for i in range(0, len(apart), _PAIRS) for Q in self._among_some(apart[i : i + _PAIRS]))
+        return [next(found if hidden.isdisjoint(pair) else below) for pair in pairs]
+
+    def _among_some(self, pairs: Sequence[tuple[int, int]]) -> list[FloatArray]:
+        """The same from the joint covariance of all that are in them."""
+        keys = list(dict.fromkeys(key for pair in pairs for key in pair))
+        ends = np.cumsum([0, *(self.unknowns.by_key[key].dim for key in keys)])
+        at = {key: np.arange(*ends[i : i + 2]) for i, key in enumerate(keys)}
+        Q, rows = self.joint(keys), [np.concatenate([at[a], at[b]]) for a, b in pairs]
+        return [Q[np.ix_(mine, mine)] for mine in rows]
 
     def by_key(
         self, rows: Mapping[int, FloatArray], times: Callable[[FloatArray], FloatArray]

@@ -6,7 +6,7 @@ results are brought back. The height of the body over the table, which a caliper
 the table in the world and every camera in the mount.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -91,7 +91,7 @@ def compare_head(adjusted: Adjustment) -> HeadComparison:
     found, (names, cov) = calibrate(given), propagate(given)
     at = {name: i for i, name in enumerate(names)}
     both = _Both(adjusted, found, axes, at, cov)
-    poses = [_table_pose(both, table), *(_camera_pose(both, station, k, k == main) for k in (main, *others))]
+    poses = [both.table(table), *(both.camera(station, k, k == main) for k in (main, *others))]
     if any(name in table.geometry.free for name in _GEOMETRY):
         notes += ("the published steps take the table's axes as perfect; the joint adjustment estimates them",)
     return HeadComparison(main, tuple(poses), notes)
@@ -227,17 +227,6 @@ def _mount_from_camera(adjusted: Adjustment, station: Station, camera_id: str) -
     return mount_from_station.compose(_pose(adjusted, ("station_from_camera", camera_id)))
 
 
-def _joint_sigma(adjusted: Adjustment, names: tuple[ParameterName, ...], J: FloatArray, pose: Pose3) -> FloatArray:
-    """(6,) of a motion whose tangent is J times those of the named ones; what is held has none."""
-    return _outside(J @ adjusted.joint(names) @ J.T, pose)
-
-
-def _outside(cov: FloatArray, pose: Pose3) -> FloatArray:
-    """Sigmas (6,) of a tangent's covariance: turns as they are, the translation along the axes on the left."""
-    turn = block_diag(np.eye(3), pose.rotation().matrix())
-    return np.asarray(np.sqrt(np.clip(np.diag(turn @ cov @ turn.T), 0.0, None)))
-
-
 @dataclass(frozen=True, eq=False)
 class _Both:
     """The joint adjustment and the steps' calibration, whose cov (n, n) has its components at these places."""
@@ -248,48 +237,51 @@ class _Both:
     at: Mapping[tuple[str, str], int]
     cov: FloatArray
 
+    def table(self, table: Table) -> ComparedPose:
+        """The table in the world."""
+        name, along = ("world_from_table", table.table_id), self.found.vectors["r_wt^w"].sigma_mm / 1e3
+        axes, joint = (self.axes.world, self.axes.mount), _pose(self.adjusted, name)
+        sigmas = _outside(self.adjusted.joint((name,)), joint)
+        return self._compared(name, self.found.world_from_table, axes, ("C_t^w", "r_wt^w"), along, joint, sigmas)
 
-def _table_pose(both: _Both, table: Table) -> ComparedPose:
-    adjusted, found, axes, at, cov = both.adjusted, both.found, both.axes, both.at, both.cov
-    name = ("world_from_table", table.table_id)
-    own = found.world_from_table
-    pose = Pose3(Rot3(axes.world @ own.rotation().matrix() @ axes.mount.T), axes.world @ own.translation())
-    rows = _rows(at, "C_t^w"), _rows(at, "r_wt^w")
-    sigma = np.concatenate([_turned(axes.mount, cov, rows[0]), _turned(axes.world, cov, rows[1])])
-    claimed = np.concatenate([
-        abs(axes.mount) @ np.radians(found.rotations["C_t^w"].sigma_deg),
-        abs(axes.world) @ found.vectors["r_wt^w"].sigma_mm / 1e3,
-    ])  # fmt: skip
-    joint = _pose(adjusted, name)
-    return ComparedPose(name, pose, joint, claimed, sigma, _joint_sigma(adjusted, (name,), np.eye(6), joint))
+    def camera(self, station: Station, camera_id: str, is_main: bool) -> ComparedPose:
+        """A camera in the mount."""
+        k, found = camera_id.lower(), self.found
+        axes = self.axes.mount, self.axes.camera if is_main else np.eye(3)
+        own = found.mount_from_station.compose(found.station_from_camera(camera_id))
+        along = found.vectors[f"r_b{k}^b"].sigma_mm / 1e3
+        if is_main:  # its height over the body and the body's over the table were found one after the other
+            along = np.append(along[:2], np.hypot(along[2], found.vectors["r_tb^b"].sigma_mm[2] / 1e3))
+        names = ("mount_from_station", station.station_id), ("station_from_camera", camera_id)
+        J = np.hstack([_pose(self.adjusted, names[1]).inverse().AdjointMap(), np.eye(6)])
+        joint = _mount_from_camera(self.adjusted, station, camera_id)
+        sigmas = _outside(J @ self.adjusted.joint(names) @ J.T, joint)
+        of = f"C_{k}^b", f"r_b{k}^b", "r_tb^b"
+        return self._compared(("mount_from_camera", camera_id), own, axes, of, along, joint, sigmas)
+
+    def _compared(
+        self, name: ParameterName, own: Pose3, axes: tuple[FloatArray, FloatArray], of: tuple[str, ...],
+        along: FloatArray, joint: Pose3, sigmas: FloatArray,
+    ) -> ComparedPose:  # fmt: skip
+        """own: a pose in the paper's frames, along: what it claims of its place. axes: the survey's, left and right.
+
+        of: its rotation, and the vectors that its place is the sum of. joint: the same adjusted, with its sigmas.
+        """
+        (left, right), (turn, *vectors) = axes, of
+        pose = Pose3(Rot3(left @ own.rotation().matrix() @ right.T), left @ own.translation())
+        sigma = np.concatenate([self._sigmas([turn], right), self._sigmas(vectors, left)])
+        claimed = np.concatenate([abs(right) @ np.radians(self.found.rotations[turn].sigma_deg), abs(left) @ along])
+        return ComparedPose(name, pose, joint, claimed, sigma, sigmas)
+
+    def _sigmas(self, names: Sequence[str], axes: FloatArray) -> FloatArray:
+        """(3,) of the sum of what is named so, in the axes that it is brought back to."""
+        J = np.zeros((3, len(self.cov)))
+        for name in names:
+            J[:, [self.at[name, axis] for axis in "xyz"]] = axes
+        return np.sqrt(np.clip(np.diag(J @ self.cov @ J.T), 0.0, None))
 
 
-def _camera_pose(both: _Both, station: Station, camera_id: str, is_main: bool) -> ComparedPose:
-    adjusted, found, axes, at, cov = both.adjusted, both.found, both.axes, both.at, both.cov
-    k, names = camera_id.lower(), axes.camera if is_main else np.eye(3)
-    own = found.mount_from_station.compose(found.station_from_camera(camera_id))
-    pose = Pose3(Rot3(axes.mount @ own.rotation().matrix() @ names.T), axes.mount @ own.translation())
-    place = np.zeros((3, len(cov)))
-    place[:, _rows(at, f"r_b{k}^b")] = place[:, _rows(at, "r_tb^b")] = axes.mount
-    moved = np.sqrt(np.clip(np.diag(place @ cov @ place.T), 0.0, None))
-    sigma = np.concatenate([_turned(names, cov, _rows(at, f"C_{k}^b")), moved])
-    along = found.vectors[f"r_b{k}^b"].sigma_mm / 1e3
-    if is_main:  # its height over the body and the body's over the table were found one after the other
-        along = np.append(along[:2], np.hypot(along[2], found.vectors["r_tb^b"].sigma_mm[2] / 1e3))
-    turns = np.radians(found.rotations[f"C_{k}^b"].sigma_deg)
-    claimed = np.concatenate([abs(names) @ turns, abs(axes.mount) @ along])
-    joint = _mount_from_camera(adjusted, station, camera_id)
-    names_of = ("mount_from_station", station.station_id), ("station_from_camera", camera_id)
-    station_from_camera = _pose(adjusted, names_of[1])
-    J = np.hstack([station_from_camera.inverse().AdjointMap(), np.eye(6)])
-    sigmas = _joint_sigma(adjusted, names_of, J, joint)
-    return ComparedPose(("mount_from_camera", camera_id), pose, joint, claimed, sigma, sigmas)
-
-
-def _rows(at: Mapping[tuple[str, str], int], name: str) -> list[int]:
-    return [at[name, axis] for axis in "xyz"]
-
-
-def _turned(rotation: FloatArray, cov: FloatArray, rows: list[int]) -> FloatArray:
-    """Sigmas (3,) of three components in the axes that they are brought back to."""
-    return np.sqrt(np.clip(np.diag(rotation @ cov[np.ix_(rows, rows)] @ rotation.T), 0.0, None))
+def _outside(cov: FloatArray, pose: Pose3) -> FloatArray:
+    """Sigmas (6,) of a tangent's covariance: turns as they are, the translation along the axes on the left."""
+    turn = block_diag(np.eye(3), pose.rotation().matrix())
+    return np.asarray(np.sqrt(np.clip(np.diag(turn @ cov @ turn.T), 0.0, None)))

@@ -31,7 +31,6 @@ class PaperRotation:
     angles.
     """
 
-    name: str
     matrix: FloatArray
     sigma_deg: FloatArray
 
@@ -49,7 +48,6 @@ class PaperRotation:
 class PaperVector:
     """``r_ij^k``: from the origin of i to that of j, in the axes of k; (3,) mm. nan: a component by definition."""
 
-    name: str
     value_mm: FloatArray
     sigma_mm: FloatArray
 
@@ -110,28 +108,21 @@ def calibrate(given: CpcInput) -> Calibration:
     r_bz = np.append(lateral.values, origin.values[2])
     table = table_origin(C_tw, main, r_bz)
     z = main.camera_id.lower()
-    rotations = [
-        _rotation("C_t^w", C_tw, angles.sigmas[:3]),
-        _rotation(f"C_{z}^b", C_zb, angles.sigmas[3:]),
-    ]
+    rotations = {"C_t^w": _rotation(C_tw, angles.sigmas[:3]), f"C_{z}^b": _rotation(C_zb, angles.sigmas[3:])}
     caliper, nan = [given.b_z_sigma_m], np.full(2, np.nan)
-    vectors = [
-        _vector("r_wb^w", np.append(origin.values[:2], given.b_z_m), np.append(origin.sigmas[:2], caliper)),
-        _vector("r_wt^w", table.values[:3], table.sigmas[:3]),
-        _vector("r_tb^b", np.array([0.0, 0.0, table.values[3]]), np.append(nan, table.sigmas[3])),
-        _vector(f"r_b{z}^b", r_bz, np.append(lateral.sigmas, origin.sigmas[2])),
-    ]
+    vectors = {
+        "r_wb^w": _vector(np.append(origin.values[:2], given.b_z_m), np.append(origin.sigmas[:2], caliper)),
+        "r_wt^w": _vector(table.values[:3], table.sigmas[:3]),
+        "r_tb^b": _vector(np.array([0.0, 0.0, table.values[3]]), np.append(nan, table.sigmas[3])),
+        f"r_b{z}^b": _vector(r_bz, np.append(lateral.sigmas, origin.sigmas[2])),
+    }
     for images in given.others:
         k = images.camera_id.lower()
         rotation = camera_rotation(C_tw, images)
         position = camera_position(C_tw, table.values[:3], float(table.values[3]), images)
-        rotations.append(_rotation(f"C_{k}^b", rotation.values.reshape(3, 3), rotation.sigmas))
-        vectors.append(_vector(f"r_b{k}^b", position.values, position.sigmas))
-    return Calibration(
-        {q.name: q for q in rotations},
-        {q.name: q for q in vectors},
-        (main.camera_id, *(i.camera_id for i in given.others)),
-    )
+        rotations[f"C_{k}^b"] = _rotation(rotation.values.reshape(3, 3), rotation.sigmas)
+        vectors[f"r_b{k}^b"] = _vector(position.values, position.sigmas)
+    return Calibration(rotations, vectors, (main.camera_id, *(i.camera_id for i in given.others)))
 
 
 def difference(a: Calibration, b: Calibration) -> tuple[tuple[tuple[str, str], ...], FloatArray]:
@@ -163,12 +154,10 @@ def propagate(given: CpcInput) -> tuple[tuple[tuple[str, str], ...], FloatArray]
         if images.cov is None:
             raise SurveyError(f"camera {images.camera_id}: the covariance of its poses is needed to propagate it")
         n = len(images.angles)
-        moved = [[_with(given, i, _moved(images, j, s * _STEP)) for s in (1, -1)] for j in range(6 * n)]
-        J = np.stack([derivative(*pair) for pair in moved], axis=1)
-        cov += J @ images.cov @ J.T
-        moved = [[_with(given, i, _read(images, j, s * _STEP)) for s in (1, -1)] for j in range(2 * n)]
-        J = np.stack([derivative(*pair) for pair in moved], axis=1)
-        cov += given.angle_sigma_rad**2 * J @ J.T
+        for change, of in ((_moved, images.cov), (_read, given.angle_sigma_rad**2 * np.eye(2 * n))):
+            moved = [[_with(given, i, change(images, j, s * _STEP)) for s in (1, -1)] for j in range(len(of))]
+            J = np.stack([derivative(*pair) for pair in moved], axis=1)
+            cov += J @ of @ J.T
     return difference(at, at)[0], cov
 
 
@@ -193,9 +182,9 @@ def _read(images: TableImages, j: int, step: float) -> TableImages:
     return replace(images, angles=angles)
 
 
-def _rotation(name: str, matrix: FloatArray, sigmas: FloatArray) -> PaperRotation:
-    return PaperRotation(name, matrix, np.degrees(sigmas))
+def _rotation(matrix: FloatArray, sigmas: FloatArray) -> PaperRotation:
+    return PaperRotation(matrix, np.degrees(sigmas))
 
 
-def _vector(name: str, value: FloatArray, sigmas: FloatArray) -> PaperVector:
-    return PaperVector(name, 1e3 * value, 1e3 * sigmas)
+def _vector(value: FloatArray, sigmas: FloatArray) -> PaperVector:
+    return PaperVector(1e3 * value, 1e3 * sigmas)

@@ -15,7 +15,7 @@ so it loses them in large sets: the loop here takes full steps, checks the closu
 were found safe.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -36,7 +36,7 @@ from adjust.relay.normal_equations import (
     condition_matrix,
     joint_covariance,
 )
-from adjust.relay.result import AdjustedPairs, Joint, adjusted_pairs, whitening
+from adjust.relay.result import AdjustedPairs, adjusted_pairs, whitening
 from adjust.spatial.rigid_motions import Motions, right_jacobian
 
 # complete networks were exact far beyond; grids of loops went wrong from about 300 on
@@ -76,19 +76,19 @@ def adjust_conditions(network: MeasuredPairs, options: ConditionOptions = Condit
     basis = loop_basis(network.topology, _loop_kind(network, options))
 
     def step(X: Motions) -> FloatArray:
-        w, blocks, r, Q = _linearise(network, basis, X)
-        B, normals = condition_matrix(basis, blocks), _normals(basis, blocks, Q)
-        multipliers = normals.solve(w.ravel() - B @ r.ravel())
-        return np.asarray(-r - (Q @ (B.T @ multipliers).reshape(*r.shape, 1))[..., 0])
+        at = _Linearised(network, basis, X)
+        multipliers = at.normals.solve(at.w.ravel() - at.B @ at.r.ravel())
+        return np.asarray(-at.r - (at.Q @ (at.B.T @ multipliers).reshape(*at.r.shape, 1))[..., 0])
 
-    found = _closed(network, basis, options, step)
-    if not found.arrived:
+    def advice() -> str:
         worst = loop_misclosures(network)
-        raise NotConvergedError(
-            f"the loops do not close after {options.max_iterations} steps (misclosure left {found.closure:.2g}, last "
-            f"step {found.step:.2g} sigma); look for a wrong pair in {worst.text(int(np.argmax(worst.test)))}"
-        )
-    return _finish(network, basis, found)
+        return f"look for a wrong pair in {worst.text(int(np.argmax(worst.test)))}"
+
+    X, closure, iterations = _closed(network, basis, options, step, advice)
+    at = _Linearised(network, basis, X)
+    cov = at.normals.adjusted_covariances()
+    pairs = adjusted_pairs(network, X, cov, network.dim * len(basis), iterations, at.joint)
+    return ConditionAdjustment(pairs, basis, closure)
 
 
 def adjust_condition_factors(
@@ -104,24 +104,23 @@ def adjust_condition_factors(
             f"{len(basis)} loops are too many hard constraints (at most {MAX_HARD_LOOPS}); use the normal equations of "
             "the conditions, or the parametric form"
         )
-    graph, n, dim = condition_graph(network, basis), network.topology.n_pairs, network.dim
+    graph, every = condition_graph(network, basis), range(network.topology.n_pairs)
 
     def step(X: Motions) -> FloatArray:
         delta = graph.linearize(station_values(X)).optimize()
-        return np.array([delta.at(e) for e in range(n)])
+        return np.array([delta.at(e) for e in every])
 
-    found = _closed(network, basis, options, step)
-    if not found.arrived:
-        raise NotConvergedError(
-            f"the hard loop closures did not settle in {options.max_iterations} steps (misclosure left "
-            f"{found.closure:.2g}, last step {found.step:.2g} sigma); use the normal equations of the conditions, "
-            "which name the loop that closes worst"
-        )
-    marginals = gtsam.Marginals(graph, station_values(found.b_from_a))
-    cov = np.array([marginals.marginalCovariance(e) for e in range(n)])
-    joint = _precision(network, basis, found.b_from_a)[1]
-    pairs = adjusted_pairs(network, found.b_from_a, cov, dim * len(basis), found.iterations, joint)
-    return ConditionAdjustment(pairs, basis, found.closure)
+    def advice() -> str:
+        return "use the normal equations of the conditions, which name the loop that closes worst"
+
+    X, closure, iterations = _closed(network, basis, options, step, advice)
+    marginals = gtsam.Marginals(graph, station_values(X))
+    cov = np.array([marginals.marginalCovariance(e) for e in every])
+    # GTSAM's own joint covariance inverts an information matrix, which pairs that close a loop do not have
+    joint = _Linearised(network, basis, X).joint
+    return ConditionAdjustment(
+        adjusted_pairs(network, X, cov, network.dim * len(basis), iterations, joint), basis, closure
+    )
 
 
 def adjust_loops(network: MeasuredPairs) -> ConditionAdjustment:
@@ -163,36 +162,28 @@ def _reach(network: MeasuredPairs) -> float:
     return 0.0 if t is None or not len(t) else float(np.linalg.norm(t, axis=1).max())
 
 
-def _linearise(
-    network: MeasuredPairs, basis: LoopBasis, X: Motions
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    w, blocks = evaluate_loops(basis, X)
-    r = (network.b_from_a.inverse() @ X).log()
-    forward = right_jacobian(r)
-    return w, blocks, r, forward @ network.cov @ np.swapaxes(forward, -1, -2)
+class _Linearised:
+    """Misclosures w, residuals r, cofactors Q, the conditions' matrix B, and their normal equations, at pairs X."""
 
+    def __init__(self, network: MeasuredPairs, basis: LoopBasis, X: Motions) -> None:
+        self.w, blocks = evaluate_loops(basis, X)
+        self.r = (network.b_from_a.inverse() @ X).log()
+        forward = right_jacobian(self.r)
+        self.Q = forward @ network.cov @ np.swapaxes(forward, -1, -2)
+        self.B = condition_matrix(basis, blocks)
+        by_tree = basis.tree is not None and 2 * len(basis) > len(np.unique(basis.pair_idx))
+        self.normals: NormalEquations = (TreeNormals if by_tree else SparseNormals)(basis, blocks, self.Q)
 
-def _normals(basis: LoopBasis, blocks: FloatArray, Q: FloatArray) -> NormalEquations:
-    if basis.chord_idx is not None and 2 * len(basis) > len(np.unique(basis.pair_idx)):
-        return TreeNormals(basis, blocks, Q)
-    return SparseNormals(basis, blocks, Q)
-
-
-@dataclass(frozen=True, eq=False)
-class _Closed:
-    """Pairs after the last step, the largest misclosure left, and the step in sigmas of the measured pairs."""
-
-    b_from_a: Motions
-    closure: float
-    step: float
-    iterations: int
-    arrived: bool
+    def joint(self, pair_idx: Sequence[int]) -> FloatArray:
+        """Joint covariance of some adjusted pairs, stacked."""
+        return joint_covariance(self.normals, self.B, self.Q, pair_idx)
 
 
 def _closed(
-    network: MeasuredPairs, basis: LoopBasis, options: ConditionOptions, step: Callable[[Motions], FloatArray]
-) -> _Closed:
-    """Full Gauss-Newton steps until all loops close and nothing moves."""
+    network: MeasuredPairs, basis: LoopBasis, options: ConditionOptions, step: Callable[[Motions], FloatArray],
+    advice: Callable[[], str],
+) -> tuple[Motions, float, int]:  # fmt: skip
+    """Full Gauss-Newton steps until all loops close and nothing moves; the largest misclosure left, and how many."""
     limit, root = options.closure * max(1.0, _reach(network)), whitening(network.cov)
     X, moved, closure = network.b_from_a, np.inf, np.inf
     for iteration in range(1, options.max_iterations + 1):
@@ -203,25 +194,11 @@ def _closed(
         if not np.isfinite(moved):
             break
         if closure < limit and moved < options.max_step:
-            return _Closed(X, closure, moved, iteration, True)
-    return _Closed(X, closure, moved, options.max_iterations, False)
-
-
-def _finish(network: MeasuredPairs, basis: LoopBasis, found: _Closed) -> ConditionAdjustment:
-    normals, joint = _precision(network, basis, found.b_from_a)
-    cov, total = normals.adjusted_covariances(), network.dim * len(basis)
-    pairs = adjusted_pairs(network, found.b_from_a, cov, total, found.iterations, joint)
-    return ConditionAdjustment(pairs, basis, found.closure)
-
-
-def _precision(network: MeasuredPairs, basis: LoopBasis, X: Motions) -> tuple[NormalEquations, Joint]:
-    """Normal equations at the solution, and the joint covariance of chosen pairs.
-
-    GTSAM's own joint covariance inverts an information matrix, which pairs that close a loop do not have.
-    """
-    _, blocks, _, Q = _linearise(network, basis, X)
-    B, normals = condition_matrix(basis, blocks), _normals(basis, blocks, Q)
-    return normals, lambda pair_idx: joint_covariance(normals, B, Q, pair_idx)
+            return X, closure, iteration
+    raise NotConvergedError(
+        f"the loops do not close after {options.max_iterations} steps (misclosure left {closure:.2g}, last step "
+        f"{moved:.2g} sigma); {advice()}"
+    )
 
 
 # -- the conditions as factors of GTSAM's graph -----------------------------------------------------------------------

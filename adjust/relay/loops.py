@@ -27,14 +27,12 @@ SEARCH_BUDGET = 20_000_000
 class LoopBasis(Loops):
     """E - n + c independent loops.
 
-    minimal: whether the total length is the least possible. chord_idx: (L,) for loops of a spanning tree the pair that
-    only this loop has. note: how the loops were found, for people.
+    minimal: whether the total length is the least possible. note: how the loops were found, for people.
     """
 
     topology: Topology
     minimal: bool
     note: str
-    chord_idx: IntArray | None = None
 
     def pairs(self, loop: int) -> tuple[str, ...]:
         """Ids of the pairs of a loop, in the order of the walk."""
@@ -63,7 +61,7 @@ def loop_basis(topology: Topology, kind: LoopKind = "shortest", budget: int = SE
     many, a, b = len(chords) > MAX_SHORTEST_LOOPS, topology.a_idx, topology.b_idx
     if kind == "tree" or not len(chords):
         found = tree_loops(a, b, forest, chords)
-        return _basis(topology, found, False, "loops of a spanning tree", chords)
+        return _basis(topology, found, False, "loops of a spanning tree")
     if many:
         reached = np.argsort(forest.order)
         chords = chords[np.argsort(np.maximum(reached[a[chords]], reached[b[chords]]), kind="stable")]
@@ -83,10 +81,8 @@ def loop_basis(topology: Topology, kind: LoopKind = "shortest", budget: int = SE
     return _basis(topology, found.and_then(rest), False, note)
 
 
-def _basis(topology: Topology, found: Loops, minimal: bool, note: str, chords: IntArray | None = None) -> LoopBasis:
-    return LoopBasis(
-        found.ptr, found.pair_idx, found.sense, found.start_idx, topology, minimal, note, chords, tree=found.tree
-    )
+def _basis(topology: Topology, found: Loops, minimal: bool, note: str) -> LoopBasis:
+    return LoopBasis(found.ptr, found.pair_idx, found.sense, found.start_idx, topology, minimal, note, tree=found.tree)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import Pair, frame_text
 from adjust.model.survey import FloatArray
 from adjust.observations.factors import gaussian
-from adjust.observations.pairs import checked_arrays
+from adjust.observations.pair_arrays import checked_arrays
 from adjust.pose_network.network import Topology
 from adjust.spatial.rigid_motions import Motions
 
@@ -75,8 +75,7 @@ def network_from_pairs(pairs: Sequence[Pair], rotations_only: bool = False) -> M
     top, found = topology((p.pair_id, frame_text(p.a), frame_text(p.b)) for p in used), checked_arrays(used)
     # of a pose the rotation comes first in the tangent, and its share of the covariance stands by itself
     cov = found.cov[:, :dim, :dim]
-    motions = found.motions if dim == 6 else Motions(found.rotations)
-    return MeasuredPairs(top, motions, 0.5 * (cov + np.swapaxes(cov, 1, 2)))
+    return MeasuredPairs(top, found.motions.in_dim(dim), 0.5 * (cov + np.swapaxes(cov, 1, 2)))
 
 
 def gtsam_motion(motions: Motions, idx: int) -> Rot3 | Pose3:

@@ -85,11 +85,11 @@ class TreeNormals:
     """N through its block diagonal part and the pairs of the spanning tree; for dense networks."""
 
     def __init__(self, basis: LoopBasis, blocks: FloatArray, Q: FloatArray) -> None:
-        if basis.chord_idx is None:
+        if basis.tree is None:
             raise ValueError("these normal equations need the loops of a spanning tree")
         dim, n_pairs = Q.shape[-1], basis.topology.n_pairs
         first = basis.ptr[:-1]  # each loop begins with its own pair
-        self.Q, self.chords = Q, basis.chord_idx
+        self.Q, self.chords = Q, basis.tree.chord_idx
         self.tree_pairs = np.setdiff1d(np.unique(basis.pair_idx), self.chords)
         own = blocks[first]
         root = own @ np.linalg.cholesky(Q[self.chords])

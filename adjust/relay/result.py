@@ -7,10 +7,10 @@ import numpy as np
 
 from adjust.model.result import GlobalTest
 from adjust.model.survey import FloatArray, IntArray
+from adjust.observations.pairs import pair_tests
 from adjust.precision.precision import global_test
 from adjust.relay.network import MeasuredPairs
 from adjust.spatial.rigid_motions import Motions, right_jacobian_inverse
-from adjust.testing.distributions import chi2
 
 # joint covariance of adjusted pairs by their positions
 Joint = Callable[[Sequence[int]], FloatArray]
@@ -65,20 +65,15 @@ def adjusted_pairs(
     e = (root @ v[..., None])[..., 0]
     to_white = root @ back
     Q = np.eye(network.dim) - to_white @ cov @ np.swapaxes(to_white, -1, -2)
-    s, V = np.linalg.eigh(0.5 * (Q + np.swapaxes(Q, -1, -2)))
-    controlled = s > _UNCONTROLLED
-    freedom = controlled.sum(axis=-1)
-    inner = np.einsum("eij,ei->ej", V, e)
+    Q = 0.5 * (Q + np.swapaxes(Q, -1, -2))
     with np.errstate(divide="ignore", invalid="ignore"):
-        test = np.where(freedom > 0, np.where(controlled, inner**2 / s, 0.0).sum(axis=-1), np.nan)
         unwhiten = np.linalg.inv(root)
         own = np.sqrt(np.maximum(np.einsum("eij,ejk,eik->ei", unwhiten, Q, unwhiten), 0.0))
         sigma = np.sqrt(np.diagonal(network.cov, axis1=1, axis2=2))
         standardized = np.where(own > np.sqrt(_UNCONTROLLED) * sigma, v / own, np.nan)
     return AdjustedPairs(
-        network, b_from_a, v, cov, np.diagonal(Q, axis1=1, axis2=2).copy(), standardized, test, freedom,
-        np.where(freedom > 0, chi2.sf(test, np.maximum(freedom, 1)), np.nan), float(np.sum(e * e)), redundancy_total,
-        iterations, joint,
+        network, b_from_a, v, cov, np.diagonal(Q, axis1=1, axis2=2).copy(), standardized,
+        *pair_tests(Q, e, _UNCONTROLLED), float(np.sum(e * e)), redundancy_total, iterations, joint,
     )  # fmt: skip
 
 

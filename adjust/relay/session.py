@@ -20,7 +20,8 @@ from adjust.model.observations import Pair
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, PoseParameter, Station, Survey
 from adjust.observations.factors import pose_prior_factor
-from adjust.observations.pairs import NoiseCache, checked_arrays, native_factor
+from adjust.observations.pair_arrays import checked_arrays
+from adjust.observations.pairs import NoiseCache, native_factor
 from adjust.pose_network.from_survey import network_from_survey
 from adjust.pose_network.network import PoseNetwork
 from adjust.pose_network.start import carried

@@ -7,6 +7,7 @@ from adjust.spatial.rigid import nearest_rotation, rigid
 
 _MEDOID_LIMIT = 40  # more candidates than this are thinned out for the quadratic search of the medoid
 _AT_ONCE = 1000  # means whose medoids are found together
+_STEPS = 20
 _SETTLED = 1e-4  # of the scale: a further step tells nothing that the motions do
 
 
@@ -31,9 +32,7 @@ def mean_pose(poses: FloatArray, lever: float, members: IntArray | None = None) 
     return mean, pose_distance(poses, mean, lever)
 
 
-def mean_poses(
-    poses: FloatArray, lever: float, ptr: IntArray, members: IntArray | None = None, iterations: int = 20
-) -> FloatArray:
+def mean_poses(poses: FloatArray, lever: float, ptr: IntArray, members: IntArray | None = None) -> FloatArray:
     """Robust means (k, 4, 4) of rigid motions (n, 4, 4), those of each mean one after the other by ptr (k + 1,).
 
     The start is the medoid; then reweighted chordal means (Hartley et al., IJCV 103, 2013) with Geman-McClure weights
@@ -49,7 +48,7 @@ def mean_poses(
         for part in np.split(np.column_stack([ptr[:-1], ptr[1:]]), range(_AT_ONCE, len(ptr) - 1, _AT_ONCE))
     ])  # fmt: skip
     live = np.arange(len(mean))
-    for _ in range(iterations):
+    for _ in range(_STEPS):
         rows = np.isin(owner, live) if len(live) < len(mean) else np.ones(len(owner), dtype=np.bool_)
         of, here = np.searchsorted(live, owner[rows]), poses[rows]
         distance = pose_distance(here, mean[live[of]], lever)

@@ -86,15 +86,14 @@ def rotation_to(a: FloatArray, b: FloatArray) -> FloatArray:
     return rotation_exp(axis / sine * float(np.arctan2(sine, cosine)))
 
 
-def align(x_in_a: FloatArray, x_in_b: FloatArray, weights: FloatArray | None = None) -> FloatArray:
+def align(x_in_a: FloatArray, x_in_b: FloatArray) -> FloatArray:
     """``a_from_b`` (4, 4) that best moves points (n, 3) of b onto those of a.
 
     Source: Umeyama, PAMI 13(4), 1991, without scale. Two points leave the turn about their line at its smallest, one
     point leaves the rotation at identity.
     """
-    w = np.full(len(x_in_a), 1.0) if weights is None else weights
-    mean_a, mean_b = w @ x_in_a / w.sum(), w @ x_in_b / w.sum()
-    m = (x_in_a - mean_a).T @ (w[:, None] * (x_in_b - mean_b))
+    mean_a, mean_b = x_in_a.mean(axis=0), x_in_b.mean(axis=0)
+    m = (x_in_a - mean_a).T @ (x_in_b - mean_b)
     scale = np.linalg.svd(m, compute_uv=False)
     if len(x_in_a) < 2 or scale[0] <= _TINY:
         r = np.eye(3)

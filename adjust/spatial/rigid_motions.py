@@ -39,6 +39,10 @@ class Motions:
         shifts = [p.translation for p in parts if p.translation is not None]
         return Motions(np.concatenate([p.rotation for p in parts]), np.concatenate(shifts) if shifts else None)
 
+    def in_dim(self, dim: int) -> "Motions":
+        """These, or with 3 their rotations alone."""
+        return Motions(self.rotation) if dim == 3 else self
+
     @property
     def shifts(self) -> FloatArray:
         """Translations (n, 3) m of rigid motions. Raises ValueError for rotations alone."""

@@ -18,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from gtsam import Rot3
 
+from adjust.frames.tables import turns
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
 
@@ -46,7 +47,7 @@ def matrix_from_euler(angles: FloatArray, order: EulerOrder = "zyx") -> FloatArr
     found = _ORDERS[order]
     i, j, k = found.axes
     turned = found.sense * np.asarray(angles, dtype=float)
-    return np.asarray(_turn(i, turned[..., i]) @ _turn(j, turned[..., j]) @ _turn(k, turned[..., k]))
+    return np.asarray(turns(i, turned[..., i]) @ turns(j, turned[..., j]) @ turns(k, turned[..., k]))
 
 
 def euler_from_matrix(matrix: FloatArray, order: EulerOrder = "zyx") -> FloatArray:
@@ -55,7 +56,7 @@ def euler_from_matrix(matrix: FloatArray, order: EulerOrder = "zyx") -> FloatArr
     i, j, k = found.axes
     e, m = found.parity, np.asarray(matrix, dtype=float)
     cosine = np.hypot(m[..., i, i], m[..., i, j])
-    _refuse_gimbal_lock(cosine, order, GIMBAL_COSINE)
+    _refuse_gimbal_lock(cosine, order)
     angles = np.empty((*m.shape[:-2], 3))
     angles[..., i] = np.arctan2(-e * m[..., j, k], m[..., k, k])
     angles[..., j] = np.arctan2(e * m[..., i, k], cosine)
@@ -77,11 +78,11 @@ def euler_jacobian(angles: FloatArray, order: EulerOrder = "zyx") -> FloatArray:
     found = _ORDERS[order]
     i, j, k = found.axes
     turned = found.sense * np.asarray(angles, dtype=float)
-    after = _turn(k, turned[..., k])
+    after = turns(k, turned[..., k])
     out = np.zeros((*turned.shape[:-1], 3, 3))
     out[..., k, k] = 1.0
     out[..., :, j] = after[..., j, :]
-    out[..., :, i] = (_turn(j, turned[..., j]) @ after)[..., i, :]
+    out[..., :, i] = (turns(j, turned[..., j]) @ after)[..., i, :]
     return found.sense * out
 
 
@@ -95,24 +96,13 @@ def euler_cov_from_tangent(angles: FloatArray, cov: FloatArray, order: EulerOrde
     """Covariance (..., 3, 3) rad^2 of Euler angles from that in the tangent. Raises SurveyError at gimbal lock."""
     J = euler_jacobian(angles, order)
     middle = _ORDERS[order].axes[1]
-    _refuse_gimbal_lock(np.abs(np.cos(np.asarray(angles, dtype=float)[..., middle])), order, GIMBAL_COSINE)
+    _refuse_gimbal_lock(np.abs(np.cos(np.asarray(angles, dtype=float)[..., middle])), order)
     inverse = np.linalg.inv(J)
     return np.asarray(inverse @ cov @ np.swapaxes(inverse, -1, -2))
 
 
-def _turn(axis: int, angle: FloatArray) -> FloatArray:
-    """Right-handed turns (..., 3, 3) about a coordinate axis."""
-    p, q = (axis + 1) % 3, (axis + 2) % 3
-    out = np.zeros((*np.shape(angle), 3, 3))
-    out[..., axis, axis] = 1.0
-    out[..., p, p] = out[..., q, q] = np.cos(angle)
-    out[..., q, p] = np.sin(angle)
-    out[..., p, q] = -out[..., q, p]
-    return out
-
-
-def _refuse_gimbal_lock(cosine: FloatArray, order: str, limit: float) -> None:
-    locked = np.flatnonzero(np.atleast_1d(cosine) < limit)
+def _refuse_gimbal_lock(cosine: FloatArray, order: str) -> None:
+    locked = np.flatnonzero(np.atleast_1d(cosine) < GIMBAL_COSINE)
     if len(locked):
         middle = "xyz"[_ORDERS[order].axes[1]]
         more = f" and {len(locked) - 1} more" if len(locked) > 1 else ""

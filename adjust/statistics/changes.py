@@ -256,11 +256,12 @@ def _coded(epochs: Sequence[str]) -> tuple[IntArray, tuple[str, ...]]:
 
 def _runs(epochs: IntArray, names: Sequence[str], most: int) -> tuple[IntArray, tuple[str, ...]]:
     """Number (k,) of the run of epochs that each belongs to, at most so many, and the first epoch of every run."""
-    there, place = np.unique(epochs, return_inverse=True)
+    seen = np.bincount(epochs, minlength=len(names)) > 0
+    there, place = np.flatnonzero(seen), np.cumsum(seen)[epochs] - 1
     n = min(most, len(there))
     number = np.arange(len(there)) * n // max(len(there), 1)
     first = there[np.searchsorted(number, np.arange(n))]
-    return number[place.reshape(-1)], tuple(names[i] for i in first.tolist())
+    return number[place], tuple(names[i] for i in first.tolist())
 
 
 def _first(u: Unit) -> IntArray:

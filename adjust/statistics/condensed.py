@@ -151,14 +151,13 @@ def _known(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> _Part:
 
 def _shapes(graph: AdjustmentGraph) -> Callable[[IntArray], FloatArray]:
     """Of image points (..) of known targets what their derivatives are to be multiplied by: (.., 4)."""
-    first, every, blocks = dict[str | None, int](), [np.zeros((1, N_SHAPE))], graph.images.blocks
+    first, every, images = dict[str | None, int](), [np.zeros((1, N_SHAPE))], graph.images
     for target in graph.survey.targets:
         first[target.target_id] = sum(map(len, every))
         every.append(_shape_factors(target.x_in_target))
-    some = [b.target_id in first for b in blocks]
-    place = [first[b.target_id] + b.point_idx if x else np.zeros(len(b.uv), dtype=np.int64)
-             for b, x in zip(blocks, some, strict=True)]  # fmt: skip
-    table, at = np.concatenate(every), np.concatenate([np.zeros(0, dtype=np.int64), *place])
+    begin = np.array([first.get(b.target_id, -1) for b in images.blocks], dtype=np.int64)
+    of_point = np.repeat(begin, np.diff(images.ptr))
+    table, at = np.concatenate(every), np.where(of_point < 0, 0, of_point + images.point_idx)
     return lambda points: table[at[points]]
 
 

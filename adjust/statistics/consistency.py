@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from adjust.model.names import numbered
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
 from adjust.statistics.changes import ChangeSearch
@@ -30,9 +31,7 @@ _EXACT = 400
 _ESTIMATED = ("estimated", "unseparable")
 
 
-def consistency(
-    adjustment: Adjustment, condensed: CondensedSystem | None, alpha: float = 0.05, changes: bool = True
-) -> Consistency:
+def consistency(adjustment: Adjustment, condensed: CondensedSystem | None, alpha: float = 0.05) -> Consistency:
     """Test every part, and look for changes; ``alpha`` is the error probability of all of it together.
 
     condensed: the system of this adjustment; None for a large network of pairs, of which the groups are tested. Where
@@ -52,7 +51,7 @@ def consistency(
     fitted = {c.group for c in known.components if c.status in _ESTIMATED} if known is not None else set()
     parts = tuple(p for p in parts if not (p.kind == "group" and p.name in fitted))
     search = None
-    if changes and condensed is not None and len(condensed.e):
+    if condensed is not None and len(condensed.e):
         search = ChangeSearch(adjustment, condensed)
     n_changes = search.n_tests if search is not None else 0
     n = len(parts) + n_changes
@@ -62,15 +61,6 @@ def consistency(
         search.found(level, relative) if search is not None else (), relative, n_changes,
         search.left_out() if search is not None else (),
     )  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class Contributions:
-    """Of every observation of a condensed system (M,): components in use, redundancy, weighted square sum."""
-
-    n: FloatArray
-    redundancy: FloatArray
-    omega: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,17 +84,18 @@ def parts_of_network(adjustment: Adjustment) -> tuple[Part, ...]:
 def parts_of(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> tuple[Part, ...]:
     """All parts that are neither the whole nor without redundancy. blocks: the image block of each observation."""
     found, out = contributions(adjustment, system, blocks), list[Part]()
-    total = int(np.count_nonzero(found.n))
+    counted = found[0] != 0.0
+    total = int(np.count_nonzero(counted))
     for kind, names in _labels(adjustment, system, blocks).items():
-        number = {name: i for i, name in enumerate(dict.fromkeys((None, *names)))}
-        of = np.fromiter(map(number.__getitem__, names), np.int64, len(names))
-        every = np.flatnonzero((of > 0) & (found.n != 0.0))
+        called, of = numbered((None, *names))
+        of = of[1:]
+        every = np.flatnonzero((of > 0) & counted)
         every = every[np.argsort(of[every], kind="stable")]
         if not len(every):
             continue
         first = np.flatnonzero(np.diff(of[every], prepend=0))
-        sums = (np.add.reduceat(x[every], first).tolist() for x in (found.n, found.redundancy, found.omega))
-        called, edges = list(number), pairwise([*first.tolist(), len(every)])
+        sums = np.add.reduceat(found[:, every], first, axis=1).tolist()
+        edges = pairwise([*first.tolist(), len(every)])
         out += [
             Part(kind, str(called[i]), every[a:b], n, r, omega)
             for i, (a, b), n, r, omega in zip(of[every[first]].tolist(), edges, *sums, strict=True)
@@ -113,24 +104,19 @@ def parts_of(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> 
     return tuple(out)
 
 
-def contributions(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> Contributions:
-    """What every observation of a condensed system contributes."""
-    graph = system.precision.graph
-    k, M = len(blocks), len(system.used)
-    n, r, omega = np.zeros(M), np.zeros(M), np.zeros(M)
+def contributions(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> FloatArray:
+    """Of every observation of a condensed system (3, M): components in use, redundancy, weighted square sum."""
+    arrays, readings, k = adjustment.other_arrays, adjustment.reading_residuals, len(blocks)
+    out = np.zeros((3, len(system.used)))
     if k:
         sums = system.precision.image_sums
         shares = sums / np.maximum(np.bincount(blocks, minlength=len(sums)), 1)[:, None]  # each part its share
-        n[:k], r[:k], omega[:k] = shares[blocks].T
-    np.add.at(omega, system.row_of, np.where(system.row_of >= k, system.e**2, 0.0))
-    others = adjustment.other_residuals[: graph.n_others]
-    first = k + len(others)
-    n[k:first] = [len(o.residual) for o in others]
-    r[k:first] = [o.redundancy.sum() for o in others]
-    readings = adjustment.reading_residuals
+        out[:, :k] = shares[blocks].T
+    out[:2, k:] = arrays.n_components, np.bincount(arrays.observation, arrays.redundancies, len(arrays.used))
+    np.add.at(out[2], system.row_of, np.where(system.row_of >= k, system.e**2, 0.0))
     if readings is not None:
-        n[first:], r[first:], omega[first:] = 1.0, readings.redundancy, readings.weighted_square
-    return Contributions(*(np.where(system.used, x, 0.0) for x in (n, r, omega)))
+        out[2, len(out[2]) - len(readings.used) :] = readings.weighted_square
+    return np.where(system.used, out, 0.0)
 
 
 def _labels(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> dict[str, list[str | None]]:

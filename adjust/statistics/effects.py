@@ -5,6 +5,8 @@ of uncertainty (GUM, JCGM 100:2008) is ``Q = sum of Q N_g Q``, N_g the normal ma
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -15,12 +17,14 @@ from adjust.model.result import Adjustment, ParameterName, VarianceComponents
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import side_by_side
 from adjust.statistics.condensed import CondensedSystem
+from adjust.statistics.normal import Inverse
 from adjust.statistics.result import BudgetEntry, BudgetLine, Influence
 from adjust.statistics.system import LinearSystem, linear_system
 from adjust.statistics.weakness import covariance_columns
 from adjust.testing.distributions import norm, student
 
 _CHUNK = 64
+_COORDINATES = frozenset(("x", "y", "z", "tx", "ty", "tz"))
 
 
 def shifts(condensed: CondensedSystem, rows: Sequence[int], bias: Mapping[int, FloatArray]) -> FloatArray:
@@ -28,6 +32,12 @@ def shifts(condensed: CondensedSystem, rows: Sequence[int], bias: Mapping[int, F
 
     rows: image points first, then all others.
     """
+    system, right = condensed.system, _right(condensed, rows, bias)
+    return system.times_covariance(right.toarray() if system.structured is None or system.motions.shape[1] else right)
+
+
+def _right(condensed: CondensedSystem, rows: Sequence[int], bias: Mapping[int, FloatArray]) -> sparse.csc_matrix:
+    """The right-hand sides (n, k) of the normal equations for these biases."""
     system, parts = condensed.system, list[tuple[IntArray, FloatArray]]()
     for row in rows:
         if row < condensed.n_points:
@@ -37,8 +47,7 @@ def shifts(condensed: CondensedSystem, rows: Sequence[int], bias: Mapping[int, F
             parts.append(system.bias_column(row - condensed.n_points + system.n_image, bias[row]))
     places, values = (np.concatenate(x) for x in zip(*parts, strict=True))
     ptr = np.cumsum([0, *(len(x) for x, _ in parts)])
-    right = sparse.csc_matrix((values, places, ptr), (len(system.columns), len(rows)))
-    return system.times_covariance(right.toarray() if system.structured is None or system.motions.shape[1] else right)
+    return sparse.csc_matrix((values, places, ptr), (len(system.columns), len(rows)))
 
 
 def influences(
@@ -48,43 +57,134 @@ def influences(
     system = condensed.system
     c, sigmas = system.columns, np.where(system.sigmas > 0.0, system.sigmas, np.inf)
     places, coordinates = _positions(system)
+    shared = None if system.structured is None or system.motions.shape[1] else system.structured
+    reach = None if shared is None else Reach.of(shared, sigmas, coordinates)
 
     def of(first: int) -> list[Influence]:
-        part, out = rows[first : first + _CHUNK], list[Influence]()
-        dx = shifts(condensed, part, bias)
-        ratio = np.abs(dx)
-        ratio /= sigmas[:, None]
-        length, furthest = _furthest(dx, coordinates)
-        for i, (row, j) in enumerate(zip(part, _first_largest(ratio).tolist(), strict=True)):
-            name = places[int(furthest[i])] if places else ()
-            out.append(Influence(row, c.names[j], c.components[j], c.units[j], float(dx[j, i]), float(ratio[j, i]),
-                                 name, float(length[i])))  # fmt: skip
-        return out
+        part = rows[first : first + _CHUNK]
+        if reach is None:
+            found = furthest_of(shifts(condensed, part, bias), sigmas, coordinates)
+        else:
+            found = reach.furthest(_right(condensed, part, bias))
+        return [
+            Influence(row, c.names[i], c.components[i], c.units[i], shift, ratio, places[p] if places else (), length)
+            for row, i, shift, ratio, p, length in zip(part, *(x.tolist() for x in found), strict=True)
+        ]
 
     return tuple(x for part in side_by_side(of, range(0, len(rows), _CHUNK)) for x in part)
 
 
+class Furthest(NamedTuple):
+    """What moves furthest for each of k biases: unknown, its shift and that in its sigmas; position, how far (k,)."""
+
+    unknown: IntArray
+    shift: FloatArray
+    ratio: FloatArray
+    position: IntArray
+    length: FloatArray
+
+
+def furthest_of(dx: FloatArray, sigmas: FloatArray, coordinates: sparse.csr_matrix) -> Furthest:
+    """Of unknowns with these sigmas (n,) that move by dx (n, k), and positions with these coordinates (p, n)."""
+    k = np.arange(dx.shape[1])
+    ratio = np.abs(dx)
+    ratio /= sigmas[:, None]
+    at = _first_largest(ratio)
+    if not coordinates.shape[0]:
+        return Furthest(at, dx[at, k], ratio[at, k], np.zeros_like(k), np.zeros(len(k)))
+    squares = np.asarray(coordinates @ np.square(dx))
+    place = _first_largest(squares)
+    return Furthest(at, dx[at, k], ratio[at, k], place, np.sqrt(squares[place, k]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Shared:
+    """How far things move by what all unknowns share, ``U' y``: at most the length of y times that of their own part.
+
+    Those with the longest part come first: number (t,) of each, U (c, r) of their components, which begin by ptr
+    (t + 1,), and lengths (t,). place: (t,) where each stands.
+    """
+
+    number: IntArray
+    U: FloatArray
+    ptr: IntArray
+    lengths: FloatArray
+    place: IntArray
+
+    @staticmethod
+    def of(U: FloatArray, components: sparse.csr_matrix) -> "_Shared":
+        """Of things with these components (t, n), one of each row of the unknowns at most."""
+        lengths = np.sqrt(components @ np.einsum("cn,cn->n", U, U))
+        number = np.argsort(-lengths, kind="stable")
+        mine = components[number]
+        place = np.empty_like(number)
+        place[number] = np.arange(len(number))
+        return _Shared(number, U[:, mine.indices], mine.indptr.astype(np.int64), lengths[number], place)
+
+    def beyond(self, y: FloatArray, found: float, others: IntArray) -> tuple[int, float] | None:
+        """The first that moves further than ``found``, and how far; None of those that are not ``others``."""
+        most = np.searchsorted(-self.lengths, -found / max(float(np.linalg.norm(y)), 1e-300), side="right")
+        if not most:
+            return None
+        squares = np.add.reduceat(np.square(y @ self.U[:, : self.ptr[most]]), self.ptr[:most])
+        place = self.place[others]
+        squares[place[place < most]] = 0.0
+        at = int(squares.argmax())
+        return (int(self.number[at]), float(np.sqrt(squares[at]))) if squares[at] > found**2 else None
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """What biases move where Q = own + U' U: the sets of unknowns that one touches by both, all others by U' U alone.
+
+    sigmas: (n,). coordinates: (p, n). unknowns, positions: by what they share. position: (n,) of coordinates, else -1.
+    """
+
+    Q: Inverse
+    sigmas: FloatArray
+    coordinates: sparse.csr_matrix
+    unknowns: _Shared
+    positions: _Shared
+    position: IntArray
+
+    @staticmethod
+    def of(Q: Inverse, sigmas: FloatArray, coordinates: sparse.csr_matrix) -> "Reach":
+        """Of unknowns with these sigmas, and positions with these coordinates."""
+        position = np.full(len(sigmas), -1)
+        position[coordinates.indices] = np.repeat(np.arange(coordinates.shape[0]), np.diff(coordinates.indptr))
+        each = sparse.identity(len(sigmas), format="csr")
+        return Reach(Q, sigmas, coordinates, _Shared.of(Q.U / sigmas, each), _Shared.of(Q.U, coordinates), position)
+
+    def furthest(self, right: sparse.csc_matrix) -> Furthest:
+        """For right-hand sides (n, k) of the normal equations."""
+        own, y = (self.Q.own @ right).tocsc(), np.asarray((right.T @ self.Q.U.T).T)
+        near = np.union1d(own.indices, np.flatnonzero(self.Q.member < 0))
+        dx = own[near].toarray() + self.Q.U[:, near].T @ y
+        out = furthest_of(dx, self.sigmas[near], self.coordinates[:, near])
+        out.unknown[:] = near[out.unknown]
+        for j in range(len(out.ratio)):
+            touched = own.indices[own.indptr[j] : own.indptr[j + 1]]
+            further = self.unknowns.beyond(y[:, j], out.ratio[j], touched)
+            if further is not None:
+                out.unknown[j], out.ratio[j] = further
+                out.shift[j] = self.Q.U[:, further[0]] @ y[:, j]
+            positions = self.position[touched]
+            further = self.positions.beyond(y[:, j], out.length[j], positions[positions >= 0])
+            if further is not None:
+                out.position[j], out.length[j] = further
+        return out
+
+
 def _positions(system: LinearSystem) -> tuple[list[ParameterName], sparse.csr_matrix]:
     """Unknowns that are positions in the world, and (p, n) which unknowns are the coordinates of each: ones."""
-    names, columns, ptr = list[ParameterName](), list[int](), [0]
-    components = system.columns.components
-    for name, at in system.columns.at.items():
-        if name[0] == "point" or in_world(system.precision.graph.survey, name):
-            mine = [c for c in at.tolist() if components[c] in ("x", "y", "z", "tx", "ty", "tz")]
-            if mine:
-                names.append(name)
-                columns += mine
-                ptr.append(len(columns))
-    return names, sparse.csr_matrix((np.ones(len(columns)), columns, ptr), (len(names), len(components)))
-
-
-def _furthest(dx: FloatArray, coordinates: sparse.csr_matrix) -> tuple[FloatArray, IntArray]:
-    """How far the position moves that moves most, and which that is; of every column of dx (n, k)."""
-    if not coordinates.shape[0]:
-        return np.zeros(dx.shape[1]), np.zeros(dx.shape[1], dtype=np.int64)
-    squares = np.asarray(coordinates @ np.square(dx))
-    at = _first_largest(squares)
-    return np.sqrt(squares[at, np.arange(len(at))]), at
+    survey, c = system.precision.graph.survey, system.columns
+    names = [name for name in c.at if name[0] == "point" or in_world(survey, name)]
+    sizes = [len(c.at[name]) for name in names]
+    columns, owner = c.of(names), np.repeat(np.arange(len(names)), sizes)
+    kept = np.array([x in _COORDINATES for x in c.components], dtype=np.bool_)[columns]
+    some, row = np.unique(owner[kept], return_inverse=True)
+    entries = np.ones(len(row)), (row, columns[kept])
+    return [names[i] for i in some.tolist()], sparse.csr_matrix(entries, (len(some), len(c)))
 
 
 def _first_largest(values: FloatArray) -> IntArray:

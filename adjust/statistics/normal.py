@@ -48,8 +48,6 @@ def structured_inverse(N: sparse.csc_matrix, scale: FloatArray) -> Inverse | Non
     An arrow has few unknowns that most others touch, the core, and small sets that touch nothing but these: a survey of
     many epochs, or of many points seen from a few places. Linear in n.
     """
-    from scipy.sparse.csgraph import connected_components
-
     degree, n = np.diff(N.indptr), N.shape[0]
     core = np.flatnonzero(degree > 2 * np.median(degree))
     rest = np.flatnonzero(degree <= 2 * np.median(degree))
@@ -57,7 +55,7 @@ def structured_inverse(N: sparse.csc_matrix, scale: FloatArray) -> Inverse | Non
         return None
     N = N.tocsr()
     own, across = N[rest][:, rest], N[rest][:, core]
-    _, label = connected_components(own, directed=False)
+    label = sets_apart(own)
     sizes = np.bincount(label)
     if sizes.max() > _SMALL_SET:
         return None
@@ -72,17 +70,31 @@ def structured_inverse(N: sparse.csc_matrix, scale: FloatArray) -> Inverse | Non
             pieces.append((rest[mine], inverse, T))
     lower = np.linalg.cholesky(head)
     U, member, first = np.empty((len(core), n)), np.full(n, -1), 0
-    U[:, core] = scipy.linalg.solve_triangular(lower, np.diag(scale[core]), lower=True)
+    of_core = np.linalg.inv(lower)
+    U[:, core] = of_core * scale[core]
     entries = [(np.zeros(0, dtype=np.int64),) * 2 + (np.zeros(0),)]
     for rows, inverse, T in pieces:
         at, k = rows.ravel(), rows.shape[1]
-        U[:, at] = -scipy.linalg.solve_triangular(lower, T.T, lower=True) * scale[at]
+        U[:, at] = -(of_core @ T.T) * scale[at]
         member[rows] = first + np.arange(len(rows))[:, None]
         first += len(rows)
         values = inverse * scale[rows][:, :, None] * scale[rows][:, None, :]
         entries.append((np.repeat(at, k), np.tile(rows, k).ravel(), values.ravel()))
     i, j, values = (np.concatenate(x) for x in zip(*entries, strict=True))
     return Inverse(sparse.csr_matrix((values, (i, j)), (n, n)), U, member)
+
+
+def sets_apart(N: sparse.csr_matrix) -> IntArray:
+    """Number (n,) of the set of unknowns that each belongs to, where those of different sets have nothing in common.
+
+    ``scipy.sparse.csgraph`` takes longer to load than this to run.
+    """
+    label, before = np.arange(N.shape[0]), np.zeros(0, dtype=np.int64)
+    while not np.array_equal(label, before):  # each takes the least of those it touches, and what that one has by now
+        before = label
+        label = np.minimum.reduceat(label[N.indices], N.indptr[:-1])
+        label = label[label]
+    return np.asarray(np.unique(label, return_inverse=True)[1])
 
 
 def _blocks(N: sparse.csr_matrix, sets: IntArray) -> FloatArray:

@@ -29,17 +29,24 @@ def ellipsoid(
 
     With sigma0 (and its redundancy) the covariance is scaled by it and Fisher's F stands for chi-square.
     """
-    values, vectors = np.linalg.eigh(0.5 * (cov + cov.T))
-    kept = values > _HELD
-    values, vectors = values[kept][::-1], vectors[:, kept][:, ::-1]
-    axes = np.zeros((3, len(values)))
-    axes[: len(cov)] = vectors
-    k = max(1, len(values))
+    return ellipsoids(cov[None], level, sigma0, redundancy)[0]
+
+
+def ellipsoids(
+    cov: FloatArray, level: float = 0.95, sigma0: float | None = None, redundancy: int = 0
+) -> list[Ellipsoid]:
+    """The same of many positions, (p, 3, 3) or (p, 2, 2)."""
+    values, vectors = np.linalg.eigh(0.5 * (cov + np.swapaxes(cov, 1, 2)))
+    scaled, k = sigma0 is not None and redundancy > 0, np.arange(1, 4)
     if sigma0 is not None and redundancy > 0:
-        quantile = k * float(fisher.ppf(level, k, redundancy)) * sigma0**2
+        quantiles = k * fisher.ppf(level, k, redundancy) * sigma0**2
     else:
-        quantile = float(chi2.ppf(level, k))
-    return Ellipsoid(np.sqrt(quantile * values), axes, level, sigma0 is not None and redundancy > 0)
+        quantiles = chi2.ppf(level, k)
+    n_kept = (values > _HELD).sum(axis=1)
+    semi_axes = np.sqrt(quantiles[np.maximum(1, n_kept) - 1, None] * np.where(values > _HELD, values, 0.0))[:, ::-1]
+    axes = np.zeros((len(cov), 3, cov.shape[1]))
+    axes[:, : cov.shape[1]] = vectors[:, :, ::-1]
+    return [Ellipsoid(a[:n], x[:, :n], level, scaled) for n, a, x in zip(n_kept.tolist(), semi_axes, axes, strict=True)]
 
 
 def relative_precision(
@@ -66,14 +73,6 @@ class _Place:
     R: FloatArray | None
     by: dict[ParameterName, FloatArray]
 
-    def cov(self, adjustment: Adjustment) -> FloatArray:
-        """Of x (3, 3)."""
-        names = list(self.by)
-        if not names:
-            return np.zeros((3, 3))
-        J = np.hstack([self.by[n][3:] for n in names])
-        return np.asarray(J @ adjustment.precision.joint(names) @ J.T)
-
 
 class _Places:
     """Positions by name or frame; the frames of a survey are built when one is asked for."""
@@ -90,15 +89,12 @@ class _Places:
             raise SurveyError(f"{' '.join(what)}: no such position was adjusted; name a point, a station or a frame")
         held = np.array([s == "held" for s in estimate.status], dtype=np.bool_)
         if isinstance(estimate.value, Pose3):
-            R, x = estimate.value.rotation().matrix(), np.asarray(estimate.value.translation())
+            R, x, J = estimate.value.rotation().matrix(), np.asarray(estimate.value.translation()), np.eye(6)
+            J[3:, 3:] = R
             if rotations_only(self.adjustment):
-                return _Place(what, np.full(3, np.nan), R, {} if held.all() else {what: np.diag([1.0] * 3 + [0.0] * 3)})
-            J = np.zeros((6, 6))
-            J[:3, :3], J[3:, 3:] = np.eye(3), R
+                x, J[3:], held = np.full(3, np.nan), 0.0, np.full(6, held.all())
             return _Place(what, x, R, {} if held.all() else {what: J * ~held})
-        J = np.zeros((6, 3))
-        J[3:] = np.eye(3)
-        return _Place(what, np.asarray(estimate.value), None, {} if held.all() else {what: J * ~held})
+        return _Place(what, np.asarray(estimate.value), None, {} if held.all() else {what: np.eye(6)[:, 3:] * ~held})
 
     def _frame(self, ref: FrameRef) -> _Place:
         if self.builder is None:
@@ -118,33 +114,24 @@ class _Places:
         return _Place(called, np.asarray(pose.translation()), R, by)
 
 
-def _scale(adjustment: Adjustment, scaled: bool) -> tuple[float | None, int]:
-    known = scaled and adjustment.redundancy > 0
-    return (adjustment.sigma0 if known else None), adjustment.redundancy
-
-
 def _relative(adjustment: Adjustment, a: _Place, b: _Place, level: float, scaled: bool) -> RelativePrecision:
-    names = list(dict.fromkeys([*a.by, *b.by]))
     dims = {n: J.shape[1] for p in (a, b) for n, J in p.by.items()}
-    turned = a.R is not None and b.R is not None
-    back = b.R.T @ a.R if a.R is not None and b.R is not None else np.eye(3)
-    columns = []
-    for n in names:
-        of_a, of_b = (p.by.get(n, np.zeros((6, dims[n]))) for p in (a, b))
+    turned, back = False, np.eye(3)
+    if a.R is not None and b.R is not None:
+        turned, back = True, b.R.T @ a.R
+    columns = [np.zeros((6, 0))]
+    for n, dim in dims.items():
+        of_a, of_b = (p.by.get(n, np.zeros((6, dim))) for p in (a, b))
         columns.append(np.vstack([of_b[:3] - back @ of_a[:3], of_b[3:] - of_a[3:]]))
-    cov = np.zeros((6, 6))
-    if names:
-        J = np.hstack(columns)
-        cov = J @ np.asarray(adjustment.precision.joint(names)) @ J.T
-    d, own = b.x - a.x, cov[3:, 3:]
-    length = float(np.linalg.norm(d))
-    u = d / length if length > 0.0 else np.zeros(3)
-    scale = _scale(adjustment, scaled)
+    J = np.hstack(columns)
+    cov = J @ np.asarray(adjustment.precision.joint(list(dims))) @ J.T if dims else np.zeros((6, 6))
+    d, own, of_rotation = b.x - a.x, cov[3:, 3:], cov[:3, :3] if turned else None
     if not np.isfinite(d).all():
         nan, none = np.full((3, 3), np.nan), Ellipsoid(np.zeros(0), np.zeros((3, 0)), level, scaled)
-        return RelativePrecision(a.name, b.name, d, nan, float("nan"), float("nan"), none,
-                                 cov[:3, :3] if turned else None)  # fmt: skip
-    return RelativePrecision(
-        a.name, b.name, d, own, length, float(np.sqrt(max(0.0, float(u @ own @ u)))), ellipsoid(own, level, *scale),
-        cov[:3, :3] if turned else None,
-    )  # fmt: skip
+        return RelativePrecision(a.name, b.name, d, nan, float("nan"), float("nan"), none, of_rotation)
+    length = float(np.linalg.norm(d))
+    u = d / length if length > 0.0 else np.zeros(3)
+    sigma0 = adjustment.sigma0 if scaled and adjustment.redundancy > 0 else None
+    region = ellipsoid(own, level, sigma0, adjustment.redundancy)
+    along = float(np.sqrt(max(0.0, float(u @ own @ u))))
+    return RelativePrecision(a.name, b.name, d, own, length, along, region, of_rotation)

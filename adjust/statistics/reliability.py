@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from adjust.model.arrays import largest
+from adjust.model.names import numbered
 from adjust.model.result import Adjustment, ReadingResiduals
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.point_tests import AdjustedPoints, controlled_directions, point_tests
@@ -34,11 +34,6 @@ class _Batch:
     x: Whitened
     W: FloatArray
     back: FloatArray
-
-    @cached_property
-    def weakest(self) -> tuple[FloatArray, FloatArray]:
-        """Their weakest controlled directions."""
-        return self.x.weakest()
 
 
 def reliability(
@@ -85,7 +80,7 @@ def observation_name(adjustment: Adjustment, row: int) -> tuple[str, tuple[str, 
 
 def _others(precision: Precision) -> list[_Batch]:
     """All other observations, those with the same number of components together."""
-    n_image = sum(len(b.uv) for b in precision.graph.survey.image_blocks)
+    n_image = len(precision.graph.survey.image_points.uv)
     found: dict[int, list[tuple[int, FloatArray, FloatArray, FloatArray, FloatArray, bool]]] = {}
     for i, item in zip(precision.graph.single, precision.graph.singles, strict=True):
         x = precision.rows(item)
@@ -153,57 +148,40 @@ def _table(
         rows = batch.rows
         parts = (ptr[rows][:, None] + np.arange(batch.x.g.shape[1])).ravel()
         used[rows] = batch.x.used
-        for name, values in _of_rows(batch, found).items():
-            columns[name][rows] = values
-        for name, values in _of_components(batch, found).items():
-            columns[name][parts] = values.ravel()
+        for name, values in _columns(batch, found).items():
+            columns[name][rows if values.ndim == 1 else parts] = values.ravel()
     readings = adjustment.reading_residuals
     if readings is not None:  # of joint readings: the shares of the degrees of freedom, not of a bias that shows
         columns["redundancy"][M - len(readings.used) :] = readings.redundancy
-    blocks = adjustment.survey.image_blocks
-    groups, counts = [b.group for b in blocks], [len(b.uv) for b in blocks]
-    others = groups_of_others(precision_of(adjustment).graph)
-    groups, counts = groups + others, counts + [1] * len(others)
-    names = tuple(dict.fromkeys(g for g, n in zip(groups, counts, strict=True) if n))
-    number = {g: i for i, g in enumerate(names)}
+    sizes, others = np.diff(adjustment.image_residuals.block_ptr), groups_of_others(precision_of(adjustment).graph)
+    blocks = [(b.group, n) for b, n in zip(adjustment.survey.image_blocks, sizes.tolist(), strict=True) if n]
+    counts = [*(n for _, n in blocks), *[1] * len(others)]
+    names, group = numbered([*(g for g, _ in blocks), *others])
     return ObservationTests(
-        n_image=n_image, ptr=ptr, group=np.repeat(np.array([number.get(g, 0) for g in groups], dtype=np.int64), counts),
-        group_names=names, used=used, n_components=np.diff(ptr), freedom=freedom, criteria=found,
+        n_image=n_image, ptr=ptr, group=np.repeat(group, counts), group_names=tuple(names), used=used,
+        n_components=np.diff(ptr), freedom=freedom, criteria=found,
         omega=adjustment.omega, total_redundancy=adjustment.redundancy, sigma0=adjustment.sigma0, **columns,
     )  # fmt: skip
 
 
-def _of_rows(batch: _Batch, found: Criteria) -> dict[str, FloatArray]:
-    x, (weakest, _), statistic = batch.x, batch.weakest, batch.x.statistic
-    lambda0 = found.lambda0[np.maximum(x.freedom, 1) - 1]
-    some = x.freedom > 0
+def _columns(batch: _Batch, found: Criteria) -> dict[str, FloatArray]:
+    """By name, of rows (n,) and of components (n, k)."""
+    x, (weakest, direction), some = batch.x, batch.x.weakest(), batch.x.freedom > 0
     least = np.where(some, weakest, 1.0)
-    size = np.sqrt(lambda0 / least)
-    detectable = np.where(some, size, np.inf)
+    size, (w, information) = np.sqrt(found.lambda0[np.maximum(x.freedom, 1) - 1] / least), component_tests(x, batch.W)
     moved = np.where(some, size * np.sqrt(np.maximum(1.0 - least, 0.0)), np.inf)
+    error, bias = (np.where(some[:, None], np.einsum("nij,nj->ni", batch.back, along), np.nan)
+                   for along in (x.error, direction * size[:, None]))  # fmt: skip
+    with np.errstate(divide="ignore"):
+        detectable = np.sqrt(found.lambda0[0] / information)
     return {
         "redundancy": np.where(x.used, np.trace(x.K, axis1=1, axis2=2), 0.0),
         "least": np.clip(x.values.min(axis=1), 0.0, 1.0),
-        "statistic": np.where(some, statistic, np.nan),
-        "detectable": detectable,
+        "statistic": np.where(some, x.statistic, np.nan),
+        "detectable": np.where(some, size, np.inf),
         "external": np.where(x.used, moved, 0.0),
-    }
-
-
-def _of_components(batch: _Batch, found: Criteria) -> dict[str, FloatArray]:
-    x = batch.x
-    single = component_tests(x, batch.W)
-    weakest, direction = batch.weakest
-    size = np.sqrt(found.lambda0[np.maximum(x.freedom, 1) - 1] / weakest)
-    with np.errstate(divide="ignore"):
-        detectable = np.sqrt(found.lambda0[0] / single.information)
-    some = (x.freedom > 0)[:, None]
-    return {
-        "w": single.w,
-        "error": np.where(some, np.einsum("nij,nj->ni", batch.back, x.error), np.nan),
-        "detectable_component": detectable,
-        "bias": np.where(some, np.einsum("nij,nj->ni", batch.back, direction * size[:, None]), np.nan),
-    }
+        "w": w, "error": error, "detectable_component": detectable, "bias": bias,
+    }  # fmt: skip
 
 
 def _influences(

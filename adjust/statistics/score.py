@@ -17,9 +17,8 @@ from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.statistics.normal import DENSE
 from adjust.statistics.system import LinearSystem, linear_system
-from adjust.testing.distributions import chi2, fisher
 from adjust.testing.quadratic_forms import pseudo_half
-from adjust.testing.significance import LEVEL, Significance
+from adjust.testing.significance import Significance, significance
 
 _SEEN = 1e-7
 """Share of a change's column that no unknown takes over, below which it does not show."""
@@ -261,7 +260,6 @@ def shared_lenses(result: Adjustment, estimated_sigma0: bool) -> tuple[SharedLen
     if not shared or result.precision is None:
         return ()
     linear, out = LinearScores(result), []
-    level = LEVEL if result.global_test is None else result.global_test.alpha
     for camera, (lender, parameters) in shared.items():
         found = result.estimates["lens", camera]
         names = tuple(x for x in found.components if x in parameters)
@@ -269,20 +267,12 @@ def shared_lenses(result: Adjustment, estimated_sigma0: bool) -> tuple[SharedLen
         k, left = score.seen, result.redundancy - score.seen
         if not k or (estimated_sigma0 and left <= 0):
             continue
-        statistic, freedom, p = _tested(score, result.omega, left if estimated_sigma0 else None)
-        test = Significance("lens_shared", names, statistic, freedom, p, p < level)
+        variance = (result.omega - score.drop) / left if estimated_sigma0 else 1.0
+        redundancy = left if estimated_sigma0 else None
+        test = significance(result, "lens_shared", names, score.drop / variance, k, redundancy)
         units = tuple(found.units[found.components.index(x)] for x in names)
         out.append(SharedLens(camera, lender, names, units, score.theta, score.cov, test))
     return tuple(out)
-
-
-def _tested(score: Score, omega: float, left: int | None) -> tuple[float, tuple[int, ...], float]:
-    """Statistic, degrees of freedom and p-value; left: redundancy without the tie, None where sigma0 is known."""
-    k = score.seen
-    if left is None:
-        return score.drop, (k,), float(chi2.sf(score.drop, k))
-    statistic = score.drop / k / ((omega - score.drop) / left)
-    return statistic, (k, left), float(fisher.sf(statistic, k, left))
 
 
 def own_score(linear: LinearScores, camera: str, lender: str, parameters: tuple[str, ...]) -> Score:

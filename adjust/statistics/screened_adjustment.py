@@ -159,9 +159,7 @@ def _left_out(given: Survey, found: Adjustment) -> int:
     before = sum(2 * b.n_used for b in given.image_blocks)
     after = 2 * int(found.image_residuals.used.sum())
     out = sum(len(o.components) for o in found.other_residuals if not o.used)
-    unused = (given.distances, given.coordinates, given.pairs, given.coordinate_differences, given.readings,
-              given.levels, given.alignments, given.laser_spots, given.on_surfaces, given.table_readings)  # fmt: skip
-    return before - after + out - sum(1 for kind in unused for o in kind if not o.used)
+    return before - after + out - sum(not o.used for kind in given.others.values() for o in kind)
 
 
 def _searched(

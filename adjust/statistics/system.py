@@ -175,6 +175,9 @@ class LinearSystem:
             of_size.setdefault(by_name[name].dim, []).append(i)
         for dim, rows in of_size.items():
             found = self.precision.covs(np.array([by_name[names[i]].key for i in rows]), dim)
+            if dim == columns.shape[1]:
+                out[rows] = found
+                continue
             for i, Q in zip(rows, found, strict=True):
                 free = self.columns.free[names[i]]
                 out[i] = Q[free[:, None], free]

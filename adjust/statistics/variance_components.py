@@ -51,9 +51,8 @@ DEFAULT_COMPONENTS = ComponentOptions()
 
 @dataclass(frozen=True, eq=False)
 class Scaled:
-    """The survey with its estimated variances, adjusted, and the components that were found."""
+    """A survey adjusted with its estimated variances, and the components that were found."""
 
-    survey: Survey
     adjustment: Adjustment
     components: VarianceComponents
 
@@ -91,13 +90,10 @@ def estimate_variance_components(
         found = _of_adjustment(now, options)
         change = max((abs(np.log(c.factor)) for c in found.components if c.status in _CHANGED), default=0.0)
         if change < options.convergence:
-            total = {c.group: total.get(c.group, 1.0) for c in found.components}
-            return Scaled(now.survey, now, _totals(found, total, iteration, True, options))
+            return Scaled(now, _totals(found, total, iteration, True, options))
         total = {c.group: total.get(c.group, 1.0) * c.factor for c in found.components}
         now = adjust(scaled_survey(survey, total), values_of(now), options.adjust, progress)
-    found = _of_adjustment(now, options)
-    total = {c.group: total.get(c.group, 1.0) for c in found.components}
-    return Scaled(now.survey, now, _totals(found, total, options.max_iterations, False, options))
+    return Scaled(now, _totals(_of_adjustment(now, options), total, options.max_iterations, False, options))
 
 
 _CHANGED = ("estimated", "unseparable", "vanished")
@@ -107,15 +103,12 @@ def _totals(
     found: VarianceComponents, total: dict[str, float], iterations: int, converged: bool, options: ComponentOptions
 ) -> VarianceComponents:
     """The last step's components with factors over the a priori variances."""
-    components = tuple(
-        _tested(Component(
-            c.group, total[c.group], c.sigma / c.factor * total[c.group], c.n, c.redundancy, c.omega,
-            "vanished" if c.status == "estimated" and total[c.group] < 10.0 * _VANISHED else c.status,
-        ), options)
-        for c in found.components
-    )  # fmt: skip
-    return VarianceComponents(components, found.estimated, found.correlation, found.unseparable, iterations, converged,
-                              found.method)  # fmt: skip
+    components = []
+    for c in found.components:
+        factor = total.get(c.group, 1.0)
+        status = "vanished" if c.status == "estimated" and factor < 10.0 * _VANISHED else c.status
+        components.append(_tested(replace(c, factor=factor, sigma=c.sigma / c.factor * factor, status=status), options))
+    return replace(found, components=tuple(components), iterations=iterations, converged=converged)
 
 
 def _of_adjustment(adjustment: Adjustment, options: ComponentOptions) -> VarianceComponents:
@@ -151,8 +144,8 @@ def components_of(
 ) -> VarianceComponents:
     """Variance components of a linear system: no new linearisation."""
     names = system.group_names
-    number = {g: i for i, g in enumerate(names)}
-    mixed = [(rows, np.array([number[g] for g in of], dtype=np.int64), back) for rows, of, back in mixed_blocks(system)]
+    mixed = [(rows, np.array([names.index(g) for g in of], dtype=np.int64), back)
+             for rows, of, back in mixed_blocks(system)]  # fmt: skip
     sums = group_sums(system, mixed)
     chosen = np.array([g in wanted for g in names], dtype=np.bool_)
     found = linear_components(sums, chosen, options)
@@ -258,7 +251,7 @@ def _tested(given: Component, options: ComponentOptions) -> Component:
     """With limits and test from chi-square with the equivalent degrees of freedom (Satterthwaite 1946)."""
     factor, sigma = given.factor, given.sigma
     if given.status == "vanished" or not (np.isfinite(sigma) and sigma > 0.0 and factor > 0.0):
-        return given
+        return replace(given, freedom=np.nan, p=np.nan, lower=np.nan, upper=np.nan)
     freedom = 2.0 * factor**2 / sigma**2
     low, high = chi2.ppf([0.5 - 0.5 * options.level, 0.5 + 0.5 * options.level], freedom)
     p = 2.0 * min(float(chi2.cdf(factor * freedom, freedom)), float(chi2.sf(factor * freedom, freedom)))

@@ -128,7 +128,10 @@ def typical_factor(statistics: FloatArray, freedom: IntArray) -> float:
 def _of_kinds(quantile: Callable[[FloatArray], FloatArray], freedom: IntArray) -> FloatArray:
     """A quantile for each of these degrees of freedom (n,), of 0 as of 1: of a million tests there are few kinds."""
     kinds = np.arange(int(freedom.max(initial=1)) + 1)
-    return np.asarray(quantile(np.maximum(kinds, 1))[freedom])
+    found = np.asarray(quantile(np.maximum(kinds, 1)))
+    if freedom.size and freedom.min() == kinds[-1]:
+        return np.broadcast_to(found[-1], freedom.shape)
+    return np.asarray(found[freedom])
 
 
 def cauchy_weights(squares: FloatArray) -> FloatArray:

@@ -44,16 +44,6 @@ class ncx2:  # noqa: N801  # the name that statisticians and SciPy use
         """Probability above x, to 1e-15: enough for the power of a test, not for far tails."""
         return 1.0 - scipy.special.chndtr(x, k, c)
 
-    @staticmethod
-    def ppf(p: Numbers, k: Numbers, c: Numbers) -> Numbers:
-        """Quantile of probability p below."""
-        return scipy.special.chndtrix(p, k, c)
-
-    @staticmethod
-    def isf(p: Numbers, k: Numbers, c: Numbers) -> Numbers:
-        """Quantile of probability p above."""
-        return scipy.special.chndtrix(np.subtract(1.0, p), k, c)
-
 
 class norm:  # noqa: N801  # the name that statisticians and SciPy use
     """The standard normal distribution."""
@@ -95,11 +85,6 @@ class fisher:  # noqa: N801  # as the others
     def ppf(p: Numbers, m: Numbers, n: Numbers) -> Numbers:
         """Quantile of probability p below."""
         return scipy.special.fdtri(m, n, p)
-
-    @staticmethod
-    def isf(p: Numbers, m: Numbers, n: Numbers) -> Numbers:
-        """Quantile of probability p above."""
-        return 1.0 / scipy.special.fdtri(n, m, p)
 
     @staticmethod
     def sf(x: Numbers, m: Numbers, n: Numbers) -> Numbers:

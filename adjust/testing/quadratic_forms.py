@@ -81,6 +81,12 @@ def normal_score(T: FloatArray, q: IntArray) -> FloatArray:
     return np.asarray(((T / q) ** (1.0 / 3.0) - 1.0 + c) / np.sqrt(c))
 
 
+def squares_in_sigmas(d: FloatArray, Q: FloatArray) -> tuple[FloatArray, IntArray]:
+    """``d' Q^+ d`` (...,) and the rank of Q (..., n, n), of d (..., n) with covariance Q, as :func:`pseudo_square`."""
+    s = np.sqrt(np.maximum(np.diagonal(Q, axis1=-2, axis2=-1), 1e-300))
+    return pseudo_squares(d / s, Q / (s[..., :, None] * s[..., None, :]), _DETERMINED, _DETERMINED)
+
+
 def pseudo_square(d: FloatArray, Q: FloatArray) -> tuple[float, int, FloatArray]:
     """``d' Q^+ d``, the rank of Q, and ``Q^+`` (n, n), of d (n,) with covariance Q; in sigmas, as units do not mix."""
     s = np.sqrt(np.maximum(np.diag(Q), 1e-300))

@@ -34,13 +34,16 @@ class Significance:
     significant: bool
 
 
-def zero_test(x: FloatArray, cov: FloatArray, redundancy: int | None = None) -> tuple[float, tuple[int, ...], float]:
-    """Statistic, degrees of freedom and p-value that x (k,) is zero; redundancy: of the sigma0^2 that is in ``cov``."""
-    k = len(x)
-    statistic = float(x @ np.linalg.solve(cov, x))
+def significance(
+    adjustment: Adjustment, term: str, components: tuple[str, ...], square: float, k: int, redundancy: int | None
+) -> Significance:
+    """Of ``x' inv(C) x``, k degrees of freedom; redundancy: of the sigma0^2 that is in C, None where it is known."""
+    level = LEVEL if adjustment.global_test is None else adjustment.global_test.alpha
     if redundancy is None:
-        return statistic, (k,), float(chi2.sf(statistic, k))
-    return statistic / k, (k, redundancy), float(fisher.sf(statistic / k, k, redundancy))
+        p = float(chi2.sf(square, k))
+        return Significance(term, components, square, (k,), p, p < level)
+    p = float(fisher.sf(square / k, k, redundancy))
+    return Significance(term, components, square / k, (k, redundancy), p, p < level)
 
 
 def terms_of(estimate: Estimate) -> Mapping[str, Sequence[str]]:
@@ -65,15 +68,20 @@ def _harmonics(components: Sequence[str]) -> Mapping[str, Sequence[str]]:
 
 def significances(adjustment: Adjustment, estimate: Estimate, estimated_sigma0: bool) -> tuple[Significance, ...]:
     """The tests of all terms of an estimate, with sigma0 of the adjustment or with one."""
-    redundancy = adjustment.redundancy if estimated_sigma0 else None
-    level = LEVEL if adjustment.global_test is None else adjustment.global_test.alpha
-    values, factor = np.asarray(estimate.value, dtype=float), adjustment.sigma0**2 if estimated_sigma0 else 1.0
-    out = []
+    values, out = np.asarray(estimate.value, dtype=float), []
     for term, names in terms_of(estimate).items():
         at = [estimate.components.index(name) for name in names]
-        statistic, freedom, p = zero_test(values[at], factor * estimate.cov[np.ix_(at, at)], redundancy)
-        out.append(Significance(term, tuple(names), statistic, freedom, p, p < level))
+        out.append(_judged(adjustment, term, tuple(names), values[at], estimate.cov[np.ix_(at, at)], estimated_sigma0))
     return tuple(out)
+
+
+def _judged(
+    adjustment: Adjustment, term: str, names: tuple[str, ...], x: FloatArray, cov: FloatArray, estimated_sigma0: bool
+) -> Significance:
+    """Whether x (k,) with this covariance a priori is zero."""
+    factor, redundancy = (adjustment.sigma0**2, adjustment.redundancy) if estimated_sigma0 else (1.0, None)
+    square = float(x @ np.linalg.solve(factor * cov, x))
+    return significance(adjustment, term, names, square, len(x), redundancy)
 
 
 def significance_of_changes(
@@ -93,9 +101,5 @@ def significance_of_changes(
         given = crops[name[1]][name[2]].parameters.values if crops else np.zeros(len(estimate.components))
         free = [s != "held" for s in estimate.status]
         parts.append((np.asarray(estimate.value, dtype=float) - given)[free])
-    factor = adjustment.sigma0**2 if estimated_sigma0 else 1.0
-    cov = factor * np.asarray(adjustment.precision.joint(names))
-    level = LEVEL if adjustment.global_test is None else adjustment.global_test.alpha
-    redundancy = adjustment.redundancy if estimated_sigma0 else None
-    statistic, freedom, p = zero_test(np.concatenate(parts), cov, redundancy)
-    return Significance(term, found[0][1].components, statistic, freedom, p, p < level)
+    cov = np.asarray(adjustment.precision.joint(names))
+    return _judged(adjustment, term, found[0][1].components, np.concatenate(parts), cov, estimated_sigma0)

@@ -93,22 +93,17 @@ def eigen2(M: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.stack([mean + half, mean - half], axis=1), vectors
 
 
-@dataclass(frozen=True, eq=False)
-class ComponentTests:
-    """Of the single components (n, k): w, variance of w's numerator (information of a bias in the component alone)."""
+def component_tests(x: Whitened, W: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Baarda's w of every component: -(W'g)_i / sqrt((W'KW)_ii), W (n, k, k) the square root information; (n, k).
 
-    w: FloatArray
-    information: FloatArray
-
-
-def component_tests(x: Whitened, W: FloatArray) -> ComponentTests:
-    """Baarda's w of every component: -(W'g)_i / sqrt((W'KW)_ii), W (n, k, k) the square root information."""
+    And the variance of its numerator, the information of a bias in the component alone (n, k).
+    """
     numerator = np.einsum("nij,ni->nj", W, x.g)
     information = np.einsum("nij,nij->nj", W, x.K @ W)
     own = np.einsum("nij,nij->nj", W, W)
     seen = information > CONTROLLED * own
     w = np.where(seen, -numerator / np.sqrt(np.where(seen, information, 1.0)), np.nan)
-    return ComponentTests(w, np.where(seen, information, 0.0))
+    return w, np.where(seen, information, 0.0)
 
 
 def p_prior(statistic: FloatArray, freedom: IntArray) -> FloatArray:

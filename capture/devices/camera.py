@@ -9,7 +9,6 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -101,25 +100,18 @@ class Camera(ABC):
     ``with open_camera(address) as camera`` closes it at the end. Between ``arm`` and ``disarm`` it takes images, one
     for each trigger where ``TriggerMode`` is On (by ``trigger`` where ``TriggerSource`` is Software), else one after
     the other. Block ids may start anew with ``arm``.
+
+    address: ``driver:place``, by which it was opened. serial: DeviceSerialNumber, or what stands for it; known after
+    ``open``.
     """
 
     def __init__(self, driver: str, place: str) -> None:
-        self._address = f"{driver}:{place}"
-        self._serial = place
+        self.address = f"{driver}:{place}"
+        self.serial = place
         self._armed = False
         self._unanswered = False
         self._triggered_armed = False
         self._source_armed = ""
-
-    @property
-    def address(self) -> str:
-        """``driver:place``, by which it was opened."""
-        return self._address
-
-    @property
-    def serial(self) -> str:
-        """DeviceSerialNumber, or what stands for it; known after ``open``."""
-        return self._serial
 
     @property
     def last_block_id(self) -> int | None:
@@ -143,9 +135,7 @@ class Camera(ABC):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @abstractmethod

@@ -5,7 +5,6 @@ Angles are radians, one per axis, outermost first; they count whole turns, becau
 """
 
 import math
-import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -119,31 +118,6 @@ class Settle:
     poll_s: float = 0.01
 
 
-class MoveStatus:
-    """How a move goes on; filled by the table, read by anyone."""
-
-    def __init__(self) -> None:
-        self._finished = threading.Event()
-        self._exception: BaseException | None = None
-
-    @property
-    def done(self) -> bool:
-        """Whether it is over, well or not."""
-        return self._finished.is_set()
-
-    def wait(self, timeout_s: float | None = None) -> None:
-        """Wait for the end; raises what went wrong, or NotSettledError after ``timeout_s``."""
-        if not self._finished.wait(timeout_s):
-            raise NotSettledError(f"the table was still moving after {timeout_s} s; give it more time")
-        if self._exception is not None:
-            raise self._exception
-
-    def finish(self, exception: BaseException | None = None) -> None:
-        """For the table, once: the end, and why where it went wrong."""
-        self._exception = exception
-        self._finished.set()
-
-
 @dataclass(frozen=True)
 class AxisState:
     """What a controller says of an axis: angle (rad, in the controller's count of turns), and a fault in its words."""
@@ -159,15 +133,10 @@ class Controller(Protocol):
     All raise TableDisconnectedError, and ControllerError where the controller refuses.
     """
 
-    @property
-    def address(self) -> str:
-        """For messages."""
-        ...
-
-    @property
-    def modulo(self) -> float | None:
-        """After what angle its readback starts anew (rad); None where it counts turns."""
-        ...
+    address: str
+    """For messages."""
+    modulo: float | None
+    """After what angle its readback starts anew (rad); None where it counts turns."""
 
     def open(self) -> None:
         """Connect."""

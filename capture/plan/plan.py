@@ -2,14 +2,15 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
+from capture.plan.given import with_given
 from capture.plan.poses import Pose, check_names, read_poses
 from capture.plan.table import TablePlan, read_table
 from survey.project.declared.node import Node, read_toml
@@ -17,17 +18,7 @@ from survey.project.declared.node import Node, read_toml
 FORMAT = 1
 _MOST_REPEATS = 10_000
 _TOP = ("format", "project", "survey", "table", "cameras", "capture", "poses")
-_CAPTURE = (
-    "repeats",
-    "trigger",
-    "wait_s",
-    "fetch_timeout_s",
-    "retries",
-    "retry_pause_s",
-    "drift_deg",
-    "overhead_s",
-    "quality",
-)
+_LEAST = {"repeats": 1, "retries": 0, "wait_s": 0, "retry_pause_s": 0, "overhead_s": 0}
 FeatureValue = bool | int | float | str
 
 
@@ -123,18 +114,8 @@ def read_plan(path: Path) -> CapturePlan:
         cameras=cameras,
         poses=poses,
         options=_options(root.table("capture")),
-        image_sizes=_image_sizes(survey),
     )
-    _check_survey(root, plan)
-    return plan
-
-
-def _image_sizes(survey: Path | None) -> Mapping[str, tuple[int, int]]:
-    if survey is None:
-        return {}
-    cameras = read_toml(survey)[0].tables("cameras")
-    sizes = {name: node.numbers("image_size_px", (2,)) for name, node in cameras if node.has("image_size_px")}
-    return {name: (int(size[0]), int(size[1])) for name, size in sizes.items()}
+    return replace(plan, image_sizes=_image_sizes(root, plan))
 
 
 def _cameras(root: Node) -> tuple[CameraPlan, ...]:
@@ -156,44 +137,29 @@ def _features(node: Node) -> Mapping[str, FeatureValue]:
 
 
 def _options(node: Node) -> CaptureOptions:
-    node.allow(*_CAPTURE)
-    default = CaptureOptions()
-    trigger: Any = node.choice("trigger", ("software", "hardware", "free"), default.trigger)
-    options = CaptureOptions(
-        repeats=node.integer("repeats", 1, default.repeats),
-        trigger=trigger,
-        wait_s=node.number("wait_s", default.wait_s),
-        fetch_timeout_s=node.number("fetch_timeout_s", default.fetch_timeout_s, positive=True),
-        retries=node.integer("retries", 0, default.retries),
-        retry_pause_s=node.number("retry_pause_s", default.retry_pause_s),
-        drift=math.radians(node.number("drift_deg", math.degrees(default.drift), positive=True)),
-        overhead_s=node.number("overhead_s", default.overhead_s),
-        quality=node.flag("quality", default.quality),
-    )
+    options = with_given(CaptureOptions(), node, _LEAST)
     if options.repeats > _MOST_REPEATS:
         raise node.error(f"found {options.repeats}; at most {_MOST_REPEATS}", "repeats")
-    for key in ("wait_s", "retry_pause_s", "overhead_s"):
-        if getattr(options, key) < 0:
-            raise node.error(f"found {getattr(options, key)}; it cannot be negative", key)
     return options
 
 
-def _check_survey(root: Node, plan: CapturePlan) -> None:
-    """The names of the plan must be those of the survey, or the folder could not be adjusted afterwards."""
+def _image_sizes(root: Node, plan: CapturePlan) -> Mapping[str, tuple[int, int]]:
+    """Of cameras, as the survey says; its names must be those of the plan, or the folder could not be adjusted."""
     if plan.survey is None:
-        return
+        return {}
     survey, _ = read_toml(plan.survey)
-    known = tuple(survey.table("cameras").values)
+    cameras = dict(survey.tables("cameras"))
     for camera in plan.cameras:
-        root.table("cameras").references("ids", known, "camera", [camera.camera_id])
+        root.table("cameras").references("ids", cameras, "camera", [camera.camera_id])
     if plan.table is not None:
-        tables = survey.table("tables")
-        name = plan.table.table_id
+        tables, name = survey.table("tables"), plan.table.table_id
         if name not in tables.values:
             raise root.error(f"{plan.survey} has no table {name!r} but {', '.join(tables.values) or 'none'}", "table")
         axes = tables.table(name).value("axes", ["x", "z"])
         if len(axes) != len(plan.table.axes):
             raise root.error(f"{len(plan.table.axes)} axes, but {plan.survey} says {len(axes)}", "table", "axes")
+    sizes = {name: node.numbers("image_size_px", (2,)) for name, node in cameras.items() if node.has("image_size_px")}
+    return {name: (int(size[0]), int(size[1])) for name, size in sizes.items()}
 
 
 def check_plan_limits(plan: CapturePlan) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from adjust.model.survey import FloatArray
+from capture.plan.given import with_given
 from capture.plan.table import TablePlan
 from survey.folder.text import id_problem
 from survey.project.declared.node import Node
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
 _KINDS = ("grid", "list", "cover", "still")
 _MOST_POSES = 100_000
-_COVER = ("cameras", "target", "count", "margin_px", "steps", "steepest_deg")
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,19 +110,13 @@ def _count(node: Node, *default: int) -> int:
 
 def _cover(node: Node, table: TablePlan, survey: Path | None) -> FloatArray:
     from capture.plan.cover import CoverRequest, cover_board
-    node.allow("kind", *_COVER)
+
+    request = with_given(CoverRequest(), node, {"count": 1, "steps": 5, "margin_px": 0}, ("kind", "cameras", "target"))
     if survey is None:
         raise node.error('"cover" needs approximate lenses and poses; name a survey.toml with survey = "..."', "kind")
     definition = definition_of(survey)
     cameras = {camera.camera_id: camera for camera in definition.survey.cameras}
     targets = {target.target_id: target for target in definition.survey.targets}
-    default = CoverRequest()
-    request = CoverRequest(
-        node.integer("count", 1, default.count),
-        node.number("margin_px", default.margin_px),
-        node.integer("steps", 5, default.steps),
-        np.radians(node.number("steepest_deg", np.degrees(default.steepest), positive=True)),
-    )
     camera_ids = node.references("cameras", cameras, "camera")
     target = targets[node.reference("target", targets, "target")]
     try:

@@ -10,6 +10,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
 from capture.devices.turntable import Axis, Controller, Settle
 from capture.devices.turntables.moving import MovingTable
+from capture.plan.given import with_given
 from survey.project.declared.node import Node
 
 DRIVERS = {
@@ -32,7 +33,6 @@ _AXIS = (
     "backlash_arcsec",
     "noise_arcsec",
 )
-_SETTLE = ("tolerance_deg", "still_deg", "window_s", "stall_s", "timeout_s", "poll_s")
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def read_table(node: Node, base: Path) -> TablePlan:
         dialect=node.text("dialect", "two-axis"),
         units=node.text("units") if node.has("units") else None,
         sigma=node.sigmas("sigma", ("arcsec",), len(axes)),
-        settle=_settle(node.table("settle")),
+        settle=with_given(Settle(), node.table("settle")),
         home=node.flag("home", False),
         base=base,
     )
@@ -113,19 +113,6 @@ def _axis(name: str, node: Node, driver: str) -> AxisPlan:
         steps_per_deg=node.number("steps_per_deg", positive=True) if driver == "standa" else 0.0,
         backlash=math.radians(node.number("backlash_arcsec", 0.0) / 3600),
         noise=math.radians(node.number("noise_arcsec", 0.0) / 3600),
-    )
-
-
-def _settle(node: Node) -> Settle:
-    node.allow(*_SETTLE)
-    default = Settle()
-    return Settle(
-        tolerance=math.radians(node.number("tolerance_deg", math.degrees(default.tolerance), positive=True)),
-        still=math.radians(node.number("still_deg", math.degrees(default.still), positive=True)),
-        window_s=node.number("window_s", default.window_s, positive=True),
-        stall_s=node.number("stall_s", default.stall_s, positive=True),
-        timeout_s=node.number("timeout_s", default.timeout_s, positive=True),
-        poll_s=node.number("poll_s", default.poll_s, positive=True),
     )
 
 

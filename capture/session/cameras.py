@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from types import TracebackType
 from typing import Any, Self
 
 from adjust.model.errors import SurveyError
@@ -36,9 +35,7 @@ class PlannedCameras:
         self.open()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def open(self) -> None:
@@ -84,7 +81,7 @@ class PlannedCameras:
             self.recover(reopen=self._set is None)
         if self._set is None:
             raise SurveyError("the cameras are not open; open them first")
-        return self._set.take(timeout_s).frames
+        return self._set.take(timeout_s)
 
     def values(self, camera_id: str, names: Sequence[str]) -> Mapping[str, Any]:
         """Features as they are now; those that a camera does not know or tell are left out."""

@@ -4,9 +4,7 @@ images/<camera_id>/<epoch_id>.png; observations/table_angles.csv with the readba
 copied from the plan's template where there is none yet; capture/journal.jsonl, status.json, lock.
 """
 
-import csv
 import hashlib
-import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,7 +17,7 @@ from adjust.model.survey import FloatArray
 from capture.devices.camera import GrayImage
 from capture.session.journal import Record
 from survey.folder.locking import SESSION_LOCK, FileLock
-from survey.folder.text import atomic_write, decode, read_bytes
+from survey.folder.text import atomic_write, csv_rows, read_text
 from survey.project.captured import CAPTURE_FOLDER
 from survey.project.project import DEFINITION_FILE, IMAGES_FOLDER, OBSERVATIONS_FOLDER
 from survey.project.tables.files import write_table
@@ -120,11 +118,12 @@ def _foreign_rows(folder: Path) -> list[dict[str, str]]:
     path = folder / OBSERVATIONS_FOLDER / "table_angles.csv"
     if not path.is_file():
         return []
-    try:
-        rows = list(csv.DictReader(io.StringIO(decode(path, read_bytes(path)[0]), newline=""), strict=True))
-    except csv.Error as error:
-        raise SurveyError(f"{path}: this is no table ({error}); correct it, or remove it") from error
-    for line, row in enumerate(rows, 2):
-        if None in row or None in row.values() or not row.get("epoch_id"):
+    lines = csv_rows(path, read_text(path))
+    _, header = next(lines, (1, []))
+    rows = []
+    for line, cells in lines:
+        row = dict(zip(header, cells, strict=False))
+        if len(cells) != len(header) or not row.get("epoch_id"):
             raise SurveyError(f"{path}:{line}: not as long as its header, or without an epoch_id; correct the table")
+        rows.append(row)
     return rows

@@ -7,51 +7,59 @@ is no record: what a crash takes of it is only not shown.
 import json
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 
+from adjust.model.survey import FloatArray
 from capture.devices.camera import Frame
 from capture.plan.plan import CapturePlan
 from capture.plan.poses import definition_of
 from capture.session.quality import image_quality
 from survey.project.captured import Coverage, quality_path
 from survey.project.captured import Qualities as SeenBefore
-from survey.project.targets import DetectableTarget, PointList
+from survey.project.targets import PointList
 
 Qualities = Mapping[str, Mapping[str, Any]]
-
-
 _BEHIND = 4  # epochs that may wait; more, and the session waits for the oldest
 
 
-def targets_by_camera(plan: CapturePlan) -> Callable[[str], Mapping[str, DetectableTarget]]:
-    """What may be seen in a camera's images, by the plan's survey; nothing without one."""
-    if plan.survey is None:
-        return lambda camera_id: {}
-    definition = definition_of(plan.survey)
-    kinds = {name: kind for name, kind in definition.target_kinds.items() if not isinstance(kind, PointList)}
-    only = definition.target_cameras
+class Judge:
+    """What is to be said of images as they come. coverage: by camera, of all that were looked at."""
 
-    def targets(camera_id: str) -> Mapping[str, DetectableTarget]:
-        return {name: kind for name, kind in kinds.items() if camera_id in only.get(name, (camera_id,))}
+    def __init__(self, plan: CapturePlan, coverage: dict[str, Coverage] | None = None) -> None:
+        self.coverage = coverage or {}
+        definition = None if plan.survey is None else definition_of(plan.survey)
+        self._kinds = {} if definition is None else definition.target_kinds
+        self._only = {} if definition is None else definition.target_cameras
 
-    return targets
+    def __call__(self, camera_id: str, frame: Frame) -> tuple[dict[str, Any], dict[str, FloatArray]]:
+        """The quality of an image of a camera as plain values, and the points (n, 2) px in it by target."""
+        targets = {name: kind for name, kind in self._kinds.items()
+                   if not isinstance(kind, PointList) and camera_id in self._only.get(name, (camera_id,))}  # fmt: skip
+        found = image_quality(frame, targets)
+        height, width = frame.image.shape
+        covered = self.coverage.get(camera_id, Coverage((width, height)))
+        self.coverage[camera_id] = covered.with_points(np.concatenate([np.zeros((0, 2)), *found.points.values()]))
+        return {
+            "width": width, "height": height, "brightness": round(found.brightness, 4), "peak": round(found.peak, 4),
+            "saturated": round(found.saturated, 6),
+            "blur_px": None if math.isnan(found.blur_px) else round(found.blur_px, 3),
+            "targets": {name: len(uv) for name, uv in found.points.items()},
+            "coverage": round(self.coverage[camera_id].share, 4),
+        }, dict(found.points)  # fmt: skip
 
 
 class QualityWatch:
     """Looks at epochs one after the other; calling it hands over one and tells of the last that is done."""
 
     def __init__(self, plan: CapturePlan) -> None:
-        self._path = quality_path(plan.project)
-        self._targets = targets_by_camera(plan)
-        before = SeenBefore(plan.project)
+        self._path, before = quality_path(plan.project), SeenBefore(plan.project)
         before.read()
-        self._coverage = before.coverage
+        self._look = Judge(plan, before.coverage)
         self._pool = ThreadPoolExecutor(1, "image quality")
         self._waiting: deque[Future[Qualities]] = deque()
         self._last: Qualities = {}
@@ -59,9 +67,7 @@ class QualityWatch:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._pool.shutdown()
 
     def __call__(self, epoch_id: str, frames: Mapping[str, Frame]) -> Qualities:
@@ -81,27 +87,13 @@ class QualityWatch:
         return {camera_id: self._judge_one(epoch_id, camera_id, frame) for camera_id, frame in frames.items()}
 
     def _judge_one(self, epoch_id: str, camera_id: str, frame: Frame) -> dict[str, Any]:
-        found = image_quality(frame, self._targets(camera_id))
-        height, width = frame.image.shape
-        row = {
-            "epoch_id": epoch_id,
-            "camera_id": camera_id,
-            "width": width,
-            "height": height,
-            "brightness": round(found.brightness, 4),
-            "peak": round(found.peak, 4),
-            "saturated": round(found.saturated, 6),
-            "blur_px": None if math.isnan(found.blur_px) else round(found.blur_px, 3),
-        }
-        points = {name: np.round(uv, 1).tolist() for name, uv in found.points.items()}
-        covered = self._coverage.get(camera_id, Coverage((width, height)))
-        for uv in found.points.values():
-            covered = covered.with_points(uv)
-        self._coverage[camera_id] = covered
+        quality, points = self._look(camera_id, frame)
+        row = {"epoch_id": epoch_id, "camera_id": camera_id, **quality}
+        told = {key: value for key, value in row.items() if key not in ("targets", "coverage")}
+        told["points"] = {name: np.round(uv, 1).tolist() for name, uv in points.items()}
         with suppress(OSError), self._path.open("a", encoding="utf-8") as stream:  # a full disk does not matter here
-            stream.write(json.dumps({**row, "points": points}) + "\n")
-        counts = {name: len(uv) for name, uv in found.points.items()}
-        return {**row, "targets": counts, "coverage": round(covered.share, 4)}
+            stream.write(json.dumps(told) + "\n")
+        return row
 
 
 def quality_text(qualities: Qualities) -> str:

@@ -82,6 +82,8 @@ class Outcome:
 class Session:
     """One run of a plan. ``listener`` is told of every epoch, ``note`` of everything else worth a line."""
 
+    _journal: Journal  # open while it runs
+
     def __init__(
         self,
         plan: CapturePlan,
@@ -96,7 +98,6 @@ class Session:
         self.control.on_stop = self._stop_table
         self._listener, self._note = listener, note
         self._retries: dict[str, int] = {}
-        self._journal: Journal | None = None
         self._at: Shot | None = None
 
     def run(self) -> Outcome:
@@ -104,15 +105,14 @@ class Session:
         begin = time.monotonic()
         plan, folder = self._plan, self._plan.project
         check_plan_limits(plan)
-        journal = Journal(journal_path(folder))
-        self._journal = journal
+        self._journal = Journal(journal_path(folder))
         try:
-            missing, n_before = self._resume(journal)
+            missing, n_before = self._resume()
             self._home(missing)
             for shot in missing:
                 self._pause(shot)
                 self._take_with_retries(shot)
-            self._finish(journal)
+            self._finish()
         except BaseException as error:
             safe = self._made_safe(error)
             if safe is error:
@@ -120,14 +120,14 @@ class Session:
             raise safe from error
         finally:
             with suppress(OSError):  # a full disk: the next start writes it from the journal
-                self._write_angles(journal)
-            journal.close()
+                self._write_angles()
+            self._journal.close()
         return Outcome(
             folder, len(plan.shots), n_before, len(missing), dict(self._retries), time.monotonic() - begin
         )
 
-    def _resume(self, journal: Journal) -> tuple[list[Shot], int]:
-        plan = self._plan
+    def _resume(self) -> tuple[list[Shot], int]:
+        plan, journal = self._plan, self._journal
         prepare(plan.project, plan.survey)
         valid = verified_sets(plan, journal, self._note)
         wanted = {shot.epoch_id for shot in plan.shots}
@@ -135,7 +135,7 @@ class Session:
         for path in removed:
             self._note(f"removed {path}: it was never acknowledged")
         journal.append("session", **self._session_record(), removed=removed, torn=journal.torn)
-        self._write_angles(journal)
+        self._write_angles()
         missing = [shot for shot in plan.shots if shot.epoch_id not in valid]
         if valid and missing:
             self._note(f"{len(valid)} epochs are there and whole, {len(missing)} to go")
@@ -145,7 +145,7 @@ class Session:
         """Look for the references, where the plan wants it and anything is to be taken."""
         if missing and self._table is not None and self._plan.table is not None and self._plan.table.home:
             self._note(f"{self._table.name}: looking for its references")
-            self._table.home().wait()
+            self._table.home().result()
 
     def _session_record(self) -> dict[str, Any]:
         plan = self._plan
@@ -215,27 +215,25 @@ class Session:
         self._require_sizes(frames)
         self.control.checkpoint()
         images = {camera_id: self._write(camera_id, shot, frame) for camera_id, frame in frames.items()}
-        journal = self._require_journal()
-        record = journal.append(
+        record = self._journal.append(
             "set", epoch_id=shot.epoch_id, pose_id=shot.pose_id, repeat=shot.repeat, attempt=attempt,
             planned_deg=np.degrees(shot.angles).tolist(), before=location_dict(before), after=location_dict(after),
             images=images, **clocks(),
         )  # fmt: skip
-        done = len(set(journal.taken()) & {s.epoch_id for s in plan.shots})
+        done = len(set(self._journal.taken()) & {s.epoch_id for s in plan.shots})
         self._listener(Taken(record, frames, done, len(plan.shots)))
 
     def _move(self, shot: Shot) -> None:
         if self._table is None or self._plan.table is None:
             return
         if self._at is None or self._at.pose_id != shot.pose_id:
-            self._table.set(shot.angles).wait()
+            self._table.set(shot.angles).result()
             self.control.sleep(self._plan.options.wait_s)
         self._at = shot
 
     def _locate(self) -> Location:
-        if self._table is None:
-            return Location(np.zeros(0), np.zeros(0), time.monotonic_ns(), time.time_ns())
-        return self._table.locate()
+        none = np.zeros(0)
+        return Location(none, none, **clocks()) if self._table is None else self._table.locate()
 
     def _require_rest(self, before: Location, after: Location) -> None:
         moved = np.abs(after.readback - before.readback)
@@ -270,23 +268,18 @@ class Session:
             "features": dict(values),
         }
 
-    def _require_journal(self) -> Journal:
-        if self._journal is None:
-            raise ValueError("the session is not running")
-        return self._journal
-
     def _event(self, what: str, message: str) -> None:
-        self._require_journal().append("event", what=what, message=message, **clocks())
+        self._journal.append("event", what=what, message=message, **clocks())
 
-    def _finish(self, journal: Journal) -> None:
+    def _finish(self) -> None:
         wanted = {shot.epoch_id for shot in self._plan.shots}
-        lost = wanted - set(journal.taken())
+        lost = wanted - set(self._journal.taken())
         if lost:
             raise ValueError(f"epochs without a record: {sorted(lost)}")
         self._event("finished", f"{len(wanted)} epochs")
 
-    def _write_angles(self, journal: Journal) -> None:
-        table, sets = self._plan.table, journal.taken()
+    def _write_angles(self) -> None:
+        table, sets = self._plan.table, self._journal.taken()
         if table is not None and sets:
             write_table_angles(self._plan.project, table.table_id, sets, table.sigma)
 

@@ -40,7 +40,7 @@ def table_job(
     try:
         if jog is not None:
             return _with_table(plan, lambda table: _jog(table, jog))
-        return _with_table(plan, (lambda table: table.home().wait()) if home else lambda table: None)
+        return _with_table(plan, (lambda table: table.home().result()) if home else lambda table: None)
     finally:
         lock.release()
 
@@ -61,7 +61,7 @@ def _with_table(plan: CapturePlan, action: Any) -> dict[str, Any]:
 
 
 def _jog(table: MovingTable, words: Sequence[str]) -> None:
-    table.set(jog_target(table, words)).wait()
+    table.set(jog_target(table, words)).result()
 
 
 def jog_target(table: MovingTable, words: Sequence[str]) -> FloatArray:

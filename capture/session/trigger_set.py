@@ -6,7 +6,6 @@ asked for is found by that, and can never be taken for the image of another pose
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 
 from adjust.model.errors import SurveyError
 from capture.devices.camera import Camera, CameraError, FetchTimeoutError, Frame, IncompleteFrameError
@@ -14,14 +13,6 @@ from capture.devices.camera import Camera, CameraError, FetchTimeoutError, Frame
 
 class FrameOrderError(CameraError):
     """An image came that does not belong to the last trigger, or one is missing; arm the set again."""
-
-
-@dataclass(frozen=True, eq=False)
-class FrameSet:
-    """The images of one trigger, by camera id; ``number`` counts the triggers since the set was armed, from 1."""
-
-    number: int
-    frames: Mapping[str, Frame]
 
 
 class TriggerSet:
@@ -37,13 +28,12 @@ class TriggerSet:
         self._cameras = dict(cameras)
         self._fire = fire
         self._last: dict[str, int] = {}
-        self._number = 0
         self.armed = False
 
     def arm(self) -> None:
         """Arm all cameras, after disarming those that are. Raises as ``Camera.arm`` does."""
         self.disarm()
-        self._last, self._number = {}, 0
+        self._last = {}
         try:
             for camera in self._cameras.values():
                 camera.arm()
@@ -59,8 +49,8 @@ class TriggerSet:
             with suppress(CameraError):
                 camera.disarm()
 
-    def take(self, timeout_s: float) -> FrameSet:
-        """Trigger, and the image of each camera.
+    def take(self, timeout_s: float) -> dict[str, Frame]:
+        """Trigger, and the image of each camera, by its id.
 
         Raises FrameOrderError where an image cannot belong to this trigger; FetchTimeoutError, IncompleteFrameError and
         DisconnectedError of the camera that failed. After any of them the set is disarmed.
@@ -75,8 +65,7 @@ class TriggerSet:
         except BaseException:
             self.disarm()
             raise
-        self._number += 1
-        return FrameSet(self._number, frames)
+        return frames
 
     def _trigger(self) -> None:
         if self._fire is not None:

@@ -15,11 +15,9 @@ from capture.plan.plan import CapturePlan
 from capture.plan.table import make_table
 from capture.session.cameras import PlannedCameras
 from capture.session.folder import session_lock
-from capture.session.quality import image_quality
-from capture.session.quality_thread import targets_by_camera
+from capture.session.quality_thread import Judge
 from capture.session.resume import last_readback
 from capture.session.table_jobs import jog_target, table_status
-from survey.project.captured import Coverage
 from survey.workbench.pages.capturing import FolderView, Shown, coverage_dict
 
 _LIVE_S = 0.3
@@ -71,10 +69,9 @@ class LiveView:
     """Cameras, and the table where moving is allowed, held by this process; the project's lock keeps sessions away."""
 
     def __init__(self, plan: CapturePlan, with_table: bool) -> None:
-        self._plan, self._targets = plan, targets_by_camera(plan)
+        self._plan, self._judge = plan, Judge(plan)
         self._shown: dict[str, Shown] = {}
         self._quality: dict[str, Any] = {}
-        self._coverage: dict[str, Coverage] = {}
         self._message, self._ending = "", threading.Event()
         self._lock = session_lock(plan.project)
         self._lock.acquire()
@@ -96,18 +93,8 @@ class LiveView:
         while not self._ending.wait(_LIVE_S):
             try:
                 for camera_id, frame in self._cameras.take(self._plan.options.fetch_timeout_s).items():
-                    found = image_quality(frame, self._targets(camera_id))
-                    uv = np.concatenate([np.zeros((0, 2)), *found.points.values()])
-                    height, width = frame.image.shape
-                    covered = self._coverage.get(camera_id, Coverage((width, height)))
-                    self._coverage[camera_id] = covered.with_points(uv)
-                    self._shown[camera_id] = Shown(frame.image, uv)
-                    self._quality[camera_id] = {
-                        "blur_px": round(found.blur_px, 3) if found.blur_px == found.blur_px else None,
-                        "brightness": round(found.brightness, 4),
-                        "saturated": round(found.saturated, 6),
-                        "targets": {name: len(points) for name, points in found.points.items()},
-                    }
+                    self._quality[camera_id], points = self._judge(camera_id, frame)
+                    self._shown[camera_id] = Shown(frame.image, np.concatenate([np.zeros((0, 2)), *points.values()]))
                 self._message = ""
             except SurveyError as error:
                 self._message = str(error)
@@ -129,7 +116,7 @@ class LiveView:
             "live": True,
             "cameras": [camera.camera_id for camera in self._plan.cameras],
             "quality": dict(self._quality),
-            "coverage": coverage_dict(dict(self._coverage)),
+            "coverage": coverage_dict(dict(self._judge.coverage)),
             "table": table,
             "time": time.monotonic(),
             "shown": {name: shown.as_dict() for name, shown in dict(self._shown).items()},

@@ -2,15 +2,14 @@
 
 import hashlib
 import json
-import platform
 from collections.abc import Mapping
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from adjust.model.errors import SurveyError
 from survey.folder.text import NOT_OURS
 from survey.project.detected import read_detected, same_file
 from survey.project.project import IMAGES_FOLDER
+from survey.solution.earlier.runs import installed_versions
 
 _BESIDE = ("covariance.npz", "residuals.csv", "residuals_other.csv", "report.html")
 
@@ -36,14 +35,7 @@ def unchanged_solution(folder: Path) -> dict[str, object] | None:
 
 def same_versions(versions: Mapping[str, str]) -> bool:
     """Whether this Python and these packages are installed in these versions."""
-    for name, recorded in versions.items():
-        try:
-            now = platform.python_version() if name == "python" else version(name)
-        except PackageNotFoundError:
-            return False
-        if now != recorded:
-            return False
-    return bool(versions)
+    return bool(versions) and versions.items() <= installed_versions().items()
 
 
 def _digests(folder: Path, names: Mapping[str, str]) -> dict[str, str]:
@@ -75,12 +67,7 @@ def _images_are(folder: Path, recorded: Mapping[str, Mapping[str, object]]) -> b
 
 def fingerprint(folder: Path) -> str:
     """One hash of all that decides how a folder fails: definition, tables, names of images, versions; "" for none."""
-    digest = hashlib.sha256(platform.python_version().encode())
-    for package in ("labsurvey", "gtsam", "numpy", "scipy"):
-        try:
-            digest.update(f"{package} {version(package)}\n".encode())
-        except PackageNotFoundError:
-            continue
+    digest = hashlib.sha256(str(installed_versions()).encode())
     try:
         own = sorted(p for p in folder.iterdir() if p.suffix in (".toml", ".csv", ".parquet") and p.is_file())
         for path in (*own, *(folder / name for name in sorted(_tables(folder)))):

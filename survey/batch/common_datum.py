@@ -12,7 +12,7 @@ is more than both have together. Epochs whose datum is carried by other names, o
 comparable; they are left out by name.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,19 +20,19 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.epochs.states import differences_of, moved_value, origin, value_motions
+from adjust.epochs.states import differences_of, laid_onto, origin, value_motions
 from adjust.model.errors import listed
 from adjust.model.survey import FloatArray
 from adjust.spatial.rotation_forms import quaternion_wxyz
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
-from survey.solution.covariances import read_covariances
+from survey.solution.covariances import read_estimates
 from survey.solution.quantities import ARCSEC_PER_RAD, sigmas_in
 
 _Kind = tuple[tuple[bool, ...], frozenset[str]]
 """The motions that a free datum leaves open, and what carries it."""
+_PLACED = ("point", "world_from_station", "world_from_table", "carrier_from_target")
 _TURNED = 1e-6
-_ROUNDS, _SETTLED = 20, 1e-13
 _SCALE = 6
 _LEVEL = 0.01
 _DETERMINED = 1e-9
@@ -81,28 +81,16 @@ def free_datum(solution: Mapping[str, Any], covariances: Path) -> FreeDatum | No
     datum = solution.get("free_datum")
     if datum is None:
         return None
-    covs = read_covariances(covariances)
-    places = tuple(
-        Place(name, tuple(x), None if q is None else tuple(q), tuple(np.asarray(covs[key]).ravel().tolist()))
-        for name, key, x, q in _world(solution) if key in covs
-    )  # fmt: skip
+    factor, places = float(solution["summary"]["sigma_factor"]), []
+    for (kind, *ids), e in read_estimates(covariances).items():
+        world = "world_from_target" if kind == "carrier_from_target" else kind
+        on_station = kind == "carrier_from_target" and "station" in solution["targets"][ids[0]]
+        if kind in _PLACED and len(ids) == 1 and not on_station:
+            wxyz = quaternion_wxyz(e.value.rotation()) if isinstance(e.value, Pose3) else None
+            cov = tuple((factor**2 * e.cov).ravel().tolist())
+            places.append(Place(f"{world}/{ids[0]}", tuple((1e3 * origin(e.value)).tolist()), wxyz, cov))
     motions = tuple(tuple(float(x) for x in row) for row in datum["open_motions"])
-    return FreeDatum(motions, tuple(datum["carried_by"]), places)
-
-
-def _world(solution: Mapping[str, Any]) -> Iterator[tuple[str, str, Sequence[float], Sequence[float] | None]]:
-    """Name as in records, name in ``covariance.npz``, mm, quaternion."""
-    for name, entry in solution["points"].items():
-        yield f"point/{name}", f"point/{name}", [entry[f"{axis}_mm"] for axis in "xyz"], None
-    for section, key, parameter in (
-        ("stations", "world_from_station", "world_from_station"), ("tables", "world_from_table", "world_from_table"),
-        ("targets", "world_from_target", "carrier_from_target"),
-    ):  # fmt: skip
-        for name, entry in solution[section].items():
-            if key in entry:
-                pose = entry[key]
-                yield (f"{key}/{name}", f"{parameter}/{name}", pose["translation_mm"],
-                       pose["rotation_quaternion_wxyz"])  # fmt: skip
+    return FreeDatum(motions, tuple(datum["carried_by"]), tuple(places))
 
 
 def incomparable(data: Sequence[FreeDatum | None]) -> dict[int, str]:
@@ -162,25 +150,21 @@ def _median(about: Pose3 | FloatArray, values: Sequence[Pose3 | FloatArray]) -> 
 
 
 class _Epoch:
-    """An epoch on its way: values by name, and by how much they have turned and grown. directions: (7, k)."""
+    """An epoch on its way: values by name, and what they were mapped by. directions: (7, k)."""
 
     def __init__(self, datum: FreeDatum, directions: FloatArray) -> None:
         self.datum, self.directions = datum, directions
         self.values = {p.name: p.value for p in datum.places}
         self.places = {p.name: p for p in datum.places}
-        self.turn, self.scale = np.eye(3), 1.0
+        self.L, self.scale = np.eye(3), 1.0
 
     def align(self, target: Mapping[str, Pose3 | FloatArray], stable: Sequence[str]) -> None:
         """Move onto the target by least squares over the stable ones."""
-        for _ in range(_ROUNDS):
-            d = np.concatenate([differences_of(target[n], self.values[n]) for n in stable])
-            known = np.isfinite(d)
-            step = self.directions @ np.linalg.lstsq(self._motions(target, stable)[known], -d[known], rcond=1e-10)[0]
-            self.values = {n: moved_value(v, step) for n, v in self.values.items()}
-            self.turn = Rot3.Expmap(step[3:6]).matrix() @ self.turn
-            self.scale *= float(np.exp(step[6]))
-            if np.abs(step).max(initial=0.0) < _SETTLED:
-                break
+        names, values, held_to = list(self.values), tuple(self.values.values()), frozenset(stable)
+        kept = np.repeat([n in held_to for n in names], [6 if isinstance(v, Pose3) else 3 for v in values])
+        there = [target.get(n, v) for n, v in self.values.items()]
+        values, L, scale = laid_onto(there, values, self.directions, kept)
+        self.values, self.L, self.scale = dict(zip(names, values, strict=True)), L @ self.L, scale * self.scale
 
     def _motions(self, target: Mapping[str, Pose3 | FloatArray], names: Sequence[str]) -> FloatArray:
         return np.concatenate([value_motions(target[n]) for n in names]) @ self.directions
@@ -208,8 +192,7 @@ class _Epoch:
         """Covariance as it turned and grew along, in the tangent of a pose."""
         place = self.places[name]
         n = 3 if place.wxyz is None else 6
-        J = np.eye(n)
-        J[-3:, -3:] = self.scale * (self.turn if n == 3 else np.eye(3))
+        J = self.L if n == 3 else np.diag([1.0] * 3 + [self.scale] * 3)
         return np.asarray(J @ np.array(place.cov).reshape(n, n) @ J.T)
 
     def _test(self, target: Mapping[str, Pose3 | FloatArray], name: str) -> float:

@@ -17,52 +17,43 @@ from survey.commands.common import (
     show,
     tested,
 )
-from survey.commands.parser import Commands, project_folder
+from survey.commands.parser import command, flag, group, project_folder
 
 if TYPE_CHECKING:
     from survey.batch.record import Record
 
 
-def declare_adjust(commands: Commands) -> None:
-    """Add ``adjust`` to the commands."""
-    parser = commands.add(
-        "adjust",
-        _adjust,
-        help="adjust a project folder, or many side by side (the main job)",
-        usage="labsurvey adjust lab   (labsurvey adjust FOLDER [FOLDER ...] [--report DIR] [--out DIR] [--redetect])",
-        description="Detects targets where that has not been done, adjusts all observations, writes FOLDER/results.\n"
-        "Several folders are a batch: side by side on all cores, past failures, without those that are unchanged.",
-        epilog="Next: open FOLDER/results/report.html, of a batch DIR/overview.html",
-    )
-    parser.add_argument("folders", nargs="+", type=project_folder, metavar="FOLDER", help="folder with a survey.toml")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER")
-    parser.add_argument("--redetect", action="store_true", help="detect targets again, even where it was done before")
-    parser.add_argument("--parquet", action="store_true", help="write results/residuals.parquet too, numbers in full")
-    parser.add_argument(
-        "--method", choices=("joint", "published"), default="joint",
-        help="published: also the published step-by-step methods (head on a table, measured pairs), beside the joint "
-        "adjustment; default: joint",
-    )  # fmt: skip
-    parser.add_argument(
-        "--try", type=positive, metavar="N", dest="candidate",
-        help="carry out cause N of the diagnosis on the project, then adjust; changed files are kept in FOLDER/kept",
-    )  # fmt: skip
-    batch = parser.add_argument_group("batch")
-    batch.add_argument("--jobs", type=positive, metavar="N", help="folders at a time; default: one per core")
-    batch.add_argument(
-        "--report", type=Path, metavar="DIR", help="write an overview of all folders: overview.html, .json, .csv"
-    )
-    batch.add_argument("--resume", action="store_true", help="go on with the batch whose journal is in DIR")
-    batch.add_argument("--fresh", action="store_true", help="adjust also folders whose inputs have not changed")
-    batch.add_argument(
-        "--retries", type=not_negative, metavar="N", default=1,
-        help="tries more where a process was lost or a file not reached; default: 1",
-    )  # fmt: skip
-    batch.add_argument("--scheduler", metavar="ADDRESS", help="work on the Dask cluster at ADDRESS")
-    batch.add_argument("--language", choices=("en", "de"), default="en", help="of the overview; default: en")
-
-
-def _adjust(arguments: argparse.Namespace) -> int:
+@command(
+    "adjust",
+    flag("folders", nargs="+", type=project_folder, metavar="FOLDER", help="folder with a survey.toml"),
+    flag("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER"),
+    flag("--redetect", action="store_true", help="detect targets again, even where it was done before"),
+    flag("--parquet", action="store_true", help="write results/residuals.parquet too, numbers in full"),
+    flag("--method", choices=("joint", "published"), default="joint",
+         help="published: also the published step-by-step methods (head on a table, measured pairs), beside the joint "
+         "adjustment; default: joint"),
+    flag("--try", type=positive, metavar="N", dest="candidate",
+         help="carry out cause N of the diagnosis on the project, then adjust; changed files are kept in FOLDER/kept"),
+    group(
+        "batch",
+        flag("--jobs", type=positive, metavar="N", help="folders at a time; default: one per core"),
+        flag("--report", type=Path, metavar="DIR",
+             help="write an overview of all folders: overview.html, .json, .csv"),
+        flag("--resume", action="store_true", help="go on with the batch whose journal is in DIR"),
+        flag("--fresh", action="store_true", help="adjust also folders whose inputs have not changed"),
+        flag("--retries", type=not_negative, metavar="N", default=1,
+             help="tries more where a process was lost or a file not reached; default: 1"),
+        flag("--scheduler", metavar="ADDRESS", help="work on the Dask cluster at ADDRESS"),
+        flag("--language", choices=("en", "de"), default="en", help="of the overview; default: en"),
+    ),
+    help="adjust a project folder, or many side by side (the main job)",
+    usage="labsurvey adjust lab   (labsurvey adjust FOLDER [FOLDER ...] [--report DIR] [--out DIR] [--redetect])",
+    description="Detects targets where that has not been done, adjusts all observations, writes FOLDER/results.\n"
+    "Several folders are a batch: side by side on all cores, past failures, without those that are unchanged.",
+    epilog="Next: open FOLDER/results/report.html, of a batch DIR/overview.html",
+)
+def adjust(arguments: argparse.Namespace) -> int:
+    """The command ``adjust``."""
     folders: list[Path] = arguments.folders
     only_batch = arguments.report is not None or arguments.scheduler is not None
     if len(folders) > 1 or only_batch:
@@ -140,25 +131,21 @@ def _adjust_batch(arguments: argparse.Namespace) -> int:
     return exit_code(records)
 
 
-def declare_report(commands: Commands) -> None:
-    """Add ``report`` to the commands."""
-    parser = commands.add(
-        "report",
-        _report,
-        help="write the precision report of a project, also in German, as PDF, or as a check",
-        usage="labsurvey report lab --pdf   (labsurvey report FOLDER [--language en|de] [--pdf] [--check] [--out DIR])",
-        description="Adjusts the observations of FOLDER and writes FOLDER/results, report.html in the language asked "
-        "for.\nWith --check the exit code is 3 when the global test or a tolerance of survey.toml is not met.",
-        epilog="Next: open FOLDER/results/report.html",
-    )
-    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="folder with a survey.toml")
-    parser.add_argument("--language", choices=("en", "de"), default="en", help="of the report; default: en")
-    parser.add_argument("--pdf", action="store_true", help="write report.pdf too; needs Chromium, Chrome or WeasyPrint")
-    parser.add_argument("--check", action="store_true", help="exit code 3 also where a tolerance is not met")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER")
-
-
-def _report(arguments: argparse.Namespace) -> int:
+@command(
+    "report",
+    flag("folder", type=project_folder, metavar="FOLDER", help="folder with a survey.toml"),
+    flag("--language", choices=("en", "de"), default="en", help="of the report; default: en"),
+    flag("--pdf", action="store_true", help="write report.pdf too; needs Chromium, Chrome or WeasyPrint"),
+    flag("--check", action="store_true", help="exit code 3 also where a tolerance is not met"),
+    flag("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER"),
+    help="write the precision report of a project, also in German, as PDF, or as a check",
+    usage="labsurvey report lab --pdf   (labsurvey report FOLDER [--language en|de] [--pdf] [--check] [--out DIR])",
+    description="Adjusts the observations of FOLDER and writes FOLDER/results, report.html in the language asked "
+    "for.\nWith --check the exit code is 3 when the global test or a tolerance of survey.toml is not met.",
+    epilog="Next: open FOLDER/results/report.html",
+)
+def report(arguments: argparse.Namespace) -> int:
+    """The command ``report``."""
     begin_adjusting()
     require_project(arguments.folder, arguments.out)
     from survey.jobs.adjusting.job import adjust_job
@@ -172,13 +159,8 @@ def _report(arguments: argparse.Namespace) -> int:
         report=ReportOptions(arguments.language, arguments.pdf), said=command_line("report", arguments.folder, **flags),
     )  # fmt: skip
     unmet = [v for v in outcome.statistics.verdicts if not v.met] if outcome.statistics is not None else []
-    if is_set(arguments, "json"):
-        print_json(outcome.summary())
-    else:
-        print(outcome.text())
-        for v in unmet:
-            times = f"{v.found / v.allowed:.2f} times what is allowed"
-            print(f"  tolerance {v.tolerance} not met: {' '.join(v.result)} {v.quantity}, {times}")
-        say(arguments, *(f"written: {path}" for path in outcome.paths.values()))
+    lines = (f"\n  tolerance {v.tolerance} not met: {' '.join(v.result)} {v.quantity}, {v.found / v.allowed:.2f} times "
+             "what is allowed" for v in unmet)  # fmt: skip
+    show(arguments, outcome, outcome.paths.values(), "".join(lines))
     code = tested(outcome.solution["summary"])
     return TEST_FAILED if code == DONE and arguments.check and unmet else code

@@ -161,6 +161,15 @@ class Outcome(Protocol):
         """For people."""
 
 
+def tell(arguments: argparse.Namespace, found: Mapping[str, object], text: str, written: Iterable[Path] = ()) -> None:
+    """What was found as JSON where that is asked for, else the text; and what was written."""
+    if is_set(arguments, "json"):
+        print_json(found)
+    else:
+        print(text)
+        say(arguments, *(f"written: {path}" for path in written))
+
+
 def show(arguments: argparse.Namespace, outcome: Outcome, written: Iterable[Path] = (), then: str = "") -> None:
     """The outcome as JSON where that is asked for, else in words, ``then`` behind them, and what was written."""
     if is_set(arguments, "json"):

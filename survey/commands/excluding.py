@@ -1,10 +1,9 @@
 """The commands ``exclude`` and ``include``."""
 
 import argparse
-from functools import partial
 
 from survey.commands.common import DONE, require_project, show
-from survey.commands.parser import Commands, project_folder
+from survey.commands.parser import Argument, command, flag, project_folder
 
 NAMES = """\
 Names: image:X/h05  epoch:h05  camera:X  target:board  target:X/h05/board  point:board/r7c2  point:B07
@@ -13,44 +12,46 @@ A name alone will do where only one thing has it; an epoch goes before its readi
 """
 
 
-def declare_exclude(commands: Commands) -> None:
-    """Add ``exclude`` to the commands."""
-    parser = commands.add(
-        "exclude",
-        partial(_change, True),
-        help="leave observations out from now on, with the reason",
-        usage='labsurvey exclude lab X/h05 --reason "motion blur"   (labsurvey exclude FOLDER NAME [NAME ...] '
-        "--reason TEXT)",
-        description="Adds rows to FOLDER/observations/exclusions.csv, which every command obeys; nothing is "
-        "adjusted.\n\n" + NAMES,
-        epilog="Next: labsurvey adjust FOLDER",
-    )
-    add_names(parser, "project folder", "what is to be left out", "why; stands in the report", required=True)
-
-
-def declare_include(commands: Commands) -> None:
-    """Add ``include`` to the commands."""
-    parser = commands.add(
-        "include",
-        partial(_change, False),
-        help="take back what was excluded",
-        usage="labsurvey include lab X/h05   (labsurvey include FOLDER NAME [NAME ...] [--reason TEXT])",
-        description="Adds rows to FOLDER/observations/exclusions.csv that take others back; nothing is adjusted.\n\n"
-        + NAMES,
-        epilog="Next: labsurvey adjust FOLDER",
-    )
-    add_names(parser, "project folder", "what was left out, by its name in the file", "why")
-
-
-def add_names(parser: argparse.ArgumentParser, folder: str, names: str, why: str, required: bool = False) -> None:
+def names(folder: str, what: str, why: str, required: bool = False) -> tuple[Argument, ...]:
     """Folder, names of observations, the reason and who decides. required: whether a reason has to be given."""
-    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help=folder)
-    parser.add_argument("names", nargs="+", metavar="NAME", help=names)
-    parser.add_argument("--reason", required=required, default="", metavar="TEXT", help=why)
-    parser.add_argument("--author", default="", metavar="TEXT", help="who; default: $LABSURVEY_AUTHOR, or the user")
+    return (
+        flag("folder", type=project_folder, metavar="FOLDER", help=folder),
+        flag("names", nargs="+", metavar="NAME", help=what),
+        flag("--reason", required=required, default="", metavar="TEXT", help=why),
+        flag("--author", default="", metavar="TEXT", help="who; default: $LABSURVEY_AUTHOR, or the user"),
+    )
 
 
-def _change(excluding: bool, arguments: argparse.Namespace) -> int:
+@command(
+    "exclude",
+    *names("project folder", "what is to be left out", "why; stands in the report", required=True),
+    help="leave observations out from now on, with the reason",
+    usage='labsurvey exclude lab X/h05 --reason "motion blur"   (labsurvey exclude FOLDER NAME [NAME ...] '
+    "--reason TEXT)",
+    description="Adds rows to FOLDER/observations/exclusions.csv, which every command obeys; nothing is adjusted.\n\n"
+    + NAMES,
+    epilog="Next: labsurvey adjust FOLDER",
+)
+def exclude(arguments: argparse.Namespace) -> int:
+    """The command ``exclude``."""
+    return _change(arguments, True)
+
+
+@command(
+    "include",
+    *names("project folder", "what was left out, by its name in the file", "why"),
+    help="take back what was excluded",
+    usage="labsurvey include lab X/h05   (labsurvey include FOLDER NAME [NAME ...] [--reason TEXT])",
+    description="Adds rows to FOLDER/observations/exclusions.csv that take others back; nothing is adjusted.\n\n"
+    + NAMES,
+    epilog="Next: labsurvey adjust FOLDER",
+)
+def include(arguments: argparse.Namespace) -> int:
+    """The command ``include``."""
+    return _change(arguments, False)
+
+
+def _change(arguments: argparse.Namespace, excluding: bool) -> int:
     require_project(arguments.folder)
     from survey.jobs.excluding import exclude_job, include_job
 

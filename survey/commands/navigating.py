@@ -4,31 +4,27 @@ import argparse
 from pathlib import Path
 
 from survey.commands.common import DONE, TEST_FAILED, is_set, require_project, say, show
-from survey.commands.parser import Commands, project_folder
+from survey.commands.parser import command, flag, project_folder
 
 
-def declare_navigate(commands: Commands) -> None:
-    """Add ``navigate`` to the commands."""
-    parser = commands.add(
-        "navigate",
-        _navigate,
-        help="find the pose of the head at every epoch from beacons, named or not",
-        usage="labsurvey navigate lab   (labsurvey navigate FOLDER [--epochs E ...] [--station S] [--interval S])",
-        description="Calibrates from the epochs that show targets, then gives the others a pose with covariance from\n"
-        "their beacons; writes FOLDER/results/trajectory.csv and .json.",
-        epilog="Next: open FOLDER/results/trajectory.csv",
-    )
-    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="folder with a survey.toml")
-    parser.add_argument("--station", metavar="S", help="the head; default: the one that a table carries")
-    parser.add_argument("--epochs", nargs="+", metavar="E", help="default: all that show beacons and no target")
-    parser.add_argument("--interval", type=float, metavar="SECONDS", help="epochs follow each other: bridge by motion")
-    parser.add_argument("--times", type=Path, metavar="CSV", help="instead, a table of epoch_id and time_s")
-    parser.add_argument("--no-table", action="store_true", help="make no use of the table's angles")
-    parser.add_argument("--unnamed", action="store_true", help="forget the names that spots have")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER")
-
-
-def _navigate(arguments: argparse.Namespace) -> int:
+@command(
+    "navigate",
+    flag("folder", type=project_folder, metavar="FOLDER", help="folder with a survey.toml"),
+    flag("--station", metavar="S", help="the head; default: the one that a table carries"),
+    flag("--epochs", nargs="+", metavar="E", help="default: all that show beacons and no target"),
+    flag("--interval", type=float, metavar="SECONDS", help="epochs follow each other: bridge by motion"),
+    flag("--times", type=Path, metavar="CSV", help="instead, a table of epoch_id and time_s"),
+    flag("--no-table", action="store_true", help="make no use of the table's angles"),
+    flag("--unnamed", action="store_true", help="forget the names that spots have"),
+    flag("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER"),
+    help="find the pose of the head at every epoch from beacons, named or not",
+    usage="labsurvey navigate lab   (labsurvey navigate FOLDER [--epochs E ...] [--station S] [--interval S])",
+    description="Calibrates from the epochs that show targets, then gives the others a pose with covariance from\n"
+    "their beacons; writes FOLDER/results/trajectory.csv and .json.",
+    epilog="Next: open FOLDER/results/trajectory.csv",
+)
+def navigate(arguments: argparse.Namespace) -> int:
+    """The command ``navigate``."""
     require_project(arguments.folder, arguments.out)
     from survey.jobs.navigating.job import NavigateRequest, navigate_job
 
@@ -43,23 +39,19 @@ def _navigate(arguments: argparse.Namespace) -> int:
     return DONE
 
 
-def declare_align(commands: Commands) -> None:
-    """Add ``align`` to the commands."""
-    parser = commands.add(
-        "align",
-        _align,
-        help="say how a board or table is to be turned until it is aligned",
-        usage="labsurvey align lab   (labsurvey align FOLDER)",
-        description="Adjusts levels, laser spots and everything else of the project, and writes a working sheet for\n"
-        "each [align.ID] of survey.toml: which foot to raise and which way to turn, by how much, and\n"
-        "whether that is significant. Exit code 3 while something is left to do.",
-        epilog="Next: turn, measure again, labsurvey align FOLDER",
-    )
-    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write DIR/results instead of FOLDER/results")
-
-
-def _align(arguments: argparse.Namespace) -> int:
+@command(
+    "align",
+    flag("folder", type=project_folder, metavar="FOLDER", help="project folder"),
+    flag("--out", type=Path, metavar="DIR", help="write DIR/results instead of FOLDER/results"),
+    help="say how a board or table is to be turned until it is aligned",
+    usage="labsurvey align lab   (labsurvey align FOLDER)",
+    description="Adjusts levels, laser spots and everything else of the project, and writes a working sheet for\n"
+    "each [align.ID] of survey.toml: which foot to raise and which way to turn, by how much, and\n"
+    "whether that is significant. Exit code 3 while something is left to do.",
+    epilog="Next: turn, measure again, labsurvey align FOLDER",
+)
+def align(arguments: argparse.Namespace) -> int:
+    """The command ``align``."""
     require_project(arguments.folder, arguments.out)
     from survey.jobs.aligning import align_job
 

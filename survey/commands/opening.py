@@ -7,8 +7,8 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from survey.commands.common import DONE, is_set, not_negative, positive, print_json, require_project, say
-from survey.commands.parser import Commands, project_folder
+from survey.commands.common import DONE, not_negative, positive, require_project, say, tell
+from survey.commands.parser import command, flag, project_folder
 from survey.folder.kept import undo_killed
 
 if TYPE_CHECKING:
@@ -16,47 +16,26 @@ if TYPE_CHECKING:
     from survey.workbench.session import Workbench
 
 _PATIENCE_S = 10.0
+_ACTIONS = ("list", "compare", "pin", "unpin", "restore")
 
 
-def declare_open(commands: Commands) -> None:
-    """Add ``open`` to the commands."""
-    parser = commands.add(
-        "open",
-        _open,
-        help="look at a project in the browser: find what is wrong, leave it out, adjust again",
-        usage="labsurvey open lab   (labsurvey open FOLDER [--at PLACE] [--port N] [--read-only] [--no-browser])",
-        description="Serves the workbench of a project on this machine alone, under an address that holds a token, "
-        "until Ctrl-C. What is decided there goes to observations/exclusions.csv and survey.toml at once; results and "
-        "runs are written by Save.\n\nFrom another machine: ssh -L 8790:127.0.0.1:8790 THIS_MACHINE",
-        epilog="Next: labsurvey adjust FOLDER, labsurvey runs FOLDER",
-    )
-    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder")
-    parser.add_argument("--at", metavar="PLACE", default="", help="what to show first: '#image=X/hX05', '#point=B07'")
-    parser.add_argument("--port", type=not_negative, default=8790, metavar="N", help="0 takes a free one")
-    parser.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help="loopback: 127.0.0.1 or ::1")
-    parser.add_argument("--read-only", action="store_true", help="look only; nothing can be changed")
-    parser.add_argument("--no-browser", action="store_true", help="print the address, open no browser")
-
-
-def declare_runs(commands: Commands) -> None:
-    """Add ``runs`` to the commands."""
-    parser = commands.add(
-        "runs",
-        _runs,
-        help="the runs of a project: list, compare any two, pin, restore",
-        usage="labsurvey runs lab   (labsurvey runs FOLDER [list | compare A B | pin N | unpin N | restore N])",
-        description="Every run of adjust that changed anything is kept under FOLDER/runs. compare: every parameter in "
-        "sigmas of A, and the verdict. pin: keep it for ever; of the others the last 50 stay. restore: survey.toml and "
-        "exclusions as they were then, where that can be solved.",
-        epilog="Next: labsurvey runs FOLDER compare 1 2",
-    )
-    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder")
-    actions = ("list", "compare", "pin", "unpin", "restore")
-    parser.add_argument("action", nargs="?", choices=actions, default="list", metavar="ACTION", help=", ".join(actions))
-    parser.add_argument("numbers", nargs="*", type=positive, metavar="N", help="numbers of runs")
-
-
-def _open(arguments: argparse.Namespace) -> int:
+@command(
+    "open",
+    flag("folder", type=project_folder, metavar="FOLDER", help="project folder"),
+    flag("--at", metavar="PLACE", default="", help="what to show first: '#image=X/hX05', '#point=B07'"),
+    flag("--port", type=not_negative, default=8790, metavar="N", help="0 takes a free one"),
+    flag("--host", default="127.0.0.1", metavar="ADDRESS", help="loopback: 127.0.0.1 or ::1"),
+    flag("--read-only", action="store_true", help="look only; nothing can be changed"),
+    flag("--no-browser", action="store_true", help="print the address, open no browser"),
+    help="look at a project in the browser: find what is wrong, leave it out, adjust again",
+    usage="labsurvey open lab   (labsurvey open FOLDER [--at PLACE] [--port N] [--read-only] [--no-browser])",
+    description="Serves the workbench of a project on this machine alone, under an address that holds a token, "
+    "until Ctrl-C. What is decided there goes to observations/exclusions.csv and survey.toml at once; results and "
+    "runs are written by Save.\n\nFrom another machine: ssh -L 8790:127.0.0.1:8790 THIS_MACHINE",
+    epilog="Next: labsurvey adjust FOLDER, labsurvey runs FOLDER",
+)
+def open_project(arguments: argparse.Namespace) -> int:
+    """The command ``open``."""
     if not _holds_images(arguments.folder):
         require_project(arguments.folder)
     import webbrowser
@@ -112,16 +91,25 @@ def _holds_images(folder: Path) -> bool:
     return any(p.suffix.lower() in IMAGE_ENDINGS for at in ("*", "*/*", "images/*/*") for p in folder.glob(at))
 
 
-def _runs(arguments: argparse.Namespace) -> int:
+@command(
+    "runs",
+    flag("folder", type=project_folder, metavar="FOLDER", help="project folder"),
+    flag("action", nargs="?", choices=_ACTIONS, default="list", metavar="ACTION", help=", ".join(_ACTIONS)),
+    flag("numbers", nargs="*", type=positive, metavar="N", help="numbers of runs"),
+    help="the runs of a project: list, compare any two, pin, restore",
+    usage="labsurvey runs lab   (labsurvey runs FOLDER [list | compare A B | pin N | unpin N | restore N])",
+    description="Every run of adjust that changed anything is kept under FOLDER/runs. compare: every parameter in "
+    "sigmas of A, and the verdict. pin: keep it for ever; of the others the last 50 stay. restore: survey.toml and "
+    "exclusions as they were then, where that can be solved.",
+    epilog="Next: labsurvey runs FOLDER compare 1 2",
+)
+def runs(arguments: argparse.Namespace) -> int:
+    """The command ``runs``."""
     wanted = {"list": 0, "compare": 2}.get(arguments.action, 1)
     if len(arguments.numbers) != wanted:
         arguments.parser.error(f"{arguments.action} takes {wanted} number{'s' * (wanted != 1)} of runs")
     require_project(arguments.folder)
-    found, text = _done(arguments)
-    if is_set(arguments, "json"):
-        print_json(found)
-    else:
-        print(text)
+    tell(arguments, *_done(arguments))
     return DONE
 
 

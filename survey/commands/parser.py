@@ -43,11 +43,45 @@ class Commands:
     def __init__(self, parser: argparse.ArgumentParser, shaped: dict[str, Any]) -> None:
         self._known, self._shaped = parser.add_subparsers(title="commands", metavar="COMMAND", required=True), shaped
 
-    def add(self, name: str, run: Callable[[argparse.Namespace], int], **words: str) -> argparse.ArgumentParser:
+    def add(self, name: str, run: "Run", **words: str) -> argparse.ArgumentParser:
         """A command that ``run`` carries out. words: help, usage, description and epilog, as argparse has them."""
         parser: argparse.ArgumentParser = self._known.add_parser(name, **{**self._shaped, **words})
         parser.set_defaults(run=run, parser=parser)  # every command's arguments know the parser that they came through
         return parser
+
+
+Run = Callable[[argparse.Namespace], int]
+Argument = Callable[[argparse.ArgumentParser], object]
+
+
+def command(name: str, *arguments: Argument, **words: str) -> Callable[[Run], Callable[[Commands], None]]:
+    """What makes a command of the function that carries it out; words: as of :meth:`Commands.add`."""
+
+    def declared(run: Run) -> Callable[[Commands], None]:
+        def declare(commands: Commands) -> None:
+            parser = commands.add(name, run, **words)
+            for add_to in arguments:
+                add_to(parser)
+
+        return declare
+
+    return declared
+
+
+def flag(*names: str, **how: Any) -> Argument:
+    """An argument as :meth:`argparse.ArgumentParser.add_argument` takes it."""
+    return lambda parser: parser.add_argument(*names, **how)
+
+
+def group(title: str, *arguments: Argument) -> Argument:
+    """Arguments that stand together in the help."""
+
+    def add_to(parser: argparse.ArgumentParser) -> None:
+        place: Any = parser.add_argument_group(title)
+        for argument in arguments:
+            argument(place)
+
+    return add_to
 
 
 def program_parser(

@@ -15,7 +15,7 @@ from survey.commands.common import (
     say,
     show,
 )
-from survey.commands.parser import Commands, project_folder
+from survey.commands.parser import command, flag, project_folder
 
 _DESCRIPTION = """\
 With FOLDER/plan.toml: predicts what will be seen and says what sigmas everything will have, which directions are weak,
@@ -24,51 +24,29 @@ already is counted in. Without: counts conditions and redundancy of observations
 """
 
 
-def declare_plan(commands: Commands) -> None:
-    """Add ``plan`` to the commands."""
-    parser = commands.add(
-        "plan",
-        _plan,
-        help="precision before measuring, what to measure next, tolerances, places for beacons",
-        usage="labsurvey plan lab   (labsurvey plan FOLDER [--for NAME ...] [--add N] [--trials N] [--navigation]\n"
-        "                              [--place N] | labsurvey plan --error-analysis [--out DIR])",
-        description=_DESCRIPTION,
-        epilog="Next: labsurvey adjust FOLDER",
-    )
-    parser.add_argument("folder", type=project_folder, nargs="?", metavar="FOLDER",
-                        help="folder with survey.toml and plan.toml")
-    parser.add_argument("--for", nargs="+", dest="wanted", metavar="NAME", default=[],
-                        help="what is to become precise: lens.X, head.camera_X, point.B*, everything")  # fmt: skip
-    parser.add_argument("--add", type=not_negative, default=5, metavar="N", help="candidates to choose (5)")
-    parser.add_argument("--criterion", choices=("D", "A"), default="D", help="determinant or mean variance (D)")
-    parser.add_argument("--trials", type=positive, metavar="N", help="simulate and adjust the plan N times")
-    parser.add_argument("--seed", type=not_negative, default=0, metavar="N", help="of everything random (0)")
-    parser.add_argument("--jobs", type=positive, metavar="N", help="processes for trials; default: one per processor")
-    parser.add_argument("--navigation", action="store_true", help="precision of the poses of [navigation]")
-    parser.add_argument("--place", type=positive, default=0, metavar="N", help="choose places of N beacons for them")
-    parser.add_argument("--error-analysis", action="store_true",
-                        help="pixel error by beacon and camera errors, 10000 trials a point")  # fmt: skip
-    parser.add_argument("--pixels", type=float, default=5.0, metavar="PX", help="pixel error allowed in it (5)")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER")
-
-
-def declare_check(commands: Commands) -> None:
-    """Add ``check`` to the commands."""
-    parser = commands.add(
-        "check",
-        _check,
-        help="what is weak or suspicious in a project, before it is adjusted",
-        usage="labsurvey check lab   (labsurvey check FOLDER)",
-        description="Looks at the observations of FOLDER without adjusting them: what they leave undetermined, points\n"
-        "without redundancy, names that appear once, epochs without partners, images that are badly covered, boards\n"
-        "too far or too flat, suspicious units and sigmas; and what to measure next. Writes nothing.\n"
-        "The exit code is 3 where something would stop or spoil the adjustment.",
-        epilog="Next: labsurvey adjust FOLDER",
-    )
-    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="folder with a survey.toml")
-
-
-def _plan(arguments: argparse.Namespace) -> int:
+@command(
+    "plan",
+    flag("folder", type=project_folder, nargs="?", metavar="FOLDER", help="folder with survey.toml and plan.toml"),
+    flag("--for", nargs="+", dest="wanted", metavar="NAME", default=[],
+         help="what is to become precise: lens.X, head.camera_X, point.B*, everything"),
+    flag("--add", type=not_negative, default=5, metavar="N", help="candidates to choose (5)"),
+    flag("--criterion", choices=("D", "A"), default="D", help="determinant or mean variance (D)"),
+    flag("--trials", type=positive, metavar="N", help="simulate and adjust the plan N times"),
+    flag("--seed", type=not_negative, default=0, metavar="N", help="of everything random (0)"),
+    flag("--jobs", type=positive, metavar="N", help="processes for trials; default: one per processor"),
+    flag("--navigation", action="store_true", help="precision of the poses of [navigation]"),
+    flag("--place", type=positive, default=0, metavar="N", help="choose places of N beacons for them"),
+    flag("--error-analysis", action="store_true", help="pixel error by beacon and camera errors, 10000 trials a point"),
+    flag("--pixels", type=float, default=5.0, metavar="PX", help="pixel error allowed in it (5)"),
+    flag("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER"),
+    help="precision before measuring, what to measure next, tolerances, places for beacons",
+    usage="labsurvey plan lab   (labsurvey plan FOLDER [--for NAME ...] [--add N] [--trials N] [--navigation]\n"
+    "                              [--place N] | labsurvey plan --error-analysis [--out DIR])",
+    description=_DESCRIPTION,
+    epilog="Next: labsurvey adjust FOLDER",
+)
+def plan(arguments: argparse.Namespace) -> int:
+    """The command ``plan``."""
     if arguments.error_analysis:
         return _error_analysis(arguments)
     if arguments.folder is None:
@@ -106,7 +84,19 @@ def _network(arguments: argparse.Namespace) -> int:
     return DONE
 
 
-def _check(arguments: argparse.Namespace) -> int:
+@command(
+    "check",
+    flag("folder", type=project_folder, metavar="FOLDER", help="folder with a survey.toml"),
+    help="what is weak or suspicious in a project, before it is adjusted",
+    usage="labsurvey check lab   (labsurvey check FOLDER)",
+    description="Looks at the observations of FOLDER without adjusting them: what they leave undetermined, points\n"
+    "without redundancy, names that appear once, epochs without partners, images that are badly covered, boards\n"
+    "too far or too flat, suspicious units and sigmas; and what to measure next. Writes nothing.\n"
+    "The exit code is 3 where something would stop or spoil the adjustment.",
+    epilog="Next: labsurvey adjust FOLDER",
+)
+def check(arguments: argparse.Namespace) -> int:
+    """The command ``check``."""
     require_project(arguments.folder)
     from survey.planning.checking import check_job
 

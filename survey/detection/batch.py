@@ -1,7 +1,7 @@
 """Targets in one image, and in many in parallel: one that fails is reported, the others go on; pictures of it."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from functools import partial
@@ -13,6 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from adjust.model.errors import SurveyError
+from adjust.model.survey import FloatArray
 from adjust.native.parallel import cores
 from survey.detection.checkerboard import find_checkerboard
 from survey.detection.gray import AnyImage, Gray8, Gray32, for_finding, gray_values, read_image
@@ -78,17 +79,14 @@ def detect_images(
     """
     if pictures is not None:
         pictures.mkdir(parents=True, exist_ok=True)
-    most = cores()
-    if jobs is None and min(most, len(tasks)) > 1:
-        processes = min(most, len(tasks) // _IMAGES_PER_PROCESS)
-        many = processes > _MOST_THREADS
-        jobs, run = (processes, _in_processes) if many else (min(most, _MOST_THREADS), _in_threads)
-    else:
-        jobs = jobs or 1
-        run = _in_processes if jobs > 1 and len(tasks) > 1 else _here
+    run, n = _in_processes, min(jobs or cores(), len(tasks) if jobs else len(tasks) // _IMAGES_PER_PROCESS)
+    if jobs is None and n <= _MOST_THREADS:
+        run, n = _in_threads, min(cores(), _MOST_THREADS, len(tasks))
+    if n <= 1:
+        run = _here
     reports: dict[int, ImageReport] = {}
     with tqdm(total=len(tasks), desc="detect", unit="image", disable=not progress) as bar:
-        for position, report in run(tasks, jobs, pictures):
+        for position, report in run(tasks, n, pictures):
             reports[position] = report
             bar.update()
             if told is not None:
@@ -96,38 +94,41 @@ def detect_images(
     return [reports[position] for position in range(len(tasks))]
 
 
-def _here(tasks: Sequence[DetectionTask], jobs: int, pictures: Path | None) -> Iterator[tuple[int, ImageReport]]:
-    for position, task in enumerate(tasks):
-        yield position, detect_task(task, pictures)
+_Found = Iterator[tuple[int, ImageReport]]
 
 
-def _in_threads(tasks: Sequence[DetectionTask], jobs: int, pictures: Path | None) -> Iterator[tuple[int, ImageReport]]:
+def _here(tasks: Sequence[DetectionTask], n: int, pictures: Path | None) -> _Found:
+    yield from enumerate(detect_task(task, pictures) for task in tasks)
+
+
+def _in_threads(tasks: Sequence[DetectionTask], n: int, pictures: Path | None) -> _Found:
     """What takes time holds no lock: OpenCV's finders and the compiled fits."""
     before = cv2.getNumThreads()
     _one_thread()
     try:
-        with ThreadPoolExecutor(min(jobs, len(tasks))) as pool:
-            futures = {pool.submit(detect_task, task, pictures): position for position, task in enumerate(tasks)}
-            for future in as_completed(futures):
-                yield futures[future], future.result()
+        with ThreadPoolExecutor(n) as pool:
+            yield from _of(pool, tasks, pictures)
     finally:
         cv2.setNumThreads(before)
 
 
-def _in_processes(
-    tasks: Sequence[DetectionTask], jobs: int, pictures: Path | None
-) -> Iterator[tuple[int, ImageReport]]:
+def _in_processes(tasks: Sequence[DetectionTask], n: int, pictures: Path | None) -> _Found:
+    with ProcessPoolExecutor(n, get_context("spawn"), initializer=_one_thread) as pool:
+        yield from _of(pool, tasks, pictures)
+
+
+def _of(pool: Executor, tasks: Sequence[DetectionTask], pictures: Path | None) -> _Found:
+    """The reports as they come."""
     work = partial(detect_task, pictures=pictures)
-    with ProcessPoolExecutor(min(jobs, len(tasks)), get_context("spawn"), initializer=_one_thread) as pool:
-        futures = {pool.submit(work, task): position for position, task in enumerate(tasks)}
-        for future in as_completed(futures):
-            position = futures[future]
-            try:
-                yield position, future.result()
-            except BrokenProcessPool:
-                task = tasks[position]
-                message = f"{task.path}: a detection process ended abruptly (memory?); run again with fewer jobs"
-                yield position, ImageReport(task.path, task.camera_id, task.epoch_id, "failed", message)
+    futures = {pool.submit(work, task): position for position, task in enumerate(tasks)}
+    for future in as_completed(futures):
+        position = futures[future]
+        try:
+            yield position, future.result()
+        except BrokenProcessPool:
+            task = tasks[position]
+            message = f"{task.path}: a detection process ended abruptly (memory?); run again with fewer jobs"
+            yield position, ImageReport(task.path, task.camera_id, task.epoch_id, "failed", message)
 
 
 def _one_thread() -> None:
@@ -192,19 +193,21 @@ def _summary(detection: Detection) -> str:
 def _draw_points(
     canvas: Gray8, detection: Detection, point_ids: tuple[str, ...], colour: tuple[int, int, int], scale: int
 ) -> None:
-    # OpenCV draws in 1/16 pixel
-    places = np.rint(((detection.uv + 0.5) * scale - 0.5) * 16.0).astype(int)
-    for (u, v), k in zip(places.tolist(), detection.point_idx.tolist(), strict=True):
+    for (u, v), k in zip(_places(detection.uv, scale), detection.point_idx.tolist(), strict=True):
         cv2.circle(canvas, (u, v), 5 * 16, colour, 1, cv2.LINE_AA, 4)
         _text(canvas, point_ids[k], (u // 16 + 6, v // 16 - 4), colour, 0.33)
 
 
 def _draw_spots(canvas: Gray8, spots: Spots, scale: int) -> None:
-    places = np.rint(((spots.uv + 0.5) * scale - 0.5) * 16.0).astype(int)
-    for k, ((u, v), diameter) in enumerate(zip(places.tolist(), spots.diameter_px.tolist(), strict=True)):
+    for k, ((u, v), diameter) in enumerate(zip(_places(spots.uv, scale), spots.diameter_px.tolist(), strict=True)):
         radius = round(16.0 * scale * (diameter / 2.0 + 2.0))
         cv2.circle(canvas, (u, v), radius, _SPOT_COLOUR, 1, cv2.LINE_AA, 4)
         _text(canvas, f"s{k}", (u // 16 + 8, v // 16 - 6), _SPOT_COLOUR, 0.4)
+
+
+def _places(uv: FloatArray, scale: int) -> list[list[int]]:
+    """In 1/16 pixel of the picture, as OpenCV draws."""
+    return list(np.rint(((uv + 0.5) * scale - 0.5) * 16.0).astype(int).tolist())
 
 
 def _text(canvas: Gray8, text: str, place: tuple[int, int], colour: tuple[int, int, int], size: float) -> None:

@@ -1,8 +1,11 @@
 """Errors and texts as a terminal may show them."""
 
+import re
 import unicodedata
 
 from adjust.model.errors import SurveyError
+
+_UNUSUAL = re.compile(r"[^\n\t -~]")
 
 
 def message(error: SurveyError | OSError) -> str:
@@ -17,10 +20,8 @@ def message(error: SurveyError | OSError) -> str:
 
 def shown(text: str) -> str:
     """A text with escapes for what is no letter: names and titles out of a file must not drive a terminal."""
-    if text.isprintable():
-        return text
-    return "".join(c if _is_harmless(c) else c.encode("unicode_escape").decode() for c in text)
+    return _UNUSUAL.sub(lambda c: c[0] if _is_harmless(c[0]) else c[0].encode("unicode_escape").decode(), text)
 
 
 def _is_harmless(sign: str) -> bool:
-    return sign.isprintable() or sign in "\n\t" or unicodedata.category(sign) == "Zs"  # narrow spaces
+    return sign.isprintable() or unicodedata.category(sign) == "Zs"  # narrow spaces

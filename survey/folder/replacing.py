@@ -299,25 +299,3 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
-
-
-def copy_folder(source: Path, target: Path) -> None:
-    """Copy all files; as ``shutil.copytree``, but its errors do not say which file."""
-    target.mkdir(parents=True, exist_ok=True)
-    for path in source.iterdir():
-        if path.is_dir():
-            copy_folder(path, target / path.name)
-        else:
-            shutil.copy2(path, target / path.name)
-
-
-def complete(folder: Path, place: Path) -> None:
-    """Put everything of the project that is not new into ``place``."""
-    for path in sorted(folder.rglob("*")):
-        name = path.relative_to(folder)
-        if name.parts[0] == OBSERVATIONS_FOLDER or name.parts[0].startswith(".") or (place / name).exists():
-            continue
-        if path.is_dir():
-            (place / name).mkdir(exist_ok=True)
-        else:
-            shutil.copy2(path, place / name)

@@ -12,7 +12,7 @@ import re
 import stat
 import tempfile
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -139,6 +139,18 @@ def decode(path: Path, data: bytes) -> str:
 def read_text(path: Path) -> str:
     """All of a UTF-8 file. Raises as :func:`read_bytes` and :func:`decode`."""
     return decode(path, read_bytes(path)[0])
+
+
+def csv_rows(path: Path, text: str) -> Iterator[tuple[int, list[str]]]:
+    """The rows of CSV that have cells, each with the line on which it begins. Raises SurveyError for broken ones."""
+    reader, begin = csv.reader(io.StringIO(text, newline=""), strict=True), 1
+    try:
+        for cells in reader:
+            line, begin = begin, reader.line_num + 1
+            if cells:
+                yield line, cells
+    except csv.Error as error:
+        raise SurveyError(f"{path}:{begin}: not a CSV line ({error}); correct the quotes") from error
 
 
 def csv_text(rows: Iterable[Iterable[object]], ending: str = "\n") -> str:

@@ -1,4 +1,4 @@
-"""A folder that appears complete or not at all."""
+"""A folder that appears complete or not at all, and what it is filled with of another one."""
 
 import os
 import shutil
@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from adjust.model.errors import SurveyError
-from survey.folder.locking import LOCK, FileLock
+from survey.folder.locking import LOCK, OBSERVATIONS_FOLDER, FileLock
 from survey.folder.text import sync_folder
 
 
@@ -64,3 +64,25 @@ def _empty(place: Path) -> None:
 def _require_empty(folder: Path, target: Path) -> None:
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise SurveyError(f"{folder}: is there already and not empty; give the name of a new folder")
+
+
+def copy_folder(source: Path, target: Path) -> None:
+    """Copy all files; as ``shutil.copytree``, but its errors do not say which file."""
+    target.mkdir(parents=True, exist_ok=True)
+    for path in source.iterdir():
+        if path.is_dir():
+            copy_folder(path, target / path.name)
+        else:
+            shutil.copy2(path, target / path.name)
+
+
+def complete(folder: Path, place: Path) -> None:
+    """Put everything of the project that is not new into ``place``."""
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder)
+        if name.parts[0] == OBSERVATIONS_FOLDER or name.parts[0].startswith(".") or (place / name).exists():
+            continue
+        if path.is_dir():
+            (place / name).mkdir(exist_ok=True)
+        else:
+            shutil.copy2(path, place / name)

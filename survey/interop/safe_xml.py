@@ -49,6 +49,17 @@ class Element:
             return default
         return number(self.get(name), name, self.where)
 
+    def all(self, tag: str) -> list["Element"]:
+        """The children of this name."""
+        return [child for child in self.children if child.tag == tag]
+
+    def one(self, tag: str) -> "Element":
+        """The only child of this name; raises where there is none or another."""
+        found = self.all(tag)
+        if len(found) != 1:
+            raise self.error(f"expected one <{tag}>, found {len(found)}; correct it")
+        return found[0]
+
     def allow(self, *names: str) -> None:
         """Raise for an attribute that is not known."""
         for name in self.attributes:

@@ -80,6 +80,13 @@ class Entry:
             raise self.error(f"found {self.text}; expected a whole number from 1 to {largest}")
         return int(value)
 
+    def size(self) -> tuple[int, int]:
+        """A list of two whole numbers: width and height of an image, px."""
+        found = [item.count() for item in self.items]
+        if len(found) != 2:
+            raise self.error("expected width and height; correct it")
+        return found[0], found[1]
+
     def numbers(self, *shape: int) -> FloatArray:
         """A list of numbers of that shape; rows may be nested or not. One -1 in ``shape`` stands for any count."""
         flat = np.array([leaf.number for leaf in _leaves(self)])

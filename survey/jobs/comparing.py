@@ -10,13 +10,13 @@ import numpy as np
 from adjust.diagnosis.between import Between, causes_between
 from adjust.epochs.congruence import CongruenceOptions, congruence
 from adjust.epochs.congruence_result import Congruence, CongruenceTest, Motion
-from adjust.epochs.deformation import Deformation, DeformationTest, station_deformations
+from adjust.epochs.deformation import Deformation, station_deformations
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
-from survey.folder.plain import plain
+from survey.folder.plain import attributes, plain
 from survey.jobs.adjusting.steps import adjust_project
 from survey.project import Project, read
-from survey.solution.quantities import ARCSEC_PER_RAD, SigmaKind
+from survey.solution.quantities import ARCSEC_PER_RAD, SigmaKind, sigmas_in
 
 ALPHA = 0.05
 """Error probability of the tests of all pairs of stations together."""
@@ -57,11 +57,8 @@ class CompareOutcome:
             "alpha": ALPHA,
             "deformations": [_entry(d) for d in self.deformations],
             "congruence": None if self.congruence is None else _congruence_dict(self.congruence),
-            "diagnosis": [
-                {"name": c.name, "cause": c.cause, "change": c.change, "ids": list(c.ids), "statistic": c.statistic,
-                 "statistic_as_it_is": c.before, "p": c.p}
-                for c in self.causes
-            ],
+            "diagnosis": [attributes(c, "name", "cause", "change") | {"ids": list(c.ids), "statistic": c.statistic}
+                          | {"statistic_as_it_is": c.before, "p": c.p} for c in self.causes],
             "warnings": list(self.problems),
         }
 
@@ -128,26 +125,18 @@ def _adjusted(project: Project, progress: bool) -> Adjustment:
         raise error if str(folder) in str(error) else SurveyError(f"{folder}: {error}") from error
 
 
-def _test(test: DeformationTest) -> dict[str, Any]:
-    return {"chi_square": plain(test.statistic), "freedom": test.freedom, "p": plain(test.p)}
-
-
 def _entry(d: Deformation) -> dict[str, Any]:
     sigmas = d.sigmas
-    return {
-        "a": d.a,
-        "b": d.b,
-        "rotation_arcsec": plain(ARCSEC_PER_RAD * d.rotation),
-        "sigma_rotation_arcsec": plain(ARCSEC_PER_RAD * sigmas[:3]),
-        "rotation_euler_xyz_arcsec": plain(ARCSEC_PER_RAD * d.euler_zyx),
-        "sigma_rotation_euler_xyz_arcsec": plain(ARCSEC_PER_RAD * np.sqrt(np.diag(d.euler_cov))),
-        "displacement_mm": plain(1e3 * d.displacement),
-        "sigma_displacement_mm": plain(1e3 * sigmas[3:]),
-        "test_rotation": _test(d.rotation_test),
-        "test_displacement": _test(d.displacement_test),
-        "test": _test(d.test),
+    tests = {"test_rotation": d.rotation_test, "test_displacement": d.displacement_test, "test": d.test}
+    return dict(plain({
+        "a": d.a, "b": d.b, "rotation_arcsec": ARCSEC_PER_RAD * d.rotation,
+        "sigma_rotation_arcsec": ARCSEC_PER_RAD * sigmas[:3],
+        "rotation_euler_xyz_arcsec": ARCSEC_PER_RAD * d.euler_zyx,
+        "sigma_rotation_euler_xyz_arcsec": ARCSEC_PER_RAD * np.sqrt(np.diag(d.euler_cov)),
+        "displacement_mm": 1e3 * d.displacement, "sigma_displacement_mm": 1e3 * sigmas[3:],
+        **{key: {"chi_square": x.statistic, "freedom": x.freedom, "p": x.p} for key, x in tests.items()},
         "significant": d.significant,
-    }
+    }))  # fmt: skip
 
 
 def _row(d: Deformation, width: int) -> str:
@@ -194,27 +183,19 @@ def _congruence_text(found: Congruence) -> str:
 
 def _table(found: Congruence) -> list[str]:
     """A line per point and station: displacements, or rotations where nothing else is known."""
-    turned = [m for m in found.motions if not np.isfinite(m.displacement).any()]
-    if turned and len(turned) == len(found.motions):
-        head = f"    {'':<14}{'rx':>9}{'ry':>9}{'rz':>9}{'sigmas':>21}{'p':>10}   arcsec"
-        return ["  rotations alone were measured: they are compared, displacements are not known", head,
-                *(_turn_row(m) for m in turned[:_MOST])]  # fmt: skip
-    head = f"    {'':<14}{'dx':>9}{'dy':>9}{'dz':>9}{'sigmas':>21}{'p':>10}{'found from':>12}   mm"
-    return [head, *(_shift_row(m) for m in found.motions[:_MOST])]
-
-
-def _shift_row(m: Motion) -> str:
-    d, s = 1e3 * m.displacement, 1e3 * np.sqrt(np.maximum(np.diag(m.cov), 0.0))
-    cells = "".join(_cell(x, 9, 3) for x in d) + "".join(_cell(x, 7, 3) for x in s)
-    return f"    {' '.join(m.name[1:]):<14}{cells}{_cell(m.test.p, 10, 4)}{_cell(1e3 * m.smallest, 12, 2)}{_mark(m)}"
-
-
-def _turn_row(m: Motion) -> str:
-    turn = np.full(3, np.nan) if m.rotation is None else m.rotation
-    spread = np.full(3, np.nan) if m.rotation_cov is None else np.sqrt(np.maximum(np.diag(m.rotation_cov), 0.0))
-    cells = "".join(_cell(ARCSEC_PER_RAD * x, 9, 1) for x in turn)
-    cells += "".join(_cell(ARCSEC_PER_RAD * x, 7, 1) for x in spread)
-    return f"    {' '.join(m.name[1:]):<14}{cells}{_cell(m.test.p, 10, 4)}{_mark(m)}"
+    turned = found.motions and not any(np.isfinite(m.displacement).any() for m in found.motions)
+    rows = []
+    for m in found.motions[:_MOST]:
+        of, cov, factor = (m.rotation, m.rotation_cov, ARCSEC_PER_RAD) if turned else (m.displacement, m.cov, 1e3)
+        digits, nothing = 1 if turned else 3, np.full(3, np.nan)
+        values, sigmas = nothing if of is None else factor * of, nothing if cov is None else factor * sigmas_in(cov)
+        cells = "".join(_cell(x, 9, digits) for x in values) + "".join(_cell(x, 7, digits) for x in sigmas)
+        least = "" if turned else _cell(1e3 * m.smallest, 12, 2)
+        rows.append(f"    {' '.join(m.name[1:]):<14}{cells}{_cell(m.test.p, 10, 4)}{least}{_mark(m)}")
+    if turned:
+        said = ["  rotations alone were measured: they are compared, displacements are not known"]
+        return [*said, f"    {'':<14}{'rx':>9}{'ry':>9}{'rz':>9}{'sigmas':>21}{'p':>10}   arcsec", *rows]
+    return [f"    {'':<14}{'dx':>9}{'dy':>9}{'dz':>9}{'sigmas':>21}{'p':>10}{'found from':>12}   mm", *rows]
 
 
 def _mark(m: Motion) -> str:
@@ -226,25 +207,23 @@ def _name(name: tuple[str, ...]) -> str:
 
 
 def _f_test(test: CongruenceTest) -> dict[str, Any]:
-    return {"f": plain(test.statistic), "freedom": test.freedom, "freedom_sigma0": plain(test.freedom_sigma0),
-            "p": plain(test.p), "passed": test.passed}  # fmt: skip
+    return dict(plain({"f": test.statistic, **attributes(test, "freedom", "freedom_sigma0", "p", "passed")}))
 
 
 def _motion(m: Motion) -> dict[str, Any]:
     out: dict[str, Any] = {
         "name": _name(m.name),
         "displacement_mm": plain(1e3 * m.displacement),
-        "sigma_displacement_mm": plain(1e3 * np.sqrt(np.maximum(np.diag(m.cov), 0.0))),
+        "sigma_displacement_mm": plain(1e3 * sigmas_in(m.cov)),
         "semi_axes_mm": [1e3 * float(x) for x in m.ellipsoid.semi_axes],
         "test": _f_test(m.test),
         "smallest_mm": plain(1e3 * m.smallest),
-        "stable": m.stable,
-        "significant": m.significant,
+        **attributes(m, "stable", "significant"),
     }
     if m.rotation is not None and m.rotation_cov is not None and m.rotation_test is not None:
-        out["rotation_arcsec"] = [ARCSEC_PER_RAD * float(x) for x in m.rotation]
-        out["sigma_rotation_arcsec"] = [ARCSEC_PER_RAD * math.sqrt(max(0.0, float(v))) for v in np.diag(m.rotation_cov)]
-        out["test_rotation"] = _f_test(m.rotation_test)
+        turn, sigmas = (ARCSEC_PER_RAD * x for x in (m.rotation, sigmas_in(m.rotation_cov)))
+        out |= {"rotation_arcsec": turn.tolist(), "sigma_rotation_arcsec": sigmas.tolist(),
+                "test_rotation": _f_test(m.rotation_test)}  # fmt: skip
     return out
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from adjust.graph.assembly import values_of
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
 from survey.folder.replacing import filling
@@ -225,12 +226,11 @@ def _as_it_stands(project: Project) -> NetworkValues:
     start = {p.point_id: p.x_in_world.value for p in project.survey.points if p.x_in_world.value is not None}
     if not (project.folder / RESULTS / "solution.json").is_file():
         return NetworkValues(project.survey, project.title, start, **_options(project))
-    previous = read_previous(project)
-    covs = {name[1]: cov for name, cov in previous.covs.items() if name[0] == "point"}
-    x = start | dict(previous.points)
-    return NetworkValues(
-        project.survey, project.title, x, True, covs, previous.factor, **_options(project)
-    )
+    before = read_previous(project)
+    factor = float(before.summary["sigma_factor"])
+    covs = {name[1]: factor**2 * e.cov for name, e in before.estimates.items() if name[0] == "point"}
+    x = start | dict(values_of(before).points)
+    return NetworkValues(project.survey, project.title, x, True, covs, factor, **_options(project))
 
 
 def _options(project: Project) -> dict[str, Any]:

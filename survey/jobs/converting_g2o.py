@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from gtsam import Pose3
 
+from adjust.graph.assembly import values_of
 from adjust.model.errors import SurveyError
 from adjust.model.survey import Survey
 from adjust.pose_network.from_survey import network_from_survey
@@ -45,7 +46,7 @@ def project_to_g2o(source: Path, target: Path, information: Information) -> tupl
         )
     network = network_from_survey(survey, any_datum=True)
     adjusted = (source / RESULTS / "solution.json").is_file()
-    known = dict(read_previous(project).poses) if adjusted else _given(survey)
+    known = values_of(read_previous(project)).poses if adjusted else _given(survey)
     found = network_poses(survey, known)
     if found is None:
         raise SurveyError(f"{source}: pairs leave stations without a pose; give them a start")

@@ -6,7 +6,9 @@
 Nothing is adjusted: every command obeys the file from then on.
 """
 
-from collections.abc import Sequence
+import getpass
+import os
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +16,9 @@ from typing import Any
 from adjust.model.errors import SurveyError
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write, suggestion, time_text
-from survey.jobs.detecting import author_name
 from survey.project import Project
 from survey.project.exclusions import EXCLUSIONS_FILE, Exclusion, Name, Row, appended, in_force, read_exclusions
+from survey.project.finding import by_member, find
 from survey.project.observed import Observed
 from survey.project.project import OBSERVATIONS_FOLDER, LeftOut
 from survey.project.reading import leaving_out, read_all
@@ -88,10 +90,18 @@ def _add(folder: Path, place: Path, rows: Sequence[Row]) -> None:
 def _outcome(folder: Path, project: Project, rows: Sequence[Row], excluded: bool) -> ExcludeOutcome:
     observed = Observed(project.survey, project.spots)
     hits = [observed.hits(row.exclusion.name, row.exclusion.at) for row in rows]
-    done = tuple(LeftOut(row.exclusion, len(h.images), h.n_image_points, h.n_spots, h.n_readings)
-                 for row, h in zip(rows, hits, strict=True))  # fmt: skip
+    done = tuple(h.left_out(row.exclusion) for row, h in zip(rows, hits, strict=True))
     now = in_force(read_exclusions(folder / OBSERVATIONS_FOLDER)[0])
     return ExcludeOutcome(folder, excluded, done, tuple(h.text() for h in hits), folder / FILE, len(now))
+
+
+def author_name(said: Iterable[tuple[str, str]] = ()) -> str:
+    """Who decides: $LABSURVEY_AUTHOR, the surveyor of [identification], or the user of the computer."""
+    surveyor = next((value for key, value in said if key == "surveyor"), "")
+    try:
+        return os.environ.get("LABSURVEY_AUTHOR", "") or surveyor or getpass.getuser()
+    except (OSError, KeyError):  # a user without a name, as in a container
+        return ""
 
 
 def _said(project: Project, name: Name, reason: str, author: str, at: tuple[float, float] | None = None) -> Exclusion:
@@ -111,9 +121,9 @@ def new_rows(project: Project, names: Sequence[str], reason: str, author: str = 
     rows: dict[Name, Row] = {}
     for text in dict.fromkeys(names):
         try:
-            name = observed.find(text)
+            name = find(observed, text)
         except SurveyError as error:
-            member = observed.by_member(text)
+            member = by_member(observed, text)
             advice = f"; its coordinates belong to {member}: name the set by its id" if member else ""
             raise SurveyError(f"{place}: {error}{advice}") from error
         if name in there:
@@ -154,7 +164,7 @@ def _ends_in(name: str, text: str) -> bool:
 def _as_found(path: Path, observed: Observed, there: dict[Name, Exclusion], text: str) -> Name:
     """What a text means among the observations, where that is excluded by its own name."""
     try:
-        name = observed.find(text)
+        name = find(observed, text)
     except SurveyError:
         name = None
     if name in there and name is not None:

@@ -12,7 +12,6 @@ from adjust.model.survey import Station
 from adjust.relay.session import Addition, NetworkSession
 from adjust.testing.distributions import chi2
 from survey.folder.text import read_text
-from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.adjusting.warm_start import warm_adjustment
 from survey.project import Definition, read, read_definition
 from survey.project.declared.node import read_toml
@@ -47,8 +46,7 @@ class Growing:
         """From the last solution of ``folder``. Raises SurveyError, also for what is no network of pairs of poses."""
         check_new(folder, new)
         project = read(folder)
-        before = read_previous(project)
-        adjusted, _ = warm_adjustment(project, before, lambda p: adjust_project(p, False), False)
+        adjusted, _ = warm_adjustment(project, read_previous(project), False)
         try:
             return cls(read_definition(folder), new, NetworkSession(adjusted))
         except SurveyError as error:

@@ -1,6 +1,5 @@
 """The jobs ``plan`` (what a network of pairs will tell, before it is measured) and ``add`` (let one grow)."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,11 +10,8 @@ from gtsam import Pose3, Rot3
 
 from adjust.model.errors import SurveyError, listed
 from adjust.model.observations import Pair
-from survey.folder.replacing import complete, place_for, replace_parts
-from survey.jobs.adjusting.outcome import AdjustOutcome, made
-from survey.jobs.adjusting.steps import adjust_project
-from survey.jobs.adjusting.warm_start import warm_adjustment
-from survey.project import Definition, Project, read, read_definition
+from survey.jobs.changing import Change, ChangeOutcome, changed_project
+from survey.project import Definition, Project, read_definition
 from survey.project.merging import Merged, merge, read_copy
 from survey.project.project import OBSERVATIONS_FOLDER
 from survey.project.tables.files import read_table
@@ -30,9 +26,7 @@ from survey.project.tables.pairs import (
 )
 from survey.project.tables.reading import Table
 from survey.project.tables.references import Names
-from survey.report.results import RESULTS
-from survey.solution.earlier.previous import Move, Previous, change_dict, change_lines, moves, read_previous
-from survey.solution.earlier.runs import Clock, command_line
+from survey.solution.earlier.runs import command_line
 from survey.solution.loops import network_dict, pair_network
 
 _MOST_SHOWN = 8
@@ -128,63 +122,26 @@ def _problems(definition: Definition, network: dict[str, Any]) -> tuple[str, ...
     return tuple(out)
 
 
-@dataclass(frozen=True, eq=False)
-class AddOutcome:
-    """A network that has grown. start: how the adjustment began, for people."""
-
-    outcome: AdjustOutcome
-    added: dict[str, list[str] | int]
-    moved: tuple[Move, ...]
-    before: Previous
-    start: str
-    seconds: float
-
-    def summary(self) -> dict[str, Any]:
-        """As plain values."""
-        return {
-            **self.outcome.summary(),
-            "added": self.added,
-            **change_dict(self.before, self.outcome.solution["summary"], self.moved),
-            "start": self.start,
-            "seconds": self.seconds,
-        }
-
-    def text(self) -> str:
-        """For people."""
-        after, how = self.outcome.solution["summary"], f", {self.start}, {self.seconds:.2f} s"
-        lines = ["added: " + "; ".join(f"{kind} {_added(what)}" for kind, what in self.added.items())]
-        lines += change_lines(self.before, after, self.moved, how, "old stations and points")
-        return "\n".join([*lines, "", self.outcome.text()])
-
-
-def _added(what: list[str] | int) -> str:
-    return listed(what, _MOST_NAMED) if isinstance(what, list) else str(what)
-
-
-def add_job(folder: Path, new: Path, *, out: Path | None = None, progress: bool = True) -> AddOutcome:
+def add_job(folder: Path, new: Path, *, out: Path | None = None, progress: bool = True) -> ChangeOutcome:
     """Add what is in ``new`` to the adjusted project ``folder``, or to a copy of it at ``out``. Raises SurveyError.
 
     The project is as before whatever goes wrong.
     """
-    begin, clock = time.perf_counter(), Clock()
     folder, new = Path(folder), Path(new)
-    with place_for(folder, out) as place:
-        with clock.step("read"):
-            project = read(folder)
-            before = read_previous(project)
-            merged = merge(folder, new, place)
-            grown = _read_merged(merged, project, out or folder)
-        with clock.step("adjust"):
-            adjustment, start = warm_adjustment(grown, before, lambda p: adjust_project(p, progress), progress)
-        outcome = made(grown, adjustment, place, clock, command=command_line("add", folder, new, out=out))
-        if out is None:
-            replace_parts(folder, [*merged.entries, RESULTS])
-        else:
-            complete(folder, place)
-    outcome = outcome.at(out or folder)
-    added: dict[str, list[str] | int] = {**merged.new_ids, **merged.rows}
-    moved = moves(before, adjustment, grown.options.sigmas)
-    return AddOutcome(outcome, added, moved, before, start, time.perf_counter() - begin)
+
+    def grown(project: Project, place: Path) -> Change:
+        merged = merge(folder, new, place)
+        added: dict[str, Sequence[str] | int] = {**merged.new_ids, **merged.rows}
+        said = "; ".join(f"{kind} {_added(what)}" for kind, what in added.items())
+        return Change(_read_merged(merged, project, out or folder), merged.entries,
+                      command_line("add", folder, new, out=out), {"added": added}, (f"added: {said}",),
+                      told=True)  # fmt: skip
+
+    return changed_project(folder, out, grown, progress=progress, compared=True)
+
+
+def _added(what: Sequence[str] | int) -> str:
+    return str(what) if isinstance(what, int) else listed(what, _MOST_NAMED)
 
 
 def _read_merged(merged: Merged, project: Project, folder: Path) -> Project:
@@ -192,5 +149,3 @@ def _read_merged(merged: Merged, project: Project, folder: Path) -> Project:
         return replace(read_copy(merged.place, project, folder), files=merged.place, origins=merged.origins)
     except SurveyError as error:
         raise merged.translated(error) from error
-
-

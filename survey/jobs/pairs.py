@@ -17,14 +17,15 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, Pair, frame_text
 from adjust.model.survey import FloatArray, PoseParameter, Station, Survey
 from adjust.relay.eyes.drift import sequences
-from adjust.relay.eyes.eyes import adjust_eye_motions
-from adjust.relay.eyes.pairs import EyePairs, close_loops, triangle_misclosure
+from adjust.relay.eyes.eyes import adjust_eyes
+from adjust.relay.eyes.pairs import EyePairs, triangle_misclosure
 from adjust.relay.network import gtsam_motion
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
 from survey.folder.whole import whole_folder
 from survey.jobs.relay import (
     RelayPairs,
+    looped,
     one_metre,
     read_trajectories,
     relay_pairs,
@@ -41,21 +42,6 @@ _ENDINGS = (".csv", ".txt", ".tum")
 _ALPHA = 0.001
 
 
-@dataclass(frozen=True)
-class TriangleMisclosure:
-    """Three pairs handed round: the lengths of the misclosure (rad, m), its test and whether it may be chance.
-
-    The test is w' inv(C) w, chi-square with 6 degrees of freedom, C with what pairs of one eye share.
-    """
-
-    eyes: tuple[str, str, str]
-    rotation: float
-    translation: float
-    test: float
-    p_value: float
-    closes: bool
-
-
 @dataclass(frozen=True, eq=False)
 class PairsOutcome:
     """What was found and where it stands. written: the project folder with the pairs, None where none was asked for.
@@ -65,7 +51,7 @@ class PairsOutcome:
 
     source: str
     found: RelayPairs
-    triangles: tuple[TriangleMisclosure, ...]
+    triangles: tuple[dict[str, Any], ...]
     written: Path | None = None
     joint: bool = False
 
@@ -81,7 +67,7 @@ class PairsOutcome:
             "refused": list(found.eyes.refused),
             "left_out": [str(outlier) for outlier in found.joint.outliers],
             "pairs": self._pairs(),
-            "loops": [_loop_entry(t) for t in self.triangles],
+            "loops": list(self.triangles),
             "written": None if self.written is None else str(self.written),
         }
 
@@ -101,11 +87,12 @@ class PairsOutcome:
         """Summary for people."""
         lines = [relay_text(self.found).rstrip()]
         if self.triangles:
-            open_ones = sum(not t.closes for t in self.triangles)
+            open_ones = sum(not t["closes"] for t in self.triangles)
             lines.append(f"loops: {len(self.triangles)} triangles, of which {open_ones} do not close; the worst first")
-        for t in sorted(self.triangles, key=lambda t: t.p_value)[:5]:
-            size = f"{ARCSEC_PER_RAD * t.rotation:.1f} arcsec {1e3 * t.translation:.3f} mm"
-            lines.append(f"  {' '.join(t.eyes):<30}{size:>28}  p {t.p_value:.2g}{'' if t.closes else '  OPEN'}")
+        for t in sorted(self.triangles, key=lambda t: float(t["p_value"]))[:5]:
+            size = f"{t['misclosure_arcsec']:.1f} arcsec {t['misclosure_mm']:.3f} mm"
+            flag = "" if t["closes"] else "  OPEN"
+            lines.append(f"  {' '.join(t['eyes']):<30}{size:>28}  p {t['p_value']:.2g}{flag}")
         return "\n".join(lines)
 
 
@@ -138,12 +125,8 @@ def _from_trajectories(folder: Path, station: str | None) -> RelayPairs:
         )
     trackers = relay_trackers(read_trajectories(by_id))
     eyes = tracker_pairs(trackers)
-    joint = adjust_eye_motions(sequences(one_metre(trackers), trackers.drift))
-    return RelayPairs(eyes, close_loops(eyes) if _has_loops(eyes) else None, joint)
-
-
-def _has_loops(eyes: EyePairs) -> bool:
-    return len(eyes.pairs) >= len({end for p in eyes.pairs for end in (p.a, p.b)})
+    joint = adjust_eyes(sequences(one_metre(trackers), trackers.drift))
+    return RelayPairs(eyes, looped(eyes), joint)
 
 
 def star(found: RelayPairs) -> tuple[Pair, ...]:
@@ -152,8 +135,11 @@ def star(found: RelayPairs) -> tuple[Pair, ...]:
     return tuple(found.joint.pair(first.frame_id, other.frame_id) for other in others)
 
 
-def triangles(eyes: EyePairs) -> tuple[TriangleMisclosure, ...]:
-    """Misclosures of all triangles whose three pairs were found, from the pairs alone."""
+def triangles(eyes: EyePairs) -> tuple[dict[str, Any], ...]:
+    """Misclosures of all triangles whose three pairs were found, from the pairs alone: lengths, and whether by chance.
+
+    The test is w' inv(C) w, chi-square with 6 degrees of freedom, C with what pairs of one eye share.
+    """
     ids = list(dict.fromkeys(end.frame_id for p in eyes.pairs for end in (p.a, p.b)))
     known = {p.pair_id for p in eyes.pairs}
     out = []
@@ -161,9 +147,11 @@ def triangles(eyes: EyePairs) -> tuple[TriangleMisclosure, ...]:
     for names in three:
         w, _, cov = triangle_misclosure(eyes, *names)
         test = float(w @ np.linalg.solve(cov, w))
-        p = float(chi2.sf(test, 6))
-        size = float(np.linalg.norm(w[:3])), float(np.linalg.norm(w[3:]))
-        out.append(TriangleMisclosure(names, *size, test, p, p >= sidak(_ALPHA, len(three))))
+        p, turn, shift = float(chi2.sf(test, 6)), np.linalg.norm(w[:3]), np.linalg.norm(w[3:])
+        out.append({
+            "eyes": list(names), "misclosure_arcsec": float(ARCSEC_PER_RAD * turn), "misclosure_mm": float(1e3 * shift),
+            "test": test, "p_value": p, "closes": p >= sidak(_ALPHA, len(three)),
+        })  # fmt: skip
     return tuple(out)
 
 
@@ -191,10 +179,3 @@ def _entry(b_from_a: Any, cov: FloatArray) -> dict[str, Any]:
     pose = b_from_a if isinstance(b_from_a, Pose3) else Pose3(b_from_a, np.zeros(3))
     sigmas = first_row(pair_sigmas(pose.rotation().matrix()[None], cov[None]))
     return pose_dict(pose) | sigmas | {"cov": cov.tolist()}
-
-
-def _loop_entry(t: TriangleMisclosure) -> dict[str, Any]:
-    return {
-        "eyes": list(t.eyes), "misclosure_arcsec": ARCSEC_PER_RAD * t.rotation, "misclosure_mm": 1e3 * t.translation,
-        "test": t.test, "p_value": t.p_value, "closes": t.closes,
-    }  # fmt: skip

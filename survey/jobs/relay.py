@@ -68,9 +68,12 @@ def relay_pairs(source: Path | str | Survey | Adjustment, station_id: str | None
     survey = read(Path(source)).survey if isinstance(source, Path | str) else source
     found = eye_sequences(in_use(survey) if isinstance(survey, Survey) else survey, station_id)
     eyes = pairs_of(found)
-    stations = {end.frame_id for p in eyes.pairs for end in (p.a, p.b)}
-    closed = close_loops(eyes) if len(eyes.pairs) >= len(stations) else None
-    return RelayPairs(eyes, closed, adjust_eyes(found))
+    return RelayPairs(eyes, looped(eyes), adjust_eyes(found))
+
+
+def looped(eyes: EyePairs) -> LoopedPairs | None:
+    """The pairs with their loops closed; None where they close none."""
+    return close_loops(eyes) if len(eyes.pairs) >= len({end for p in eyes.pairs for end in (p.a, p.b)}) else None
 
 
 def relay_trackers(trajectories: Sequence[Trajectory]) -> RelayTrackers:
@@ -129,10 +132,7 @@ def read_trajectory(text: str, eye_id: str, name: str = "trajectory") -> Traject
 
 def read_trajectories(paths: Mapping[str, Path]) -> tuple[Trajectory, ...]:
     """Trajectory files by the ids of their eyes. Raises SurveyError naming file and line."""
-    out = []
-    for eye_id, path in paths.items():
-        out.append(read_trajectory(read_text(Path(path)), eye_id, str(path)))
-    return tuple(out)
+    return tuple(read_trajectory(read_text(Path(path)), eye_id, str(path)) for eye_id, path in paths.items())
 
 
 def write_relay_pairs(folder: Path, pairs: Sequence[Pair]) -> Path:

@@ -14,7 +14,7 @@ from survey.batch.run import BatchOptions, counts, run_batch
 from survey.batch.tables import STATES, count_line, findings, short_names, summary_table
 from survey.batch.trends import Trends, trends_of
 from survey.folder.text import suggestion
-from survey.notebook.frames import frame
+from survey.notebook.frames import frame, of_rows
 from survey.notebook.names import heading, html_table
 from survey.notebook.plots import Plot
 from survey.report.drawing import ON_WHITE, standalone
@@ -39,31 +39,30 @@ class Batch:
     @property
     def folders(self) -> Any:
         """Data frame: state and key figures of each folder."""
-        rows = [{"folder": r.folder, "state": r.state, "origin": r.origin, "sigma0": r.summary.get("sigma0"),
-                 "redundancy": r.summary.get("redundancy"), "verdict": r.summary.get("verdict", ""),
-                 "seconds": r.seconds, "tries": r.tries, "cause": r.cause,
-                 "message": r.error or r.summary.get("reason", "")} for r in self.records]  # fmt: skip
-        return frame(rows, ["folder"], list(rows[0])[1:] if rows else [])
+        return frame(self.records, ["folder"], {
+            **{k: k for k in ("folder", "state", "origin")},
+            "sigma0": lambda r: r.summary.get("sigma0"), "redundancy": lambda r: r.summary.get("redundancy"),
+            "verdict": lambda r: r.summary.get("verdict", ""), **{k: k for k in ("seconds", "tries", "cause")},
+            "message": lambda r: r.error or r.summary.get("reason", ""),
+        })  # fmt: skip
 
     @property
     def values(self) -> Any:
         """Data frame: every number of every folder with its sigma; (name, folder) is the index."""
-        rows = [{"name": c.series.name, "folder": self.records[int(e)].folder, "value": v, "sigma": s,
-                 "unit": c.series.unit, "mean": c.mean, "outside": bool(o)}
+        rows = ((c.series.name, self.records[int(e)].folder, v, s, c.series.unit, c.mean, bool(o))
                 for c in self.trends.charts for e, v, s, o in zip(
-                    c.series.epoch, c.series.value, c.series.sigma, c.outside, strict=True)]  # fmt: skip
-        return frame(rows, ["name", "folder"], ["value", "sigma", "unit", "mean", "outside"])
+                    c.series.epoch, c.series.value, c.series.sigma, c.outside, strict=True))  # fmt: skip
+        return of_rows(rows, ["name", "folder"], "value", "sigma", "unit", "mean", "outside")
 
     @property
     def charts(self) -> Any:
         """Data frame: mean, scatter, slope and findings of every number, most alarming first."""
-        rows = [{"name": c.series.name, "unit": c.series.unit, "n": len(c.series.value), "mean": c.mean,
-                 "sigma_mean": c.mean_sigma, "ratio": c.ratio, "p": c.p, "slope": c.slope,
-                 "sigma_slope": c.slope_sigma, "p_slope": c.p_slope, "in_control": not self.trends.is_alarming(c),
-                 "findings": "; ".join(findings(self.trends, c, self.records))}
-                for c in self.trends.charts]  # fmt: skip
-        return frame(rows, ["name"], ["unit", "n", "mean", "sigma_mean", "ratio", "p", "slope", "sigma_slope",
-                                      "p_slope", "in_control", "findings"])  # fmt: skip
+        return frame(self.trends.charts, ["name"], {
+            "name": "series.name", "unit": "series.unit", "n": lambda c: len(c.series.value), "mean": "mean",
+            "sigma_mean": "mean_sigma", "ratio": "ratio", "p": "p", "slope": "slope", "sigma_slope": "slope_sigma",
+            "p_slope": "p_slope", "in_control": lambda c: not self.trends.is_alarming(c),
+            "findings": lambda c: "; ".join(findings(self.trends, c, self.records)),
+        })  # fmt: skip
 
     def plot(self, name: str) -> Plot:
         """The control chart of a number, such as ``lens/left/fx``. Raises SurveyError for one that there is not."""

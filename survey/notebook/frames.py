@@ -3,26 +3,33 @@
 Every function gives a new frame; changing one changes no result. Sigmas are scaled as in the report.
 """
 
-from typing import Any, Protocol
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from operator import attrgetter, itemgetter
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from gtsam import Pose3
 
-from adjust.model.result import Adjustment, Estimate, ParameterName
+from adjust.model.result import Adjustment
+from adjust.statistics.result import RelativePrecision
 from survey.folder.extras import library
 from survey.solution.quantities import (
     ARCSEC_PER_RAD,
     Scale,
-    ellipsoid,
-    pose_entry,
+    Status,
+    point_entry,
+    pose_columns,
     sigma_unit_for_people,
     sigmas_of,
-    status_of,
     unit_for_people,
+    units_for_people,
 )
 from survey.solution.residual_tables import image_rows
 from survey.solution.statistics import Statistics
 
+T = TypeVar("T")
 _POSES = ("station_from_camera", "mount_from_station", "world_from_station", "world_from_table", "carrier_from_target")
 
 
@@ -47,37 +54,62 @@ def pandas() -> Any:
     return library("pandas", "notebook", "data frames need pandas")
 
 
-def frame(rows: list[dict[str, Any]], index: list[str], columns: list[str]) -> Any:
-    """A data frame with an index; empty ones have their columns too."""
-    made = pandas().DataFrame(rows, columns=[*index, *columns])
-    return made.set_index(index if len(index) > 1 else index[0])
+def frame(things: Iterable[T], index: Sequence[str], columns: Mapping[str, str | Callable[[T], object]]) -> Any:
+    """A data frame of things: its columns by name, each an attribute of theirs or a function; some are the index."""
+    rows, of = list(things), {k: attrgetter(how) if isinstance(how, str) else how for k, how in columns.items()}
+    return indexed(pandas().DataFrame({k: [how(thing) for thing in rows] for k, how in of.items()}), index)
+
+
+def of_rows(rows: Iterable[tuple[object, ...]], index: Sequence[str], *columns: str) -> Any:
+    """A data frame of rows, each with the index first; none of them has its columns too."""
+    return indexed(pandas().DataFrame(list(rows), columns=[*index, *columns]), index)
+
+
+def indexed(made: Any, index: Sequence[str]) -> Any:
+    """A data frame with some of its columns as the index."""
+    return made.set_index(list(index) if len(index) > 1 else index[0])
+
+
+def _axes(pattern: str, of: Callable[[Any], Any], names: str = "xyz") -> dict[str, Callable[[Any], float]]:
+    """A column for each of the numbers that a thing has, named after the axes."""
+    return {pattern.format(c): partial(_number, of, k) for k, c in enumerate(names)}
+
+
+def _number(of: Callable[[Any], Any], k: int, thing: Any) -> float:
+    return float(of(thing)[k])
 
 
 def points(s: Solved) -> Any:
     """World points: coordinates, sigmas, semi-axes of the 95 % ellipsoid (mm), status."""
-    rows = []
-    for name, e in s.adjustment.estimates.items():
-        if name[0] == "point":
-            values, sigmas = 1e3 * np.asarray(e.value, dtype=float), 1e3 * sigmas_of(e, s.scale)
-            axes = 1e3 * ellipsoid(e.cov, s.scale)[0]
-            rows.append({"point_id": name[1], **_named("{}_mm", values), **_named("sigma_{}_mm", sigmas),
-                         **dict(zip(("a_mm", "b_mm", "c_mm"), axes, strict=True)), "status": _status(e)})  # fmt: skip
-    columns = [p.format(c) for p in ("{}_mm", "sigma_{}_mm") for c in "xyz"]
-    return frame(rows, ["point_id"], [*columns, "a_mm", "b_mm", "c_mm", "status"])
+    found = [{"point_id": name[1]} | point_entry(e, s.scale) for name, e in s.adjustment.estimates.items()
+             if name[0] == "point"]  # fmt: skip
+    own = ("point_id", *(pattern.format(c) for pattern in ("{}_mm", "sigma_{}_mm") for c in "xyz"))
+    return frame(found, ["point_id"], {
+        **{key: itemgetter(key) for key in own}, **_axes("{}_mm", itemgetter("ellipsoid_95_semi_axes_mm"), "abc"),
+        "status": lambda x: _status(x["status"]),
+    })  # fmt: skip
 
 
-def _named(pattern: str, values: Any) -> dict[str, float]:
-    return {pattern.format(c): float(v) for c, v in zip("xyz", values, strict=True)}
-
-
-def _status(e: Estimate) -> str:
-    found = status_of(e)
+def _status(found: Status) -> str:
     return found if isinstance(found, str) else " ".join(found.values())
 
 
 def poses(s: Solved, kinds: tuple[str, ...] = _POSES) -> Any:
     """Adjusted poses a_from_b: translation (mm) along a, rotation as Euler angles (deg) and quaternion, sigmas."""
-    return frame(_pose_rows(s, kinds), ["transform", "id", "epoch_id"], _POSE_COLUMNS)
+    found = pose_columns((e for name, e in s.adjustment.estimates.items() if name[0] in kinds), s.scale)
+    columns: dict[str, Any]
+    columns = {key: [(*name, "")[k] for name in found.rows] for k, key in enumerate(("transform", "id", "epoch_id"))}
+    for pattern, key, axes in _OF_POSES:
+        columns |= {pattern.format(c): found.columns[key][:, k] for k, c in enumerate(axes)}
+    columns["status"] = list(map(_status, found.status))
+    return pandas().DataFrame(columns).set_index(["transform", "id", "epoch_id"])
+
+
+_OF_POSES = (
+    ("{}_mm", "translation_mm", "xyz"), ("sigma_{}_mm", "sigma_translation_mm", "xyz"),
+    ("euler_{}_deg", "rotation_euler_xyz_deg", "xyz"), ("sigma_r{}_arcsec", "sigma_rotation_arcsec", "xyz"),
+    ("q{}", "rotation_quaternion_wxyz", "wxyz"),
+)  # fmt: skip
 
 
 def stations(s: Solved) -> Any:
@@ -85,45 +117,18 @@ def stations(s: Solved) -> Any:
     return poses(s, ("world_from_station", "mount_from_station"))
 
 
-def _pose_rows(s: Solved, kinds: tuple[str, ...]) -> list[dict[str, Any]]:
-    return [_pose_row(name, e, s.scale) for name, e in s.adjustment.estimates.items()
-            if name[0] in kinds and isinstance(e.value, Pose3)]  # fmt: skip
-
-
-_POSE_COLUMNS = [*(f"{c}_mm" for c in "xyz"), *(f"sigma_{c}_mm" for c in "xyz"), *(f"euler_{c}_deg" for c in "xyz"),
-                 *(f"sigma_r{c}_arcsec" for c in "xyz"), *(f"q{c}" for c in "wxyz"), "status"]  # fmt: skip
-
-
-def _pose_row(name: ParameterName, e: Estimate, scale: Scale) -> dict[str, Any]:
-    entry = pose_entry(e, scale)
-    q = dict(zip(("qw", "qx", "qy", "qz"), entry["rotation_quaternion_wxyz"], strict=True))
-    return {
-        "transform": name[0], "id": name[1], "epoch_id": name[2] if len(name) > 2 else "",
-        **_named("{}_mm", entry["translation_mm"]), **_named("sigma_{}_mm", entry["sigma_translation_mm"]),
-        **_named("euler_{}_deg", entry["rotation_euler_xyz_deg"]),
-        **_named("sigma_r{}_arcsec", entry["sigma_rotation_arcsec"]), **q, "status": _status(e),
-    }  # fmt: skip
-
-
 def cameras(s: Solved) -> Any:
     """Cameras: station, size, number of images and points used, RMS residual (px), pose in the station."""
-    found, rows = s.adjustment.image_residuals, []
-    blocks = s.adjustment.survey.image_blocks
-    where = {row["id"]: row for row in _pose_rows(s, ("station_from_camera",))}
-    for camera in s.adjustment.survey.cameras:
-        mine = [i for i, b in enumerate(blocks) if b.camera_id == camera.camera_id]
-        parts = [found.residuals[found.block_ptr[i] : found.block_ptr[i + 1]][
-            found.used[found.block_ptr[i] : found.block_ptr[i + 1]]] for i in mine]  # fmt: skip
-        every = np.concatenate([*parts, np.empty((0, 2))])
-        rows.append({
-            "camera_id": camera.camera_id, "station_id": camera.station_id, "model": camera.lens.model,
-            "width_px": camera.image_size[0], "height_px": camera.image_size[1],
-            "n_images": len({blocks[i].epoch_id for i in mine}), "n_points": len(every),
-            "rms_px": float(np.sqrt(np.mean(every**2))) if every.size else float("nan"),
-            **where.get(camera.camera_id, {}),
-        })  # fmt: skip
-    first = ["station_id", "model", "width_px", "height_px", "n_images", "n_points", "rms_px"]
-    return frame(rows, ["camera_id"], first + _POSE_COLUMNS)
+    made = frame(s.adjustment.survey.cameras, ["camera_id"], {
+        "camera_id": "camera_id", "station_id": "station_id", "model": "lens.model",
+        "width_px": lambda c: c.image_size[0], "height_px": lambda c: c.image_size[1],
+    })  # fmt: skip
+    rows = image_residuals(s)
+    used = rows[rows["used"]].assign(square=lambda x: (x["residual_u_px"] ** 2 + x["residual_v_px"] ** 2) / 2.0)
+    made["n_images"] = rows.groupby("camera_id")["epoch_id"].nunique().reindex(made.index, fill_value=0)
+    made["n_points"] = used.groupby("camera_id").size().reindex(made.index, fill_value=0)
+    made["rms_px"] = np.sqrt(used.groupby("camera_id")["square"].mean()).reindex(made.index)
+    return made.join(poses(s, ("station_from_camera",)).droplevel(["transform", "epoch_id"]).rename_axis("camera_id"))
 
 
 def lenses(s: Solved) -> Any:
@@ -137,34 +142,37 @@ def tables(s: Solved) -> Any:
 
 
 def _vectors(s: Solved, kind: str) -> Any:
-    rows = []
-    for name, e in s.adjustment.estimates.items():
-        if name[0] == kind and not isinstance(e.value, Pose3):
-            values = np.asarray(e.value, dtype=float)
-            for component, unit, value, sigma, status in zip(
-                e.components, e.units, values, sigmas_of(e, s.scale), e.status, strict=True
-            ):
-                shown, factor = unit_for_people(component, unit)
-                rows.append({
-                    "id": name[1] if len(name) > 1 else name[0], "component": component, "value": value * factor,
-                    "sigma": sigma * factor, "unit": shown,
-                    "value_over_sigma": abs(value) / sigma if sigma > 0.0 else float("nan"), "status": status,
-                })  # fmt: skip
-    return frame(rows, ["id", "component"], ["value", "sigma", "unit", "value_over_sigma", "status"])
+    parts = ((p, *unit_for_people(p.component, p.unit)) for p in _parts(s) if p.kind == kind)
+    rows = ((p.id, p.component, p.value * f, p.sigma * f, unit, abs(p.value) / p.sigma if p.sigma > 0.0 else np.nan,
+             p.status) for p, unit, f in parts)  # fmt: skip
+    return of_rows(rows, ["id", "component"], "value", "sigma", "unit", "value_over_sigma", "status")
 
 
 def unknowns(s: Solved) -> Any:
     """Every component of every estimate in the tangent, SI units and radians: what ``covariance.npz`` is about."""
-    rows = []
+    columns = ["kind", "id", "epoch_id", "component", "value", "sigma", "unit", "status"]
+    return frame(_parts(s), columns[:4], {name: name for name in columns})
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One component of an estimate, in units inside; of a pose it has no value."""
+
+    kind: str
+    id: str
+    epoch_id: str
+    component: str
+    value: float
+    sigma: float
+    unit: str
+    status: str
+
+
+def _parts(s: Solved) -> Iterator[_Part]:
     for name, e in s.adjustment.estimates.items():
-        flat = None if isinstance(e.value, Pose3) else np.asarray(e.value, dtype=float)
-        for i, (component, unit) in enumerate(zip(e.components, e.units, strict=True)):
-            rows.append({
-                "kind": name[0], "id": name[1] if len(name) > 1 else "", "epoch_id": name[2] if len(name) > 2 else "",
-                "component": component, "value": float("nan") if flat is None else flat[i],
-                "sigma": float(sigmas_of(e, s.scale)[i]), "unit": unit, "status": e.status[i],
-            })  # fmt: skip
-    return frame(rows, ["kind", "id", "epoch_id", "component"], ["value", "sigma", "unit", "status"])
+        values = np.full(6, np.nan) if isinstance(e.value, Pose3) else np.asarray(e.value, dtype=float)
+        for row in zip(e.components, values.tolist(), sigmas_of(e, s.scale).tolist(), e.units, e.status, strict=True):
+            yield _Part(name[0], (*name, "")[1], (*name, "", "")[2], *row)
 
 
 def image_residuals(s: Solved) -> Any:
@@ -182,28 +190,25 @@ def image_residuals(s: Solved) -> Any:
 
 def readings(s: Solved) -> Any:
     """Every observation that is no image point, a row per component: mm and deg, residual and sigma mm and arcsec."""
-    rows = []
-    for o in s.adjustment.other_residuals:
-        for i, (component, unit) in enumerate(zip(o.components, o.units, strict=True)):
-            value_unit, f = unit_for_people(component, unit)
-            sigma_unit, g = sigma_unit_for_people(unit)
-            rows.append({
-                "kind": o.kind, "group": o.group, "ids": " ".join(o.ids), "component": component,
-                "observed": o.observed[i] * f, "adjusted": o.adjusted[i] * f, "unit": value_unit,
-                "residual": o.residual[i] * g, "sigma": o.sigma[i] * g, "residual_unit": sigma_unit,
-                "redundancy": o.redundancy[i], "standardized": o.standardized[i], "test": o.test, "used": o.used,
-            })  # fmt: skip
-    columns = ["kind", "group", "ids", "component", "observed", "adjusted", "unit", "residual", "sigma",
-               "residual_unit", "redundancy", "standardized", "test", "used"]  # fmt: skip
-    return pandas().DataFrame(rows, columns=columns)
+    arrays, every = s.adjustment.other_arrays, s.adjustment.other_residuals
+    said = [(o.kind, o.group, " ".join(o.ids), c, *units_for_people(c, unit)) for o in every
+            for c, unit in zip(o.components, o.units, strict=True)]  # fmt: skip
+    kind, group, ids, component, unit, f, residual_unit, g = np.array(said, dtype=object).reshape(-1, 8).T
+    return pandas().DataFrame({
+        "kind": kind, "group": group, "ids": ids, "component": component, "observed": arrays.observed * f.astype(float),
+        "adjusted": arrays.adjusted * f.astype(float), "unit": unit, "residual": arrays.residual * g.astype(float),
+        "sigma": arrays.sigma * g.astype(float), "residual_unit": residual_unit, "redundancy": arrays.redundancies,
+        "standardized": arrays.standardized, "test": arrays.test[arrays.observation],
+        "used": arrays.used[arrays.observation],
+    })  # fmt: skip
 
 
 def groups(s: Solved) -> Any:
     """Groups of observations: number, redundancy, weighted square sum, variance factor and its root."""
-    rows = [{"group": g.group, "n": g.n_observations, "redundancy": g.redundancy, "omega": g.omega,
-             "variance_factor": g.factor, "sigma_scale": float(np.sqrt(g.factor)) if g.factor >= 0 else float("nan")}
-            for g in s.adjustment.groups]  # fmt: skip
-    return frame(rows, ["group"], ["n", "redundancy", "omega", "variance_factor", "sigma_scale"])
+    return frame(s.adjustment.groups, ["group"], {
+        "group": "group", "n": "n_observations", "redundancy": "redundancy", "omega": "omega",
+        "variance_factor": "factor", "sigma_scale": lambda g: np.sqrt(g.factor) if g.factor >= 0 else np.nan,
+    })  # fmt: skip
 
 
 def reliability(s: Solved) -> Any:
@@ -224,26 +229,22 @@ def reliability(s: Solved) -> Any:
 
 def relative_precision(s: Solved) -> Any:
     """Relative precision of neighbours: distance, its sigma and semi-axes of the relative ellipsoid, mm."""
-    rows = []
-    for r in s.precision.relative:
-        axes = [1e3 * float(a) for a in r.ellipsoid.semi_axes] + [float("nan")] * (3 - r.ellipsoid.dimension)
-        turn = float("nan")
-        if r.rotation_cov is not None:
-            turn = ARCSEC_PER_RAD * float(np.sqrt(np.linalg.eigvalsh(r.rotation_cov)[-1]))
-        rows.append({
-            "a": r.a[-1], "b": r.b[-1], "distance_mm": 1e3 * r.distance, "sigma_mm": 1e3 * r.sigma_distance,
-            **dict(zip(("a_mm", "b_mm", "c_mm"), axes, strict=True)), "sigma_rotation_arcsec": turn,
-        })  # fmt: skip
-    columns = ["distance_mm", "sigma_mm", "a_mm", "b_mm", "c_mm", "sigma_rotation_arcsec"]
-    return frame(rows, ["a", "b"], columns)
+
+    def turn(r: RelativePrecision) -> float:
+        cov = r.rotation_cov
+        return np.nan if cov is None else ARCSEC_PER_RAD * float(np.sqrt(np.linalg.eigvalsh(cov)[-1]))
+
+    return frame(s.precision.relative, ["a", "b"], {
+        "a": lambda r: r.a[-1], "b": lambda r: r.b[-1], "distance_mm": lambda r: 1e3 * r.distance,
+        "sigma_mm": lambda r: 1e3 * r.sigma_distance,
+        **_axes("{}_mm", lambda r: [*(1e3 * np.asarray(r.ellipsoid.semi_axes)), np.nan, np.nan], "abc"),
+        "sigma_rotation_arcsec": turn,
+    })  # fmt: skip
 
 
 def budget(s: Solved) -> Any:
     """Uncertainty budget: a row per source of every result, with its share of the variance."""
-    rows = []
-    for e in s.precision.budget:
-        unit, f = sigma_unit_for_people(e.unit)
-        rows += [{"result": "/".join(e.name), "component": e.component, "source": line.source, "type": line.kind,
-                  "u": line.u * f, "share": line.share, "u_total": e.u * f, "k": e.coverage, "U": e.expanded * f,
-                  "unit": unit} for line in e.lines]  # fmt: skip
-    return frame(rows, ["result", "component", "source"], ["type", "u", "share", "u_total", "k", "U", "unit"])
+    entries = [(e, *sigma_unit_for_people(e.unit)) for e in s.precision.budget]
+    rows = (("/".join(e.name), e.component, line.source, line.kind, line.u * f, line.share, e.u * f, e.coverage,
+             e.expanded * f, unit) for e, unit, f in entries for line in e.lines)  # fmt: skip
+    return of_rows(rows, ["result", "component", "source"], "type", "u", "share", "u_total", "k", "U", "unit")

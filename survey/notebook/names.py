@@ -3,7 +3,7 @@
 And small pieces of HTML that look well in a notebook, on light and on dark ground.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from markupsafe import Markup
@@ -34,25 +34,22 @@ def components(estimates: Estimates, names: Sequence[str | tuple[str, ...]]) -> 
     return tuple(out)
 
 
-def _meant(estimates: Estimates, name: str | tuple[str, ...]) -> Iterator[tuple[ParameterName, tuple[str, ...]]]:
+def _meant(estimates: Estimates, name: str | tuple[str, ...]) -> list[tuple[ParameterName, tuple[str, ...]]]:
     parts = tuple(name.split("/")) if isinstance(name, str) else tuple(name)
     if parts in estimates:
-        return iter([(parts, estimated(estimates[parts]))])
-    if parts[:-1] in estimates and parts[-1] in estimates[parts[:-1]].components:
-        whole = parts[:-1]
-        return iter([(whole, tuple(c for c in estimated(estimates[whole]) if c == parts[-1]))])
-    every: list[ParameterName]
+        return [(parts, estimated(estimates[parts]))]
+    whole, last = parts[:-1], parts[-1:]
+    if whole in estimates and last[0] in estimates[whole].components:
+        return [(whole, last if last[0] in estimated(estimates[whole]) else ())]
     if len(parts) == 1:
-        once: list[ParameterName] = [
-            n for n in estimates if len(n) == 2 and n[1] == parts[0] and estimated(estimates[n])
-        ]
-        every = once or [n for n in estimates if len(n) > 1 and n[1] == parts[0]]
+        every = [n for n in estimates if len(n) > 1 and n[1] == parts[0]]
+        every = [n for n in every if len(n) == 2 and estimated(estimates[n])] or every
     else:
         every = [n for n in estimates if n[: len(parts)] == parts]
     if not every:
         hint = suggestion(_shown(name), _known(estimates))
         raise SurveyError(f"{_shown(name)}: nothing of that name was adjusted; {hint}")
-    return iter([(n, estimated(estimates[n])) for n in every])
+    return [(n, estimated(estimates[n])) for n in every]
 
 
 def _shown(name: str | tuple[str, ...]) -> str:
@@ -61,8 +58,6 @@ def _shown(name: str | tuple[str, ...]) -> str:
 
 def _known(estimates: Estimates) -> list[str]:
     return [*dict.fromkeys(n[1] for n in estimates if len(n) > 1), *("/".join(n) for n in estimates)]
-
-
 
 
 def rows_in_joint(estimates: Estimates, wanted: Sequence[Component]) -> tuple[list[ParameterName], list[int]]:

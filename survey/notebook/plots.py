@@ -1,9 +1,8 @@
 """Plots by name: the pictures of the report, one by one, as SVG."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from markupsafe import Markup
@@ -20,10 +19,6 @@ from survey.solution.quantities import Scale
 from survey.solution.residual_tables import image_rows
 from survey.solution.statistics import correlation_matrix
 from survey.solution.verdict import suspects
-
-if TYPE_CHECKING:
-    from survey.report.charts import CameraResiduals
-
 
 
 @dataclass(frozen=True)
@@ -49,35 +44,17 @@ class Plot:
         return f"Plot({self.name!r}, {len(self.svg)} bytes of SVG)"
 
 
-def _camera(adjustment: Adjustment, camera: str | None) -> "CameraResiduals":
+def _camera(adjustment: Adjustment, camera: str | None) -> charts.CameraResiduals:
     ids = [c.camera_id for c in adjustment.survey.cameras]
     if camera is None and len(ids) == 1:
         camera = ids[0]
     if camera not in ids:
-        found = "no camera is named" if camera is None else f"there is no camera {camera!r}"
+        wrong = "no camera is named" if camera is None else f"there is no camera {camera!r}"
         hint = suggestion(camera, ids) if camera else f"cameras are {', '.join(ids)}"
-        raise SurveyError(f"{found}; {hint}")
-    rows, found_residuals = image_rows(adjustment), adjustment.image_residuals
-    of_block = np.array([b.camera_id == camera for b in adjustment.survey.image_blocks], dtype=bool)
-    mine = of_block[rows.block] if len(of_block) else np.zeros(0, dtype=bool)
-    suspect = found_residuals.used & (found_residuals.test > suspects(adjustment).image_limit)
-    return charts.CameraResiduals(
-        camera, adjustment.survey.cameras[ids.index(camera)].image_size, rows.uv[mine],
-        found_residuals.residuals[mine], found_residuals.standardized[mine], found_residuals.used[mine],
-        suspect[mine],
-    )  # fmt: skip
-
-
-def _residuals(adjustment: Adjustment, _scale: Scale, camera: str | None = None) -> Markup:
-    return charts.vector_field(_camera(adjustment, camera))
-
-
-def _mean_residuals(adjustment: Adjustment, _scale: Scale, camera: str | None = None) -> Markup:
-    return charts.mean_field(_camera(adjustment, camera))
-
-
-def _histogram(adjustment: Adjustment, _scale: Scale, camera: str | None = None) -> Markup:
-    return charts.histogram(_camera(adjustment, camera))
+        raise SurveyError(f"{wrong}; {hint}")
+    found = adjustment.image_residuals
+    suspect = found.used & (found.test > suspects(adjustment).image_limit)
+    return charts.camera_residuals(adjustment, image_rows(adjustment), suspect, adjustment.survey.cameras_by_id[camera])
 
 
 def _view(adjustment: Adjustment, scale: Scale, make: Callable[[FloatArray], picture.View]) -> Markup:
@@ -89,22 +66,14 @@ def _view(adjustment: Adjustment, scale: Scale, make: Callable[[FloatArray], pic
     return picture.draw(scene, make(everything), everything, enlarged, scale.ellipsoid)
 
 
-def _map(adjustment: Adjustment, scale: Scale) -> Markup:
-    return _view(adjustment, scale, picture.plan)
-
-
-def _perspective(adjustment: Adjustment, scale: Scale) -> Markup:
-    return _view(adjustment, scale, picture.perspective)
-
-
-def _correlations(adjustment: Adjustment, _scale: Scale) -> Markup:
+def _correlations(adjustment: Adjustment) -> Markup:
     found = correlation_matrix(adjustment)
     if found is None:
         raise SurveyError("there are not two unknowns whose correlation could be shown")
     return charts.heat_map(found)
 
 
-def _quantiles(adjustment: Adjustment, _scale: Scale, group: str | None = None) -> Markup:
+def _quantiles(adjustment: Adjustment, group: str | None = None) -> Markup:
     names = [g.group for g in adjustment.groups]
     group = names[0] if group is None and len(names) == 1 else group
     if group not in names:
@@ -116,15 +85,9 @@ def _quantiles(adjustment: Adjustment, _scale: Scale, group: str | None = None) 
     return charts.quantiles(group, w)
 
 
-PLOTS: Mapping[str, Callable[..., Markup]] = {
-    "residuals": _residuals,
-    "mean_residuals": _mean_residuals,
-    "histogram": _histogram,
-    "map": _map,
-    "perspective": _perspective,
-    "correlations": _correlations,
-    "quantiles": _quantiles,
-}
+_OF_CAMERA = {"residuals": charts.vector_field, "mean_residuals": charts.mean_field, "histogram": charts.histogram}
+_VIEWS = {"map": picture.plan, "perspective": picture.perspective}
+PLOTS = (*_OF_CAMERA, *_VIEWS, "correlations", "quantiles")
 """What can be plotted: the first three take ``camera=``, the last ``group=``, where there is more than one."""
 
 
@@ -132,9 +95,15 @@ def plot(name: str, adjustment: Adjustment, scale: Scale, **chosen: str) -> Plot
     """A plot by its name. Raises SurveyError for one that there is not, or a camera or group that there is not."""
     if name not in PLOTS:
         raise SurveyError(f"there is no plot {name!r}; {choice_hint(name, PLOTS)}")
-    allowed = {"residuals": "camera", "mean_residuals": "camera", "histogram": "camera", "quantiles": "group"}
+    allowed = "camera" if name in _OF_CAMERA else "group" if name == "quantiles" else ""
     for key in chosen:
-        if key != allowed.get(name):
-            takes = f"it takes {allowed[name]}=" if name in allowed else "it takes nothing more"
+        if key != allowed:
+            takes = f"it takes {allowed}=" if allowed else "it takes nothing more"
             raise SurveyError(f"plot {name!r} knows no {key}=; {takes}")
-    return Plot(name, standalone(PLOTS[name](adjustment, scale, **chosen), ON_WHITE))
+    if name in _OF_CAMERA:
+        drawn = _OF_CAMERA[name](_camera(adjustment, chosen.get("camera")))
+    elif name in _VIEWS:
+        drawn = _view(adjustment, scale, _VIEWS[name])
+    else:
+        drawn = _quantiles(adjustment, chosen.get("group")) if name == "quantiles" else _correlations(adjustment)
+    return Plot(name, standalone(drawn, ON_WHITE))

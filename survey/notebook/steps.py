@@ -11,7 +11,8 @@ from survey.jobs.adjusting.outcome import run_info
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.cross_validation import CrossValidation
 from survey.jobs.cross_validation import cross_validate as cross_validate_project
-from survey.jobs.detecting import DetectOutcome, detect_job
+from survey.jobs.detecting.job import detect_job
+from survey.jobs.detecting.outcome import DetectOutcome
 from survey.jobs.excluding import ExcludeOutcome, exclude_job, include_job
 from survey.notebook.names import heading, html_table
 from survey.notebook.solution import Solution

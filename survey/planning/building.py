@@ -1,21 +1,19 @@
 """From a project and its plan to a survey with predicted observations, its values, and candidates."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from gtsam import Pose3
 
 from adjust.design import Candidate, predict, with_candidates
 from adjust.graph.assembly import StartValues
-from adjust.lenses.models import MODELS, camera_constants, unit_rays
 from adjust.model.errors import SurveyError, listed
-from adjust.model.observations import Coordinates, ImageBlock, PositionRef, TableReading
-from adjust.model.result import Adjustment, ParameterName
-from adjust.model.rewriting import Rewriting
-from adjust.model.survey import Camera, FloatArray, IntArray, Point, PointParameter, PoseParameter, Station, Survey
-from survey.planning.plan_file import ByHand, Measurements, Moment, Moments, NewPoint, Plan
-from survey.planning.plan_readings import Terrestrial, lengths_between, terrestrial_candidates, with_usual_sigmas
+from adjust.model.observations import ImageBlock, PositionRef, TableReading
+from adjust.model.result import Adjustment
+from adjust.model.survey import IntArray, Point, PointParameter, Station, Survey
+from survey.planning.plan_file import Moment, NewPoint, Plan
+from survey.planning.plan_readings import coordinates_at, with_usual_sigmas
+from survey.planning.values import PlannedValues, gathered, placed_moments
 from survey.project import Project
 
 
@@ -35,41 +33,18 @@ class Planned:
     notes: tuple[str, ...]
 
 
-@dataclass(eq=False)
-class _Values(Rewriting):
-    """Values as they are gathered: of poses and points by a walk over a survey, which stays as it is."""
-
-    lenses: dict[str, FloatArray] = field(default_factory=dict)
-    poses: dict[ParameterName, Pose3] = field(default_factory=dict)
-    points: dict[str, FloatArray] = field(default_factory=dict)
-    vectors: dict[ParameterName, FloatArray] = field(default_factory=dict)
-
-    def start(self) -> StartValues:
-        return StartValues(self.lenses, self.poses, self.points, self.vectors)
-
-    def pose(self, name: ParameterName, given: PoseParameter) -> PoseParameter:
-        if given.value is not None:
-            self.poses[name] = given.value
-        return given
-
-    def point(self, name: ParameterName, given: PointParameter) -> PointParameter:
-        if given.value is not None:
-            self.points[name[1]] = np.asarray(given.value, dtype=float)
-        return given
-
-
 def build_plan(project: Project, plan: Plan, existing: Adjustment | None, notes: Sequence[str] = ()) -> Planned:
     """Predict everything planned. existing: adjustment of what is observed already, whose values then count.
 
     Raises SurveyError where a value or a sigma is missing.
     """
     base = existing.survey if existing is not None else project.survey
-    values = _gather(base, existing)
+    values = gathered(base, existing)
     taken = {b.epoch_id for b in base.image_blocks} | {r.epoch_id for r in base.table_readings}
     taken |= {epoch for _, epoch in project.images}
     said = list(notes)
-    planned = _moments(plan.planned.epochs, base, values)
-    possible = _moments(plan.candidates.epochs, base, values)
+    planned = placed_moments(plan.planned.epochs, base, values)
+    possible = placed_moments(plan.candidates.epochs, base, values)
     _check_new(plan, taken, planned + possible)
     _check_moving(base, planned + possible)
     readings = tuple(r for m in planned + possible for r in _readings(m, project))
@@ -84,49 +59,14 @@ def build_plan(project: Project, plan: Plan, existing: Adjustment | None, notes:
         base,
         image_blocks=base.image_blocks + seen,
         table_readings=base.table_readings + tuple(r for m in lit for r in _readings(m, project)),
-        distances=base.distances + plan.planned.distances,
-        coordinates=base.coordinates + tuple(_coordinates(c.position, c.sigma) for c in plan.planned.coordinates),
-        pairs=base.pairs + plan.planned.pairs,
     )
     extra = {p.name: p.x_in_world for p in plan.candidates.points}
     start = replace(start, points={**start.points, **extra})
-    whole = _terrestrial(plan.planned, whole, start, project).added_to(whole)
+    whole = with_candidates(whole, with_usual_sigmas(plan.planned.singles, whole, start, project))
     candidates, blind = _candidates(whole, everything, start, possible, plan, project, lit)
     if blind:
         said.append(f"candidates that show nothing, left out: {listed(blind, 8)}")
     return Planned(whole, start, candidates, len(base.image_blocks), len(lit), tuple(said))
-
-
-def _gather(survey: Survey, existing: Adjustment | None) -> _Values:
-    """Values of survey.toml, those of an adjustment before them."""
-    v = _Values()
-    estimates = {} if existing is None else existing.estimates
-    for c in survey.cameras:
-        value = c.lens.values
-        if (found := estimates.get(("lens", c.camera_id))) is not None:
-            value = np.asarray(found.value)
-        if value is None:
-            raise SurveyError(
-                f"camera {c.camera_id}: its lens has no values to plan with; give them under "
-                f"[cameras.{c.camera_id}.lens] values, from a data sheet or an earlier calibration"
-            )
-        v.lenses[c.camera_id] = np.asarray(value, dtype=float)
-    v(survey)
-    for co in survey.coordinates:
-        for ref, x in zip(co.positions, co.values, strict=True):
-            if ref.frame is None and ref.point_id is not None:
-                v.points.setdefault(ref.point_id, np.asarray(x))
-    for beam in survey.beams:  # else it would be fitted to spots that are not measured yet
-        if np.isfinite(beam.parameters.values).all():
-            v.vectors["beam", beam.beam_id] = np.asarray(beam.parameters.values, dtype=float)
-    for name, e in estimates.items():
-        if isinstance(e.value, Pose3):
-            v.poses[name] = e.value
-        elif name[0] == "point":
-            v.points[name[1]] = np.asarray(e.value)
-        elif name[0] != "lens":
-            v.vectors[name] = np.asarray(e.value)
-    return v
 
 
 def _check_new(plan: Plan, taken: set[str], moments: Sequence[Moment]) -> None:
@@ -135,70 +75,6 @@ def _check_new(plan: Plan, taken: set[str], moments: Sequence[Moment]) -> None:
         if m.epoch_id in taken or m.epoch_id in seen:
             raise SurveyError(f"{plan.path}: epoch {m.epoch_id!r} is there already; give the series another name")
         seen.add(m.epoch_id)
-
-
-def _moments(series: Sequence[Moments], survey: Survey, values: _Values) -> list[Moment]:
-    out: list[Moment] = []
-    for s in series:
-        if s.by_hand is None:
-            out += s.moments
-            continue
-        poses = _hand_poses(s.by_hand, survey, values)
-        per = len(s.moments) // s.by_hand.count
-        out += [_held_by_hand(m, s.by_hand, survey, values, poses[i // per]) for i, m in enumerate(s.moments)]
-    return out
-
-
-def _hand_poses(hand: ByHand, survey: Survey, values: _Values) -> list[Pose3]:
-    """camera_from_target: the middle of the target in nine cells of the image in turn, tilted, at any distance."""
-    rng = np.random.default_rng(hand.seed)
-    camera = survey.cameras_by_id[hand.camera_id]
-    target = survey.targets_by_id[hand.target_id]
-    middle = 0.5 * (target.x_in_target.min(axis=0) + target.x_in_target.max(axis=0))
-    out = []
-    for i in range(hand.count):
-        cell = (4, 0, 8, 2, 6, 1, 7, 3, 5)[i % 9]
-        share = (np.array([cell % 3, cell // 3]) + rng.uniform(0.2, 0.8, 2)) / 3.0
-        ray = _ray(camera, values.lenses[camera.camera_id], share * np.array(camera.image_size))
-        axis, tilt = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.25, 1.0) * hand.tilt
-        turn = Pose3.Expmap(np.array([tilt * np.cos(axis), tilt * np.sin(axis), 0, 0, 0, 0])).rotation()
-        roll = Pose3.Expmap(np.array([0, 0, rng.choice([0.0, 0.0, 0.5, 1.0]) * np.pi, 0, 0, 0])).rotation()
-        R = turn.compose(roll)
-        out.append(Pose3(R, ray * rng.uniform(*hand.distance) - R.matrix() @ middle))
-    return out
-
-
-def _ray(camera: Camera, lens: FloatArray, pixel: FloatArray) -> FloatArray:
-    ray = unit_rays(MODELS[camera.lens.model], lens, camera_constants(camera), pixel[None])[0]
-    return np.asarray(ray / ray[2])
-
-
-def _held_by_hand(m: Moment, hand: ByHand, survey: Survey, values: _Values, camera_from_target: Pose3) -> Moment:
-    """Who moves: the target where it moves between epochs, else the station with its camera."""
-    camera = survey.cameras_by_id[hand.camera_id]
-    target = survey.targets_by_id[hand.target_id]
-    station = survey.stations_by_id[camera.station_id]
-    mount = _value(values, ("station_from_camera", camera.camera_id), camera.station_from_camera)
-    if target.motion == "epoch":
-        if station.motion != "fixed":
-            raise SurveyError(
-                f"target {target.target_id} and station {station.station_id} both move between epochs: give poses for "
-                "one of them in plan.toml, by_hand is for one thing that moves"
-            )
-        world = _value(values, ("world_from_station", station.station_id), station.world_from_station)
-        return replace(m, target_id=target.target_id, pose=world * mount * camera_from_target)
-    if station.motion == "fixed":
-        raise SurveyError(f"neither {target.target_id} nor station {station.station_id} moves; by_hand needs one")
-    world = _value(values, ("carrier_from_target", target.target_id), target.carrier_from_target)
-    return replace(m, station_id=station.station_id, pose=world * camera_from_target.inverse() * mount.inverse())
-
-
-def _value(values: _Values, name: ParameterName, parameter: PoseParameter) -> Pose3:
-    if name in values.poses:
-        return values.poses[name]
-    if parameter.treatment == "held":
-        return parameter.value or Pose3()
-    raise SurveyError(f"{' '.join(name)} has no value to plan with; give translation_mm and a rotation in survey.toml")
 
 
 def _check_moving(survey: Survey, moments: Sequence[Moment]) -> None:
@@ -210,7 +86,7 @@ def _check_moving(survey: Survey, moments: Sequence[Moment]) -> None:
             raise SurveyError(f'target {m.target_id} is given poses but is fixed; write motion = "epoch"')
 
 
-def _with_moving(values: _Values, moments: Sequence[Moment]) -> _Values:
+def _with_moving(values: PlannedValues, moments: Sequence[Moment]) -> PlannedValues:
     for m in moments:
         if m.pose is not None:
             name = ("world_from_station", m.station_id) if m.station_id else ("carrier_from_target", str(m.target_id))
@@ -284,10 +160,6 @@ def _seen(
         raise SurveyError(f"{plan.path}: {error}; planning needs a value in survey.toml for everything") from error
 
 
-def _coordinates(ref: PositionRef, sigma: float) -> Coordinates:
-    return Coordinates((ref,), np.zeros((1, 3)), sigma**2 * np.eye(3))
-
-
 def _candidates(
     whole: Survey, everything: Survey, start: StartValues, possible: Sequence[Moment], plan: Plan, project: Project,
     planned: Sequence[Moment],
@@ -304,17 +176,7 @@ def _candidates(
         found = _new_beacon(whole, start, new, plan, project, planned)
         out += [found] if found is not None else []
         blind += [new.name] if found is None else []
-    c: Measurements = plan.candidates
-    out += [Candidate(d.distance_id, "distance", distances=(d,)) for d in c.distances]
-    out += [Candidate(p.name, "coordinates", coordinates=(_coordinates(p.position, p.sigma),)) for p in c.coordinates]
-    out += [Candidate(p.pair_id, "pair", pairs=(p,)) for p in c.pairs]
-    return tuple(out + terrestrial_candidates(_terrestrial(c, whole, start, project))), blind
-
-
-def _terrestrial(part: Measurements, survey: Survey, start: StartValues, project: Project) -> Terrestrial:
-    """Of a part of the plan, with sigmas."""
-    lengths = lengths_between(survey, start)
-    return replace(part.terrestrial, readings=with_usual_sigmas(part.terrestrial.readings, survey, project, lengths))
+    return (*out, *with_usual_sigmas(plan.candidates.singles, whole, start, project)), blind
 
 
 def _epoch_text(m: Moment) -> str:
@@ -334,7 +196,7 @@ def _new_beacon(
     )
     one = Candidate(new.name, "beacon", blocks, points=(point,))
     seen = predict(with_candidates(whole, [one]), start, blocks, plan.seeing)
-    surveyed = (_coordinates(PositionRef(new.name), new.sigma),) if np.isfinite(new.sigma) else ()
+    surveyed = (coordinates_at(PositionRef(new.name), new.sigma),) if np.isfinite(new.sigma) else ()
     if not seen:
         return None
     return replace(one, image_blocks=seen, coordinates=surveyed)

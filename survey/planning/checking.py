@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 from adjust.diagnosis.beforehand import Beforehand, Finding, coverage, look_beforehand
 from adjust.model.errors import SurveyError
 from adjust.model.survey import Survey
-from survey.jobs.adjusting.image_defects import defective
 from survey.jobs.adjusting.steps import with_loops_closed
+from survey.jobs.detecting.image_defects import defective
 from survey.jobs.navigating.task import with_known_points
 from survey.project import Project, read
 

@@ -51,51 +51,52 @@ class ErrorAnalysis:
                      f"{1e3 * self.bounded[0].field.farthest_m:.0f} mm; slopes in px per mm or deg")  # fmt: skip
         head = f"  {'':<18}{'analytic':>10}{'Monte Carlo':>13}{'± s.e.':>8}{'worst point':>13}{'plain worst':>13}"
         lines.append(f"{head}{'its s.e.':>10}{f'for {self.rms_px:g} px':>14}")
-        for f in self.bounded:
-            unit, factor = _unit(f)
-            at = int(np.argmax(np.abs(f.rms / f.analytic - 1)))
-            slopes = f"{f.slope / factor:>10.4f}{f.slope_monte_carlo / factor:>13.4f}{f.slope_se / factor:>8.4f}"
+        for f, r in ((f, _Read(f, self.rms_px)) for f in self.bounded):
             lines.append(
-                f"  {f.kind:<18}{slopes}"
-                f"{100 * np.abs(f.deviation).max():>11.2f} %{100 * abs(f.rms[at] / f.analytic[at] - 1):>11.2f} %"
-                f"{100 * f.rms_se[at] / f.rms[at]:>8.2f} %{factor * tolerance(self.rms_px, f.slope):>9.3f} {unit}"
+                f"  {f.kind:<18}{r.slope:>10.4f}{r.monte_carlo:>13.4f}{r.se:>8.4f}{100 * r.deviation:>11.2f} %"
+                f"{100 * r.plain[r.worst]:>11.2f} %{100 * f.rms_se[r.worst] / f.rms[r.worst]:>8.2f} %"
+                f"{r.tolerance:>9.3f} {r.unit}"
             )
         lines += ["", "  as printed, beacons from 0 mm: the RMS of positions has no expectation, near beacons carry it"]
-        for f in self.paper:
-            unit, factor = _unit(f)
-            slope = float(np.median(f.rms / f.sigmas))
+        for f, r in ((f, _Read(f, self.rms_px)) for f in self.paper):
             lines.append(
-                f"  {f.kind:<18}{slope / factor:>10.2f} px per {unit} (median point), {np.median(f.effective):.0f} of "
-                f"{f.n_trials} trials carry it; {factor * tolerance(self.rms_px, slope):.3f} {unit} for "
-                f"{self.rms_px:g} px"
+                f"  {f.kind:<18}{r.median:>10.2f} px per {r.unit} (median point), {np.median(f.effective):.0f} of "
+                f"{f.n_trials} trials carry it; {r.loose_tolerance:.3f} {r.unit} for {self.rms_px:g} px"
             )
         return "\n".join(lines)
 
 
-def _unit(f: ErrorFigure) -> tuple[str, float]:
-    return ("deg", 180.0 / np.pi) if f.kind == "camera attitude" else ("mm", 1e3)
+class _Read:
+    """A figure in the unit that people read: slopes px per unit, their median, tolerances for the pixels allowed.
+
+    plain: (n,) how far the RMS of the trials is from the analytic one; worst: where most. deviation: of the Monte Carlo
+    with control variate, the largest. loose_tolerance: by the median, where the slope has no expectation.
+    """
+
+    def __init__(self, f: ErrorFigure, rms_px: float) -> None:
+        self.unit, factor = ("deg", 180.0 / np.pi) if f.kind == "camera attitude" else ("mm", 1e3)
+        self.factor = factor
+        self.slope, self.monte_carlo, self.se = (x / factor for x in (f.slope, f.slope_monte_carlo, f.slope_se))
+        median = float(np.median(f.rms / f.sigmas))
+        self.median = median / factor
+        self.deviation, self.plain = float(np.abs(f.deviation).max()), np.abs(f.rms / f.analytic - 1)
+        self.worst = int(np.argmax(self.plain))
+        own = f.slope if np.isfinite(f.slope) else median
+        self.tolerance, self.of_three = (factor * tolerance(x, own) for x in (rms_px, rms_px / np.sqrt(3.0)))
+        self.loose_tolerance = factor * tolerance(rms_px, median)
 
 
 def _entry(f: ErrorFigure, rms_px: float) -> dict[str, object]:
-    unit, factor = _unit(f)
-    median = float(np.median(f.rms / f.sigmas))
-    slope = f.slope if np.isfinite(f.slope) else median
-    return {
-        "kind": f.kind, "nearest_mm": 1e3 * f.field.nearest_m,
-        f"sigma_{unit}": (factor * f.sigmas).tolist(),
-        "monte_carlo_px": f.rms.tolist(), "standard_error_px": f.rms_se.tolist(),
-        "controlled_px": plain(f.controlled),
-        "controlled_standard_error_px": plain(f.controlled_se),
-        "same_draws_px": f.same_draws.tolist(), "analytic_px": plain(f.analytic),
-        f"slope_px_per_{unit}": plain(f.slope / factor),
-        f"slope_monte_carlo_px_per_{unit}": plain(f.slope_monte_carlo / factor),
-        f"slope_standard_error_px_per_{unit}": plain(f.slope_se / factor),
-        f"slope_median_px_per_{unit}": median / factor,
-        "largest_deviation": float(np.abs(f.deviation).max()),
-        "effective_trials": f.effective.tolist(),
-        f"tolerance_{unit}": factor * tolerance(rms_px, slope),
-        f"tolerance_of_three_{unit}": factor * tolerance(rms_px / np.sqrt(3.0), slope),
-    }  # fmt: skip
+    r = _Read(f, rms_px)
+    return dict(plain({
+        "kind": f.kind, "nearest_mm": 1e3 * f.field.nearest_m, f"sigma_{r.unit}": r.factor * f.sigmas,
+        "monte_carlo_px": f.rms, "standard_error_px": f.rms_se, "controlled_px": f.controlled,
+        "controlled_standard_error_px": f.controlled_se, "same_draws_px": f.same_draws, "analytic_px": f.analytic,
+        f"slope_px_per_{r.unit}": r.slope, f"slope_monte_carlo_px_per_{r.unit}": r.monte_carlo,
+        f"slope_standard_error_px_per_{r.unit}": r.se, f"slope_median_px_per_{r.unit}": r.median,
+        "largest_deviation": r.deviation, "effective_trials": f.effective, f"tolerance_{r.unit}": r.tolerance,
+        f"tolerance_of_three_{r.unit}": r.of_three,
+    }))  # fmt: skip
 
 
 def error_analysis_job(
@@ -114,8 +115,8 @@ def error_analysis_job(
 
 
 def _drawn(f: ErrorFigure) -> Markup:
-    unit, factor = _unit(f)
-    x = factor * f.sigmas
+    r = _Read(f, 1.0)
+    x = r.factor * f.sigmas
     title = f"Figure {_NUMBERS[f.kind]}: {f.kind} error"
     if np.isfinite(f.slope):
         lines = [
@@ -127,22 +128,16 @@ def _drawn(f: ErrorFigure) -> Markup:
             Series("Monte Carlo", x, f.rms, d.RED),
             Series("first order, same draws", x, f.same_draws, d.BLUE, line=True),
         ]
-    return chart(lines, title, f"sigma of each component [{unit}]", "RMS error of u [px]")
+    return chart(lines, title, f"sigma of each component [{r.unit}]", "RMS error of u [px]")
 
 
 def _page(a: ErrorAnalysis) -> str:
-    rows = []
-    for f in a.bounded:
-        unit, factor = _unit(f)
-        three = factor * tolerance(a.rms_px / np.sqrt(3.0), f.slope)
-        rows.append((
-            f"{_NUMBERS[f.kind]}", f.kind, fixed(f.slope / factor, 4),
-            f"{fixed(f.slope_monte_carlo / factor, 4)} ± {fixed(f.slope_se / factor, 4)}",
-            fixed(100 * float(np.abs(f.deviation).max()), 2) + " %",
-            fixed(100 * float(np.abs(f.rms / f.analytic - 1).max()), 2) + " %",
-            fixed(100 * float((f.rms_se / f.rms).max()), 2) + " %",
-            f"{general(factor * tolerance(a.rms_px, f.slope), 3)} {unit}", f"{general(three, 3)} {unit}",
-        ))  # fmt: skip
+    rows = [
+        (_NUMBERS[f.kind], f.kind, fixed(r.slope, 4), f"{fixed(r.monte_carlo, 4)} ± {fixed(r.se, 4)}",
+         *(f"{fixed(100 * x, 2)} %" for x in (r.deviation, r.plain.max(), (f.rms_se / f.rms).max())),
+         *(f"{general(x, 3)} {r.unit}" for x in (r.tolerance, r.of_three)))
+        for f, r in ((f, _Read(f, a.rms_px)) for f in a.bounded)
+    ]  # fmt: skip
     columns = ("Figure", "<Error of", "Analytic slope", "Monte Carlo slope", "Worst point", "Plain worst",
                "Its s.e. up to", f"Alone for {a.rms_px:g} px", "One of three")  # fmt: skip
     note = (
@@ -153,13 +148,11 @@ def _page(a: ErrorAnalysis) -> str:
     )
     body = figures(map(_drawn, a.bounded)) + table(columns, rows)
     first = section("bounded", "Figures 4 to 6, beacons not nearer than 100 mm", body, note)
-    lines = []
-    for f in a.paper:
-        unit, factor = _unit(f)
-        slope = float(np.median(f.rms / f.sigmas))
-        allowed = f"{general(factor * tolerance(a.rms_px, slope), 3)} {unit}"
-        carried = f"{np.median(f.effective):,.0f}"
-        lines.append((_NUMBERS[f.kind], f.kind, general(slope / factor, 3), carried, allowed))
+    lines = [
+        (_NUMBERS[f.kind], f.kind, general(r.median, 3), f"{np.median(f.effective):,.0f}",
+         f"{general(r.loose_tolerance, 3)} {r.unit}")
+        for f, r in ((f, _Read(f, a.rms_px)) for f in a.paper)
+    ]  # fmt: skip
     said = (
         "As the paper has it, beacons may be anywhere from depth 0 on. The mean of 1/Z² is then infinite: the RMS of "
         "position errors has no expectation, and a handful of near beacons decides it. Effective: how many of the "

@@ -29,7 +29,8 @@ from survey.planning.building import Planned, build_plan
 from survey.planning.navigation import plan_navigation
 from survey.planning.page import plan_page
 from survey.planning.plan_file import read_plan
-from survey.planning.summary import PlanningOutcome
+from survey.planning.summary import PlanResult, plan_summary
+from survey.planning.text import plan_text
 from survey.planning.wanted import required_sigmas, wanted_components
 from survey.project import Project, atomic_write, read
 from survey.project.project import RESULTS
@@ -53,6 +54,18 @@ class PlanRequest:
     workers: int | None = None
     navigation: bool = False
     place: int = 0
+
+
+class PlanningOutcome(PlanResult):
+    """What was planned, told."""
+
+    def summary(self) -> dict[str, object]:
+        """As plain values."""
+        return plan_summary(self)
+
+    def text(self) -> str:
+        """For people."""
+        return plan_text(self)
 
 
 def planning_job(

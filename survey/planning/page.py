@@ -6,7 +6,7 @@ from markupsafe import Markup
 
 from adjust.design import group_redundancy
 from survey.planning.navigation import NavigationOutcome
-from survey.planning.summary import PlanningOutcome, expected_sigmas, meets, pose_sigmas, tolerance_values
+from survey.planning.summary import PlanResult, expected_sigmas, meets, pose_sigmas, tolerance_values
 from survey.report import drawing as d
 from survey.report import markup as m
 from survey.report.charts import Series, bars, chart, seen_map
@@ -25,7 +25,7 @@ def html_page(title: str, heading: str, sections: list[Markup]) -> str:
     return m.document(title, head + m.joined(sections, "\n"))
 
 
-def plan_page(o: PlanningOutcome) -> str:
+def plan_page(o: PlanResult) -> str:
     """The page of a plan, in English whatever is spoken around it."""
     title = o.title or o.folder.resolve().name
     with speaking("en"):
@@ -36,7 +36,7 @@ def plan_page(o: PlanningOutcome) -> str:
         return html_page(f"{title} – plan", "Plan: expected precision before measuring", [p for p in parts if p])
 
 
-def _summary(o: PlanningOutcome) -> Markup:
+def _summary(o: PlanResult) -> Markup:
     e = o.expected
     cards = [(m.count(e.n_observations), "observations"), (m.count(e.n_unknowns), "unknowns"),
              (m.count(e.redundancy), "redundancy"), (m.count(o.planned.n_planned_epochs), "planned epochs"),
@@ -55,7 +55,7 @@ def _summary(o: PlanningOutcome) -> Markup:
     return m.section("summary", "Summary", body + m.table(columns, rows), said)
 
 
-def _picture(o: PlanningOutcome) -> Markup:
+def _picture(o: PlanResult) -> Markup:
     scale = scale_of(o.expected, "a_priori")
     drawn, enlarged = pictures(scene_of(o.expected, scale), scale.ellipsoid)
     said = (
@@ -65,7 +65,7 @@ def _picture(o: PlanningOutcome) -> Markup:
     return m.section("picture", "The survey", m.figures(drawn), said)
 
 
-def _seen(o: PlanningOutcome) -> Markup:
+def _seen(o: PlanResult) -> Markup:
     blocks = o.planned.survey.image_blocks
     if not blocks:
         return Markup()
@@ -80,7 +80,7 @@ def _seen(o: PlanningOutcome) -> Markup:
     return m.section("seen", "What will be seen", m.element("figure", drawn))
 
 
-def _sigmas(o: PlanningOutcome) -> Markup:
+def _sigmas(o: PlanResult) -> Markup:
     rows = [
         (".".join(name), " \u00a0 ".join(f"{c} {m.sigma_text(sigma)} {unit}".strip() for c, sigma, unit in sigmas))
         for name, sigmas in expected_sigmas(o) if len(name) < 3
@@ -89,7 +89,7 @@ def _sigmas(o: PlanningOutcome) -> Markup:
     return m.section("sigmas", "Expected sigmas", m.table(("<Unknown", "<Sigmas"), rows), said)
 
 
-def _weak(o: PlanningOutcome) -> Markup:
+def _weak(o: PlanResult) -> Markup:
     rows = [
         (m.fixed(w.factor, 0), m.part("lines", [f"{s:+.2f}  {a}: {c}" for a, c, s in w.parts])) for w in o.weak
     ]  # fmt: skip
@@ -100,7 +100,7 @@ def _weak(o: PlanningOutcome) -> Markup:
     return m.section("weak", "Weak directions", m.table(("Factor", "<What moves together"), rows) if rows else "", said)
 
 
-def _selection(o: PlanningOutcome) -> Markup:
+def _selection(o: PlanResult) -> Markup:
     s = o.selection
     if s is None:
         return Markup()
@@ -131,7 +131,7 @@ def _selection(o: PlanningOutcome) -> Markup:
     return m.section("next", "What to add next", body, said)
 
 
-def _tolerances(o: PlanningOutcome) -> Markup:
+def _tolerances(o: PlanResult) -> Markup:
     if o.budget is None:
         return Markup()
     rows, share = [], o.budget.variances / o.budget.variances.sum(axis=0)
@@ -157,7 +157,7 @@ def _factor(value: float) -> str:
     return "any" if value > 1e6 else m.general(value, 3)
 
 
-def _trials(o: PlanningOutcome) -> Markup:
+def _trials(o: PlanResult) -> Markup:
     t = o.trials
     if t is None:
         return Markup()

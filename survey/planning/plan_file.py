@@ -8,15 +8,14 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3
 
-from adjust.design import Seeing
-from adjust.model.observations import Distance, Pair, PositionRef
+from adjust.design import Candidate, Seeing
 from adjust.model.survey import FloatArray, Survey
 from survey.folder.text import id_problem
 from survey.folder.units import to_si
 from survey.planning.plan_navigation import NavigationPlan, read_navigation
-from survey.planning.plan_readings import TERRESTRIAL_KEYS, Terrestrial, few, planned_poses, read_terrestrial, tables_of
+from survey.planning.plan_readings import SINGLES, few, planned_poses, read_singles, tables_of
 from survey.project.declared.node import Node, read_toml
-from survey.project.tables.references import Names, read_frame, read_position
+from survey.project.tables.references import Names
 
 PLAN_FILE = "plan.toml"
 _EPOCH_KEYS = (
@@ -66,15 +65,6 @@ class Moments:
     by_hand: ByHand | None = None
 
 
-@dataclass(frozen=True)
-class PlannedPoint:
-    """Coordinates to be measured; sigma in m."""
-
-    name: str
-    position: PositionRef
-    sigma: float
-
-
 @dataclass(frozen=True, eq=False)
 class NewPoint:
     """A beacon that could be added, with surveyed coordinates (sigma m) or without (nan)."""
@@ -86,14 +76,11 @@ class NewPoint:
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """Epochs and single observations, planned or possible; distances and pairs have no values of their own yet."""
+    """Epochs, single observations and new beacons, planned or possible; observations have no values yet."""
 
     epochs: tuple[Moments, ...] = ()
-    distances: tuple[Distance, ...] = ()
-    coordinates: tuple[PlannedPoint, ...] = ()
-    pairs: tuple[Pair, ...] = ()
+    singles: tuple[Candidate, ...] = ()
     points: tuple[NewPoint, ...] = ()
-    terrestrial: Terrestrial = field(default_factory=Terrestrial)
 
 
 @dataclass(frozen=True)
@@ -122,11 +109,10 @@ class Plan:
 def read_plan(folder: Path, survey: Survey) -> Plan:
     """Read ``plan.toml`` of a project folder. Raises SurveyError with file and line."""
     root, digest = read_toml(Path(folder) / PLAN_FILE)
-    root.allow("image_sigma_px", "seen", "epochs", "distances", "coordinates", "pairs", "candidates", "required",
-               "wanted", "navigation", *TERRESTRIAL_KEYS)  # fmt: skip
+    root.allow("image_sigma_px", "seen", "epochs", "candidates", "required", "wanted", "navigation", *SINGLES)
     names = Names.of(survey)
     candidates = root.table("candidates")
-    candidates.allow("epochs", "distances", "coordinates", "pairs", "points", *TERRESTRIAL_KEYS)
+    candidates.allow("epochs", "points", *SINGLES)
     return Plan(
         path=Path(folder) / PLAN_FILE,
         image_sigma_px=root.si("image_sigma_px", None, True),
@@ -157,11 +143,8 @@ def _seeing(node: Node, survey: Survey) -> Seeing:
 def _measurements(node: Node, survey: Survey, names: Names, prefix: str) -> Measurements:
     return Measurements(
         tuple(_moments(n, survey, i) for i, n in enumerate(tables_of(node, "epochs"))),
-        tuple(_distance(n, names) for n in tables_of(node, "distances")),
-        tuple(p for n in tables_of(node, "coordinates") for p in _coordinates(n, names)),
-        tuple(_pair(n, names) for n in tables_of(node, "pairs")),
+        read_singles(node, names, prefix),
         tuple(_new_point(n, survey) for n in tables_of(node, "points")) if prefix == "c" else (),
-        read_terrestrial(node, names, prefix),
     )
 
 
@@ -236,30 +219,6 @@ def _by_hand(node: Node, survey: Survey) -> ByHand:
         few(node, node.integer("count", 1), "count"), (near, far), node.si("tilt_deg", 40.0),
         node.integer("seed", 0, 1),
     )  # fmt: skip
-
-
-def _distance(node: Node, names: Names) -> Distance:
-    node.allow("name", "from", "to", "sigma_mm")
-    a, b = (read_position(node.text(key), names, node.fail(key)) for key in ("from", "to"))
-    name = node.text("name", f"{node.text('from')}-{node.text('to')}")
-    return Distance(name, a, b, 1.0, node.si("sigma_mm", positive=True))
-
-
-def _coordinates(node: Node, names: Names) -> list[PlannedPoint]:
-    node.allow("of", "sigma_mm")
-    sigma = node.si("sigma_mm", positive=True)
-    return [PlannedPoint(f"coordinates of {text}", read_position(text, names, node.fail("of", i)), sigma)
-            for i, text in enumerate(node.names("of"))]  # fmt: skip
-
-
-def _pair(node: Node, names: Names) -> Pair:
-    node.allow("name", "a", "b", "sigma_rotation_arcsec", "sigma_translation_mm")
-    a, b = (read_frame(node.text(key), names, node.fail(key)) for key in ("a", "b"))
-    turn = node.si("sigma_rotation_arcsec", positive=True)
-    shift = node.si("sigma_translation_mm", None, True)
-    sigmas = [turn] * 3 + ([] if shift is None else [shift] * 3)
-    name = node.text("name", f"{node.text('a')}-{node.text('b')}")
-    return Pair(name, a, b, Pose3(), np.diag(np.square(sigmas)))
 
 
 def _new_point(node: Node, survey: Survey) -> NewPoint:

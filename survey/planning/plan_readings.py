@@ -1,7 +1,7 @@
-"""Readings, levels, alignments, laser spots, surfaces and differences of ``plan.toml``; values are predicted later."""
+"""Single observations of ``plan.toml``, of every kind, as candidates are; values are predicted later."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -13,9 +13,12 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import (
     Alignment,
     CoordinateDifferences,
+    Coordinates,
+    Distance,
     LaserSpot,
     Level,
     OnSurface,
+    Pair,
     PositionRef,
     Reading,
     position_text,
@@ -25,7 +28,7 @@ from survey.project.declared.instruments import setup_problem
 from survey.project.declared.node import Node
 from survey.project.declared.poses import read_pose
 from survey.project.project import Accuracy, Project
-from survey.project.tables.references import Names, read_position, timed_frame
+from survey.project.tables.references import Names, read_frame, read_position, timed_frame
 from survey.project.tables.terrestrial import ANGLES, READING_KINDS
 
 _MOST = 100_000  # of whatever is counted in one place: more nobody measures, and memory ends
@@ -34,23 +37,6 @@ _KEYS = (
     *("setup", "from", "to", "second", "kinds", "sigma_arcsec", "sigma_mm", "instrument_height_mm"),
     "target_height_mm",
 )
-
-
-@dataclass(frozen=True, eq=False)
-class Terrestrial:
-    """Planned observations by field of the survey; sigmas of readings are nan where the instrument's hold."""
-
-    readings: tuple[Reading, ...] = ()
-    levels: tuple[Level, ...] = ()
-    alignments: tuple[Alignment, ...] = ()
-    laser_spots: tuple[LaserSpot, ...] = ()
-    on_surfaces: tuple[OnSurface, ...] = ()
-    coordinate_differences: tuple[CoordinateDifferences, ...] = ()
-
-    def added_to(self, survey: Survey) -> Survey:
-        """The survey with these observations too."""
-        lists: dict[str, Any] = {f.name: getattr(survey, f.name) + getattr(self, f.name) for f in fields(self)}
-        return replace(survey, **lists)
 
 
 def tables_of(node: Node, key: str) -> list[Node]:
@@ -77,40 +63,29 @@ def few(node: Node, n: _Count, key: str) -> _Count:
     return n
 
 
-def read_terrestrial(node: Node, names: Names, prefix: str) -> Terrestrial:
-    """Everything of these kinds. prefix: of the ids. Raises SurveyError."""
-    parts = {key: tables_of(node, key) for key in TERRESTRIAL_KEYS}
-    return Terrestrial(
-        tuple(r for i, n in enumerate(parts["readings"]) for r in _readings(n, names, f"{prefix}{i + 1}")),
-        tuple(_level(n, names, f"{prefix}level{i + 1}") for i, n in enumerate(parts["levels"])),
-        tuple(_alignment(n, names, f"{prefix}alignment{i + 1}") for i, n in enumerate(parts["alignments"])),
-        tuple(_spot(n, names, f"{prefix}spot{i + 1}") for i, n in enumerate(parts["laser_spots"])),
-        tuple(o for n in parts["surfaces"] for o in _on_surface(n, names)),
-        tuple(d for n in parts["coordinate_differences"] for d in _differences(n, names)),
-    )
+def read_singles(node: Node, names: Names, prefix: str) -> tuple[Candidate, ...]:
+    """Every single observation that ``node`` lists, each by itself; readings of one sight together.
+
+    Sigmas of readings are nan where the instrument's hold. prefix: of the ids. Raises SurveyError.
+    """
+    out, readings = list[Candidate](), list[Reading]()
+    for key in _SINGLES:
+        for i, one in enumerate(tables_of(node, key), 1):
+            if key == "readings":
+                readings += _readings(one, names, f"{prefix}{i}")
+            else:
+                out += _SINGLES[key](one, names, f"{prefix}{i}")
+        out += sights(readings) if key == "readings" else []
+    return tuple(out)
 
 
-TERRESTRIAL_KEYS = ("readings", "levels", "alignments", "laser_spots", "surfaces", "coordinate_differences")
-
-
-def terrestrial_candidates(part: Terrestrial) -> list[Candidate]:
-    """Readings of a set-up with one target are one candidate, everything else stands for itself."""
-    sights: dict[str, list[Reading]] = {}
-    for r in part.readings:
+def sights(readings: Iterable[Reading]) -> list[Candidate]:
+    """Readings of a set-up with one target are one candidate."""
+    found: dict[str, list[Reading]] = {}
+    for r in readings:
         ends = [position_text(x) for x in (r.at, r.to, r.second) if x is not None]
-        sights.setdefault(" ".join(dict.fromkeys(ends)), []).append(r)
-    out = [Candidate(name, "sight", readings=tuple(group)) for name, group in sights.items()]
-    out += [Candidate(x.level_id, "level", levels=(x,)) for x in part.levels]
-    out += [Candidate(x.alignment_id, "alignment", alignments=(x,)) for x in part.alignments]
-    out += [Candidate(x.spot_id, "laser", laser_spots=(x,)) for x in part.laser_spots]
-    out += [
-        Candidate(f"{position_text(x.position)} on {x.surface_id}", "surface", on_surfaces=(x,))
-        for x in part.on_surfaces
-    ]
-    return out + [
-        Candidate(f"baseline {position_text(x.at[0])} {position_text(x.to[0])}", "coordinate difference",
-                  coordinate_differences=(x,)) for x in part.coordinate_differences
-    ]  # fmt: skip
+        found.setdefault(" ".join(dict.fromkeys(ends)), []).append(r)
+    return [Candidate(name, "sight", readings=tuple(group)) for name, group in found.items()]
 
 
 def lengths_between(survey: Survey, start: StartValues) -> Callable[[Reading], float]:
@@ -126,12 +101,17 @@ def lengths_between(survey: Survey, start: StartValues) -> Callable[[Reading], f
 
 
 def with_usual_sigmas(
-    readings: tuple[Reading, ...], survey: Survey, project: Project, distance: Callable[[Reading], float]
-) -> tuple[Reading, ...]:
-    """Readings with the sigmas of their instruments where the plan gives none. Raises SurveyError where none is known.
+    singles: Sequence[Candidate], survey: Survey, start: StartValues, project: Project
+) -> list[Candidate]:
+    """Sigmas of instruments for readings that the plan gives none; raises SurveyError where none is known."""
+    distance = lengths_between(survey, start)
+    return [replace(c, readings=_with_sigmas(c.readings, survey, project, distance)) for c in singles]
 
-    distance: m between the ends of a reading, for what depends on it.
-    """
+
+def _with_sigmas(
+    readings: Sequence[Reading], survey: Survey, project: Project, distance: Callable[[Reading], float]
+) -> tuple[Reading, ...]:
+    """distance: m between the ends of a reading, for what depends on it."""
     instruments = {s.setup_id: s.instrument_id for s in survey.setups}
     out = []
     for r in readings:
@@ -193,39 +173,81 @@ def _axis(node: Node, key: str) -> FloatArray:
     return np.asarray(sign * np.eye(3)["xyz".index(name)])
 
 
-def _level(node: Node, names: Names, name: str) -> Level:
+def _distance(node: Node, names: Names, _: str) -> list[Candidate]:
+    node.allow("name", "from", "to", "sigma_mm")
+    a, b = (_position(node, key, names) for key in ("from", "to"))
+    name = node.text("name", f"{node.text('from')}-{node.text('to')}")
+    distance = Distance(name, a, b, 1.0, node.si("sigma_mm", positive=True))
+    return [Candidate(name, "distance", distances=(distance,))]
+
+
+def _coordinates(node: Node, names: Names, _: str) -> list[Candidate]:
+    node.allow("of", "sigma_mm")
+    sigma = node.si("sigma_mm", positive=True)
+    refs = ((text, read_position(text, names, node.fail("of", i))) for i, text in enumerate(node.names("of")))
+    return [Candidate(f"coordinates of {text}", "coordinates", coordinates=(coordinates_at(ref, sigma),))
+            for text, ref in refs]  # fmt: skip
+
+
+def coordinates_at(ref: PositionRef, sigma: float) -> Coordinates:
+    """Coordinates of a position to be measured, sigma m each."""
+    return Coordinates((ref,), np.zeros((1, 3)), sigma**2 * np.eye(3))
+
+
+def _pair(node: Node, names: Names, _: str) -> list[Candidate]:
+    node.allow("name", "a", "b", "sigma_rotation_arcsec", "sigma_translation_mm")
+    a, b = (read_frame(node.text(key), names, node.fail(key)) for key in ("a", "b"))
+    turn = node.si("sigma_rotation_arcsec", positive=True)
+    shift = node.si("sigma_translation_mm", None, True)
+    sigmas = [turn] * 3 + ([] if shift is None else [shift] * 3)
+    name = node.text("name", f"{node.text('a')}-{node.text('b')}")
+    return [Candidate(name, "pair", pairs=(Pair(name, a, b, Pose3(), np.diag(np.square(sigmas))),))]
+
+
+def _level(node: Node, names: Names, number: str) -> list[Candidate]:
     node.allow("frame", "axis", "sigma_arcsec")
     frame = timed_frame(node.text("frame"), names, node.fail("frame"))
-    return Level(node.text("name", name), frame, _axis(node, "axis"), 0.0, node.si("sigma_arcsec", positive=True))
+    name, sigma = node.text("name", f"{number[0]}level{number[1:]}"), node.si("sigma_arcsec", positive=True)
+    return [Candidate(name, "level", levels=(Level(name, frame, _axis(node, "axis"), 0.0, sigma),))]
 
 
-def _alignment(node: Node, names: Names, name: str) -> Alignment:
+def _alignment(node: Node, names: Names, number: str) -> list[Candidate]:
     node.allow("a", "axis_a", "b", "axis_b", "sigma_arcsec")
-    sigma = node.si("sigma_arcsec", positive=True)
+    sigma, name = node.si("sigma_arcsec", positive=True), f"{number[0]}alignment{number[1:]}"
     a, b = (timed_frame(node.text(key), names, node.fail(key)) for key in ("a", "b"))
-    return Alignment(name, a, _axis(node, "axis_a"), b, _axis(node, "axis_b"), np.zeros(2), sigma**2 * np.eye(2))
+    found = Alignment(name, a, _axis(node, "axis_a"), b, _axis(node, "axis_b"), np.zeros(2), sigma**2 * np.eye(2))
+    return [Candidate(name, "alignment", alignments=(found,))]
 
 
-def _spot(node: Node, names: Names, name: str) -> LaserSpot:
+def _spot(node: Node, names: Names, number: str) -> list[Candidate]:
     node.allow("beam", "target", "epoch", "sigma_mm")
     beam = node.reference("beam", (b.beam_id for b in names.survey.beams), "beam")
     target = node.reference("target", (t.target_id for t in names.survey.targets), "target")
-    sigma = node.si("sigma_mm", positive=True)
-    return LaserSpot(name, beam, node.text("epoch"), target, np.zeros(2), sigma**2 * np.eye(2))
+    sigma, name = node.si("sigma_mm", positive=True), f"{number[0]}spot{number[1:]}"
+    spot = LaserSpot(name, beam, node.text("epoch"), target, np.zeros(2), sigma**2 * np.eye(2))
+    return [Candidate(name, "laser", laser_spots=(spot,))]
 
 
-def _on_surface(node: Node, names: Names) -> list[OnSurface]:
+def _on_surface(node: Node, names: Names, _: str) -> list[Candidate]:
     node.allow("surface", "of", "sigma_mm")
     surface = node.reference("surface", (s.surface_id for s in names.survey.surfaces), "surface")
     sigma = node.si("sigma_mm", positive=True)
-    return [OnSurface(surface, p, sigma) for p in _positions(node, "of", names)]
+    return [Candidate(f"{position_text(p)} on {surface}", "surface", on_surfaces=(OnSurface(surface, p, sigma),))
+            for p in _positions(node, "of", names)]  # fmt: skip
 
 
-def _differences(node: Node, names: Names) -> list[CoordinateDifferences]:
+def _differences(node: Node, names: Names, _: str) -> list[Candidate]:
     node.allow("from", "to", "sigma_mm")
-    at = _position(node, "from", names)
-    sigma = node.si("sigma_mm", positive=True)
-    return [
-        CoordinateDifferences((at,), (to,), np.zeros((1, 3)), sigma**2 * np.eye(3))
-        for to in _positions(node, "to", names)
-    ]
+    at, sigma = _position(node, "from", names), node.si("sigma_mm", positive=True)
+    found = (CoordinateDifferences((at,), (to,), np.zeros((1, 3)), sigma**2 * np.eye(3))
+             for to in _positions(node, "to", names))  # fmt: skip
+    return [Candidate(f"baseline {position_text(at)} {position_text(d.to[0])}", "coordinate difference",
+                      coordinate_differences=(d,)) for d in found]  # fmt: skip
+
+
+_SINGLES: Mapping[str, Callable[[Node, Names, str], Sequence[Any]]] = {
+    "distances": _distance, "coordinates": _coordinates, "pairs": _pair, "readings": _readings, "levels": _level,
+    "alignments": _alignment, "laser_spots": _spot, "surfaces": _on_surface, "coordinate_differences": _differences,
+}  # fmt: skip
+"""How single observations are read, by the key of their tables."""
+SINGLES = tuple(_SINGLES)

@@ -2,17 +2,17 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import combinations, product
+from itertools import combinations, islice, product
 
 import numpy as np
 from gtsam import Pose3
 
-from adjust.design import Seeing
+from adjust.design import Candidate, Seeing
 from adjust.model.observations import FrameRef, Pair, Reading
 from adjust.model.result import Adjustment
 from adjust.model.survey import Camera, FloatArray, Survey, Target
 from survey.planning.plan_file import ByHand, Measurements, Moment, Moments, Plan
-from survey.planning.plan_readings import Terrestrial
+from survey.planning.plan_readings import sights
 from survey.project import Project
 from survey.solution.frames import AdjustedFrames
 
@@ -32,8 +32,8 @@ def usual_plan(project: Project, expected: Adjustment) -> Plan:
     """
     survey = expected.survey
     epochs = (*_by_hand(survey, expected), *_by_table(survey))
-    terrestrial = Terrestrial(readings=tuple(_sights(survey))[: 3 * _MOST])
-    candidates = Measurements(epochs=epochs, pairs=tuple(_pairs(survey))[:_MOST], terrestrial=terrestrial)
+    pairs = [Candidate(p.pair_id, "pair", pairs=(p,)) for p in islice(_pairs(survey), _MOST)]
+    candidates = Measurements(epochs, (*pairs, *sights(islice(_sights(survey), 3 * _MOST))))
     return Plan(project.folder / "survey.toml", None, Seeing(), Measurements(), candidates)
 
 

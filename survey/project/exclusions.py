@@ -20,23 +20,25 @@ spot         ``camera/epoch/spot``; u_px and v_px tell which one it was when it 
 ===========  ========================================================================================
 """
 
-import csv
-import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from adjust.model.errors import SurveyError
 from survey.folder.plain import attributes
-from survey.folder.text import csv_text, decode, read_bytes, read_text, suggestion
+from survey.folder.text import csv_rows, csv_text, decode, read_bytes, read_text, suggestion
 from survey.project.tables.reading import LARGEST_ROWS, Layout, check_header
 
 EXCLUSIONS_FILE = "exclusions.csv"
 WHAT = ("image_point", "image", "target", "point", "epoch", "camera", "reading", "spot")
 EXCLUDED, INCLUDED = "excluded", "included"
 EXCLUSIONS = Layout("exclusions", ("what", "id"), (), ("state", "reason", "author", "time"), ("u_px", "v_px"))
-_PARTS = {"image_point": (3, 4), "image": (2,), "target": (1, 3), "epoch": (1,), "camera": (1,), "spot": (3,)}
+_FORMS = {
+    "image_point": ("camera/epoch/target/point", "camera/epoch/point"), "image": ("camera/epoch",),
+    "target": ("target", "camera/epoch/target"), "point": ("target/point", "point"), "epoch": ("epoch",),
+    "camera": ("camera",), "spot": ("camera/epoch/spot",),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -51,9 +53,11 @@ class Name:
         return self.id if self.what == "reading" else f"{self.what}:{self.id}"
 
     @property
-    def parts(self) -> tuple[str, ...]:
-        """The ids that make up the id; a reading has its table and its id."""
-        return tuple(self.id.split(":", 1) if self.what == "reading" else self.id.split("/"))
+    def meant(self) -> dict[str, str]:
+        """The ids that make up the id, by what they are; of any but a reading."""
+        forms = [form.split("/") for form in _FORMS[self.what]]
+        parts = self.id.rsplit("/", max(map(len, forms)) - 1)
+        return dict(zip(next(form for form in forms if len(form) == len(parts)), parts, strict=True))
 
 
 @dataclass(frozen=True)
@@ -91,11 +95,9 @@ def name_problem(what: str, text: str) -> str | None:
     if what == "point":
         return None if text else "id: is blank; fill it in"
     parts = text.split("/")
-    if all(parts) and len(parts) in _PARTS[what]:
+    if all(parts) and any(form.count("/") + 1 == len(parts) for form in _FORMS[what]):
         return None
-    forms = {"image_point": "camera/epoch/target/point", "image": "camera/epoch", "spot": "camera/epoch/spot",
-             "target": "target or camera/epoch/target"}  # fmt: skip
-    return f"id: found {text!r}; {what.replace('_', ' ')} is written {forms.get(what, what)}"
+    return f"id: found {text!r}; {what.replace('_', ' ')} is written {' or '.join(_FORMS[what])}"
 
 
 def read_exclusions(folder: Path) -> tuple[tuple[Row, ...], str]:
@@ -109,28 +111,22 @@ def read_exclusions(folder: Path) -> tuple[tuple[Row, ...], str]:
     if not path.is_file():
         return (), ""
     data, digest = read_bytes(path)
-    text = decode(path, data)
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    header: list[str] | None = None
-    rows: list[Row] = []
-    begin = 1
-    try:
-        for cells in reader:
-            line, begin = begin, reader.line_num + 1
-            if not any(cells) or cells[0].lstrip().startswith("#"):
-                continue
-            if header is None:
-                header = cells
-                check_header(path, header, EXCLUSIONS)
-                continue
-            rows.append(_row(path, line, header, cells))
-            if len(rows) > LARGEST_ROWS:
-                raise SurveyError(f"{path}:{line}: more than {LARGEST_ROWS} rows; exclude whole images or epochs")
-    except csv.Error as error:
-        raise SurveyError(f"{path}:{begin}: not a CSV line ({error}); correct the quotes") from error
+    lines = _lines(path, decode(path, data))
+    _, header = next(lines, (1, None))
     if header is None:
         raise SurveyError(f"{path}:1: the file is empty; the first line names the columns: what,id,state,reason")
+    check_header(path, header, EXCLUSIONS)
+    rows: list[Row] = []
+    for line, cells in lines:
+        rows.append(_row(path, line, header, cells))
+        if len(rows) > LARGEST_ROWS:
+            raise SurveyError(f"{path}:{line}: more than {LARGEST_ROWS} rows; exclude whole images or epochs")
     return tuple(rows), digest
+
+
+def _lines(path: Path, text: str) -> Iterator[tuple[int, list[str]]]:
+    """The header and the rows, each with its line."""
+    return ((n, cells) for n, cells in csv_rows(path, text) if any(cells) and not cells[0].lstrip().startswith("#"))
 
 
 def _row(path: Path, line: int, header: Sequence[str], cells: Sequence[str]) -> Row:
@@ -182,7 +178,7 @@ def appended(path: Path, rows: Sequence[Row]) -> str:
     if not text.strip():
         header, text = list(EXCLUSIONS.columns), text + ",".join(EXCLUSIONS.columns) + "\n"
     else:
-        header, line = _header_of(text)
+        line, header = next(_lines(path, text))
         needed = [name for name in EXCLUSIONS.columns
                   if name not in header and any(c[name] not in ("", EXCLUDED) for c in cells)]  # fmt: skip
         lines = text.splitlines(keepends=True)
@@ -191,13 +187,6 @@ def appended(path: Path, rows: Sequence[Row]) -> str:
         header, text = [*header, *needed], "".join(lines)
     text += "" if text.endswith("\n") else "\n"
     return text + csv_text([one[name] for name in header] for one in cells)
-
-
-def _header_of(text: str) -> tuple[list[str], int]:
-    """The names of the columns, and the line on which they stand."""
-    lines = csv.reader(io.StringIO(text, newline=""), strict=True)
-    header = next(cells for cells in lines if any(cells) and not cells[0].lstrip().startswith("#"))
-    return header, lines.line_num
 
 
 def _cells(row: Row) -> dict[str, str]:

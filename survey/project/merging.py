@@ -1,7 +1,5 @@
 """Two project folders as one: what is new is put behind what is there, and every line remembers where it came from."""
 
-import csv
-import io
 import re
 import shutil
 import tomllib
@@ -13,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from adjust.model.errors import SurveyError
-from survey.folder.replacing import copy_folder
-from survey.folder.text import atomic_write, csv_text, read_text, suggestion
+from survey.folder.text import atomic_write, csv_rows, csv_text, read_text, suggestion
+from survey.folder.whole import copy_folder
 from survey.project.declared.node import read_toml
 from survey.project.declared.toml_text import KeyPath, key_lines, toml_text
 from survey.project.detected import ImageKey, file_of
@@ -206,7 +204,7 @@ def _link_into(path: Path, merged: Merged) -> None:
 def _merge_table(merged: Merged, old: Path, new: Path, target: Path) -> None:
     new_header, new_rows = table_rows(new)
     text = read_text(old).replace("\r\n", "\n") if old.is_file() else ""
-    old_header = next(csv.reader(io.StringIO(text, newline=""), strict=True), new_header)
+    _, old_header = next(csv_rows(old, text), (1, new_header))
     header = [*old_header, *(name for name in new_header if name not in old_header)]
     as_it_is = bool(text) and len(header) == len(old_header) and "\r" not in text
     parts = [(new, new_header, new_rows)]
@@ -230,9 +228,8 @@ def _merge_table(merged: Merged, old: Path, new: Path, target: Path) -> None:
 
 def table_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Header, and the rows with their lines; what is there was read as a table before."""
-    reader = csv.reader(io.StringIO(read_text(path), newline=""), strict=True)
-    header = next(reader)
-    return header, [(reader.line_num, row) for row in reader if row]
+    (_, header), *rows = csv_rows(path, read_text(path))
+    return header, rows
 
 
 def _take_images(merged: Merged) -> None:

@@ -30,6 +30,7 @@ from survey.project.declared.poses import flat_point, read_point
 from survey.project.declared.targets import read_targets
 from survey.project.detected import DetectedImage, ImageKey, ImageNews, image_news, read_detected
 from survey.project.exclusions import EXCLUSIONS, EXCLUSIONS_FILE, Exclusion, in_force, read_exclusions
+from survey.project.finding import near
 from survey.project.images import find_images, sought_in
 from survey.project.observed import Observed, union
 from survey.project.omitting import without
@@ -39,12 +40,11 @@ from survey.project.project import (
     IMAGES_FOLDER,
     OBSERVATIONS_FOLDER,
     Definition,
-    LeftOut,
     Project,
     Sigmas,
     SpotsRequest,
 )
-from survey.project.tables.files import Begun, begin_tables, read_table
+from survey.project.tables.files import Begun, begun_table, large_tables, read_table
 from survey.project.tables.image_points import read_image_blocks, read_spots, world_names
 from survey.project.tables.kinds import GROUPS, KINDS, LAYOUTS, with_observations
 from survey.project.tables.reading import Layout, Table
@@ -57,36 +57,37 @@ def read_definition(folder: Path) -> Definition:
         return _read_definition(Path(folder))[0]
 
 
-def read(folder: Path, meanwhile: Callable[[bool], object] = lambda _: None) -> Project:
+def read(folder: Path, meanwhile: Callable[[], object] = lambda: None) -> Project:
     """Read a whole project folder; tables of observations that are not there yet are empty. Raises SurveyError.
 
     What ``exclusions.csv`` leaves out is not used. ``notes`` say which of its rows name nothing, ``image_notes``
-    which images are not those any more that the points come from. meanwhile: called while large tables are being read,
-    with whether that of image points is one of them.
+    which images are not those any more that the points come from. meanwhile: called while large tables are being read.
     """
     project = read_all(folder, meanwhile=meanwhile)
     return leaving_out(project, in_force(read_exclusions(project.folder / OBSERVATIONS_FOLDER)[0]).values())
 
 
 def read_all(
-    folder: Path, texts: Mapping[str, str] = MappingProxyType({}), meanwhile: Callable[[bool], object] = lambda _: None
+    folder: Path, texts: Mapping[str, str] = MappingProxyType({}), meanwhile: Callable[[], object] = lambda: None
 ) -> Project:
     """:func:`read`, with what is excluded as if it were not.
 
     texts: what is to stand in files of the folder, not yet written, by their paths in it.
     """
     place = Path(folder) / OBSERVATIONS_FOLDER
-    with settled(Path(folder)), Beside() as beside:
-        begun = begin_tables(place, LAYOUTS, beside) if not texts else {}
-        if begun:
-            meanwhile(any(path.stem == "image_points" for path in begun))
-        definition, root = _read_definition(Path(folder), texts.get(DEFINITION_FILE))
-        tables = _read_tables(place, {Path(folder) / name: text for name, text in texts.items()}, begun)
-        begun.clear()
-        _, digest = read_exclusions(place)
-        known = read_detected(place)
-        images = _image_news(definition, tables, known)
-    project = _observed(definition, root, tables)
+    with settled(Path(folder)), Beside() as loading:
+        large = [] if texts or loading.alone else large_tables(place, LAYOUTS)
+        loaded = loading.of(meanwhile if large else lambda: None)
+        with Beside() as reading:
+            begun = {path: begun_table(path, reading) for path in large}
+            definition, root = _read_definition(Path(folder), texts.get(DEFINITION_FILE))
+            tables = _read_tables(place, {Path(folder) / name: text for name, text in texts.items()}, begun)
+            begun.clear()
+            _, digest = read_exclusions(place)
+            known = read_detected(place)
+            images = _image_news(definition, tables, known)
+        project = _observed(definition, root, tables)
+        loaded()
     hashes = dict(sorted({**project.inputs, f"{OBSERVATIONS_FOLDER}/{EXCLUSIONS_FILE}": digest}.items()))
     if digest:
         project = dataclasses.replace(project, inputs=hashes)
@@ -109,10 +110,10 @@ def leaving_out(project: Project, exclusions: Iterable[Exclusion]) -> Project:
             hits.append(hit)
         else:
             notes.append(f"{path}:{one.line}: {one.name} is left out, but nothing has that name; "
-                         f"{observed.near(one.name)}")  # fmt: skip
-        found.append(LeftOut(one, len(hit.images), hit.n_image_points, hit.n_spots, hit.n_readings))
-    survey, spots = without(project.survey, project.spots, hits)
+                         f"{near(observed, one.name)}")  # fmt: skip
+        found.append(hit.left_out(one))
     every = union(hits)
+    survey, spots = without(project.survey, project.spots, every)
     in_files = _n_unused(survey) - (every.n - every.n_spots)
     return dataclasses.replace(
         project, survey=survey, spots=spots, left_out=tuple(found), n_left_out=every.n, n_unused_in_files=in_files,

@@ -6,11 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
-from adjust.model.survey import BoolArray, FloatArray
+from adjust.model.arrays import ranked
+from adjust.model.result import Adjustment
+from adjust.model.survey import BoolArray, Camera, FloatArray, IntArray
 from adjust.testing.distributions import beta, norm
 from survey.report import drawing as d
 from survey.report.language import esc, known, localised, t
 from survey.report.markup import MINUS, count
+from survey.solution.residual_tables import ImageRows
 from survey.solution.statistics import CorrelationMatrix
 
 WIDTH = 316.0
@@ -34,18 +37,28 @@ class CameraResiduals:
     suspect: BoolArray
 
 
+def camera_residuals(adjustment: Adjustment, rows: ImageRows, suspect: BoolArray, camera: Camera) -> CameraResiduals:
+    """Of one of the cameras; ``suspect``: of all image points (N,)."""
+    found = adjustment.image_residuals
+    blocks = [i for i, b in enumerate(adjustment.survey.image_blocks) if b.camera_id == camera.camera_id]
+    mine = _rows_of(blocks, found.block_ptr)
+    return CameraResiduals(camera.camera_id, camera.image_size, rows.uv[mine], found.residuals[mine],
+                           found.standardized[mine], found.used[mine], suspect[mine])  # fmt: skip
+
+
+def _rows_of(blocks: Sequence[int], ptr: IntArray) -> IntArray | slice:
+    """Rows of these blocks, as a slice where they follow each other: then nothing is copied."""
+    if len(blocks) and blocks[-1] - blocks[0] == len(blocks) - 1:
+        return slice(int(ptr[blocks[0]]), int(ptr[blocks[-1] + 1]))
+    return np.concatenate([np.zeros(0, dtype=np.int64), *(np.arange(ptr[b], ptr[b + 1]) for b in blocks)])
+
+
 def _frame(size: tuple[int, int], title: str) -> tuple[float, float, list[str]]:
     """Pixels of the picture per image pixel, height of the image, and the parts to start with."""
     scale = WIDTH / size[0]
     height = scale * size[1]
-    return (
-        scale,
-        height,
-        [
-            d.heading(title),
-            d.rect(0.5, _ABOVE, WIDTH - 1, height, d.FRAME, f' stroke="{d.FAINT}"'),
-        ],
-    )
+    frame = d.rect(0.5, _ABOVE, WIDTH - 1, height, d.FRAME, f' stroke="{d.FAINT}"')
+    return scale, height, [d.heading(title), frame]
 
 
 def _arrow_scale(lengths: FloatArray, wanted: float) -> float:
@@ -164,7 +177,7 @@ def heat_map(m: CorrelationMatrix) -> Markup:
 
 
 def quantiles(name: str, w: FloatArray) -> Markup:
-    """A Q-Q plot of sorted values; the band is that of order statistics (beta distribution)."""
+    """A Q-Q plot of values; the band is that of order statistics (beta distribution)."""
     n, side, pad = len(w), 240.0, 26.0
     keep = np.unique(np.concatenate([np.arange(min(n, 40)), np.linspace(0, n - 1, 160).astype(int),
                                      np.arange(max(0, n - 40), n)]))  # fmt: skip
@@ -183,7 +196,7 @@ def quantiles(name: str, w: FloatArray) -> Markup:
         d.polygon(band, d.BAND, "none"),
         d.polyline(at(np.array([-reach, reach]), np.array([-reach, reach])), d.GREY, 0.9),
     ]
-    parts += [d.dot(a, b, 1.7, d.BLUE) for a, b in at(x, w[keep])]
+    parts += [d.dot(a, b, 1.7, d.BLUE) for a, b in at(x, ranked(w, keep))]
     for tick in range(-int(reach) + 1, int(reach), 2 if reach > 4 else 1):
         parts.append(d.text(middle + unit * tick, side - 4, f"{tick}".replace("-", MINUS), "middle", 9))
         parts.append(d.text(4, middle + 11 - unit * tick, f"{tick}".replace("-", MINUS), "start", 9))

@@ -44,6 +44,13 @@ class Context:
     statistics: Statistics | None = None
     listed: Listed | None = None
 
+    @property
+    def found(self) -> Statistics:
+        """The statistics, for sections that are about nothing else; raises ValueError where there are none."""
+        if self.statistics is None:
+            raise ValueError("only the adjustment itself is reported")
+        return self.statistics
+
 
 def worst(values: FloatArray, most: int) -> IntArray:
     """Positions of the largest absolute values, largest first, equal ones in their order; NaN comes last."""

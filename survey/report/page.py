@@ -55,8 +55,10 @@ _SECTIONS = (
 )
 
 
+_LAST = "all-observations"
+"""Of the sections that are made when there are statistics, that which has a part of its own without them."""
 _OF_STATISTICS = frozenset((
-    "tolerances", "components", "parts", "all-observations", "reliability", "relative", "budget", "correlations",
+    "tolerances", "components", "parts", "reliability", "relative", "budget", "correlations", _LAST,
 ))  # fmt: skip
 
 
@@ -104,7 +106,8 @@ def finished_page(begun: BegunPage, solution: dict[str, Any], found: Statistics 
     """The whole page; arguments as of :func:`report_html`."""
     c = replace(begun.context, solution=solution, statistics=found)
     with speaking(begun.language):
-        made = begun.made | {anchor: make(c) for _, anchor, make in _SECTIONS if anchor in _OF_STATISTICS}
+        made = begun.made | {anchor: make(c) if found is not None or anchor == _LAST else Markup()
+                             for _, anchor, make in _SECTIONS if anchor in _OF_STATISTICS}  # fmt: skip
         nav = part("nav", [(anchor, t(name)) for name, anchor, _ in _SECTIONS if made[anchor]])
         title = f"{c.solution['summary']['title'] or c.run.folder} – {t('Adjustment report')}"
         shown = overview.header(c) + nav + joined((made[anchor] for _, anchor, _ in _SECTIONS), "\n")

@@ -103,6 +103,11 @@ def begun_results(
     """
     files = ResultFiles(place, writing)
     rows = writing.of(lambda: image_rows(adjustment))
+
+    def begun() -> BegunPage:
+        return begun_page(adjustment, run, {**solution_dict(adjustment, run), **more}, rows(), options.language)
+
+    page = writing.of(begun)  # first: what follows shares out its work
     parquet = options.parquet or (place.parent / RESULTS / PARQUET).is_file()  # there: not to be old
     files.begin({
         "covariance.npz": lambda: covariance_npz(adjustment, run.sigmas),
@@ -110,11 +115,7 @@ def begun_results(
         **({PARQUET: lambda: image_residuals_parquet(adjustment)} if parquet else {}),
         "residuals_other.csv": lambda: other_residuals_csv(adjustment),
     })  # fmt: skip
-
-    def page() -> BegunPage:
-        return begun_page(adjustment, run, {**solution_dict(adjustment, run), **more}, rows(), options.language)
-
-    return BegunResults(files, writing.of(page))
+    return BegunResults(files, page)
 
 
 def finished_results(

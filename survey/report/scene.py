@@ -3,8 +3,9 @@
 Also the view in space, to be turned around on the screen: lines, points and ellipsoids as plain values for the page.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -187,9 +188,14 @@ def scene_values(adjustment: Adjustment, scale: Scale, drawn: Scene | None = Non
     taken = dict.fromkeys((b.camera_id, b.epoch_id) for b in adjustment.survey.image_blocks)
     shown = set(_shown(adjustment))
     poses = {key: frames.world_from(FrameRef("camera", *key)) for key in taken if every or key[1] in shown}
+    return drawn_values(drawn, scale.ellipsoid, {"/".join(k): pose for k, pose in poses.items() if pose is not None})
+
+
+def drawn_values(drawn: Scene, ellipsoid: float, images: Mapping[str, Pose3] = MappingProxyType({})) -> dict[str, Any]:
+    """The same of any scene; images: ``world_from_camera`` by image."""
     return dict(plain({
-        "ellipsoid": scale.ellipsoid,
-        "images": {"/".join(key): pose.matrix()[:3].ravel() for key, pose in poses.items() if pose is not None},
+        "ellipsoid": ellipsoid,
+        "images": {name: pose.matrix()[:3].ravel() for name, pose in images.items()},
         "cameras": {s.label: {"index": s.camera_idx, "half_angles_rad": s.half_angles} for s in drawn.shots},
         "spots": [{"id": s.label, "kind": s.kind, "x": x, "cov": cov} for s, x, cov in zip(
             drawn.spots, drawn.spot_places().tolist(), drawn.spot_covs().reshape(-1, 9).tolist(), strict=True)],
@@ -207,20 +213,8 @@ def space(adjustment: Adjustment, scale: Scale, scene: Scene) -> Markup:
     if not len(everything):
         return Markup()
     extent = float(np.linalg.norm(np.ptp(everything, axis=0)))
-    places, covs = _seven_digits(scene.spot_places()), _seven_digits(scene.spot_covs())
-    spots = [replace(s, x=x, cov=cov) for s, x, cov in zip(scene.spots, places, covs, strict=True)]
-    data = scene_values(adjustment, scale, replace(scene, spots=spots))
-    data |= {"enlarged": enlargement(scene, scale.ellipsoid, extent)}
-    short = {key: value if key == "spots" else _short(value) for key, value in data.items()}
-    return part("space", of="report.html") + json_script("space-data", json_of(short))
-
-
-def _seven_digits(x: FloatArray) -> FloatArray:
-    """As :func:`_short` has them, of many numbers at once."""
-    size = np.abs(x)
-    places = 6.0 - np.floor(np.log10(size, out=np.zeros_like(size), where=size > 0.0))
-    power = 10.0 ** np.abs(places)
-    return np.where(places >= 0.0, np.rint(x * power) / power, np.rint(x / power) * power)
+    data = scene_values(adjustment, scale, scene) | {"enlarged": enlargement(scene, scale.ellipsoid, extent)}
+    return part("space", of="report.html") + json_script("space-data", json_of(_short(data)))
 
 
 def _short(value: object) -> object:

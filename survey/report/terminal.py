@@ -1,7 +1,7 @@
 """The summary of an adjustment for the terminal: about twenty-five aligned lines, the worst first."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,14 +25,19 @@ def summary_text(adjustment: Adjustment, run: RunInfo, solution: dict[str, Any] 
     solution: that of :func:`survey.solution.dictionary.solution_dict`, made here where it is not given.
     """
     solution = solution_dict(adjustment, run) if solution is None else solution
-    lines: list[str] = []
-    for part in (_head, _warnings, _figures, _exclusions, _groups, _cameras, _terms, _network, _loops, _published):
-        lines += part(solution)
-    lines += _observations(adjustment, solution["summary"]["suspects"]["standardized_limit"])
-    lines += _points(solution)
-    if run.seconds:
-        lines += ["", "  " + ", ".join(f"{step} {seconds:.2f} s" for step, seconds in run.seconds.items())]
-    return "\n".join(line.rstrip() for line in lines) + "\n"
+    limit = solution["summary"]["suspects"]["standardized_limit"]
+    parts = (_head, _figures, _exclusions, _groups, _cameras, _terms, _network, _loops, _published)
+    took = [", ".join(f"{step} {seconds:.2f} s" for step, seconds in run.seconds.items())] if run.seconds else []
+    blocks = [list(part(solution)) for part in parts]
+    blocks += [list(_observations(adjustment, limit)), list(_points(solution)), [f"  {said}" for said in took]]
+    return "\n\n".join("\n".join(map(str.rstrip, block)) for block in blocks if block) + "\n"
+
+
+def _few(rows: Sequence[str], most: int, what: str) -> Iterator[str]:
+    """The first ones, and how many more there are; ``what`` begins as the line does, with ``{n}``."""
+    yield from rows[:most]
+    if len(rows) > most:
+        yield what.format(n=len(rows) - most)
 
 
 def _number(value: float | None, width: int, decimals: int) -> str:
@@ -47,19 +52,13 @@ def _head(solution: dict[str, Any]) -> Iterator[str]:
     s = solution["summary"]
     yield f"{_cut(s['title'] or solution['inputs']['folder'], 70)}: {_WORDS[s['verdict']]}"
     yield s["reason"]
-
-
-def _warnings(solution: dict[str, Any]) -> Iterator[str]:
-    warnings = solution["warnings"]
-    yield from ("  ".join([f"  ! {w}", *anchors_in(w)]) for w in warnings[:_MOST_WARNINGS])
-    if len(warnings) > _MOST_WARNINGS:
-        yield f"  ! and {len(warnings) - _MOST_WARNINGS} more, see the report"
+    warnings = ["  ".join([f"  ! {w}", *anchors_in(w)]) for w in solution["warnings"]]
+    yield from _few(warnings, _MOST_WARNINGS, "  ! and {n} more, see the report")
 
 
 def _figures(solution: dict[str, Any]) -> Iterator[str]:
     s, test = solution["summary"], solution["summary"]["global_test"]
     found = s["suspects"]
-    yield ""
     yield (
         f"  sigma0 {_number(s['sigma0'], 0, 4)}   observations {s['n_observations']}   unknowns {s['n_unknowns']}   "
         f"redundancy {s['redundancy']}   iterations {s['iterations']}"
@@ -93,7 +92,6 @@ def _figures(solution: dict[str, Any]) -> Iterator[str]:
 def _exclusions(solution: dict[str, Any]) -> Iterator[str]:
     found = solution["exclusions"]
     if found:
-        yield ""
         yield f"  excluded by people ({len(found)})"
     for e in found[-_MOST_EXCLUSIONS:]:
         w = e["largest_standardized_residual"]
@@ -107,25 +105,19 @@ def _exclusions(solution: dict[str, Any]) -> Iterator[str]:
 def _groups(solution: dict[str, Any]) -> Iterator[str]:
     groups = sorted(solution["groups"].items(), key=lambda x: -abs(x[1]["deviation"] or 0.0))
     if groups:
-        yield ""
         yield f"  {'group':<18}{'observations':>13}{'redundancy':>12}{'variance factor':>17}"
-    for name, g in groups[:_MOST_GROUPS]:
-        factor = _number(g["variance_factor"], 17, 3)
-        yield f"  {_cut(name, 18):<18}{g['n_observations']:>13}{g['redundancy']:>12.1f}{factor}"
-    if len(groups) > _MOST_GROUPS:
-        yield f"  and {len(groups) - _MOST_GROUPS} more groups"
+    rows = [f"  {_cut(name, 18):<18}{g['n_observations']:>13}{g['redundancy']:>12.1f}"
+            f"{_number(g['variance_factor'], 17, 3)}" for name, g in groups]  # fmt: skip
+    yield from _few(rows, _MOST_GROUPS, "  and {n} more groups")
 
 
 def _cameras(solution: dict[str, Any]) -> Iterator[str]:
     cameras = sorted(solution["cameras"].items(), key=lambda x: -(x[1]["rms_residual_px"] or 0.0))
     if cameras:
-        yield ""
         yield f"  {'camera':<18}{'images':>7}{'points':>9}{'RMS px':>9}   largest sigma of the lens"
-    for camera_id, c in cameras[:_MOST_CAMERAS]:
-        rms = _number(c["rms_residual_px"], 9, 3)
-        yield f"  {_cut(camera_id, 18):<18}{c['n_images']:>7}{c['n_image_points']:>9}{rms}   {_lens(c.get('lens'))}"
-    if len(cameras) > _MOST_CAMERAS:
-        yield f"  and {len(cameras) - _MOST_CAMERAS} more cameras"
+    rows = [f"  {_cut(camera_id, 18):<18}{c['n_images']:>7}{c['n_image_points']:>9}"
+            f"{_number(c['rms_residual_px'], 9, 3)}   {_lens(c.get('lens'))}" for camera_id, c in cameras]  # fmt: skip
+    yield from _few(rows, _MOST_CAMERAS, "  and {n} more cameras")
 
 
 def _lens(lens: dict[str, Any] | None) -> str:
@@ -156,14 +148,12 @@ def _terms(solution: dict[str, Any]) -> Iterator[str]:
                for key in ("lens_drift", "lens_crop", "lens_shared") if key in e]  # fmt: skip
     owners += [(f"{kind[:-1]} {k}", e["clock"]) for kind in ("cameras", "tables", "stations")
                for k, e in having(solution[kind], "clock").items()]  # fmt: skip
-    rows = [(k, term, test) for k, e in owners for term, test in e.get("significance", {}).items()]
-    if rows:
-        yield ""
-    for name, term, test in rows[:_MOST_TERMS]:
+    rows = []
+    for name, term, test in ((k, *one) for k, e in owners for one in e.get("significance", {}).items()):
         said = _SAID.get(term, _SAID[""])[not test["significant"]]
-        yield f"  {_cut(name, 26):<26}  {_cut(term.replace('_', ' '), 24):<24}  {said}, p {test['p_value']:.2g}"
-    if len(rows) > _MOST_TERMS:
-        yield f"  and {len(rows) - _MOST_TERMS} more terms"
+        shown = f"{_cut(name, 26):<26}  {_cut(term.replace('_', ' '), 24):<24}"
+        rows.append(f"  {shown}  {said}, p {test['p_value']:.2g}")
+    yield from _few(rows, _MOST_TERMS, "  and {n} more terms")
 
 
 def _network(solution: dict[str, Any]) -> Iterator[str]:
@@ -171,7 +161,6 @@ def _network(solution: dict[str, Any]) -> Iterator[str]:
     if n is None:
         return
     what = "poses" if n["equations_per_condition"] == 6 else "rotations"
-    yield ""
     yield (
         f"  network: {n['n_stations']} stations, {n['measured_pairs']} of {n['measurable_pairs']} pairs measured, "
         f"{n['independent_unknown_poses']} unknown {what}"
@@ -188,33 +177,27 @@ def _loops(solution: dict[str, Any]) -> Iterator[str]:
     found = solution.get("loops")
     if not found or not found["n_loops"]:
         return
-    yield ""
     how = ", closed by the adjustment" if found["form"] == "closed" else ""
     yield f"  loops: {found['n_loops']}{how}, of which {found['n_failed']} do not close as measured; worst, and after"
     for e in found["worst_first"][:_MOST_LOOPS]:
-        size = f"{e['misclosure_arcsec']:.4g}″" + (f" {e['misclosure_mm']:.4g} mm" if "misclosure_mm" in e else "")
-        flag = "" if e["closes"] else "  OPEN"
-        yield f"  {_cut(' '.join(e['stations']), 40):<40}{size:>22} {_left(e):>14}  p {e['p_value']:.2g}{flag}"
+        flag, left = "" if e["closes"] else "  OPEN", _size(e, "misclosure_after", 1e-6)
+        names = _cut(" ".join(e["stations"]), 40)
+        yield f"  {names:<40}{_size(e, 'misclosure'):>22} {left:>14}  p {e['p_value']:.2g}{flag}"
     for name, e in solution.get("closures", {}).items():
-        size = f"{e['misclosure_arcsec']:.4g}″" + (f" {e['misclosure_mm']:.4g} mm" if "misclosure_mm" in e else "")
-        play = f"{e['play_arcsec']:.4g}″" + (f" {e['play_mm']:.4g} mm" if "play_mm" in e else "")
-        yield f"  mount {_cut(name, 34):<34}{size:>22} {play:>14}  p {e['p_value']:.2g}"
+        play = _size(e, "play")
+        yield f"  mount {_cut(name, 34):<34}{_size(e, 'misclosure'):>22} {play:>14}  p {e['p_value']:.2g}"
 
 
-def _left(e: dict[str, Any]) -> str:
-    """The misclosure that is left; what is below a microarcsecond or a nanometre is none."""
-    turn, shift = e.get("misclosure_after_arcsec"), e.get("misclosure_after_mm")
-    if turn is None:
-        return ""
-    parts = [f"{turn if turn > 1e-6 else 0:.4g}″"]
-    return " ".join(parts + ([] if shift is None else [f"{shift if shift > 1e-6 else 0:.4g} mm"]))
+def _size(e: dict[str, Any], what: str, least: float = 0.0) -> str:
+    """The parts of a misclosure or play that there are; what is not above ``least`` is none."""
+    parts = ((e.get(f"{what}_arcsec"), "″"), (e.get(f"{what}_mm"), " mm"))
+    return " ".join(f"{x if x > least else 0:.4g}{unit}" for x, unit in parts if x is not None)
 
 
 def _published(solution: dict[str, Any]) -> Iterator[str]:
     found = solution.get("published")
     if not found:
         return
-    yield ""
     yield "  published methods, step by step, beside this adjustment"
     if "head" in found:
         heads = f"{'published':>11}{'claimed σ':>10}{'σ':>9}{'joint':>11}{'σ':>9}{'difference':>11}{'ratio':>7}"
@@ -249,7 +232,6 @@ def _observations(adjustment: Adjustment, limit: float) -> Iterator[str]:
     size, used = adjustment.other_arrays.largest, np.flatnonzero(adjustment.other_arrays.used)
     worst = used[np.argsort(-size[used], kind="stable")][:_MOST_OTHER].tolist()
     if worst:
-        yield ""
         yield "  largest standardized residuals"
     for k in worst:
         o = adjustment.other_residuals[k]
@@ -262,7 +244,6 @@ def _points(solution: dict[str, Any]) -> Iterator[str]:
     sized = {k: p["ellipsoid_95_semi_axes_mm"][0] for k, p in solution["points"].items()}
     worst = sorted(sized, key=lambda k: -sized[k])[:_MOST_POINTS]
     if worst:
-        yield ""
         heading = f"least precise of {len(sized)} points"
         yield f"  {heading:<32}{'sigma x y z mm':>24}{'95 % semi-axis mm':>20}"
     for name in worst:

@@ -1,6 +1,8 @@
 """Fresh noise on every observation and prior of a survey, drawn around the truth with its own covariance."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -15,16 +17,12 @@ from survey.simulate.scene import Scene, Truth
 
 @dataclass(frozen=True, eq=False)
 class _Ideal:
-    """Error-free readings of one survey, and the factors that turn white noise into theirs."""
+    """Error-free image points (N, 2) px of a survey, factors (N, 2, 2) of their noise, and other readings by field."""
 
     scene: Scene
-    uv: FloatArray  # (N, 2) px over all blocks
-    uv_factor: FloatArray  # (N, 2, 2)
-    block_ends: list[int]
-    table: list[FloatArray]
-    pairs: list[Pose3 | Rot3]
-    distances: list[float]
-    coordinates: list[FloatArray]
+    uv: FloatArray
+    uv_factor: FloatArray
+    others: dict[str, list[Any]]
 
 
 _IDEAL: WeakKeyDictionary[Survey, _Ideal] = WeakKeyDictionary()
@@ -38,54 +36,28 @@ def resample(survey: Survey, truth: Truth, seed: int) -> Survey:
     """
     ideal = _IDEAL.get(survey)
     if ideal is None or ideal.scene.truth is not truth:
-        ideal = _ideal(Scene(survey, truth))
-        _IDEAL[survey] = ideal
+        ideal = _IDEAL[survey] = _ideal(Scene(survey, truth))
     rng = np.random.default_rng(seed)
-    noise = np.einsum("nij,nj->ni", ideal.uv_factor, rng.standard_normal(ideal.uv.shape))
-    parts = np.split(ideal.uv + noise, ideal.block_ends[:-1]) if ideal.block_ends else []
-    again = replace(
-        survey,
-        image_blocks=tuple(replace(b, uv=uv) for b, uv in zip(survey.image_blocks, parts, strict=True)),
-        table_readings=tuple(
-            replace(r, angles=angles + draw(r.cov, rng))
-            for r, angles in zip(survey.table_readings, ideal.table, strict=True)
-        ),
-        pairs=tuple(
-            replace(p, b_from_a=moved(value, draw(p.cov, rng)))
-            for p, value in zip(survey.pairs, ideal.pairs, strict=True)
-        ),
-        distances=tuple(
-            replace(d, value=value + d.sigma * rng.standard_normal())
-            for d, value in zip(survey.distances, ideal.distances, strict=True)
-        ),
-        coordinates=tuple(
-            replace(c, values=values + draw(c.cov, rng).reshape(-1, 3))
-            for c, values in zip(survey.coordinates, ideal.coordinates, strict=True)
-        ),
-    )
+    uv = ideal.uv + np.einsum("nij,nj->ni", ideal.uv_factor, rng.standard_normal(ideal.uv.shape))
+    ends = np.cumsum([len(block.uv) for block in survey.image_blocks])
+    parts = np.split(uv, ends[:-1]) if len(ends) else []
+    blocks = tuple(replace(b, uv=part) for b, part in zip(survey.image_blocks, parts, strict=True))
+    drawn: dict[str, Any] = {}
+    for name, (_, noisy) in _KINDS.items():
+        rows = zip(getattr(survey, name), ideal.others[name], strict=True)
+        drawn[name] = tuple(noisy(item, true, rng) for item, true in rows)
+    again = replace(survey, image_blocks=blocks, **drawn)
     return replace(with_drawn_priors(again, rng, truth), **fresh_readings(ideal.scene, rng))
 
 
 def _ideal(scene: Scene) -> _Ideal:
     survey = scene.survey
-    images: list[FloatArray] = [np.zeros((0, 2))]
-    factors: list[FloatArray] = [np.zeros((0, 2, 2))]
-    for block in survey.image_blocks:
-        images.append(scene.image(block))
-        factors.append(np.asarray(np.linalg.cholesky(block.cov), dtype=np.float64))
-    uv = np.concatenate(images)
+    uv = np.concatenate([np.zeros((0, 2)), *map(scene.image, survey.image_blocks)])
     if np.isnan(uv).any():
         raise ValueError("the survey has image points that its truth puts behind the camera")
-    return _Ideal(
-        scene,
-        uv,
-        np.concatenate(factors),
-        np.cumsum([len(block.uv) for block in survey.image_blocks]).tolist(),
-        [_true_angles(scene, r) for r in survey.table_readings],
-        [_true_pair(scene, pair) for pair in survey.pairs],
-        [float(np.linalg.norm(scene.position(d.b) - scene.position(d.a))) for d in survey.distances],
-        [np.array([scene.position(p) for p in c.positions]) for c in survey.coordinates],
-    )
+    factors = np.concatenate([np.zeros((0, 2, 2)), *(np.linalg.cholesky(block.cov) for block in survey.image_blocks)])
+    others = {name: [true(scene, item) for item in getattr(survey, name)] for name, (true, _) in _KINDS.items()}
+    return _Ideal(scene, uv, factors, others)
 
 
 def _true_angles(scene: Scene, reading: TableReading) -> FloatArray:
@@ -101,3 +73,18 @@ def _true_pair(scene: Scene, pair: Pair) -> Pose3 | Rot3:
     late = sum(scene.courses.late(("pose_clock", f.frame_id), clocks[f.frame_id], str(f.epoch_id)) for f in moving[:1])
     b_from_a = np.linalg.inv(scene.world_from_frame(pair.b, late)) @ scene.world_from_frame(pair.a, late)
     return Rot3(b_from_a[:3, :3]) if isinstance(pair.b_from_a, Rot3) else Pose3(b_from_a)
+
+
+_KINDS: dict[str, tuple[Callable[[Scene, Any], Any], Callable[[Any, Any, np.random.Generator], Any]]] = {
+    "table_readings": (_true_angles, lambda r, true, rng: replace(r, angles=true + draw(r.cov, rng))),
+    "pairs": (_true_pair, lambda p, true, rng: replace(p, b_from_a=moved(true, draw(p.cov, rng)))),
+    "distances": (
+        lambda scene, d: float(np.linalg.norm(scene.position(d.b) - scene.position(d.a))),
+        lambda d, true, rng: replace(d, value=true + d.sigma * rng.standard_normal()),
+    ),
+    "coordinates": (
+        lambda scene, c: np.array([scene.position(p) for p in c.positions]),
+        lambda c, true, rng: replace(c, values=true + draw(c.cov, rng).reshape(-1, 3)),
+    ),
+}
+"""By field of a survey what is true of an observation, and that with noise; drawn in this order."""

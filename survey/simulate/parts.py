@@ -6,6 +6,7 @@ out in the frame of the table: outer axis x level, inner axis z upright when bot
 obliquely above the table. World is the frame of the board.
 """
 
+from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
@@ -162,36 +163,37 @@ def shoot_board_by_hand(draft: Draft, camera_id: str, n: int) -> None:
     """``n`` epochs with the head taken off the table and held before the board."""
     camera = draft.truth["station_from_camera", camera_id]
     camera_from_station = np.linalg.inv(camera.matrix()) if isinstance(camera, Pose3) else np.eye(4)
-    border = outline(BOARD, _BOARD_BORDER)
     for number in range(n):
-        for _ in range(_TRIALS):
-            world_from_camera = np.linalg.inv(hand_pose(draft, camera_id, BOARD, number, (0.45, 1.0)))
-            shot = Shot(camera_id, f"h{camera_id}{number + 1:02d}", ("board",))
-            name = ("world_from_station", "head", shot.epoch_id)
-            draft.truth[name] = Pose3(world_from_camera @ camera_from_station)
-            if draft.outline_visible(shot, "board", border, 8.0):
-                draft.shots.append(shot)
-                break
-        else:
-            raise ValueError(f"no pose of camera {camera_id} shows the whole board")
+        shot = Shot(camera_id, f"h{camera_id}{number + 1:02d}", ("board",))
+        for camera_from_board in _by_hand(draft, shot, number, (0.45, 1.0), _BOARD_BORDER):
+            pose = Pose3(np.linalg.inv(camera_from_board) @ camera_from_station)
+            draft.truth["world_from_station", "head", shot.epoch_id] = pose
 
 
 def shoot_target_by_hand(
     draft: Draft, camera_id: str, target_id: str, epochs: list[str], distance_m: tuple[float, float], border_m: float
 ) -> None:
     """A target held before a camera of a fixed station, once per epoch."""
-    kind = draft.kinds[target_id]
     for number, epoch_id in enumerate(epochs):
         shot = Shot(camera_id, epoch_id, (target_id,))
         world_from_camera = draft.scene().world_from_camera(camera_id)
-        for _ in range(_TRIALS):
-            camera_from_target = hand_pose(draft, camera_id, kind, number, distance_m)
+        for camera_from_target in _by_hand(draft, shot, number, distance_m, border_m):
             draft.truth["carrier_from_target", target_id, epoch_id] = Pose3(world_from_camera @ camera_from_target)
-            if draft.outline_visible(shot, target_id, outline(kind, border_m), 8.0):
-                draft.shots.append(shot)
-                break
-        else:
-            raise ValueError(f"no pose of {target_id} is fully in camera {camera_id}")
+
+
+def _by_hand(
+    draft: Draft, shot: Shot, number: int, distance_m: tuple[float, float], border_m: float
+) -> Iterator[FloatArray]:
+    """camera_from_target (4, 4) to be made true, until the image shows the whole target; it is taken then."""
+    (target_id,) = shot.target_ids
+    kind = draft.kinds[target_id]
+    border = outline(kind, border_m)
+    for _ in range(_TRIALS):
+        yield hand_pose(draft, shot.camera_id, kind, number, distance_m)
+        if draft.outline_visible(shot, target_id, border, 8.0):
+            draft.shots.append(shot)
+            return
+    raise ValueError(f"no pose of {target_id} is fully in camera {shot.camera_id}")
 
 
 def world_from_room(draft: Draft) -> FloatArray:

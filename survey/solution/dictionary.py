@@ -11,7 +11,7 @@ from adjust.model.result import Adjustment, GroupSummary
 from adjust.precision.precision import in_conditions
 from survey.folder.plain import attributes, plain
 from survey.project.detected import DetectedImage
-from survey.project.observed import Hits, Observed, name_of_residual
+from survey.project.observed import IMAGES, Hits, Observed, name_of_residual
 from survey.project.project import LeftOut
 from survey.solution import quantities as q
 from survey.solution.instruments import instrument_entries
@@ -215,7 +215,7 @@ def _exclusion(
     adjustment: Adjustment, one: LeftOut, hit: Hits, observed: Observed, others: Mapping[str, Any]
 ) -> dict[str, Any]:
     said, ptr, images = one.exclusion, adjustment.image_residuals.block_ptr, adjustment.image_residuals
-    sizes = [np.abs(images.standardized[ptr[i] : ptr[i + 1]][mask]).ravel() for i, mask in hit.images.items()]
+    sizes = [np.abs(images.standardized[ptr[i] : ptr[i + 1]][mask]).ravel() for i, mask in hit.of(IMAGES).items()]
     sizes += [np.abs(others[name].standardized).ravel() for name in observed.names(hit) if name in others]
     known = np.concatenate([*sizes, np.zeros(0)])
     known = known[np.isfinite(known)]

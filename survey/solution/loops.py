@@ -6,18 +6,18 @@ rig the cameras and targets whose poses on their station are held or have a full
 of its frames, each joined to the station.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from gtsam import Pose3, Rot3
+from gtsam import Pose3
 
 from adjust.model.names import natural_key
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, PoseParameter, Survey
-from adjust.observations.pairs import PairArrays, pair_arrays
+from adjust.observations.pair_arrays import PairArrays, pair_arrays
 from adjust.pose_network.loops import loop_vectors
 from adjust.pose_network.network import Topology
 from adjust.relay.closed import play
@@ -29,7 +29,6 @@ from survey.solution.quantities import ARCSEC_PER_RAD
 
 ALPHA = 0.001
 """Error probability of the test of all loops together."""
-_MOST_LOOPS = 1000
 _Ends = list[tuple[str, str, str]]
 _GIVEN = "given:"  # no station's id holds a colon
 _WORLD = "world"
@@ -217,14 +216,6 @@ def loops_after(adjustment: Adjustment, loops: LoopMisclosures) -> FloatArray:
     return w
 
 
-def motion_arrays(of: Sequence[Pose3 | Rot3], dim: int) -> Motions:
-    """Rotations or poses (then all of them) as arrays; of poses the rotations alone where ``dim`` is 3."""
-    rotation = np.array([(m.rotation() if isinstance(m, Pose3) else m).matrix() for m in of])
-    if dim == 3:
-        return Motions(rotation)
-    return Motions(rotation, np.array([m.translation() for m in of if isinstance(m, Pose3)]))
-
-
 def network_dict(network: PairNetwork) -> dict[str, Any]:
     """The counts as plain values."""
     c = network.counts
@@ -257,11 +248,17 @@ def loops_dict(
     sigma_misclosure: along the direction of the misclosure. after: misclosures (L, dim) by the adjusted pairs. form:
     "poses" or "closed", as asked for. solved_by: "poses" or "conditions", how the pairs were adjusted.
     """
-    failed = set(loops.failed(ALPHA).tolist())
-    order = np.argsort(loops.p_value, kind="stable")[:_MOST_LOOPS].tolist()
+    failed = np.zeros(len(loops.test), dtype=np.bool_)
+    failed[loops.failed(ALPHA)] = True
+    order, out = np.argsort(loops.p_value, kind="stable"), set(left_out)
+    columns = misclosure_columns(loops.vector, loops.cov)
+    columns |= {"test": loops.test, "p_value": loops.p_value}
+    if after is not None:
+        columns |= {key: size for key, _, size in _lengths("misclosure_after", after)}
+    rows = zip(*(column[order].tolist() for column in columns.values()), strict=True)
     return {
-        "n_loops": len(loops.test),
-        "n_failed": len(failed),
+        "n_loops": len(order),
+        "n_failed": int(failed.sum()),
         "n_listed": len(order),
         "minimal": loops.basis.minimal,
         "note": loops.basis.note,
@@ -269,14 +266,11 @@ def loops_dict(
         "form": form,
         "solved_by": solved_by,
         "worst_first": [
-            _loop(loops, k, k in failed, set(left_out)) | ({} if after is None else _after(after[k])) for k in order
+            _walk(loops, k, out) | {"freedom": loops.vector.shape[1], "closes": not failed[k]}
+            | dict(zip(columns, row, strict=True))
+            for k, row in zip(order.tolist(), rows, strict=True)
         ],
-    }
-
-
-def _after(w: FloatArray) -> dict[str, Any]:
-    out = {"misclosure_after_arcsec": float(ARCSEC_PER_RAD * np.linalg.norm(w[:3]))}
-    return out if len(w) == 3 else out | {"misclosure_after_mm": float(1e3 * np.linalg.norm(w[3:]))}
+    }  # fmt: skip
 
 
 def closures_dict(adjustment: Adjustment) -> dict[str, Any]:
@@ -285,21 +279,17 @@ def closures_dict(adjustment: Adjustment) -> dict[str, Any]:
     sigma: of the mount, as given. play_over_sigma: length of the play over its sigmas, of dim components.
     """
     survey, out = adjustment.survey, {}
-    by_id = {p.pair_id: p for p in survey.pairs}
+    every, number = pair_arrays(survey.pairs), {p.pair_id: e for e, p in enumerate(survey.pairs)}
     of_pairs = adjustment.other_residuals if survey.closures else ()
     found = {o.ids[0]: np.asarray(o.residual) for o in of_pairs if o.kind == "pair"}
     for closure in survey.closures:
-        pairs = [by_id[i] for i in closure.pair_ids]
-        dim = 6 if all(isinstance(p.b_from_a, Pose3) for p in pairs) else 3
-        covs = np.array([np.asarray(p.cov)[:dim, :dim] for p in pairs])
-        motions = motion_arrays([p.b_from_a for p in pairs], dim)
-        loop = loop_misclosures(MeasuredPairs(topology(_ends(pairs)), motions, covs))
-        w, cov = loop.vector[0], loop.cov[0]
+        rows = [number[i] for i in closure.pair_ids]
+        pairs, dim = [survey.pairs[e] for e in rows], 6 if every.is_pose[rows].all() else 3
+        motions = Motions(every.rotations[rows], every.translations[rows] if dim == 6 else None)
+        loop = loop_misclosures(MeasuredPairs(topology(_ends(pairs)), motions, every.cov[rows, :dim, :dim]))
         entry: dict[str, Any] = {"pairs": list(closure.pair_ids), "used": pairs[-1].used}
         entry |= {"sigma_arcsec": ARCSEC_PER_RAD * closure.rotation_sigma, "sigma_mm": 1e3 * closure.translation_sigma}
-        entry["misclosure_arcsec"], entry["sigma_misclosure_arcsec"] = _along(w[:3], cov[:3, :3], ARCSEC_PER_RAD)
-        if dim == 6:
-            entry["misclosure_mm"], entry["sigma_misclosure_mm"] = _along(w[3:], cov[3:, 3:], 1e3)
+        entry |= {key: float(of[0]) for key, of in misclosure_columns(loop.vector, loop.cov).items()}
         entry |= {"test": loop.test[0], "freedom": dim, "p_value": loop.p_value[0]}
         v = found.get(closure.pair_ids[-1])
         if v is not None:
@@ -312,18 +302,27 @@ def closures_dict(adjustment: Adjustment) -> dict[str, Any]:
     return out
 
 
-def _loop(loops: LoopMisclosures, k: int, failed: bool, left_out: set[str]) -> dict[str, Any]:
-    w, cov = loops.vector[k], loops.cov[k]
+def _walk(loops: LoopMisclosures, k: int, left_out: set[str]) -> dict[str, Any]:
     pairs = _real(loops.basis.pairs(k))
-    entry: dict[str, Any] = {"stations": list(loops.basis.stations(k)), "pairs": list(pairs)}
-    entry["misclosure_arcsec"], entry["sigma_misclosure_arcsec"] = _along(w[:3], cov[:3, :3], ARCSEC_PER_RAD)
-    if len(w) == 6:
-        entry["misclosure_mm"], entry["sigma_misclosure_mm"] = _along(w[3:], cov[3:, 3:], 1e3)
-    entry |= {"test": loops.test[k], "freedom": len(w), "p_value": loops.p_value[k], "closes": not failed}
-    return entry | {"pairs_not_used": [p for p in pairs if p in left_out]}
+    return {"stations": list(loops.basis.stations(k)), "pairs": list(pairs),
+            "pairs_not_used": [p for p in pairs if p in left_out]}  # fmt: skip
 
 
-def _along(w: FloatArray, cov: FloatArray, factor: float) -> tuple[float, float]:
-    size = float(np.linalg.norm(w))
-    sigma = float(np.sqrt(w @ cov @ w)) / size if size > 0.0 else float(np.sqrt(np.trace(cov) / 3.0))
-    return factor * size, factor * sigma
+def _lengths(name: str, w: FloatArray) -> Iterator[tuple[str, slice, FloatArray]]:
+    """Of the parts of misclosures (L, 3 or 6): key with its unit, components, lengths (L,) in that unit."""
+    parts = (("arcsec", slice(3), ARCSEC_PER_RAD), ("mm", slice(3, 6), 1e3))
+    for unit, of, factor in parts[: w.shape[1] // 3]:
+        yield f"{name}_{unit}", of, factor * np.linalg.norm(w[:, of], axis=1)
+
+
+def misclosure_columns(w: FloatArray, cov: FloatArray) -> dict[str, FloatArray]:
+    """Lengths (L,) of misclosures (L, 3 or 6), and their sigmas along them; of none at all, the mean sigma."""
+    out: dict[str, FloatArray] = {}
+    for key, of, size in _lengths("misclosure", w):
+        part, C = w[:, of], cov[:, of, of]
+        length = np.linalg.norm(part, axis=1)
+        along = np.einsum("li,lij,lj->l", part, C, part) / np.where(length > 0.0, length, 1.0) ** 2
+        variance = np.where(length > 0.0, along, np.trace(C, axis1=1, axis2=2) / 3.0)
+        factor = ARCSEC_PER_RAD if key.endswith("_arcsec") else 1e3
+        out |= {key: size, f"sigma_{key}": factor * np.sqrt(variance)}
+    return out

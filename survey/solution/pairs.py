@@ -8,12 +8,11 @@ from gtsam import Pose3
 from adjust.model.observations import frame_text
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.survey import FloatArray, IntArray
-from adjust.observations.pairs import pair_arrays
+from adjust.observations.pair_arrays import pair_arrays
 from adjust.precision.precision import Precision
 from adjust.spatial.rigid_motions import Motions
 from adjust.testing.distributions import chi2
 from survey.solution.frames import AdjustedFrames
-from survey.solution.loops import motion_arrays
 from survey.solution.quantities import ARCSEC_PER_RAD, Scale, motion_columns, pair_sigmas
 from survey.solution.records import Column, Form, Records, Tree
 
@@ -62,7 +61,8 @@ def _adjusted(adjustment: Adjustment) -> tuple[FloatArray, tuple[list[str], list
     a, b = (np.array([number[name] for name in names], dtype=np.int64) for names in ends)
     place = [frames.world_from(r) for r in ref.values()]
     known = np.array([p is not None for p in place])
-    world = motion_arrays([Pose3() if p is None else p for p in place], 6)
+    at = np.array([(Pose3() if p is None else p).matrix() for p in place])
+    world = Motions(at[:, :3, :3], at[:, :3, 3])
     return known[a] & known[b], ends, world[b].inverse() @ world[a]
 
 
@@ -70,12 +70,11 @@ def _covariances(adjustment: Adjustment) -> tuple[FloatArray, IntArray]:
     """Of the adjusted pairs (E, 6, 6), and how many components of them there are (E,), 0 where none."""
     precision, pairs = adjustment.precision, adjustment.survey.pairs
     found = precision.pair_covariances() if isinstance(precision, Precision) else {}
-    covs = [found.get(p.pair_id) for p in pairs]
-    out, size = np.zeros((len(pairs), 6, 6)), np.array([0 if c is None else len(c) for c in covs], dtype=np.int64)
-    for dim in (3, 6):
-        rows = np.flatnonzero(size == dim)
-        out[rows, :dim, :dim] = np.array([covs[e] for e in rows.tolist()]).reshape(-1, dim, dim)
-    return out, size
+    covs = [found.get(p.pair_id, np.zeros((0, 0))) for p in pairs]
+    out = np.zeros((len(pairs), 6, 6))
+    for e, cov in enumerate(covs):
+        out[e, : len(cov), : len(cov)] = cov
+    return out, np.array(list(map(len, covs)), dtype=np.int64)
 
 
 def _tests(adjustment: Adjustment) -> tuple[dict[str, FloatArray], IntArray]:

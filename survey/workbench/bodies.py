@@ -189,7 +189,7 @@ DECISIONS: Mapping[str, Asked] = {
 
 def told_changes(changes: "Changes | None", most: int | None) -> dict[str, Any] | None:
     """What an adjustment changed, its summaries in the language that is spoken."""
-    from survey.workbench.views import in_words
+    from survey.workbench.views.project import in_words
 
     found = None if changes is None else changes.as_dict(most)
     return found and found | {k: in_words(found[k]) for k in ("before", "after")}

@@ -10,11 +10,11 @@ from adjust.model.errors import SurveyError
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write, read_text
 from survey.jobs.adjusting.edits import changed_files, kept_name, left_out
-from survey.jobs.detecting import author_name
-from survey.jobs.excluding import FILE, included_rows, new_rows
+from survey.jobs.excluding import FILE, author_name, included_rows, new_rows
 from survey.project.declared.editing import with_datum, with_sigma_scale, with_treatment
 from survey.project.exclusions import Exclusion, Name, Row, appended, in_force, read_exclusions
-from survey.project.observed import Observed, union
+from survey.project.finding import find
+from survey.project.observed import IMAGES, Observed, union
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER, Project
 from survey.project.reading import leaving_out, read_all
 from survey.report.language import message
@@ -73,7 +73,7 @@ class Deciding(Resident):
         epochs = {e for _, e in images} - {e for _, e in kept}
         return {
             "names": [str(n) for n in found], "text": message(hits.text()), "n_image_points": hits.n_image_points,
-            "n_readings": hits.n_readings, "n_spots": hits.n_spots, "n_images": len(hits.images),
+            "n_readings": hits.n_readings, "n_spots": hits.n_spots, "n_images": len(hits.of(IMAGES)),
             "images_lost": ["/".join(x) for x in sorted(images - kept)], "epochs_lost": sorted(epochs),
         }  # fmt: skip
 
@@ -256,4 +256,4 @@ class Deciding(Resident):
         for name in self.situation.exclusions:
             if str(name) == text:
                 return name
-        return observed.find(text)
+        return find(observed, text)

@@ -92,7 +92,7 @@ class Guard:
             await self.app(scope, receive, send)
             return
         headers = {k.decode("latin-1"): v.decode("latin-1") for k, v in scope["headers"]}
-        refused = self._refused(scope, headers)
+        refused = self.refused(scope, headers)
         if refused is not None and scope["type"] == "websocket":
             await send({"type": "websocket.close", "code": 1008})
             return
@@ -102,7 +102,8 @@ class Guard:
             return
         await self.app(scope, _limited(receive) if scope["type"] == "http" else receive, answer)
 
-    def _refused(self, scope: Scope, headers: Mapping[str, str]) -> tuple[int, str] | None:
+    def refused(self, scope: Scope, headers: Mapping[str, str]) -> tuple[int, str] | None:
+        """Why a request is refused, with the status, or None."""
         is_socket, path, method = scope["type"] == "websocket", scope["path"], scope.get("method")
         if not is_from_here(headers.get("host", ""), headers.get("origin"), needed=is_socket):
             return 403, NOT_FROM_HERE

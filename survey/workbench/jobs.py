@@ -12,7 +12,6 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, PoseParameter
-from survey.folder.plain import plain
 from survey.folder.replacing import changing, replace_parts
 from survey.project.project import DEFINITION_FILE, RESULTS
 from survey.report.language import text_said
@@ -29,8 +28,7 @@ if TYPE_CHECKING:  # detection brings in OpenCV, planning much else
     from survey.detection import ImageReport
     from survey.jobs.adjusting.outcome import AdjustOutcome
     from survey.jobs.cross_validation import CrossValidation
-    from survey.planning.job import PlanRequest
-    from survey.planning.summary import PlanningOutcome
+    from survey.planning.job import PlanningOutcome, PlanRequest
     from survey.solution.dictionary import RunInfo
 
 _MOST_LINES = 300
@@ -67,7 +65,7 @@ class Jobs(Deciding):
 
         told: called with what was found in each image as it comes.
         """
-        from survey.jobs.detecting import detect_job
+        from survey.jobs.detecting.job import detect_job
 
         self._check(None)
         outcome = detect_job(self.folder, progress=False, everything=everything, told=told)
@@ -153,12 +151,12 @@ def _positions(adjustment: Adjustment) -> dict[str, FloatArray]:
 
 
 def _beacons(known: "Beacons") -> dict[str, Any]:
-    """What a path is drawn beside where there is no solution; as :func:`survey.report.scene.scene_values`."""
-    places = range(len(known.beacon_ids))
-    spots = [{"id": known.beacon_ids[i], "kind": "point", "x": known.x_in_world[i],
-              "cov": known.cov[3 * i : 3 * i + 3, 3 * i : 3 * i + 3].ravel()} for i in places]  # fmt: skip
-    return dict(plain({"ellipsoid": 1.0, "images": {}, "cameras": {}, "spots": spots, "outlines": [], "clouds": [],
-                       "tables": [], "moves": [], "n_left_out": 0}))  # fmt: skip
+    """What a path is drawn beside where there is no solution."""
+    from survey.report.scene import Scene, Spot, drawn_values
+
+    covs = (known.cov[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(len(known.beacon_ids)))
+    spots = (Spot(name, "point", x, cov) for name, x, cov in zip(known.beacon_ids, known.x_in_world, covs, strict=True))
+    return drawn_values(Scene(list(spots)), 1.0)
 
 
 def _in_world(pose: Pose3, cov: FloatArray) -> FloatArray:

@@ -73,9 +73,7 @@ async def _until_gone(page: WebSocket) -> None:
 
 
 class Served(Protocol):
-    """What is listened for: an application, its messages, and how what runs is given up."""
-
-    live: Live
+    """What is listened for: an application, and how what runs for its pages is given up."""
 
     def app(self) -> ASGIApp:
         """The application, guarded."""
@@ -108,9 +106,8 @@ class Listening:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Sockets of pages that are still open end first: the server would wait for them."""
+        """What runs for pages that are still open ends first: the server would wait for it."""
         self._server.end()
-        self._server.live.post(None)
         self._program.should_exit = True
         self._thread.join(10.0)
         self._socket.close()

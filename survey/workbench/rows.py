@@ -196,10 +196,12 @@ def reading_rows(survey: Survey, left: Hits, adjustment: Adjustment | None, limi
     """
     found = {} if adjustment is None else {name_of_residual(o): o for o in adjustment.other_residuals}
     out: list[dict[str, Any]] = []
-    for name, places in Observed(survey, ()).readings.items():
+    observed = Observed(survey, ())
+    gone = set(observed.names(left))
+    for name, places in observed.readings.items():
         field, i = places[0]
         item, residual = getattr(survey, field)[i], found.get(name)
-        why = BY_FILE if not item.used else BY_PEOPLE if i in left.others.get(field, ()) else IN_USE
+        why = BY_FILE if not item.used else BY_PEOPLE if name in gone else IN_USE
         if residual is not None and not residual.used and why == IN_USE:
             why = BY_THIS_RUN
         table, _, reading = name.partition(":")

@@ -131,9 +131,10 @@ class Server:
         return Guard(app, self.token, self.cookie)
 
     def end(self) -> None:
-        """Give up what runs."""
+        """Give up what runs, and the messages to pages."""
         if self._project is not None:
             self._project.cancel()
+        self.live.post(None)
 
     @asynccontextmanager
     async def _lifespan(self, _app: Starlette) -> AsyncIterator[None]:
@@ -143,7 +144,6 @@ class Server:
         for task in tasks:
             task.cancel()
         self.end()
-        self.live.post(None)
         self._worker.shutdown(wait=False, cancel_futures=True)
 
     async def _open(self) -> None:
@@ -331,7 +331,7 @@ class Server:
 
     async def _save(self, _request: Request) -> Response:
         said = (await self._run("save", self.bench.save)).summary()
-        from survey.workbench.views import in_words
+        from survey.workbench.views.project import in_words
 
         told = {"summary": in_words(said["summary"]), "warnings": [*map(message, said["warnings"])]}
         return JSONResponse(said | told)

@@ -12,15 +12,14 @@ itself. Only the third is found anew by every adjustment, which begins at the va
 
 from dataclasses import replace
 
-from survey.jobs.detecting import author_name
-from survey.jobs.excluding import FILE
+from survey.jobs.excluding import FILE, author_name
 from survey.project.exclusions import Row
 from survey.project.project import DEFINITION_FILE
 from survey.solution.earlier.changes import Changes, Snapshot, snapshot, solution_changes
 from survey.solution.earlier.runs import Run, definition_of, find_run, load_run, pin_run
-from survey.workbench import cameras, views
 from survey.workbench.jobs import Jobs
 from survey.workbench.pictures import picture
+from survey.workbench.views import cameras, findings, project
 
 
 class Workbench(Jobs):
@@ -29,17 +28,17 @@ class Workbench(Jobs):
     read_only: nothing is ever written. watch: called with (iteration, v'Pv) while something is adjusted.
     """
 
-    state = views.state
-    points = views.points
-    readings = views.readings
-    parameters = views.parameters
-    findings = views.findings
-    scene = views.scene
-    loops = views.loops
-    network = views.network
-    table_residuals = views.table_residuals
-    statistics_part = views.statistics_part
-    runs = views.runs
+    state = project.state
+    points = project.points
+    readings = project.readings
+    parameters = project.parameters
+    findings = findings.findings
+    scene = project.scene
+    loops = project.loops
+    network = project.network
+    table_residuals = project.table_residuals
+    statistics_part = project.statistics_part
+    runs = project.runs
     camera_view = cameras.camera_view
     lens_change = cameras.lens_change
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from survey.cli import main
-from survey.solution.covariances import read_covariances
+from tests.covariances import written_covariances
 from tests.data import data_folder
 
 # 0.657275451718 times the a priori variance of (0.5 micrometre)^2
@@ -84,7 +84,7 @@ def test_lens_and_its_deviations(adjusted, source):
     for title, name in names.items():
         printed = float(re.search(rf"{re.escape(title)}\s*=\s*(\S+)", text)[1])
         assert values[name] == pytest.approx(printed, abs=5.1e-11), title
-    cov = read_covariances(adjusted / "results" / "covariance.npz")["lens/camera1"]
+    cov = written_covariances(adjusted / "results" / "covariance.npz")["lens/camera1"]
     sigma = np.sqrt(np.diag(cov))
     report = (source / "example.htm").read_text(encoding="utf-8")
     for k, name in enumerate(("Ck", "Xh", "Yh", "A1", "A2", "A3", "B1", "B2")):

@@ -21,9 +21,9 @@ from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import Camera, FloatArray, LensParameter, PoseParameter, Station, Survey
 from adjust.relay.conditions import adjust_conditions
 from adjust.relay.eyes.drift import fit_drift, sequences
-from adjust.relay.eyes.eyes import EyeOptions, adjust_eye_motions, adjust_eyes
+from adjust.relay.eyes.eyes import EyeOptions, adjust_eyes
 from adjust.relay.eyes.pairs import close_loops, pairs_of, triangle_misclosure
-from adjust.relay.eyes.sequences import PoseSequence
+from adjust.relay.eyes.sequences import EyeSequence
 from adjust.relay.eyes.trajectories import CommonMotions, Trajectory, common_motions, time_offset
 from adjust.relay.loops import loop_misclosures
 from adjust.relay.network import network_from_pairs
@@ -85,7 +85,7 @@ def test_no_white_noise_explains_the_poses(recording: str) -> None:
     cov = np.broadcast_to(np.diag(np.repeat([0.01, 0.05], 3) ** 2), (len(ids), 6, 6)).copy()
     other = c.at(times + offset).rescaled(result.joint.scales[IDS[1]])
     eyes = [
-        PoseSequence(FrameRef("camera", i), ids, (i,) * len(ids), p, cov)
+        EyeSequence(FrameRef("camera", i), ids, p, cov, (i,) * len(ids))
         for i, p in zip(IDS[:2], (a.at(times), other), strict=True)
     ]
     pair = adjust_eyes(eyes, (), EyeOptions(reject=False))
@@ -121,8 +121,8 @@ def test_lengths_of_the_trackers_differ(recording: str) -> None:
     joint = solved(recording)[1].joint
     assert joint.scales["MARS"] < 1.0 - 3 * joint.scale_sigmas["MARS"]
     assert joint.scales["MARS"] < joint.scales["NERO"] < 1.01
-    held = adjust_eye_motions(
-        sequences(solved(recording)[1].common, solved(recording)[1].drift), EyeOptions(reject=False)
+    held = adjust_eyes(
+        sequences(solved(recording)[1].common, solved(recording)[1].drift), (), EyeOptions(reject=False)
     )
     assert held.omega - joint.omega > chi2.ppf(0.999, 2)
 
@@ -145,7 +145,7 @@ def independent_pairs(result: RelayTrackers) -> list[Pair]:
     for start, (i, j) in enumerate(((0, 1), (1, 2), (0, 2))):
         own = common[slice(start, None, 3)]
         both = [sequences(own, result.drift)[k] for k in (i, j)]
-        pair = adjust_eye_motions(both, EyeOptions(reject=False)).pair(IDS[i], IDS[j])
+        pair = adjust_eyes(both, (), EyeOptions(reject=False)).pair(IDS[i], IDS[j])
         assert isinstance(pair.b_from_a, Pose3)
         t = pair.b_from_a.rotation().unrotate(pair.b_from_a.translation())  # the lever arm in frame a, as its tangent
         spread = max(result.joint.scale_sigmas[IDS[k]] for k in (i, j) if k > 0)
@@ -190,7 +190,7 @@ def joint_graph(result: RelayTrackers) -> dict[tuple[str, str], tuple[Pose3, Flo
     rig = Station("rig", "epoch", epochs={"0": held})
     observed = []
     for k, s in enumerate(sequences(common, result.drift)):
-        for i, motion in enumerate(poses(s.before_from_after)):
+        for i, motion in enumerate(poses(s.reference_from_eye)):
             a, b = (FrameRef("camera", IDS[k], str(e)) for e in (i + 1, i))
             observed.append(Pair(f"{IDS[k]}{i}", a, b, motion, s.cov[i]))
     start: dict[tuple[str, ...], Pose3] = {}
@@ -207,7 +207,7 @@ def joint_graph(result: RelayTrackers) -> dict[tuple[str, str], tuple[Pose3, Flo
     joint = np.zeros((18, 18))
     joint[6:, 6:] = graph.precision.joint(names)
     # the same without station poses: conditions between motions
-    conditions = adjust_eye_motions(sequences(common, result.drift), EyeOptions(reject=False))
+    conditions = adjust_eyes(sequences(common, result.drift), (), EyeOptions(reject=False))
     assert graph.omega == pytest.approx(conditions.omega, rel=1e-6)
     assert np.sqrt(np.diag(conditions.cov)[6:]) == pytest.approx(np.sqrt(np.diag(joint)[6:]), rel=0.02)
     out = {}

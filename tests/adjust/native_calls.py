@@ -12,6 +12,7 @@ from gtsam import Pose3, Rot3
 from scipy import sparse
 
 from adjust.adjustment import adjust
+from adjust.graph.pair_normals import PairNormals
 from adjust.model.survey import PoseParameter
 from adjust.native import (
     bundles,
@@ -138,6 +139,12 @@ def _images() -> None:
     tree = solved.precision.tree
     tree.among(sparse.csr_array(np.eye(tree.n)[:2]))
     trees.clique_covariance(tree.arrays, tree.cliques.n_front, 0)
+    graph = solved.minimum.graph
+    normals = PairNormals(graph, [])
+    normals.by_rows = True
+    found = normals.solution(normals.linearized(graph.prepare(graph.start, True)))
+    if found is not None:
+        normals.bent(graph.start, found[0])
     ring = [(chr(65 + i), chr(65 + (i + step) % 12)) for step in (1, 2) for i in range(0, 12, step)]
     loop_basis(topology([(a + b, a, b) for a, b in ring]))  # triangles, then a loop through the stations of one pair
     survey, truth = head_on_table(1, n_cameras=2, n_table_epochs=3, n_free_epochs=2)

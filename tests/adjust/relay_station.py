@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from adjust.model.observations import FrameRef, ImageBlock
 from adjust.model.survey import Camera, FloatArray, LensParameter, PoseParameter, Station, Survey, Target
-from adjust.relay.eyes.sequences import PoseSequence
+from adjust.relay.eyes.sequences import EyeSequence
 from adjust.spatial.rigid_motions import Motions
 from survey.simulate.scene import BROWN
 
@@ -109,11 +109,11 @@ class Trackers:
             np.linalg.inv(self.room_from_world[eye]) @ self.room_from_station @ self.station_from_eye[eye]
         )
 
-    def measured(self, sigma_rad: float = 1e-4, sigma_m: float = 1e-3) -> list[PoseSequence]:
+    def measured(self, sigma_rad: float = 1e-4, sigma_m: float = 1e-3) -> list[EyeSequence]:
         """Poses with noise of full, different covariances."""
         return [self.sequence(eye, sigma_rad, sigma_m) for eye in range(len(self.station_from_eye))]
 
-    def sequence(self, eye: int, sigma_rad: float, sigma_m: float) -> PoseSequence:
+    def sequence(self, eye: int, sigma_rad: float, sigma_m: float) -> EyeSequence:
         """Poses of one eye."""
         poses = self.poses(eye)
         sigma = np.repeat([sigma_rad, sigma_m], 3)
@@ -123,7 +123,7 @@ class Trackers:
         noisy = np.array([p @ Pose3.Expmap(d).matrix() for p, d in zip(poses, e, strict=True)])
         ids = tuple(f"e{i}" for i in range(len(poses)))
         name = "abcdef"[eye]
-        return PoseSequence(FrameRef("camera", name), ids, (f"w{name}",) * len(ids), motions(noisy), cov)
+        return EyeSequence(FrameRef("camera", name), ids, motions(noisy), cov, (f"w{name}",) * len(ids))
 
 
 def turn_between(a: Pose3, b: Pose3) -> float:

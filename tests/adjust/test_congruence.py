@@ -8,7 +8,7 @@ from gtsam import Pose3
 from scipy.stats import binom
 
 from adjust.adjustment import adjust
-from adjust.epochs.congruence import CongruenceOptions, compare, congruence, joint_congruence
+from adjust.epochs.congruence import Common, CongruenceOptions, Pooled, compare, congruence, joint_congruence
 from adjust.epochs.congruence_result import Congruence
 from adjust.epochs.joint import joint_survey
 from adjust.epochs.states import EpochState, aligned, epoch_normals, epoch_state, moved
@@ -49,7 +49,7 @@ def drawn(state: EpochState, rng: np.random.Generator, factor: float = 1.0) -> E
     return replace(state, values=tuple(np.asarray(v) + x for v, x in zip(state.values, d.reshape(-1, 3), strict=True)))
 
 
-KNOWN = (1.0, float("inf"), float("nan"))
+KNOWN = Pooled(1.0, float("inf"), float("nan"))
 
 
 @pytest.mark.slow
@@ -60,7 +60,7 @@ def test_error_rate_of_the_global_test_and_of_the_single_ones() -> None:
     failed, single, n = 0, 0, 150
     for _ in range(n):
         a, b = drawn(state, rng), drawn(state, rng)
-        found = compare(state.names, a, b, state.directions, KNOWN, options)
+        found = compare(Common(a, b, state.directions, KNOWN), options)
         assert found.before.freedom == 3 * len(state.names) - 4
         failed += not found.before.passed
         single += any(m.significant for m in found.motions)
@@ -76,7 +76,7 @@ def test_power_of_the_smallest_motion() -> None:
     rng, i = np.random.default_rng(2), 5
     stable = tuple(n for j, n in enumerate(state.names) if j != i)
     options = CongruenceOptions(scaled=False, search=False, reference=stable)
-    one = compare(state.names, state, state, state.directions, KNOWN, options)
+    one = compare(Common(state, state, state.directions, KNOWN), options)
     motion = next(m for m in one.motions if m.name == ("point", ids[i]))
     step = motion.smallest * motion.ellipsoid.axes[:, 0]
     seen = 0
@@ -84,7 +84,7 @@ def test_power_of_the_smallest_motion() -> None:
         a, b = drawn(state, rng), drawn(state, rng)
         values = list(b.values)
         values[i] = values[i] + step
-        found = compare(state.names, a, replace(b, values=tuple(values)), state.directions, KNOWN, options)
+        found = compare(Common(a, replace(b, values=tuple(values)), state.directions, KNOWN), options)
         seen += next(m for m in found.motions if m.name == motion.name).significant
     low, high = binom.ppf([0.001, 0.999], 150, 0.8)
     assert low <= seen <= high
@@ -122,8 +122,8 @@ def test_the_datum_of_the_epochs_does_not_matter() -> None:
     before, after = epoch_state(first), epoch_state(adjust(survey, start))
     away = moved(after, np.array([3.0, -2.0, 1.0, 0.0, 0.0, 0.7, 0.0]))
     back = aligned(before, away, before.directions, range(len(before.names)))
-    again = compare(before.names, before, back, before.directions, (expected.sigma0, expected.redundancy, 0.5),
-                    CongruenceOptions())  # fmt: skip
+    pooled = Pooled(expected.sigma0, expected.redundancy, 0.5)
+    again = compare(Common(before, back, before.directions, pooled), CongruenceOptions())
     assert again.before.statistic == pytest.approx(expected.before.statistic, rel=1e-6)
     before_motion = {m.name: m.displacement for m in expected.motions}
     for m in again.motions:

@@ -24,10 +24,8 @@ X = np.array([1e-3, 0.5, 1.0, 3.0, 20.0, 200.0])
         (d.student.ppf(P, K), st.t.ppf(P, K)),
         (d.student.sf(X, K), st.t.sf(X, K)),
         (d.beta.ppf(P, 3, K), st.beta.ppf(P, 3, K)),
-        (d.ncx2.isf(0.8, K, 12.0), st.ncx2.isf(0.8, K, 12.0)),
         (d.student.sf(2.0, np.inf), st.norm.sf(2.0)),
         (d.fisher.ppf(P, 3, K), st.f.ppf(P, 3, K)),
-        (st.f.sf(d.fisher.isf(P, 3, K), 3, K), np.broadcast_to(P, (6, 7))),
         (d.fisher.sf(X, 3, K), st.f.sf(X, 3, K)),
     ],
 )

@@ -67,7 +67,7 @@ def test_rows_are_the_derivatives():
     pose = turned(0.2, (0.01, -0.02), (0.01, 0.02, 0.03)).matrix()
     camera, beacon = np.array([0, 1, 2]), np.array([8, 6, 9])
     uv = np.array([[600.0, 400], [700, 500], [650, 450]])
-    residual, H, M, _ = evaluate(system, pose, camera, beacon, uv)
+    residual, H, M = evaluate(system, pose, camera, beacon, uv)
     for j, h in enumerate(np.eye(6) * 1e-6):
         up, down = (evaluate(system, retract(pose, s * h), camera, beacon, uv)[0] for s in (1, -1))
         np.testing.assert_allclose((up - down) / 2e-6, H[:, j], rtol=1e-5, atol=1e-3)

@@ -144,8 +144,8 @@ def test_planted_errors_are_found_and_named(seed: int) -> None:
     assert len(named - set(sizes)) <= 1
     assert abs(found.adjustment.sigma0 - 1.0) < 0.2
     # reversible: what was given is as it was but for the flags
-    assert [replace(r, used=True) for r in found.survey.readings] == list(wrong.readings)
-    kept = {r.reading_id for r in found.survey.readings if not r.used}
+    assert [replace(r, used=True) for r in found.adjustment.survey.readings] == list(wrong.readings)
+    kept = {r.reading_id for r in found.adjustment.survey.readings if not r.used}
     assert kept == named
     worst = found.rejected[0]
     assert worst.kind in worst.text()
@@ -320,7 +320,7 @@ def test_the_last_solution_stays_where_there_is_none_without_an_observation(monk
     found = search_outliers(wrong, start)
     assert needed not in {d.ids[0] for d in found.rejected}
     assert any(f"cannot be left out: {wrong.readings[4].kind}" in n and needed in n for n in found.notes)
-    assert all(r.used for r in found.survey.readings if r.reading_id == needed)
+    assert all(r.used for r in found.adjustment.survey.readings if r.reading_id == needed)
 
 
 @pytest.mark.slow

@@ -14,23 +14,23 @@ from adjust.adjustment import adjust
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.survey import FloatArray
-from adjust.relay.eyes.eyes import EyeOptions, adjust_eye_motions, adjust_eyes
+from adjust.relay.eyes.eyes import EyeOptions, adjust_eyes
 from adjust.relay.eyes.images import camera_sequence, eye_sequences, target_sequence
 from adjust.relay.eyes.pairs import close_loops, pairs_of, triangle_misclosure
-from adjust.relay.eyes.sequences import KnownWorlds, MotionSequence, PoseSequence
-from adjust.relay.eyes.setup import motion_setup, pose_setup
+from adjust.relay.eyes.sequences import EyeSequence, KnownWorlds
+from adjust.relay.eyes.setup import eye_setup
 from adjust.relay.eyes.solver import EyeProblem, linearise
 from adjust.spatial.rigid_motions import Motions
 from tests.adjust.relay_station import EYES, Station4, Trackers, motions, poses, random_rigid
 from tests.sizes import size
 
 
-def exact(sequence: PoseSequence, trackers: Trackers, eye: int) -> PoseSequence:
+def exact(sequence: EyeSequence, trackers: Trackers, eye: int) -> EyeSequence:
     """The sequence without noise."""
-    return replace(sequence, world_from_eye=motions(trackers.poses(eye)))
+    return replace(sequence, reference_from_eye=motions(trackers.poses(eye)))
 
 
-def motion_sequences(trackers: Trackers, sigma_rad: float, sigma_m: float) -> list[MotionSequence]:
+def motion_sequences(trackers: Trackers, sigma_rad: float, sigma_m: float) -> list[EyeSequence]:
     """Motions between neighbouring epochs, each with noise of its own."""
     out, sigma = [], np.repeat([sigma_rad, sigma_m], 3)
     for eye in range(len(trackers.station_from_eye)):
@@ -39,7 +39,7 @@ def motion_sequences(trackers: Trackers, sigma_rad: float, sigma_m: float) -> li
         noisy = np.array([m @ Pose3.Expmap(sigma * trackers.rng.normal(size=6)).matrix() for m in true])
         cov = np.broadcast_to(np.diag(sigma**2), (len(true), 6, 6)).copy()
         ids = tuple(f"i{i}" for i in range(len(true)))
-        out.append(MotionSequence(FrameRef("camera", "abcdef"[eye]), ids, motions(noisy), cov))
+        out.append(EyeSequence(FrameRef("camera", "abcdef"[eye]), ids, motions(noisy), cov))
     return out
 
 
@@ -63,7 +63,7 @@ def test_poses_without_noise_give_the_truth() -> None:
 
 def test_motions_without_noise_give_the_truth() -> None:
     trackers = Trackers(4)
-    found = adjust_eye_motions([replace(s, cov=s.cov + 1e-8 * np.eye(6)) for s in motion_sequences(trackers, 0.0, 0.0)])
+    found = adjust_eyes([replace(s, cov=s.cov + 1e-8 * np.eye(6)) for s in motion_sequences(trackers, 0.0, 0.0)])
     assert np.abs(error(found.station_from_eye, trackers.station_from_eye)).max() < 1e-10
 
 
@@ -71,9 +71,9 @@ def test_motions_without_noise_give_the_truth() -> None:
 @pytest.mark.parametrize("scaled", [False, True])
 def test_derivatives_away_from_zero_error(scaled: bool) -> None:
     trackers = Trackers(5, n=4)
-    problems: list[EyeProblem] = [motion_setup(motion_sequences(trackers, 0.02, 0.05), scaled).problem]
+    problems: list[EyeProblem] = [eye_setup(motion_sequences(trackers, 0.02, 0.05), free_scales=scaled).problem]
     if not scaled:
-        problems.append(pose_setup(trackers.measured(0.02, 0.05), ()).problem)
+        problems.append(eye_setup(trackers.measured(0.02, 0.05)).problem)
     for problem in problems:
         everything = np.ones(len(problem.free), dtype=np.bool_)
         _check_derivatives(replace(problem, free=everything), trackers.rng)
@@ -118,7 +118,7 @@ def test_minimum_is_that_of_all_true_poses_as_unknowns() -> None:
     sequences = trackers.measured(0.01, 0.02)
     found = adjust_eyes(sequences, (), EyeOptions(reject=False))
     k, n = 3, 6
-    measured = [poses(s.world_from_eye) for s in sequences]
+    measured = [poses(s.reference_from_eye) for s in sequences]
     roots = [np.linalg.inv(np.linalg.cholesky(s.cov)) for s in sequences]
 
     def moved(start: FloatArray, d: FloatArray) -> list[Pose3]:
@@ -172,7 +172,7 @@ def test_motions_covariance_is_the_scatter() -> None:
     tests, n = [], size(40, 10)
     for seed in range(n):
         trackers = Trackers(100 + seed)
-        found = adjust_eye_motions(motion_sequences(trackers, 1e-3, 2e-3))
+        found = adjust_eyes(motion_sequences(trackers, 1e-3, 2e-3))
         d = error(found.station_from_eye, trackers.station_from_eye)[1:].ravel()
         tests.append(d @ np.linalg.solve(found.cov[6:, 6:], d))
     assert chi2.ppf(0.0005, n * 12) < np.sum(tests) < chi2.ppf(0.9995, n * 12)
@@ -202,12 +202,12 @@ def test_eyes_that_see_several_worlds_and_not_at_all_epochs() -> None:
             a,
             epoch_ids=a.epoch_ids[5:],
             world_ids=a.world_ids[5:],
-            world_from_eye=a.world_from_eye[late],
+            reference_from_eye=a.reference_from_eye[late],
             cov=a.cov[late],
         )
         other = motions(random_rigid(trackers.rng, 1, 2.0, 3.0))
-        seen = c.world_from_eye.where(np.arange(14) < 7, other @ c.world_from_eye)
-        c = replace(c, world_ids=("wc",) * 7 + ("wd",) * 7, world_from_eye=seen)
+        seen = c.reference_from_eye.where(np.arange(14) < 7, other @ c.reference_from_eye)
+        c = replace(c, world_ids=("wc",) * 7 + ("wd",) * 7, reference_from_eye=seen)
         found = adjust_eyes((a, b, c))
         assert found.redundancy == 6 * (9 + 14 - 2 - 3)
         d = error(found.station_from_eye, trackers.station_from_eye)[1:].ravel()
@@ -223,7 +223,7 @@ def test_influence_is_the_derivative() -> None:
     found = adjust_eyes(sequences, (), EyeOptions(reject=False))
     step = np.zeros((5, 6))
     step[2] = [1e-5, -2e-5, 3e-5, 1e-4, 2e-4, -1e-4]
-    moved = [replace(sequences[0], world_from_eye=sequences[0].world_from_eye.retract(step)), *sequences[1:]]
+    moved = [replace(sequences[0], reference_from_eye=sequences[0].reference_from_eye.retract(step)), *sequences[1:]]
     again = adjust_eyes(moved, (), EyeOptions(reject=False))
     predicted = found.by_observation()[:, :30] @ step.ravel()
     actual = (found.station_from_eye.inverse() @ again.station_from_eye).log().ravel()
@@ -274,7 +274,8 @@ def test_wrong_epochs_are_found_and_listed() -> None:
     sequences = trackers.measured()
     step = np.zeros((14, 6))
     step[3, 0], step[9, 4] = 30e-4, 30e-3  # 30 sigmas
-    bad = [sequences[0], replace(sequences[1], world_from_eye=sequences[1].world_from_eye.retract(step)), sequences[2]]
+    moved = sequences[1].reference_from_eye.retract(step)
+    bad = [sequences[0], replace(sequences[1], reference_from_eye=moved), sequences[2]]
     found = adjust_eyes(bad)
     assert {(o.epoch_id, o.a_id, o.b_id) for o in found.outliers} == {("e3", "a", "b"), ("e9", "a", "b")}
     assert "left out" in str(found.outliers[0])
@@ -295,7 +296,7 @@ def test_two_targets_with_known_relation_need_one_epoch() -> None:
     Z = Pose3(np.linalg.inv(trackers.room_from_world[0]) @ trackers.room_from_world[1])
     z_cov = np.diag(np.repeat([2e-4, 5e-4], 3) ** 2)
     found = adjust_eyes((a, b), (KnownWorlds("wa", "wb", Z, z_cov),))
-    A, B = (poses(s.world_from_eye)[0] for s in (a, b))
+    A, B = (poses(s.reference_from_eye)[0] for s in (a, b))
     X = A.inverse().compose(Z).compose(B)
     by_a, by_z = X.inverse().AdjointMap(), B.inverse().AdjointMap()
     cov = by_a @ a.cov[0] @ by_a.T + by_z @ z_cov @ by_z.T + b.cov[0]

@@ -7,10 +7,25 @@ import numpy as np
 import pytest
 from gtsam import Pose3
 
+from adjust.design.noise import disturbed
 from adjust.graph.building import GraphBuilder
 from adjust.model.result import ParameterName
-from adjust.model.rewriting import Rewriting, Vector, with_changed, with_rows
-from adjust.model.survey import Beam, PointParameter, PoseParameter, Surface, Survey, Table, VectorParameter
+from adjust.model.rewriting import Rewriting, Vector, vector_parameters, with_changed, with_rows
+from adjust.model.survey import (
+    Beam,
+    Camera,
+    Clock,
+    ImageCrop,
+    LensParameter,
+    PointParameter,
+    PoseParameter,
+    Station,
+    Surface,
+    Survey,
+    Table,
+    VectorParameter,
+    VectorPrior,
+)
 from survey.simulate import full_lab
 from tests.adjust import helpers as h
 
@@ -64,6 +79,24 @@ def test_beams_and_surfaces_are_met_and_a_surface_without_parameters_stays() -> 
     changed = names(Survey(beams=(Beam("b", "station", "s"),), surfaces=(known, Surface("s2", "line"))))
     assert names.seen == [("beam", "b"), ("surface", "s1"), ("vertical",)]
     assert changed.surfaces[1].parameters is None
+
+
+def test_crops_and_clocks_are_met_and_their_priors_drawn() -> None:
+    """Beside what they belong to; their priors are observations as those of everything else are."""
+    known = VectorPrior(("offset",), np.zeros(1), np.eye(1))
+    late = Clock(VectorParameter(("offset",), np.zeros(1), ("offset",), known))
+    shifted = VectorParameter(("left",), np.zeros(1), ("left",), replace(known, names=("left",)))
+    lens = LensParameter("pinhole", (), crops={"e1": ImageCrop(shifted)})
+    survey = Survey(cameras=(Camera("c", "s", (640, 480), lens, clock=late),), stations=(Station("s", clock=late),),
+                    tables=(Table("t", clock=late),))  # fmt: skip
+    names = Names()
+    names(survey)
+    assert set(vector_parameters(survey)) <= set(names.seen)
+    wanted = {("lens_crop", "c", "e1"), ("camera_clock", "c"), ("pose_clock", "s"), ("table_clock", "t")}
+    assert wanted <= set(names.seen)
+    drawn = vector_parameters(disturbed(survey, np.random.default_rng(1)))
+    means = [prior.mean[0] for name in sorted(wanted) if (prior := drawn[name].prior) is not None]
+    assert len(set(means) - {0.0}) == len(wanted)
 
 
 def test_rows_and_things_are_changed_alone() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from adjust.model.observations import Distance, FrameRef, ImageBlock, PositionRef, Reading, ReadingCovariance
 from adjust.model.subsets import only_between, points_read, with_points
 from adjust.model.survey import TILT, Point, Setup, Survey, VectorParameter, Vertical
-from adjust.statistics.outliers.undetermined_points import without_named_points
+from adjust.statistics.outliers.supported import without_named_points
 
 A, B, C = PositionRef("A"), PositionRef("B"), PositionRef("C")
 

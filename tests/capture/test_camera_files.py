@@ -32,7 +32,7 @@ def test_files_in_natural_order_bit_by_bit(tmp_path: Path) -> None:
         cameras = TriggerSet({"F": camera})
         for _ in range(2):  # arming begins anew
             cameras.arm()
-            frames = [cameras.take(0.1).frames["F"] for _ in written]
+            frames = [cameras.take(0.1)["F"] for _ in written]
             assert [f.block_id for f in frames] == [1, 2, 3, 4]
             assert all(np.array_equal(f.image, image) for f, image in zip(frames, written, strict=True))
             assert (frames[0].bits, frames[0].device_time_ns) == (16, None)

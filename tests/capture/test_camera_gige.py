@@ -80,7 +80,7 @@ def test_block_ids_of_16_bit_begin_anew_at_1(port: None) -> None:
         set_up(camera)
         cameras = TriggerSet({"X": camera})
         cameras.arm()
-        frames = [cameras.take(2.0).frames["X"] for _ in range(144)]
+        frames = [cameras.take(2.0)["X"] for _ in range(144)]
         assert camera.last_block_id == 65535
     ids = [f.block_id for f in frames]
     assert 1 in ids

@@ -144,7 +144,7 @@ def test_three_cameras_through_two_makers_stacks_see_the_table_as_it_stands(
     cameras.arm()
     for pose in (*lab.poses[:3], lab.poses[0]):
         write_angles(folder / ANGLES, pose.axis1_rad, pose.axis2_rad)
-        frames = cameras.take(5.0).frames
+        frames = cameras.take(5.0)
         for name, frame in frames.items():
             expected = lab.image(name, (pose.axis1_rad, pose.axis2_rad)).astype(float)
             assert np.std(frame.image - expected) == pytest.approx(np.sqrt(2.0) * 4.0, rel=0.1)
@@ -164,7 +164,7 @@ def test_exposure_reaches_the_scene_through_every_stack(
         for camera in served.values():
             camera.set("ExposureTime", exposure_us)
         cameras.arm()
-        bright[exposure_us] = {name: f.image.mean() for name, f in cameras.take(5.0).frames.items()}
+        bright[exposure_us] = {name: f.image.mean() for name, f in cameras.take(5.0).items()}
     cameras.disarm()
     for name in CAMERA_IDS:
         assert bright[10000.0][name] / bright[2500.0][name] == pytest.approx(4.0, rel=0.03)

@@ -17,10 +17,10 @@ from capture.cli import main
 from capture.simulated.folder import write_lab
 from capture.simulated.laboratory import LabSize
 from survey.jobs.adjusting.job import adjust_job
-from survey.solution.covariances import read_covariances
 from tests.capture.camera_helpers import GIGE, gige_port
 from tests.capture.gige_server import GigeServer
 from tests.capture.table_server import table_server
+from tests.covariances import written_covariances
 
 pytestmark = pytest.mark.slow
 
@@ -102,7 +102,7 @@ def test_each_lens_as_a_whole(adjusted):
     home, _ = adjusted
     solution = json.loads((home / "lab" / "results" / "solution.json").read_text())
     truth = json.loads((home / "room" / "truth.json").read_text())["parameters"]
-    blocks = read_covariances(home / "lab" / "results" / "covariance.npz")
+    blocks = written_covariances(home / "lab" / "results" / "covariance.npz")
     for name, camera in solution["cameras"].items():
         lens = camera["lens"]
         free = [p for p, status in lens["status"].items() if status == "free"]

@@ -37,9 +37,9 @@ def make(physics=FAST, axes=AXES, settle=QUICK, near=None):
 def test_moves_and_settles_at_the_setpoint():
     table, controller = make()
     status = table.set([20 * DEG, -30 * DEG])
-    assert not status.done
-    status.wait(5.0)
-    assert status.done
+    assert not status.done()
+    status.result(5.0)
+    assert status.done()
     location = table.locate()
     assert np.allclose(location.setpoint, [20 * DEG, -30 * DEG], atol=1e-12)
     assert np.allclose(np.degrees(location.readback), [20, -30], atol=1e-9)
@@ -105,7 +105,7 @@ def test_readback_that_loses_turns_is_counted():
     axes = (Axis("axis1", -400 * DEG, 400 * DEG), Axis("axis2", -400 * DEG, 400 * DEG))
     table, _ = make(physics, axes)
     for angles in ((170, -170), (350, -350), (390, -390), (0, 0)):
-        table.set(np.radians(angles)).wait(5.0)
+        table.set(np.radians(angles)).result(5.0)
         assert np.allclose(np.degrees(table.position), angles, atol=1e-6)
 
 
@@ -126,7 +126,7 @@ def test_stall_is_found_and_the_table_stopped():
         jammed = time.monotonic()
         controller.simulated[0].jam(jammed)
         with pytest.raises(StalledError, match=r"'axis1' stands still.*setpoint 50\.0000 deg"):
-            status.wait(3.0)
+            status.result(3.0)
         when, what = controller.received[-1]
         assert what == "stop"
         delays.append(when - jammed)
@@ -136,7 +136,7 @@ def test_stall_is_found_and_the_table_stopped():
 def test_ending_short_of_the_setpoint_is_a_stall():
     table, controller = make(AxisPhysics(speed=200 * DEG, acceleration=4000 * DEG, backlash=1.0 * DEG))
     with pytest.raises(StalledError, match=r"has ended at 19\.5000 deg, 0\.5000 deg from its setpoint"):
-        table.set(np.radians([20.0, 0.0])).wait(3.0)
+        table.set(np.radians([20.0, 0.0])).result(3.0)
     assert controller.received[-1][1] == "stop"
 
 
@@ -144,7 +144,7 @@ def test_backlash_is_in_the_readback():
     """Half the backlash short of the setpoint, on the side that the table came from (a play operator)."""
     table, _ = make(AxisPhysics(speed=200 * DEG, acceleration=4000 * DEG, backlash=0.02 * DEG))
     for target, expected in ((10.0, 9.99), (-10.0, -9.99), (0.0, -0.01)):
-        table.set(np.radians([target, 0.0])).wait(3.0)
+        table.set(np.radians([target, 0.0])).result(3.0)
         assert math.degrees(table.position[0]) == pytest.approx(expected, abs=1e-9)
 
 
@@ -153,7 +153,7 @@ def test_restless_readback_does_not_settle(poll_s):
     settle = Settle(0.5 * DEG, 0.001 * DEG, window_s=0.05, stall_s=0.15, timeout_s=0.4, poll_s=poll_s)
     table, controller = make(AxisPhysics(200 * DEG, 4000 * DEG, encoder_noise=0.1 * DEG), settle=settle)
     with pytest.raises(NotSettledError, match=r"not at rest after 0\.4 s"):
-        table.set(np.radians([1.0, 0.0])).wait(3.0)
+        table.set(np.radians([1.0, 0.0])).result(3.0)
     assert controller.received[-1][1] == "stop"
 
 
@@ -163,7 +163,7 @@ def test_stop_ends_the_move_and_brakes():
     time.sleep(0.15)
     table.stop()
     with pytest.raises(StoppedError):
-        status.wait(2.0)
+        status.result(2.0)
     time.sleep(0.12)  # v/a
     first = table.position
     time.sleep(0.05)
@@ -178,7 +178,7 @@ def test_emergency_stop_locks_until_release():
         table.set([0.1, 0.1])
     assert [word for _, word in controller.received] == ["stop"]
     table.release()
-    table.set([0.1, 0.1]).wait(3.0)
+    table.set([0.1, 0.1]).result(3.0)
 
 
 def test_fault_of_the_controller_stops_all_axes_within_50_ms():
@@ -190,7 +190,7 @@ def test_fault_of_the_controller_stops_all_axes_within_50_ms():
         begin = time.monotonic()
         controller.simulated[1].fault = "over-current"
         with pytest.raises(ControllerError, match="'over-current' of axis 'axis2'"):
-            status.wait(2.0)
+            status.result(2.0)
         assert controller.received[-1][1] == "stop"
         delays.append(controller.received[-1][0] - begin)
         controller.simulated[1].fault = None
@@ -203,10 +203,10 @@ def test_pulled_cable_stops_over_a_new_connection():
     time.sleep(0.02)
     controller._connected = False  # cut once; connecting anew works
     with pytest.raises(TableDisconnectedError):
-        status.wait(2.0)
+        status.result(2.0)
     assert controller.received[-1][1] == "stop"
     table.reopen()
-    table.set([0.0, 0.0]).wait(5.0)
+    table.set([0.0, 0.0]).result(5.0)
 
 
 def test_cable_that_stays_out_is_said():
@@ -214,7 +214,7 @@ def test_cable_that_stays_out_is_said():
     status = table.set(np.radians([20.0, 0.0]))
     controller.cut = True
     with pytest.raises(TableDisconnectedError) as caught:
-        status.wait(2.0)
+        status.result(2.0)
     assert any("the stop after it failed too" in note for note in caught.value.__notes__)
 
 
@@ -228,7 +228,7 @@ def test_second_move_waits_for_the_first():
 
 def test_home_goes_to_the_reference():
     table, _ = make(AxisPhysics(200 * DEG, 4000 * DEG, home_at=3 * DEG))
-    table.home().wait(3.0)
+    table.home().result(3.0)
     assert np.allclose(np.degrees(table.locate().setpoint), [3, 3], atol=1e-6)
 
 

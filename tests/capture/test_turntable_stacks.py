@@ -40,10 +40,10 @@ def ascii_table(server, dialect="two-axis", signs=(1, 1), zeros=(0.0, 0.0), axes
 @pytest.mark.parametrize("dialect", ["two-axis", "newport-esp301"])
 def test_dialect_over_tcp(tmp_path, dialect):
     with table_server(tmp_path, "--language", dialect, "--noise", "1") as server, ascii_table(server, dialect) as table:
-        table.set(np.radians([12.5, -30.25])).wait(5.0)
+        table.set(np.radians([12.5, -30.25])).result(5.0)
         assert np.allclose(np.degrees(table.position), [12.5, -30.25], atol=2e-3)
         assert np.allclose(server.truth_deg(), [12.5, -30.25], atol=1e-5)
-        table.home().wait(5.0)
+        table.home().result(5.0)
         assert np.allclose(np.degrees(table.position), [0, 0], atol=2e-3)
 
 
@@ -55,7 +55,7 @@ def test_sign_and_zero(tmp_path):
     """angle = sign * (controller's) + zero, so the controller goes to sign * (angle - zero)."""
     with table_server(tmp_path) as server:
         with ascii_table(server, signs=(1, -1), zeros=(0.0, math.radians(5.0))) as table:
-            table.set(np.radians([10.0, 20.0])).wait(5.0)
+            table.set(np.radians([10.0, 20.0])).result(5.0)
             assert np.allclose(np.degrees(table.position), [10, 20], atol=1e-5)
         assert "MA 2 -15.000000" in [line for _, line in server.received()]
 
@@ -101,7 +101,7 @@ def test_stop_within_50_ms_of_a_fault(tmp_path):
             time.sleep(0.05)
             begin = server.inject(fault)
             with pytest.raises(ControllerError if "FAULT" in fault else TableDisconnectedError):
-                status.wait(2.0)
+                status.result(2.0)
             when = server.stopped()
             assert when > begin
             delays[fault].append((when - begin) / 1e6)
@@ -174,7 +174,7 @@ def test_standa_virtual_axes(tmp_path):
     table = MovingTable("table", AXES, controller, QUICK)
     table.open()
     try:
-        table.set(np.radians([1.5, -0.7])).wait(10.0)
+        table.set(np.radians([1.5, -0.7])).result(10.0)
         # a microstep is 1/256 of 0.015 deg
         assert np.allclose(np.degrees(table.position), [1.5, -0.7], atol=0.5 * 0.015 / 256 + 1e-9)
         with pytest.raises(LimitError):
@@ -183,7 +183,7 @@ def test_standa_virtual_axes(tmp_path):
         time.sleep(0.1)
         table.stop()
         with pytest.raises(StoppedError):
-            status.wait(2.0)
+            status.result(2.0)
         assert math.degrees(table.position[0]) < 40.0
     finally:
         table.close()
@@ -230,7 +230,7 @@ settle = Settle(0.05 * DEG, 0.01 * DEG, window_s=0.05, stall_s=30.0, timeout_s=1
 controller = epics.EpicsController(["labsurvey:m1", "labsurvey:m2"], [1, -1], [0.0, 0.0], "deg")
 table = MovingTable("table", axes, controller, settle)
 table.open()
-table.set(np.radians([12.5, -30.0])).wait(120.0)
+table.set(np.radians([12.5, -30.0])).result(120.0)
 assert np.allclose(np.degrees(table.position), [12.5, -30.0], atol=1e-6), table.position
 try:
     table.set(np.radians([61.0, 0.0]))
@@ -248,7 +248,7 @@ while not controller.read(0).moving:  # the record loses a STOP that comes befor
     time.sleep(0.01)
 table.stop()
 try:
-    status.wait(60.0)
+    status.result(60.0)
     raise AssertionError("stop")
 except StoppedError:
     pass

@@ -6,6 +6,7 @@ import socket
 import struct
 import threading
 from contextlib import contextmanager
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -16,33 +17,32 @@ from capture.cli import main
 from capture.plan.plan import read_plan
 from capture.session.run import run_plan
 from capture.simulated import controller
-from capture.web.serve import PageServer
+from capture.web.serve import Pages
 from capture.web.state import LiveView, SessionView, png_of
 from survey.workbench.guard import loopback_address
+from survey.workbench.live import Listening
 from tests.capture.session_runs import write_plan
 from tests.capture.table_server import table_server
 
 
 @contextmanager
 def served(view, token=None):
-    with PageServer(view, token=token) as server:
-        threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+    with Listening(Pages(view, token), "127.0.0.1", 0) as listening:
         try:
-            yield server
+            yield urlsplit(listening.address)
         finally:
-            server.shutdown()
             view.close()
 
 
 def ask(server, method, path, headers=None, body=None):
     """Status and body of an answer."""
-    port = server.server_address[1]
+    port = server.port
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
     try:
         sent = {"Host": f"127.0.0.1:{port}", **(headers or {})}
         connection.request(method, path, json.dumps(body) if body is not None else None, sent)
         answer = connection.getresponse()
-        return answer.status, answer.read(), dict(answer.getheaders())
+        return answer.status, answer.read(), {name.title(): value for name, value in answer.getheaders()}
     finally:
         connection.close()
 
@@ -71,8 +71,8 @@ def test_moving_needs_live(tmp_path, capsys):
 def test_other_addresses_of_this_machine_do_not_answer(tmp_path):
     """127.0.0.2 is this machine too, but the socket is bound to 127.0.0.1 alone."""
     with served(SessionView(read_plan(write_plan(tmp_path)))) as server:
-        assert server.socket.getsockname()[0] == "127.0.0.1"
-        other = ("127.0.0.2", server.server_address[1])
+        assert server.hostname == "127.0.0.1"
+        other = ("127.0.0.2", server.port)
         with pytest.raises(ConnectionRefusedError), socket.create_connection(other, 1.0):
             pass
 
@@ -159,17 +159,16 @@ def test_head_is_answered_without_a_body(tmp_path):
 
 @pytest.mark.slow
 def test_client_that_leaves_is_no_traceback(tmp_path, capsys):
-    with served(SessionView(read_plan(write_plan(tmp_path)))) as server:
+    view = SessionView(read_plan(write_plan(tmp_path)))
+    with served(view) as server:
         for sent in (b"GET / HTTP/1.1\r\nHost: localhost\r\n", b"GET /app.js HTTP/1.1\r\nHost: localhost\r\n\r\n"):
             for _ in range(20):
-                with socket.create_connection(server.server_address[:2]) as client:
+                with socket.create_connection(("127.0.0.1", server.port)) as client:
                     client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # leaves by a reset
                     client.sendall(sent)
         assert ask(server, "GET", "/")[0] == 200
-        try:
-            raise ValueError("a bug")
-        except ValueError:
-            server.handle_error(None, ("127.0.0.1", 1))
+        view.shown = lambda camera_id: {}["a bug"]
+        assert ask(server, "GET", "/image/X.png")[0] == 500
     said = capsys.readouterr().err
     assert "a bug" in said  # what is not about the client is still shown
     assert "Connection" not in said

@@ -1,6 +1,5 @@
 """The page of ``labcapture view`` in a real browser."""
 
-import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -8,8 +7,9 @@ import pytest
 
 from capture.plan.plan import read_plan
 from capture.session.run import run_plan
-from capture.web.serve import PageServer
+from capture.web.serve import Pages
 from capture.web.state import SessionView
+from survey.workbench.live import Listening
 from tests.browsing import CONTRAST, INKED, Page
 from tests.capture.session_runs import write_plan
 
@@ -21,10 +21,8 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Of a session that has taken its images."""
     plan = read_plan(write_plan(tmp_path_factory.mktemp("view")))
     run_plan(plan, shown=False)
-    with PageServer(SessionView(plan)) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield server.url
-        server.shutdown()
+    with Listening(Pages(SessionView(plan)), "127.0.0.1", 0) as listening:
+        yield listening.address
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import pytest
 from survey.batch.cache import unchanged_solution
 from survey.cli import main
 from survey.jobs.adjusting.job import adjust_job
-from survey.jobs.detecting import detect_job
+from survey.jobs.detecting.job import detect_job
 from survey.jobs.network import add_job
 from survey.project import read
 from survey.project.detected import read_detected

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 CORPUS = ROOT / "tests" / "fuzz" / "corpus"
 NO_READERS = {
-    "survey/commands/opening.py:_open": "a browser",
+    "survey/commands/opening.py:open_project": "a browser",
     "survey/report/modules.py:bundled": "a part of the package",
     "survey/report/modules.py:looks": "a part of the package",
     "survey/report/page.py:_words": "a part of the package",
@@ -36,14 +36,15 @@ NO_READERS = {
     "survey/project/merging.py:read_copy": "the copy of a project that was read before",
     "survey/project/tables/files.py:_last_start": "the line of what could not be read, for the message",
     "survey/jobs/starting.py:start_project": "copies images that read_image has read before",
-    "survey/interop/cameras/colmap.py:reconstruction": "an empty model of pycolmap, to be filled and written",
+    "survey/interop/cameras/colmap_writer.py:reconstruction": "an empty model of pycolmap, to be filled and written",
     "survey/report/page.py:_by_browser": "a PDF that was just printed",
     "survey/report/language.py:catalogue": "the program's own words",
+    "survey/workbench/bodies.py:json_of": "a request; tests/survey/test_workbench_hostile.py",
+    "survey/workbench/server.py:Server._file": "the workbench's own files",
     "survey/jobs/adjusting/edits.py:_table": "a table of a project that was read and diagnosed before",
     "survey/project/declared/editing.py:with_product": "the text of survey.toml, read before",
     "survey/project/declared/editing.py:_with_change": "the text of survey.toml, read before",
-    "survey/project/declared/editing.py:with_sigma_scale": "the text of survey.toml, read before",
-    "survey/project/declared/editing.py:with_datum": "the text of survey.toml, read before",
+    "survey/project/declared/editing.py:_with_keys": "the text of survey.toml, read before",
     "survey/project/declared/editing.py:with_treatment": "the text of survey.toml, read before",
     "capture/devices/cameras/opencv.py:discover": "the system's list of devices",
     "capture/devices/cameras/opencv.py:_serial": "the system's list of devices",
@@ -57,8 +58,8 @@ NO_READERS = {
     "capture/simulated/controller.py:SimulatedTable.__init__": "opens to write",
     "capture/simulated/pylon_camera.py:LabPylonCamera.open": "a device",
     "capture/session/table_jobs.py:_with_table": "a device",
-    "capture/web/serve.py:_Handler.do_GET": "the program's own page",
-    "capture/web/serve.py:_Handler.do_POST": "a request; tests/capture/test_web.py",
+    "capture/web/serve.py:_file": "the program's own page",
+    "capture/web/serve.py:Pages._command": "a request; tests/capture/test_web.py",
     "capture/web/state.py:LiveView.__init__": "a device",
 }
 """Functions that open or parse something, and why nothing that a stranger has written comes through them."""

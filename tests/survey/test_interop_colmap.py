@@ -11,8 +11,8 @@ from gtsam import Pose3, Rot3
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from survey.cli import main
-from survey.interop.cameras.colmap import reconstruction, rigid3d
 from survey.interop.cameras.colmap_model import read_model
+from survey.interop.cameras.colmap_writer import reconstruction, rigid3d
 from survey.jobs.converting import adjusted_values
 from survey.project import read
 from tests.survey.camera_lab import SIGMA_PX, world_pixels

@@ -202,6 +202,22 @@ def test_tests_of_loops_are_distributed_as_they_claim():
     assert abs(sum(tests) - 360) < 135
 
 
+def test_every_loop_is_told_with_its_sigma_along_it_however_many_there_are():
+    survey, _ = _network(48, combinations(range(48), 2), 1.0)
+    loops = pair_loops(survey)
+    found = loops_dict(loops)["worst_first"]
+    assert len(found) == 48 * 47 // 2 - 47 > 1000
+    assert [e["p_value"] for e in found] == sorted(e["p_value"] for e in found)
+    at = {loops.basis.pairs(k): k for k in range(len(loops.test))}
+    for entry in found[::97]:
+        k = at[tuple(entry["pairs"])]
+        for unit, of, factor in (("arcsec", slice(3), ARCSEC_PER_RAD), ("mm", slice(3, 6), 1e3)):
+            w, length = loops.vector[k, of], np.linalg.norm(loops.vector[k, of])
+            sigma = np.sqrt(w @ loops.cov[k, of, of] @ w) / length
+            got = [entry[f"misclosure_{unit}"], entry[f"sigma_misclosure_{unit}"]]
+            assert got == pytest.approx([factor * length, factor * sigma], rel=1e-12)
+
+
 def test_both_ways_of_adjusting_a_pure_network_agree():
     survey, _ = _network(6, combinations(range(6), 2), 1.0)
     mixed = _mixed(survey)

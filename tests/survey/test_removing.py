@@ -153,7 +153,7 @@ def test_distances_and_sets_of_coordinates(tmp_path):
     with pytest.raises(SurveyError, match="cannot do without coordinates:C"):
         remove_job(lab, ["C"], progress=False)
     outcome = remove_job(lab, ["distances:twice"], progress=False)
-    assert outcome.removed == ("distances:twice",)
+    assert outcome.summary()["removed"] == ["distances:twice"]
     survey = read(lab).survey
     assert not survey.distances[0].used
     assert all(p.used for p in survey.pairs)

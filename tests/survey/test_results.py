@@ -20,7 +20,7 @@ from adjust.native.text import NUMBERS, TEXT, WORD, Words, number_rows, record_r
 from survey.report.language import ReportOptions
 from survey.report.results import write_results
 from survey.simulate import head_on_table
-from survey.solution.covariances import covariance_npz, read_covariances
+from survey.solution.covariances import covariance_npz, read_estimates
 from survey.solution.dictionary import RunInfo, solution_dict
 from survey.solution.frames import AdjustedFrames, table_from_mount
 from survey.solution.quantities import ellipsoid, key_of, pose_entry, scale_of, vector_entry
@@ -270,13 +270,21 @@ def test_frames_follow_the_table_and_its_adjusted_angles(adjustment: Adjustment)
 def test_covariances_come_back_as_they_were(adjustment: Adjustment, tmp_path: Path) -> None:
     path = tmp_path / "covariance.npz"
     path.write_bytes(covariance_npz(adjustment))
-    blocks = read_covariances(path)
-    assert len(blocks) == len(adjustment.estimates)
-    np.testing.assert_allclose(
-        blocks["world_from_station/relay"],
-        adjustment.sigma0**2 * adjustment.estimates["world_from_station", "relay"].cov, rtol=1e-14,
-    )  # fmt: skip
+    back = read_estimates(path)
+    assert list(back) == list(adjustment.estimates)
+    for name, e in adjustment.estimates.items():
+        np.testing.assert_allclose(back[name].cov, e.cov, rtol=1e-14)
+        assert (back[name].components, back[name].units, back[name].status) == (e.components, e.units, e.status)
+        if isinstance(e.value, Pose3):
+            assert back[name].value.equals(e.value, 0.0)
+        else:
+            np.testing.assert_array_equal(back[name].value, e.value)
     with np.load(path) as found:
+        relay = np.flatnonzero(found["parameters"] == "world_from_station/relay")[0]
+        np.testing.assert_allclose(
+            found["covariance"][found["block"][relay] : found["block"][relay + 1]].reshape(6, 6),
+            adjustment.sigma0**2 * adjustment.estimates["world_from_station", "relay"].cov, rtol=1e-14,
+        )  # fmt: skip
         assert "table_angles/turntable/e01/axis2" in found["names"]
         assert str(found["sigmas"]) == "a_posteriori"
         assert "tangent" in " ".join(found["README"]).lower()

@@ -13,8 +13,8 @@ from survey.jobs.aligning import align_job
 from survey.jobs.navigating.job import NavigateRequest, navigate_job
 from survey.project import AdjustmentOptions, read, write_project
 from survey.simulate import beacons
-from survey.solution.covariances import read_covariances
 from tests.adjust.test_deformation import chain, measured, small
+from tests.covariances import written_covariances
 from tests.survey.test_working_sheet import definition, write
 
 KINDS = (None, "a_priori", "a_posteriori")
@@ -54,7 +54,7 @@ def test_results_and_report_obey(tmp_path):
         folder = tmp_path / str(sigmas)
         _project(folder, sigmas)
         found[sigmas] = _solution(folder)
-        covs[sigmas] = read_covariances(folder / "results" / "covariance.npz")["world_from_station/S3"]
+        covs[sigmas] = written_covariances(folder / "results" / "covariance.npz")["world_from_station/S3"]
         pages[sigmas] = (folder / "results" / "report.html").read_text(encoding="utf-8")
     sigma0 = found[None]["summary"]["sigma0"]
     assert abs(sigma0 - 1.0) > 0.01  # so that the two kinds differ

@@ -22,7 +22,6 @@ from survey.project import read
 from survey.report.anchors import anchors_in
 from survey.solution.earlier.changes import snapshot, solution_changes
 from survey.solution.earlier.runs import MOST, list_runs, load_run
-from survey.workbench import views
 from survey.workbench.pictures import picture
 from survey.workbench.rows import BY_PEOPLE, IN_USE, columns, point_rows
 from survey.workbench.session import Workbench
@@ -77,10 +76,10 @@ def test_a_decision_gives_what_the_command_line_gives(bench, mine):
 
 
 def test_parameters_have_the_angles_of_the_results(bench):
-    columns = views.parameters(bench)["columns"]
+    columns = bench.parameters()["columns"]
     texts = {k: [columns[k]["texts"][i] for i in columns[k]["codes"]] for k in ("name", "component", "unit")}
     rows = list(zip(*texts.values(), columns["value"], strict=True))
-    wanted = views.statistics_part(bench, "solution")["solution"]["cameras"]["right"]["station_from_camera"]
+    wanted = bench.statistics_part("solution")["solution"]["cameras"]["right"]["station_from_camera"]
     found = [row[2:] for row in rows if row[0] == "station_from_camera/right"]
     assert [unit for unit, _ in found] == [*(3 * ["deg"]), *(3 * ["mm"])]
     expected = [*wanted["rotation_euler_xyz_deg"], *wanted["translation_mm"]]
@@ -107,17 +106,17 @@ def test_a_planted_mistake_is_found_left_out_and_back(mine):
     name = wrong_point(mine)
     bench = Workbench(mine)
     bench.adjust()
-    worst = views.findings(bench)["findings"][0]
+    worst = bench.findings()["findings"][0]
     assert worst["id"] == f"image_point:{name}"
     assert worst["share"] > 1.0
     change = worst["remedies"][0]["changes"][0]
     bench.exclude(change["name"], reason="reflection")
-    assert all(f["id"] != worst["id"] for f in views.findings(bench)["findings"])
+    assert all(f["id"] != worst["id"] for f in bench.findings()["findings"])
     row = next(i for i in np.flatnonzero(bench.rows.why == BY_PEOPLE))
     assert bench.rows.id_of(int(row)) == name
     assert np.isfinite(bench.rows.residuals[row]).all()  # predicted still: it can be invited back
     bench.undo()
-    assert views.findings(bench)["findings"][0]["id"] == worst["id"]
+    assert bench.findings()["findings"][0]["id"] == worst["id"]
 
 
 def test_a_camera_left_out_can_still_be_seen_and_come_back(bench):
@@ -327,7 +326,7 @@ def test_exclusions_of_another_command_are_those_of_the_next_session(bench, mine
     exclude_job(mine, [f"left/{epoch}"], "by hand")
     bench.reload()
     assert [str(n) for n in bench.situation.exclusions] == [f"image:left/{epoch}"]
-    assert views.state(bench)["exclusions"][0]["reason"] == "by hand"
+    assert bench.state()["exclusions"][0]["reason"] == "by hand"
 
 
 def definition(folder):
@@ -411,7 +410,7 @@ def test_a_remedy_is_carried_out_by_one_call_and_taken_back_by_undo_unless_other
     bench = Workbench(folder)
     bench.adjust()
     table = folder / "observations/image_points.csv"
-    found = views.findings(bench)["remedies"]
+    found = bench.findings()["remedies"]
     assert "mirrored" in found[0]["cause"]
     assert found[0]["possible"]
     assert 0.9 < found[0]["explained"] <= 1.0
@@ -455,17 +454,17 @@ def test_what_cannot_be_adjusted_has_its_remedies_too(mine, monkeypatch):
     bench = Workbench(mine)
     with pytest.raises(SurveyError):
         bench.adjust()
-    said = views.findings(bench)
+    said = bench.findings()
     assert (said["verdict"], said["reason"], said["findings"]) == ("failed", "nothing fits", [])
     assert said["remedies"][0]["anchor"] == f"#epoch={epoch}"
-    assert views.state(bench)["failure"] == "nothing fits"
-    assert len(views.points(bench)) > 1000
+    assert bench.state()["failure"] == "nothing fits"
+    assert len(bench.points()) > 1000
     bench.apply_remedy(1)
     assert bench.failure is None
     assert bench.adjustment.sigma0 < 2
     assert "tried: epoch moved" in exclusions(mine)[-1]
     bench.undo()
-    assert views.state(bench)["failure"] == "nothing fits"
+    assert bench.state()["failure"] == "nothing fits"
     assert len(bench.remedies) == 1
     bench.redo()
     assert bench.adjustment.sigma0 < 2
@@ -482,7 +481,7 @@ def test_the_network_of_readings_is_where_the_solution_is(tmp_path):
     path.write_text("\n".join([*lines[:2], ",".join(cells), *lines[3:]]) + "\n")
     bench = Workbench(tmp_path / "lab")
     bench.adjust()
-    found = views.network(bench)
+    found = bench.network()
     assert found["n_nowhere"] == 0
     adjusted = {o.ids[0]: o.adjusted[0] for o in bench.adjustment.other_residuals if o.kind == "distance"}
     ends = {x["id"].split(":")[1]: np.array(x["x"]) for x in found["lines"] if x["table"] == "distances"}

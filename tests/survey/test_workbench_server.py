@@ -25,7 +25,7 @@ from survey.workbench.live import Listening
 from survey.workbench.pages.beginning import Beginning
 from survey.workbench.server import WEB, Server
 from survey.workbench.session import Workbench
-from survey.workbench.views import PARTS
+from survey.workbench.views.project import PARTS
 from tests.browsing import SECONDS
 from tests.survey.test_workbench import exclusions, wrong_point
 

@@ -42,24 +42,17 @@ def look_beforehand(survey: Survey) -> Beforehand:
 
 def _expected(survey: Survey) -> tuple[Adjustment | None, list[Finding]]:
     """The precision to be expected, or why there is none."""
-    try:
-        survey = supported(survey)[0]
-    except IndeterminateError as error:
-        return None, [_undetermined(error)]
+    start = None
+    survey = supported(survey)[0]
     try:
         start = find_start(survey)
-    except SurveyError as error:
-        return None, [Finding("problem", "no start values", (), str(error), "mend that first")]
-    try:
         return expect(survey, start), []
-    except IndeterminateError as error:
-        return None, [_undetermined(error)]
     except SurveyError as error:
-        return None, [Finding("problem", "no start values", (), str(error), "mend that first")]
-
-
-def _undetermined(error: IndeterminateError) -> Finding:
-    return Finding("problem", "undetermined", (), str(error), "measure or fix what is named")
+        if start is not None and isinstance(error, IndeterminateError):
+            found = Finding("problem", "undetermined", (), str(error), "measure or fix what is named")
+        else:
+            found = Finding("problem", "no start values", (), str(error), "mend that first")
+        return None, [found]
 
 
 def _weak(expected: Adjustment) -> Iterator[Finding]:

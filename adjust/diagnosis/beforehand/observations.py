@@ -5,8 +5,10 @@ from collections.abc import Iterator, Mapping
 
 from adjust.diagnosis.hypothesis import Finding
 from adjust.model.errors import listed
-from adjust.model.observations import PositionRef
+from adjust.model.names import grouped
+from adjust.model.observations import CoordinateDifferences, Coordinates
 from adjust.model.result import Adjustment
+from adjust.model.subsets import positions_of
 from adjust.model.survey import Survey
 
 
@@ -25,16 +27,9 @@ def _usage(survey: Survey) -> Counter[str]:
     for block in survey.image_blocks:
         for i in block.point_idx[block.mask].tolist() if block.target_id is None else ():
             out[survey.points[i].point_id] += 2
-    refs: list[tuple[PositionRef | None, int]] = [
-        *((ref, 1) for r in survey.readings if r.used for ref in {r.at, r.to, r.second}),
-        *((ref, 1) for d in survey.distances if d.used for ref in (d.a, d.b)),
-        *((ref, 3) for c in survey.coordinates if c.used for ref in c.positions),
-        *((ref, 3) for b in survey.coordinate_differences if b.used for ref in (*b.at, *b.to)),
-        *((o.position, 1) for o in survey.on_surfaces if o.used),
-    ]
-    for ref, n in refs:
-        if ref is not None and ref.frame is None:
-            out[str(ref.point_id)] += n
+    for o in (o for kind in survey.others.values() for o in kind if o.used):
+        for ref in (ref for ref in positions_of(o) if ref.frame is None):
+            out[str(ref.point_id)] += 3 if isinstance(o, Coordinates | CoordinateDifferences) else 1
     return out
 
 
@@ -42,7 +37,7 @@ def _lonely_ids(survey: Survey, used: Mapping[str, int]) -> Iterator[Finding]:
     """Free points that a single sight names: often a name typed wrongly."""
     sights: Counter[str] = Counter()
     for r in survey.readings:
-        sights.update({str(x.point_id) for x in (r.at, r.to, r.second) if x is not None and x.frame is None})
+        sights.update({str(x.point_id) for x in positions_of(r) if x.frame is None})
     for b in survey.image_blocks:
         if b.target_id is None:
             sights.update(survey.points[i].point_id for i in b.point_idx.tolist())
@@ -55,7 +50,7 @@ def _lonely_ids(survey: Survey, used: Mapping[str, int]) -> Iterator[Finding]:
 def _lonely_targets(survey: Survey) -> Iterator[Finding]:
     """Targets at a place of their own that a single image shows: nothing is gained by them, or their name is wrong."""
     sights = Counter(b.target_id for b in survey.image_blocks if b.n_used)
-    named = {r.frame.frame_id for d in survey.distances for r in (d.a, d.b) if r.frame is not None}
+    named = {r.frame.frame_id for d in survey.distances for r in positions_of(d) if r.frame is not None}
     named |= {r.frame_id for p in survey.pairs for r in (p.a, p.b)} | {s.target_id for s in survey.laser_spots}
     named |= {x.frame.frame_id for x in survey.levels} | {r.frame_id for x in survey.alignments for r in (x.a, x.b)}
     for t in survey.targets:
@@ -78,16 +73,14 @@ def _epochs(survey: Survey) -> Iterator[Finding]:
     """Epochs that join nothing: one camera alone sees something that is there at this epoch alone."""
     movers = {s.station_id for s in survey.stations if s.motion == "epoch"}
     hand_held = {t.target_id for t in survey.targets if t.motion == "epoch"}
-    seen: dict[str, set[str]] = {}
-    alone: dict[str, bool] = {}
     station_of = {c.camera_id: c.station_id for c in survey.cameras}
-    for b in survey.image_blocks:
-        seen.setdefault(b.epoch_id, set()).add(b.camera_id)
-        loose = b.target_id in hand_held or (station_of[b.camera_id] in movers)
-        alone[b.epoch_id] = alone.get(b.epoch_id, True) and loose
+    seen = grouped((b.epoch_id, b) for b in survey.image_blocks)
+    loose = {e for e, of in seen.items()
+             if all(b.target_id in hand_held or station_of[b.camera_id] in movers for b in of)}  # fmt: skip
     tied = {r.epoch_id for p in survey.pairs for r in (p.a, p.b)}
-    lonely = [e for e, cameras in seen.items() if len(cameras) == 1 and alone[e] and e not in tied]
-    rig = len({station_of[c] for cs in seen.values() for c in cs}) < len({c for cs in seen.values() for c in cs})
+    lonely = [e for e, of in seen.items() if e in loose - tied and len({b.camera_id for b in of}) == 1]
+    cameras = {b.camera_id for b in survey.image_blocks}
+    rig = len({station_of[c] for c in cameras}) < len(cameras)
     if rig and lonely and len(lonely) > 0.5 * len(seen):
         yield Finding("weak", "epochs without partners", tuple(lonely),
                       f"{len(lonely)} of {len(seen)} epochs are seen by one camera alone: {listed(lonely, 6)}",

@@ -8,13 +8,14 @@ import numpy as np
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Finding, Hypothesis
 from adjust.diagnosis.names.given import wrong_given
-from adjust.diagnosis.units.conventions import ANGLES, LENGTH_RATIOS, LENGTHS, SLIPS
+from adjust.diagnosis.units.conventions import ANGLES, LENGTH_RATIOS, SLIPS
 from adjust.diagnosis.units.readings import misread_readings
 from adjust.diagnosis.weights.sigmas import ODD, id_of, odd_among
 from adjust.model.errors import listed
 from adjust.model.names import grouped
-from adjust.model.observations import Distance, PositionRef, Reading
+from adjust.model.observations import Distance, Reading
 from adjust.model.result import Adjustment
+from adjust.model.subsets import positions_of
 from adjust.model.survey import Survey
 
 _NEAR, _OFF = 0.02, 0.1
@@ -60,22 +61,17 @@ def _tried(make: Callable[[Case], Iterable[Hypothesis]], case: Case) -> list[Hyp
 
 def _slips(given: Survey, predicted: Survey) -> Iterator[_Slip]:
     """Lengths and angles that fit as soon as their decimal point is moved, and do not as they stand."""
-    distances, readings = ({o.distance_id: o.value for o in predicted.distances},
-                           {o.reading_id: o.value for o in predicted.readings})  # fmt: skip
-    for d in (d for d in given.distances if d.used and d.distance_id in distances):
-        if said := _slipped(f"distance {d.distance_id}", d.value, distances[d.distance_id], 1e3, "mm"):
-            yield _Slip(d.distance_id, said, _points((d.a, d.b)))
-    for r in (r for r in given.readings if r.used and r.reading_id in readings):
-        to, is_length = readings[r.reading_id], r.kind in LENGTHS
-        factor, unit = (1.0, "m") if is_length else (180.0 / np.pi, "deg")
-        if is_length or r.kind in ANGLES:
-            to = to if is_length else to % (2.0 * np.pi)
-            if said := _slipped(f"{r.kind} {r.reading_id}", r.value, to, factor, unit):
-                yield _Slip(r.reading_id, said, _points((r.at, r.to)))
-
-
-def _points(refs: Iterable[PositionRef]) -> frozenset[str]:
-    return frozenset(str(ref.point_id) for ref in refs if ref.frame is None)
+    there: tuple[Distance | Reading, ...] = (*predicted.distances, *predicted.readings)
+    every: tuple[Distance | Reading, ...] = (*given.distances, *given.readings)
+    known = {(type(o), id_of(o)): o.value for o in there}
+    for o in (o for o in every if o.used and (type(o), id_of(o)) in known):
+        to, kind = known[type(o), id_of(o)], o.kind if isinstance(o, Reading) else "distance"
+        factor, unit = (1e3, "mm") if isinstance(o, Distance) else (1.0, "m")
+        if kind in ANGLES:
+            to, factor, unit = to % (2.0 * np.pi), 180.0 / np.pi, "deg"
+        if said := _slipped(f"{kind} {id_of(o)}", o.value, to, factor, unit):
+            ends = (ref for ref in positions_of(o)[:2] if ref.frame is None)
+            yield _Slip(id_of(o), said, frozenset(str(ref.point_id) for ref in ends))
 
 
 def _slipped(what: str, value: float, predicted: float, factor: float, unit: str) -> str:

@@ -5,7 +5,7 @@ neighbouring epochs. What is tried are clocks as unknowns (:mod:`adjust.diagnosi
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
@@ -19,7 +19,7 @@ from adjust.diagnosis.late import Freed, as_unknowns, keyed, spoken
 from adjust.diagnosis.prediction import Linear
 from adjust.diagnosis.sequences import hand_poses
 from adjust.model.names import grouped
-from adjust.model.observations import ImageBlock, TableReading
+from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import Clock, FloatArray, Survey
@@ -77,97 +77,98 @@ def _smooth(uv: FloatArray) -> tuple[FloatArray, FloatArray]:
     return speed, bend
 
 
-def _always(_: int, n: int, block: ImageBlock, height: int) -> FloatArray:
-    return np.ones(len(block.uv))
+@dataclass(frozen=True)
+class _Late:
+    """How cameras are late. weight: how much later each point of an image is by one unit; components: of a clock."""
+
+    name: str
+    weight: Callable[[int, int, ImageBlock, int], FloatArray]
+    components: tuple[str, ...]
+    text: str
+    remedy: str
+    unit: str
 
 
-def _with_time(k: int, n: int, block: ImageBlock, height: int) -> FloatArray:
-    return np.full(len(block.uv), drift_times(n)[k])
-
-
-def _with_row(_: int, n: int, block: ImageBlock, height: int) -> FloatArray:
-    return np.asarray((block.uv[:, 1] + 0.5) / height - 0.5)
-
-
-_Weight = Callable[[int, int, ImageBlock, int], FloatArray]
-_CAMERAS: Sequence[tuple[str, _Weight, tuple[str, ...]]] = (
-    ("cameras not simultaneous", _always, ("offset",)), ("clock drift", _with_time, ("offset", "drift")),
-    ("rolling shutter", _with_row, ("line_time",)),
+_TOGETHER = "trigger the cameras together, or hold the target still at every epoch, and measure again"
+_LATE = (
+    _Late("cameras not simultaneous", lambda k, n, b, height: np.ones(len(b.uv)), ("offset",),
+          "camera {} does not expose when the others do: its clock is late", _TOGETHER, "throughout"),
+    _Late("clock drift", lambda k, n, b, height: np.full(len(b.uv), drift_times(n)[k]), ("offset", "drift"),
+          "camera {} does not expose when the others do, and less and less so: its clock drifts", _TOGETHER,
+          "over all epochs"),
+    _Late("rolling shutter", lambda k, n, b, height: (b.uv[:, 1] + 0.5) / height - 0.5, ("line_time",),
+          "the rows of camera {} are read one after the other while things move",
+          "hold still what moves, or take a camera with a global shutter", "from the first row to the last"),
 )  # fmt: skip
-"""Causes, how much later an image point is by one unit of them, and the unknowns of a clock."""
 
 
 def _of_cameras(case: Case, linear: Linear) -> Iterator[Effect]:
     cameras = {c.camera_id: () if c.clock is None else c.clock.parameters.free for c in case.survey.cameras}
-    motion = _motion(linear.result.survey)
-    blocks = linear.result.survey.image_blocks
-    moving = [c for c in cameras if sum(blocks[i].camera_id == c for i in motion) >= _FEWEST - 2]
-    for name, weight, components in _CAMERAS:
-        which = [c for c in (moving if "line_time" in components else moving[1:]) if components[-1] not in cameras[c]]
+    survey = linear.result.survey
+    moving = [c for c in cameras if sum(survey.image_blocks[i].camera_id == c for i in _motion(survey)) >= _FEWEST - 2]
+    for late in _LATE:
+        possible = moving if late.components == ("line_time",) else moving[1:]
+        which = [c for c in possible if late.components[-1] not in cameras[c]]
         if not which:
             continue
-        first = of_shifts(linear, _late(linear.result.survey, which, weight))
+        first = of_shifts(linear, _shifts(survey, which, late))
         sigmas = np.sqrt(np.maximum(np.diag(first.cov), 1e-300) * linear.scale)
         clear = [c for c, t, s in zip(which, first.theta, sigmas, strict=True) if abs(t) > _CLEAR * s]
         if clear:
-            yield _camera_effect(case, linear, name, weight, clear, {("camera_clock", c): components for c in clear})
+            yield _late_cameras(case, linear, late, clear)
 
 
-def _late(survey: Survey, cameras: Sequence[str], weight: _Weight) -> Shifts:
+def _weighted(
+    survey: Survey, cameras: Sequence[str], late: _Late
+) -> Iterator[tuple[int, int, FloatArray, FloatArray, FloatArray]]:
+    """Image blocks of these cameras with a course: position, number of the camera, weights (n, 1), speed and bend."""
+    for i, (k, n, speed, bend) in _motion(survey).items():
+        b = survey.image_blocks[i]
+        if b.camera_id in cameras:
+            w = late.weight(k, n, b, survey.cameras_by_id[b.camera_id].image_size[1])
+            yield i, cameras.index(b.camera_id), w[:, None], speed, bend
+
+
+def _shifts(survey: Survey, cameras: Sequence[str], late: _Late) -> Shifts:
     """By block the shifts (n, 2, k) px that an interval of each of k cameras makes."""
     out = {}
-    for i, (k, n, speed, _) in _motion(survey).items():
-        block = survey.image_blocks[i]
-        if block.camera_id in cameras:
-            D = np.zeros((len(speed), 2, len(cameras)))
-            w = weight(k, n, block, survey.cameras_by_id[block.camera_id].image_size[1])
-            D[:, :, cameras.index(block.camera_id)] = w[:, None] * speed
-            out[i] = D
+    for i, k, w, speed, _ in _weighted(survey, cameras, late):
+        out[i] = np.zeros((len(speed), 2, len(cameras)))
+        out[i][:, :, k] = w * speed
     return out
 
 
-def _camera_effect(case: Case, linear: Linear, name: str, weight: _Weight, cameras: list[str], freed: Freed) -> Effect:
-    first = of_shifts(linear, _late(linear.result.survey, cameras, weight))
-    worst = cameras[int(np.argmax(np.abs(first.theta)))]
-    drift, rows = name == "clock drift", name == "rolling shutter"
-    late = (f"camera {worst} does not expose when the others do{', and less and less so' if drift else ''}: its clock "
-            f"{'drifts' if drift else 'is late'}")  # fmt: skip
-    text = f"the rows of camera {worst} are read one after the other while things move" if rows else late
-    remedy = ("hold still what moves, or take a camera with a global shutter" if rows else
-              "trigger the cameras together, or hold the target still at every epoch, and measure again")  # fmt: skip
-    hypothesis = Hypothesis(name, "", remedy, Place("camera", (worst,), "clock"), case.survey, (), 1.0, 0)
-    unit = "from the first row to the last" if rows else "over all epochs" if drift else "throughout"
-    model = None if rows else lambda h: as_unknowns(case, replace(hypothesis, evidence=h.evidence), freed)
-    said = f"{text} ({{}}, {unit})"
-    return _by_tracks(case, keyed(case.survey, hypothesis, freed), weight, cameras, first, said, model)
+def _late_cameras(case: Case, linear: Linear, late: _Late, cameras: Sequence[str]) -> Effect:
+    """Image points moved along their tracks to where they were in time: a clock as an unknown costs many times more."""
+    survey = case.survey
+    freed: Freed = {("camera_clock", c): late.components for c in cameras}
 
-
-def _by_tracks(
-    case: Case, hypothesis: Hypothesis, weight: _Weight, cameras: Sequence[str], first: Score, text: str,
-    model: Callable[[Hypothesis], Hypothesis] | None,
-) -> Effect:  # fmt: skip
-    """Image points moved along their tracks to where they were in time: a clock as an unknown costs many times more.
-
-    text: its cause, with a place for the size. model: with such a clock, for what tracks do not tell.
-    """
-    heights = {c.camera_id: c.image_size[1] for c in case.survey.cameras}
-    factor, of_time = spoken(case.survey)
+    def scored(at: Linear) -> Score:
+        return of_shifts(at, _shifts(at.result.survey, cameras, late))
 
     def mended(_: Adjustment, theta: FloatArray) -> Survey:
         blocks = {}
-        for i, (k, n, speed, bend) in _motion(case.survey).items():
-            b = case.survey.image_blocks[i]
-            if b.camera_id in cameras:
-                late = (theta[cameras.index(b.camera_id)] * weight(k, n, b, heights[b.camera_id]))[:, None]
-                blocks[i] = replace(b, uv=b.uv - late * speed + 0.5 * late**2 * bend)
-        return with_rows(case.survey, "image_blocks", blocks)
+        for i, k, w, speed, bend in _weighted(survey, cameras, late):
+            b, by = survey.image_blocks[i], theta[k] * w
+            blocks[i] = replace(b, uv=b.uv - by * speed + 0.5 * by**2 * bend)
+        return with_rows(survey, "image_blocks", blocks)
+
+    first, (factor, of_time) = scored(linear), spoken(survey)
+    worst = cameras[int(np.argmax(np.abs(first.theta)))]
 
     def said(theta: FloatArray, sigmas: FloatArray) -> str:
         sizes = zip(cameras, factor * theta, factor * sigmas, strict=True)
-        return text.format(", ".join(f"camera {c}: {t:+.3g} +- {s:.2g} {of_time}" for c, t, s in sizes))
+        each = ", ".join(f"camera {c}: {t:+.3g} +- {s:.2g} {of_time}" for c, t, s in sizes)
+        return f"{late.text.format(worst)} ({each}, {late.unit})"
 
-    return Effect(hypothesis, first, lambda at: of_shifts(at, _late(at.result.survey, cameras, weight)), mended, said,
-                  further=model)  # fmt: skip
+    plain = Hypothesis(late.name, "", late.remedy, Place("camera", (worst,), "clock"), survey, (), 1.0, 0)
+
+    def modelled(tried: Hypothesis) -> Hypothesis:
+        """With such a clock as an unknown, for what tracks do not tell."""
+        return as_unknowns(case, replace(plain, evidence=tried.evidence), freed)
+
+    further = None if late.components == ("line_time",) else modelled
+    return Effect(keyed(survey, plain, freed), first, scored, mended, said, further=further)
 
 
 def _modelled(
@@ -178,17 +179,17 @@ def _modelled(
 
     score: of n observations that are late, each by so much (n,).
     """
+
+    def effect(name: str, freed: Freed, text: str, first: Score) -> Effect:
+        hypothesis = Hypothesis(name, "", remedy, place, case.survey, (), 1.0, 0)
+        return Effect(hypothesis, first, lambda _: first, lambda *_: case.survey, lambda *_: text,
+                      model=lambda h: as_unknowns(case, h, freed))  # fmt: skip
+
     free = () if known is None else known.parameters.free
-    for name, components, text, late in (("clock offset", ("offset",), texts[0], np.ones(n)),
-                                         ("clock drift", ("offset", "drift"), texts[1], drift_times(n))):  # fmt: skip
-        if components[-1] not in free:
-            hypothesis = Hypothesis(name, "", remedy, place, case.survey, (), 1.0, 0)
-            yield _unknown(case, hypothesis, {owner: components}, score(late), text)
-
-
-def _unknown(case: Case, hypothesis: Hypothesis, freed: Freed, first: Score, text: str) -> Effect:
-    return Effect(hypothesis, first, lambda _: first, lambda *_: case.survey, lambda *_: text,
-                  model=lambda h: as_unknowns(case, h, freed))  # fmt: skip
+    if "offset" not in free:
+        yield effect("clock offset", {owner: ("offset",)}, texts[0], score(np.ones(n)))
+    if "drift" not in free:
+        yield effect("clock drift", {owner: ("offset", "drift")}, texts[1], score(drift_times(n)))
 
 
 # -- tables and hands ------------------------------------------------------------------------------------------------
@@ -218,24 +219,23 @@ def _of_tables(case: Case, linear: Linear) -> Iterator[Effect]:
 
 
 def _gear_effect(case: Case, linear: Linear, table_id: str, axis: int, D: dict[tuple[str, ...], FloatArray]) -> Effect:
-    shifts = {i: d[:, None] for i, d in D.items()}
+    readings = case.survey.table_readings
 
-    def mended(r: TableReading, theta: float) -> TableReading:
-        d = D.get((r.table_id, r.epoch_id))
-        return r if d is None else replace(r, angles=r.angles - theta * d)
+    def scored(at: Linear) -> Score:
+        return of_others(at, "table", {i: d[:, None] for i, d in D.items()})
+
+    def mended(_: Adjustment, theta: FloatArray) -> Survey:
+        mine = {i: r for i, r in enumerate(readings) if (r.table_id, r.epoch_id) in D}
+        new = {i: replace(r, angles=r.angles - theta[0] * D[r.table_id, r.epoch_id]) for i, r in mine.items()}
+        return with_rows(case.survey, "table_readings", new)
 
     def said(theta: FloatArray, sigmas: FloatArray) -> str:
         return (f"table {table_id}: axis {axis + 1} turns by {theta[0]:+.6f} +- {sigmas[0]:.6f} of its readings more "
                 "than they say: its gear ratio, or the lines of its encoder")  # fmt: skip
 
-    hypothesis = Hypothesis("gear ratio", "", "correct table_angles.csv", Place("table", (table_id,), "axis1_deg"),
-                            case.survey, (), 1.0, 0)  # fmt: skip
-    return Effect(
-        hypothesis, of_others(linear, "table", shifts), lambda at: of_others(at, "table", shifts),
-        lambda _, theta: replace(case.survey, table_readings=tuple(
-            mended(r, float(theta[0])) for r in case.survey.table_readings)),
-        said,
-    )  # fmt: skip
+    place = Place("table", (table_id,), "axis1_deg")
+    hypothesis = Hypothesis("gear ratio", "", "correct table_angles.csv", place, case.survey, (), 1.0, 0)
+    return Effect(hypothesis, scored(linear), scored, mended, said)
 
 
 def _of_hands(case: Case, linear: Linear) -> Iterator[Effect]:

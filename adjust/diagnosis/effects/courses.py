@@ -9,6 +9,7 @@ from gtsam import Pose3
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import CENTRE, FOCAL
 from adjust.diagnosis.prediction import Linear
+from adjust.model.names import numbered
 from adjust.model.result import ParameterName
 from adjust.model.survey import IntArray, Survey
 from adjust.statistics.normal import DENSE
@@ -136,9 +137,8 @@ def _of_images(
 ) -> Iterator[Course]:
     blocks = linear.result.survey.image_blocks
     ptr = 2 * linear.result.image_residuals.block_ptr
-    epochs = list(dict.fromkeys(b.epoch_id for b in blocks))
-    number = {e: k for k, e in enumerate(epochs)}
-    of = np.repeat([number[b.epoch_id] for b in blocks], np.diff(ptr))
+    epochs, at = numbered(b.epoch_id for b in blocks)
+    of = np.repeat(at, np.diff(ptr))
     images = rows[rows < ptr[-1]]
     known = np.unique(of[images])
     by_epoch = [images[of[images] == k] for k in known]

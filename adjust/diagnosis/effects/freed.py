@@ -61,12 +61,13 @@ def unsteady_axes(case: Case, linear: Linear) -> Iterator[Hypothesis]:
             continue
         for axis in range(len(table.axes)):
             for name, kinds, said in _KINDS:
-                survey = _with_harmonics(case.survey, table, axis, kinds)
-                if survey is None:
-                    continue
-                found, drop = _uneven(survey, table, axis, name, kinds, said), _promised(survey, linear.result)
-                if linear.clear(drop, found.parameters, found.looked_at):
-                    yield replace(found, evidence=linear.ratio(drop), scored=True)
+                waves = tuple(n for kind, highest in kinds.items() for n in harmonic_names(kind, axis, highest))
+                survey, looked_at = _with_harmonics(case.survey, table, waves), len(table.axes) * len(_KINDS)
+                drop = 0.0 if survey is None else _promised(survey, linear.result)
+                if survey is not None and linear.clear(drop, len(waves), looked_at):
+                    keys = {f"{kind}_{axis + 1}": highest for kind, highest in kinds.items()}
+                    cause = f"axis {axis + 1} of table {table.table_id}: {said}"
+                    yield _uneven(survey, table.table_id, name, cause, keys, linear.ratio(drop), len(waves), looked_at)
 
 
 def _promised(survey: Survey, result: Adjustment) -> float:
@@ -83,9 +84,8 @@ def _promised(survey: Survey, result: Adjustment) -> float:
     return 2.0 * float(linear.error(nothing) - linear.error(step))
 
 
-def _with_harmonics(survey: Survey, table: Table, axis: int, kinds: dict[str, int]) -> Survey | None:
-    """With these harmonics unknown; None where the axis was not read widely enough for them."""
-    waves = tuple(n for kind, highest in kinds.items() for n in harmonic_names(kind, axis, highest))
+def _with_harmonics(survey: Survey, table: Table, waves: tuple[str, ...]) -> Survey | None:
+    """With these harmonics unknown; None where an axis was not read widely enough for them."""
     given = table.geometry
     geometry = replace(given, names=(*given.names, *waves), values=np.append(given.values, np.zeros(len(waves))),
                        free=(*given.free, *waves))  # fmt: skip
@@ -97,18 +97,15 @@ def _with_harmonics(survey: Survey, table: Table, axis: int, kinds: dict[str, in
     return changed
 
 
-def _uneven(survey: Survey, table: Table, axis: int, name: str, kinds: dict[str, int], said: str) -> Hypothesis:
-    keys = {f"{kind}_{axis + 1}": highest for kind, highest in kinds.items()}
+def _uneven(
+    survey: Survey, table: str, name: str, cause: str, keys: dict[str, int], evidence: float, n: int, looked_at: int
+) -> Hypothesis:
     shown = ", ".join(f"{key} = {highest}" for key, highest in keys.items())
-    n = sum(len(harmonic_names(kind, axis, highest)) for kind, highest in kinds.items())
-    cause = f"axis {axis + 1} of table {table.table_id}: {said}"
+    edits = tuple(SetKey(("tables", table, "harmonics", key), highest) for key, highest in keys.items())
     return Hypothesis(
-        name, cause,
-        f"let the adjustment find its harmonics: harmonics = {{ {shown} }}",
-        Place("table", (table.table_id,), "harmonics"), survey,
-        tuple(SetKey(("tables", table.table_id, "harmonics", key), highest) for key, highest in keys.items()),
-        parameters=n, looked_at=len(table.axes) * len(_KINDS),
-    ).told(lambda result: f"{cause} ({_sizes(result, table.table_id)})")  # fmt: skip
+        name, cause, f"let the adjustment find its harmonics: harmonics = {{ {shown} }}",
+        Place("table", (table,), "harmonics"), survey, edits, evidence, n, looked_at, scored=True,
+    ).told(lambda result: f"{cause} ({_sizes(result, table)})")  # fmt: skip
 
 
 def _sizes(result: Adjustment, table_id: str) -> str:

@@ -22,13 +22,14 @@ from adjust.diagnosis.hypothesis import (
     motion_text,
 )
 from adjust.diagnosis.prediction import Linear, Prediction, adjusted_values
-from adjust.model.observations import FrameRef, ImageBlock, Pair
+from adjust.model.observations import ImageBlock, Pair
 from adjust.model.result import Adjustment
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, Survey
 from adjust.statistics.score import Part, Score, drift_times
 
 _BOUND = 50.0  # of the square of one image point
+_OF_CAMERAS, _OF_TARGETS = ("lens", "station_from_camera"), ("carrier_from_target", "target_body")
 
 
 def steps(case: Case, linear: Linear) -> Iterator[Effect]:
@@ -154,18 +155,10 @@ def _edits(survey: Survey, course: Course, later: Sequence[str]) -> tuple[Edit, 
         return (LeaveOut(tuple(f"pairs:{p}" for p in later)),)
     if course.kind == "reading":
         return ()
-    thing, chosen = course.name[1], set(later)
-    owner = {
-        "station_from_camera": "camera_id",
-        "lens": "camera_id",
-        "carrier_from_target": "target_id",
-        "target_body": "target_id",
-    }
-    field = owner.get(course.name[0])
-    rows = [b for b in survey.image_blocks if b.epoch_id in chosen and (not field or getattr(b, field) == thing)]
-    if course.name[0] in ("carrier_from_target", "target_body"):
-        return (LeaveOut(tuple(dict.fromkeys(f"target:{b.camera_id}/{b.epoch_id}/{thing}" for b in rows))),)
-    if field:
+    rows = [b for b in survey.image_blocks if b.epoch_id in later and _concerns(b, course)]
+    if course.name[0] in _OF_TARGETS:
+        return (LeaveOut(tuple(dict.fromkeys(f"target:{b.camera_id}/{b.epoch_id}/{b.target_id}" for b in rows))),)
+    if course.name[0] in _OF_CAMERAS:
         return (LeaveOut(tuple(dict.fromkeys(f"image:{b.camera_id}/{b.epoch_id}" for b in rows))),)
     return (LeaveOut(tuple(f"epoch:{e}" for e in later)),) if course.name[0] != "point" else ()
 
@@ -198,9 +191,10 @@ def _mended(
     if course.kind == "image":
         return _mended_images(survey, result, course, weights, theta)
     if course.kind == "pair":
-        return with_rows(survey, "pairs", _mended_pairs(survey, course, weights, theta))
-    late = {i: r for i, r in enumerate(survey.readings) if r.reading_id in weights}
-    return with_rows(survey, "readings", {i: replace(r, value=r.value + float(theta[0])) for i, r in late.items()})
+        late = {i: p for i, p in enumerate(survey.pairs) if p.pair_id in weights}
+        return with_rows(survey, "pairs", {i: _mended_pair(p, course.name[1], theta) for i, p in late.items()})
+    read = {i: r for i, r in enumerate(survey.readings) if r.reading_id in weights}
+    return with_rows(survey, "readings", {i: replace(r, value=r.value + float(theta[0])) for i, r in read.items()})
 
 
 def _mended_images(
@@ -219,23 +213,14 @@ def _mended_images(
 
 
 def _concerns(block: ImageBlock, course: Course) -> bool:
-    if course.name[0] in ("lens", "station_from_camera"):
+    if course.name[0] in _OF_CAMERAS:
         return block.camera_id == course.name[1]
-    return course.name[0] not in ("carrier_from_target", "target_body") or block.target_id == course.name[1]
+    return course.name[0] not in _OF_TARGETS or block.target_id == course.name[1]
 
 
-def _mended_pairs(survey: Survey, course: Course, weights: Mapping[str, float], theta: FloatArray) -> dict[int, Pair]:
+def _mended_pair(pair: Pair, station: str, theta: FloatArray) -> Pair:
     """``a_late = a exp(theta)``: measured was ``b_from_a exp(theta)``, or ``exp(-theta) a_from_b``."""
-    out = {}
-    for i, pair in enumerate(survey.pairs):
-        if pair.pair_id not in weights:
-            continue
-        motion = type(pair.b_from_a).Expmap(theta if isinstance(pair.b_from_a, Pose3) else theta[:3])
-        at_a = _is(pair.a, course.name[1])
-        m: Any = pair.b_from_a
-        out[i] = replace(pair, b_from_a=m.compose(motion.inverse()) if at_a else motion.compose(m))
-    return out
-
-
-def _is(ref: FrameRef, station: str) -> bool:
-    return ref.kind == "station" and ref.frame_id == station
+    m: Any = pair.b_from_a
+    motion = type(m).Expmap(theta if isinstance(m, Pose3) else theta[:3])
+    at_a = (pair.a.kind, pair.a.frame_id) == ("station", station)
+    return replace(pair, b_from_a=m.compose(motion.inverse()) if at_a else motion.compose(m))

@@ -6,16 +6,17 @@ Evidence: a rig, or a hand and its eye, is rigid; see :mod:`adjust.diagnosis.seq
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import combinations
+from typing import Any
 
 import numpy as np
-from gtsam import Pose3, Rot3
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Edit, Hypothesis, LeaveOut, Place, Rename
 from adjust.diagnosis.sequences import MOST, Link, Shift, links, shifts
 from adjust.model.errors import listed
-from adjust.model.observations import FrameRef, ImageBlock, Pair, TableReading
-from adjust.model.rewriting import with_rows
+from adjust.model.names import grouped
+from adjust.model.observations import FrameRef
+from adjust.model.rewriting import Fields, with_rows
 from adjust.model.survey import FloatArray, Survey
 from adjust.spatial.averaging import mean_pose
 from adjust.spatial.rigid import inverse
@@ -36,25 +37,18 @@ def misplaced_epochs(case: Case) -> Iterator[Hypothesis]:
 
 def _moved(survey: Survey, link: Link, epoch_of: Mapping[str, str]) -> Survey:
     """The survey with the second's observations at other epochs; those that would have none are dropped."""
-    if link.pairs:
-        chosen = set(link.pairs)
-        pairs = tuple(_pair_at(p, epoch_of) if i in chosen else p for i, p in enumerate(survey.pairs))
-        return replace(survey, pairs=tuple(p for p in pairs if p is not None))
-    blocks = tuple(_block_at(b, epoch_of) if b.camera_id == link.names[1] else b for b in survey.image_blocks)
-    return replace(survey, image_blocks=tuple(b for b in blocks if b is not None))
 
-
-def _block_at(block: ImageBlock, epoch_of: Mapping[str, str]) -> ImageBlock | None:
-    new = epoch_of.get(block.epoch_id, block.epoch_id)
-    return replace(block, epoch_id=new) if new else None
-
-
-def _pair_at(pair: Pair, epoch_of: Mapping[str, str]) -> Pair | None:
     def at(ref: FrameRef) -> FrameRef:
         return replace(ref, epoch_id=epoch_of.get(ref.epoch_id, ref.epoch_id)) if ref.epoch_id else ref
 
-    a, b = at(pair.a), at(pair.b)
-    return None if "" in (a.epoch_id, b.epoch_id) else replace(pair, a=a, b=b)
+    if link.pairs:
+        chosen = {i: survey.pairs[i] for i in link.pairs}
+        moved = with_rows(survey, "pairs", {i: replace(p, a=at(p.a), b=at(p.b)) for i, p in chosen.items()})
+        return replace(moved, pairs=tuple(p for p in moved.pairs if "" not in (p.a.epoch_id, p.b.epoch_id)))
+    mine = {i: b for i, b in enumerate(survey.image_blocks) if b.camera_id == link.names[1]}
+    new = {i: replace(b, epoch_id=epoch_of.get(b.epoch_id, b.epoch_id)) for i, b in mine.items()}
+    moved = with_rows(survey, "image_blocks", new)
+    return replace(moved, image_blocks=tuple(b for b in moved.image_blocks if b.epoch_id))
 
 
 def _said(link: Link) -> tuple[str, str, Place]:
@@ -146,45 +140,29 @@ def exchanged_cameras(survey: Survey, a: str, b: str, epochs: tuple[str, ...]) -
 
 def _twice(survey: Survey) -> Iterator[Hypothesis]:
     """Two measured poses of the same frames, or two readings of a table at one epoch, that differ: either may go."""
-    of: dict[tuple[object, ...], list[tuple[int, Pair | TableReading]]] = {}
-    for i, p in enumerate(survey.pairs):
-        of.setdefault((p.a, p.b, type(p.b_from_a)), []).extend([(i, p)] * p.used)
-    for i, r in enumerate(survey.table_readings):
-        of.setdefault((r.table_id, r.epoch_id), []).extend([(i, r)] * r.used)
-    for same in of.values():
-        if any(_far(same[0][1], o) for _, o in same[1:]):
-            yield from (_without_one(survey, i, o) for i, o in same)
+    pairs = grouped(((p.a, p.b, type(p.b_from_a)), i) for i, p in enumerate(survey.pairs) if p.used)
+    for rows in pairs.values():
+        same = [survey.pairs[i] for i in rows]
+        motions: list[Any] = [p.b_from_a for p in same]  # all of one type
+        if any(_far(motions[0].localCoordinates(m), p.cov) for m, p in zip(motions, same, strict=True)):
+            for i, p in zip(rows, same, strict=True):
+                edits = (LeaveOut((f"pairs:{p.pair_id}",)),)
+                yield _without_one(survey, "pairs", i, f"pair {p.pair_id}", Place("pair", (p.pair_id,)), edits)
+    readings = grouped(((r.table_id, r.epoch_id), i) for i, r in enumerate(survey.table_readings) if r.used)
+    for (table, epoch), rows in readings.items():
+        first, *others = (survey.table_readings[i] for i in rows)
+        if any(_far(r.angles - first.angles, r.cov) for r in others):
+            what = f"the reading of table {table} at epoch {epoch}"
+            place = Place("table", (table,), "axis1_deg", (epoch,))
+            yield from (_without_one(survey, "table_readings", i, what, place, ()) for i in rows)
 
 
-def _far(one: Pair | TableReading, other: Pair | TableReading) -> bool:
-    """Whether the second of two that observe the same lies ten sigmas or more from the first."""
-    if isinstance(one, Pair) and isinstance(other, Pair):
-        difference = _between(one, other)
-    elif isinstance(one, TableReading) and isinstance(other, TableReading):
-        difference = other.angles - one.angles
-    else:
-        raise TypeError("a pair and a table reading do not observe the same")
-    return bool(np.max(np.abs(difference) / np.sqrt(np.diag(other.cov))) >= 10.0)
+def _far(difference: FloatArray, cov: FloatArray) -> bool:
+    """Whether what observes the same differs by ten sigmas or more."""
+    return bool(np.max(np.abs(difference) / np.sqrt(np.diag(cov))) >= 10.0)
 
 
-def _between(one: Pair, other: Pair) -> FloatArray:
-    """Tangent of the second of two motions of one kind at the first."""
-    a, b = one.b_from_a, other.b_from_a
-    if isinstance(a, Pose3) and isinstance(b, Pose3):
-        return np.asarray(a.localCoordinates(b))
-    if isinstance(a, Rot3) and isinstance(b, Rot3):
-        return np.asarray(a.localCoordinates(b))
-    raise TypeError(f"pairs {one.pair_id} and {other.pair_id} measure different kinds of motion")
-
-
-def _without_one(survey: Survey, row: int, o: Pair | TableReading) -> Hypothesis:
-    edits: tuple[Edit, ...] = ()
-    if isinstance(o, Pair):
-        what, place, edits = f"pair {o.pair_id}", Place("pair", (o.pair_id,)), (LeaveOut((f"pairs:{o.pair_id}",)),)
-        rest = replace(survey, pairs=survey.pairs[:row] + survey.pairs[row + 1 :])
-    else:
-        what = f"the reading of table {o.table_id} at epoch {o.epoch_id}"
-        place = Place("table", (o.table_id,), "axis1_deg", (o.epoch_id,))
-        rest = replace(survey, table_readings=survey.table_readings[:row] + survey.table_readings[row + 1 :])
-    return Hypothesis("the same twice", f"{what} is there twice with different values, and this one (row {row + 1} of "
-                      "those in use) does not fit", "leave it out", place, rest, edits, 10.0, 1, 2)  # fmt: skip
+def _without_one(survey: Survey, field: str, row: int, what: str, place: Place, edits: tuple[Edit, ...]) -> Hypothesis:
+    rest: Fields = {field: tuple(o for i, o in enumerate(getattr(survey, field)) if i != row)}
+    cause = f"{what} is there twice with different values, and this one (row {row + 1} of those in use) does not fit"
+    return Hypothesis("the same twice", cause, "leave it out", place, replace(survey, **rest), edits, 10.0, 1, 2)

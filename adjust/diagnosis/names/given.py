@@ -10,7 +10,7 @@ from itertools import combinations, compress
 import numpy as np
 
 from adjust.diagnosis.case import Case
-from adjust.diagnosis.hypothesis import Edit, Hypothesis, Place, SetKey
+from adjust.diagnosis.hypothesis import Hypothesis, Place, SetKey
 from adjust.diagnosis.screen import Fit, Screen, at_best, improvement, screen
 from adjust.diagnosis.units.conventions import LENGTH_RATIOS
 from adjust.model.rewriting import with_rows
@@ -105,10 +105,5 @@ def _axes(survey: Survey, given: list[str]) -> Iterator[Hypothesis]:
 def _changed(
     survey: Survey, name: str, cause: str, remedy: str, key: str, new: dict[str, FloatArray]
 ) -> Hypothesis:
-    return Hypothesis(name, cause, remedy, Place("point", tuple(new), key), with_given(survey, new),
-                      _edits(new))  # fmt: skip
-
-
-def _edits(new: dict[str, FloatArray]) -> tuple[Edit, ...]:
-    """Other coordinates (m) of points, as keys of ``survey.toml``."""
-    return tuple(SetKey(("points", n, "x_mm"), tuple(float(f"{1e3 * c:.15g}") for c in x)) for n, x in new.items())
+    keys = (SetKey(("points", n, "x_mm"), tuple(float(f"{1e3 * c:.15g}") for c in x)) for n, x in new.items())
+    return Hypothesis(name, cause, remedy, Place("point", tuple(new), key), with_given(survey, new), tuple(keys))

@@ -24,7 +24,7 @@ from adjust.diagnosis.table.places import (
 )
 from adjust.diagnosis.table.readings import shared_mistake
 from adjust.diagnosis.table.signs import SignVerdict, constants, given_constants, sign_mistake
-from adjust.diagnosis.table.views import TableViews, table_views
+from adjust.diagnosis.table.views import TableViews, table_views, with_lenses
 from adjust.model.errors import SurveyError, listed
 from adjust.model.result import Adjustment, ParameterName, adjusted_pose
 from adjust.model.survey import FloatArray, IntArray, PoseParameter, Survey, Table
@@ -44,19 +44,10 @@ def probable_causes(survey: Survey, result: Adjustment | None = None) -> tuple[s
     table carries anything.
     """
     try:
-        every = table_views(survey if result is None else _with_lenses(survey, result))
+        every = table_views(survey if result is None else with_lenses(survey, result.estimates))
     except SurveyError:
         return ()
     return tuple(line for views in every for line in _causes(survey, views))
-
-
-def _with_lenses(survey: Survey, result: Adjustment) -> Survey:
-    """The survey whose lenses start from those of an adjustment."""
-    cameras = []
-    for camera in survey.cameras:
-        value = result.estimates[("lens", camera.camera_id)].value
-        cameras.append(camera if isinstance(value, Pose3) else replace(camera, lens=replace(camera.lens, values=value)))
-    return replace(survey, cameras=tuple(cameras))
 
 
 _SYMPTOMS = (
@@ -98,8 +89,7 @@ def _causes(survey: Survey, views: TableViews) -> list[str]:
             "targets agree: look for mirrored or turned images, or those of another camera under its name"
         ]
     found = find_places(views)
-    fits = found is not None and 2 * len(outlying(found.fit)) < len(views.poses)
-    if found is None or not fits:
+    if found is None or not 2 * len(outlying(found.fit)) < len(views.poses):
         if as_given < _UNEXPLAINED_RAD:
             return []
         return [
@@ -150,15 +140,11 @@ def _sign_text(table: Table, verdict: SignVerdict) -> str:
 
 
 def _moved_text(views: TableViews, found: Places) -> str:
-    moved, second = found.moved or 0, found.second
-    first = np.flatnonzero(found.place == moved)
-    later = np.flatnonzero(found.place == second)
-    # the second place is that of the later epochs
-    a, b = moved, second
-    if views.epoch[later].mean() < views.epoch[first].mean():
-        a, b, later = second, moved, first
+    moved = found.moved or 0
+    epochs_at = {p: views.epoch[found.place == p] for p in (moved, found.second)}
+    a, b = sorted(epochs_at, key=lambda p: float(epochs_at[p].mean()))  # the second place is that of the later epochs
     how = motion_text(Pose3(inverse(found.fit.table_from_place[a]) @ found.fit.table_from_place[b]))
-    epochs = [views.epoch_ids[e] for e in np.unique(views.epoch[later])]
+    epochs = [views.epoch_ids[e] for e in np.unique(epochs_at[b])]
     return (
         f"{' '.join(views.outer_ids[moved])} was moved between images: at epochs {listed(epochs, _SHOWN)} it stands "
         f"elsewhere than at the others, {how}; give it a name of its own there, or leave these epochs out"
@@ -172,25 +158,22 @@ def _epoch_lines(views: TableViews, found: Places) -> list[str]:
     if not epochs:
         return []
     scatter = reading_scatter(views, found)
-    again = {e: _no_better_than(reread(views, found, e), scatter) for e in epochs}
+    again = {e: reread(views, found, e) for e in epochs}
+    again = {e: replace(r, sigmas=np.maximum(r.sigmas, scatter)) for e, r in again.items()}
     lines, done = [], set()
     for e in epochs:
-        other = next((o for o in epochs if o > e and o not in done and _exchanged(views, again, e, o)), None)
         if e in done:
             continue
-        if other is not None:
+        other = next((o for o in epochs if o > e and o not in done and _exchanged(views, again, e, o)), None)
+        if other is None:
+            lines.append(_epoch_text(views, found, e, rows[views.epoch[rows] == e], again[e]))
+        else:
             done.add(other)
             lines.append(
                 f"table {views.table.table_id}: the readings of epochs {views.epoch_ids[e]} and "
                 f"{views.epoch_ids[other]} are exchanged: each fits the images of the other"
             )
-            continue
-        lines.append(_epoch_text(views, found, e, rows[views.epoch[rows] == e], again[e]))
     return lines
-
-
-def _no_better_than(again: Reread, scatter: FloatArray) -> Reread:
-    return replace(again, sigmas=np.maximum(again.sigmas, scatter))
 
 
 def _exchanged(views: TableViews, again: Mapping[int, Reread], a: int, b: int) -> bool:

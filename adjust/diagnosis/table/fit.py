@@ -44,37 +44,34 @@ class TableFit:
 def residuals(
     views: TableViews, motions: FloatArray, X: FloatArray, Z: FloatArray, place: IntArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Residuals (n, 6) rad and m in the mount, their covariance (n, 6, 6), and mount_from_table (n, 4, 4)."""
+    """Residuals (n, 6) rad and m in the mount, their information (n, 6, 6), and mount_from_table (n, 4, 4)."""
     mount_from_table = inverse(motions)[views.epoch]
     seen = X[views.inner] @ views.poses
     error = seen @ inverse(mount_from_table @ Z[place])
     A = adjoint(X[views.inner])
     r = np.concatenate([rotation_log(error[:, :3, :3]), error[:, :3, 3]], axis=1)
-    return r, A @ views.cov @ A.swapaxes(1, 2), mount_from_table
+    return r, _inverse(A @ views.cov @ A.swapaxes(1, 2)), mount_from_table
 
 
 def fit_table(
-    views: TableViews, place: IntArray, start: TableFit | None = None, iterations: int = 12, known: Known | None = None
+    views: TableViews, place: IntArray, iterations: int = 12, known: Known | None = None
 ) -> TableFit | None:
     """Robust least squares; ``place`` (n,): which place of an outer thing each view shows. None where nothing starts.
 
     Gauss-Newton with Geman-McClure weights whose scale follows the median. known: poses that fits of the same views
     began with, to which those of this one are added: most trials differ in few of them.
     """
-    geometry = given_geometry(views.table) if start is None else start.geometry
-    motions = views.motions(geometry=geometry)
-    begun = (_start(views, motions, place, {} if known is None else known) if start is None
-             else _renewed(views, motions, place, start))  # fmt: skip
+    geometry = given_geometry(views.table)
+    begun = _start(views, views.motions(geometry=geometry), place, {} if known is None else known)
     if begun is None:
         return None
     X, Z = begun
     groups = _groups(views, place, len(X), len(Z))
     by_geometry = (views.by_geometry() * _free_geometry(views))[views.epoch]
     for step in range(iterations + 1):
-        r, cov, mount_from_table = residuals(views, views.motions(geometry=geometry), X, Z, place)
+        r, info, mount_from_table = residuals(views, views.motions(geometry=geometry), X, Z, place)
         if not np.isfinite(r).all():
             return None
-        info = _inverse(cov)
         chi2 = np.einsum("ni,nij,nj->n", r, info, r)
         scale = max(1.0, float(np.median(chi2)) / _MEDIAN_6)
         if step < iterations:
@@ -128,16 +125,6 @@ def _improved(
 def _free_geometry(views: TableViews) -> FloatArray:
     free = views.table.geometry.free
     return np.array([float("non_orthogonality" in free), float("axis_offset" in free)])
-
-
-def _renewed(
-    views: TableViews, motions: FloatArray, place: IntArray, start: TableFit
-) -> tuple[FloatArray, FloatArray] | None:
-    """The inner poses of another fit, with every place as the mean of what its views say."""
-    X = start.mount_from_inner
-    offers = motions[views.epoch] @ X[views.inner] @ views.poses
-    Z = [_mean(offers[place == p]) for p in range(int(place.max()) + 1)]
-    return X, np.array(Z)
 
 
 def _start(

@@ -55,7 +55,7 @@ def find_places(views: TableViews) -> Places | None:
     if not len(outlying(one)) and one.scale < _VAGUE:
         return Places(views.outer, one)
     trials = [p for o in range(len(views.outer_ids)) for p in _splits(views, o)]
-    fits = [(p, f) for p in trials if (f := fit_table(views, p, None, 6, known)) is not None]
+    fits = [(p, f) for p in trials if (f := fit_table(views, p, 6, known)) is not None]
     if not fits:
         return Places(views.outer, one)
     scale = min([one.scale, *(f.scale for _, f in fits)])
@@ -90,17 +90,17 @@ def _torn(one: TableFit, place: IntArray, moved: int, second: int, scale: float)
 def _agree(views: TableViews, place: IntArray, fit: TableFit, moved: int, second: int) -> bool:
     """Whether most views of the second place fit there, and do not fit the first one."""
     there = place == second
-    _, at_first = _squares(views, np.where(there, moved, place), fit)
+    at_first = _squares(views, np.where(there, moved, place), fit)
     limit = LIMIT * fit.scale
     good = (fit.chi2 < limit) & (at_first > limit)
     return int(good[there].sum()) >= max(_LEAST, (int(there.sum()) + 1) // 2)
 
 
-def _squares(views: TableViews, place: IntArray, fit: TableFit) -> tuple[FloatArray, FloatArray]:
-    """Residuals (n, 6) of the views at other places of the same fit, and their squares (n,)."""
+def _squares(views: TableViews, place: IntArray, fit: TableFit) -> FloatArray:
+    """(n,) of the views at other places of the same fit."""
     motions = views.motions(geometry=fit.geometry)
-    r, cov, _ = residuals(views, motions, fit.mount_from_inner, fit.table_from_place, place)
-    return r, np.einsum("ni,nij,nj->n", r, np.linalg.inv(cov), r)
+    r, info, _ = residuals(views, motions, fit.mount_from_inner, fit.table_from_place, place)
+    return np.asarray(np.einsum("ni,nij,nj->n", r, info, r))
 
 
 def _splits(views: TableViews, outer: int) -> list[IntArray]:
@@ -119,7 +119,7 @@ def _splits(views: TableViews, outer: int) -> list[IntArray]:
 def _reassigned(views: TableViews, place: IntArray, fit: TableFit, moved: int, second: int) -> IntArray | None:
     """Every epoch of the moved thing at the place that suits its views better."""
     mine = views.outer == moved
-    squares = [_squares(views, np.where(mine, p, place), fit)[1] for p in (moved, second)]
+    squares = [_squares(views, np.where(mine, p, place), fit) for p in (moved, second)]
     new = place.copy()
     for e in np.unique(views.epoch[mine]):
         rows = mine & (views.epoch == e)
@@ -149,8 +149,7 @@ def reread(views: TableViews, found: Places, epoch: int) -> Reread:
 
     def misfit(a: FloatArray) -> tuple[FloatArray, FloatArray]:
         motions = part.motions(a[None], fit.geometry)
-        r, cov, _ = residuals(part, motions, fit.mount_from_inner, fit.table_from_place, place)
-        return r, np.asarray(np.linalg.pinv(cov, rcond=1e-14, hermitian=True), dtype=np.float64)
+        return residuals(part, motions, fit.mount_from_inner, fit.table_from_place, place)[:2]
 
     step = 1e-6
     for _ in range(6):

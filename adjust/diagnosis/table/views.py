@@ -11,6 +11,8 @@ from adjust.diagnosis.alone import own_lens, single_views
 from adjust.frames.tables import table_motions
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
+from adjust.model.result import Estimate, ParameterName
+from adjust.model.rewriting import with_rows
 from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, Station, Survey, Table, Target
 from adjust.spatial.rigid import adjoint, inverse, rigid, rotation_exp, skew
 from adjust.start.views import View, untrustworthy
@@ -75,12 +77,9 @@ class TableViews:
     def without(self, kind: str, thing_id: str) -> "TableViews":
         """The same without the views of one thing, and without what only these show."""
         rest = self.only(np.flatnonzero(~self.shows(kind, thing_id)))
-        left, place = np.unique(rest.inner, return_inverse=True)
-        right, other = np.unique(rest.outer, return_inverse=True)
-        return replace(
-            rest, inner=place, outer=other, inner_ids=tuple(self.inner_ids[i] for i in left),
-            outer_ids=tuple(self.outer_ids[i] for i in right),
-        )  # fmt: skip
+        (left, inner), (right, outer) = (np.unique(x, return_inverse=True) for x in (rest.inner, rest.outer))
+        shown = tuple(self.inner_ids[i] for i in left), tuple(self.outer_ids[i] for i in right)
+        return replace(rest, inner=inner, outer=outer, inner_ids=shown[0], outer_ids=shown[1])
 
 
 def given_geometry(table: Table) -> FloatArray:
@@ -124,18 +123,22 @@ def table_views(survey: Survey) -> tuple[TableViews, ...]:
 
 def _calibrated(survey: Survey) -> Survey:
     """With the lens of each camera from its own images alone: tables and other cameras have no say."""
-    cameras = []
-    for camera in survey.cameras:
+    found = dict[ParameterName, Estimate]()
+    for camera in (c for c in survey.cameras if c.lens.free):
         alone = single_camera_survey(survey, camera.camera_id)
-        lens = camera.lens
         try:
-            if lens.free and alone.image_blocks:
-                value = adjust(alone).estimates[("lens", camera.camera_id)].value
-                lens = lens if isinstance(value, Pose3) else replace(lens, values=value)
+            found |= adjust(alone).estimates if alone.image_blocks else {}
         except SurveyError:  # too few images: the lens that the search for start values finds will do
-            pass
-        cameras.append(replace(camera, lens=lens))
-    return replace(survey, cameras=tuple(cameras))
+            continue
+    return with_lenses(survey, found)
+
+
+def with_lenses(survey: Survey, estimates: Mapping[ParameterName, Estimate]) -> Survey:
+    """The survey whose lenses start from those of adjustments, as far as there are any."""
+    known = {i: c for i, c in enumerate(survey.cameras) if ("lens", c.camera_id) in estimates}
+    values = {i: np.asarray(estimates["lens", c.camera_id].value) for i, c in known.items()}
+    new = {i: replace(c, lens=replace(c.lens, values=values[i])) for i, c in known.items()}
+    return with_rows(survey, "cameras", new)
 
 
 def single_camera_survey(survey: Survey, camera_id: str) -> Survey:

@@ -8,6 +8,7 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, SetKey
 from adjust.model.rewriting import with_changed
 from adjust.model.survey import FloatArray, IntArray, Survey
+from adjust.native.views import homographies
 
 _CLEARLY = 5.0
 _WIDEST, _IMAGES = 40, 4
@@ -45,24 +46,9 @@ def _columns(x: FloatArray, square: float) -> int:
 
 
 def _misses(x: FloatArray, uv: FloatArray) -> FloatArray:
-    """(m,) px, rms of the best homographies of points (m, n, 2) to uv (n, 2), by the direct linear transformation."""
-    (a, _), (b, scale) = _normalized(x), _normalized(uv[None])
-    one, zero = np.concatenate([a, np.ones((*a.shape[:2], 1))], axis=2), np.zeros((*a.shape[:2], 3))
-    rows = [np.concatenate(r, axis=2) for r in ((one, zero, -b[..., :1] * one), (zero, one, -b[..., 1:] * one))]
-    A = np.concatenate(rows, axis=1)
-    H = np.linalg.eigh(np.swapaxes(A, 1, 2) @ A)[1][:, :, 0].reshape(-1, 3, 3)
-    q = one @ np.swapaxes(H, 1, 2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        miss = (q[..., :2] / q[..., 2:] - b) / scale
-    square = np.minimum(np.abs(np.nan_to_num(miss, nan=1e6)), 1e6) ** 2
-    return np.asarray(np.sqrt(square.mean(axis=(1, 2))))
-
-
-def _normalized(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Sets (m, n, 2) about their middle, within 1, and what each was multiplied by (m, 1, 1)."""
-    centred = x - x.mean(axis=1, keepdims=True)
-    scale = 1.0 / np.maximum(np.abs(centred).max(axis=(1, 2), keepdims=True), 1e-12)
-    return scale * centred, scale
+    """(m,) px, rms of the best homographies of points (m, n, 2) to uv (n, 2); infinite where there is none."""
+    m, n, _ = x.shape
+    return homographies(x.reshape(-1, 2), np.tile(uv, (m, 1)), n * np.arange(m + 1), 0)[1][:, 0]
 
 
 def _hypothesis(survey: Survey, target: str, columns: int, square: float, evidence: float) -> Hypothesis:

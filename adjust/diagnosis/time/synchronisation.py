@@ -41,7 +41,7 @@ def unsynchronised(case: Case) -> Iterator[Hypothesis]:
     offsets = [o for o in (time_offset(link) for link in rigs) if o is not None]
     bound = norm.isf(sidak(_ALPHA, len(rigs)))
     clear = [o for o in offsets if abs(o.intervals) > bound * o.sigma]
-    seen = np.nanmedian(case.error_px) if np.isfinite(case.error_px).any() else np.inf
+    seen = float(np.median([v.error_px[0] for v in case.views.values()] or [np.inf]))
     if not clear or not seen < _ALONE_PX:
         return
     worst = max(clear, key=lambda o: abs(o.intervals) / o.sigma)

@@ -10,10 +10,10 @@ import numpy as np
 
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
-from adjust.diagnosis.screen import Screen, at_best
-from adjust.model.observations import Reading
-from adjust.model.rewriting import with_rows
+from adjust.diagnosis.screen import at_best
+from adjust.model.rewriting import Fields, with_rows
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.observations.terrestrial.batch import TerrestrialBatch
 from adjust.statistics.score import LinearScores
 
 _CLEARLY = 3.0
@@ -42,10 +42,11 @@ def wrong_heights(case: Case) -> Iterator[Hypothesis]:
     if not survey.readings:
         return
     before = at_best(case)
-    if before is None or before.graph.terrestrial is None:
+    batch = None if before is None else before.graph.terrestrial
+    if before is None or batch is None:
         return
-    constants = list(_constants(survey, before))
-    judged = _by_scores(case, constants) or [_evidence(before, c) for c in constants]
+    constants = list(_constants(survey, batch.A))
+    judged = _by_scores(case, constants) or [_evidence(before.scale, batch, c) for c in constants]
     found = [(e, c, d) for c, (e, d) in zip(constants, judged, strict=True) if e > _CLEARLY and abs(d) < _LARGEST]
     for evidence, constant, metres in sorted(found, key=lambda f: (-f[0], -len(f[1].rows)))[:_MOST]:
         changed = _changed(survey, constant, metres)
@@ -81,70 +82,53 @@ def _by_scores(case: Case, constants: list[_Constant]) -> list[tuple[float, floa
     return [(float(result.omega / max(result.omega - d, 1.0)), float(x)) for d, x in zip(drop, metres, strict=True)]
 
 
-def _constants(survey: Survey, before: Screen) -> Iterator[_Constant]:
-    """Those that enough readings show."""
-    batch = before.graph.terrestrial
-    for name, text, place, which, by, remedy in () if batch is None else _possible(survey, batch.A):
-        rows = np.flatnonzero(which)
-        if len(rows) >= _FEWEST:
-            yield _Constant(name, text, place, rows, by[rows], remedy)
-
-
-def _possible(
-    survey: Survey, A: FloatArray
-) -> Iterator[tuple[str, str, Place, BoolArray, FloatArray, str]]:
-    """Fields of constants, with all readings (N,) that they change. A: (N, 9) derivatives by positions."""
+def _constants(survey: Survey, A: FloatArray) -> Iterator[_Constant]:
+    """Those that enough readings show. A: (N, 9) derivatives of all readings by positions."""
     kinds, setups = (np.array([getattr(r, of) for r in survey.readings]) for of in ("kind", "setup_id"))
     targets = np.array([str(r.to.point_id) for r in survey.readings])
     up_to, up_at, along = A[:, 5], A[:, 2], np.ones(len(A))  # by the heights of the two ends' positions, and by lengths
     tilted = np.isin(kinds, ("zenith", "slope_distance", "height_difference"))
     lengths = np.isin(kinds, ("slope_distance", "horizontal_distance"))
+
+    def of(name: str, text: str, place: Place, which: BoolArray, by: FloatArray, remedy: str) -> Iterator[_Constant]:
+        rows = np.flatnonzero(which)
+        if len(rows) >= _FEWEST:
+            yield _Constant(name, text, place, rows, by[rows], remedy)
+
     for setup_id in dict.fromkeys(s for s in setups.tolist() if s):
         mine = setups == setup_id
-        yield ("instrument height", f"the instrument's height at set-up {setup_id}",
-               Place("setup", (setup_id,), "instrument_height_m"), mine & tilted, up_at,
-               "change instrument_height of its rows in terrestrial.csv")  # fmt: skip
-        yield ("prism constant", f"the reflector's constant at set-up {setup_id}",
-               Place("setup", (setup_id,), "value"), mine & lengths, along,
-               "change the distances of its rows in terrestrial.csv")  # fmt: skip
+        yield from of("instrument height", f"the instrument's height at set-up {setup_id}",
+                      Place("setup", (setup_id,), "instrument_height_m"), mine & tilted, up_at,
+                      "change instrument_height of its rows in terrestrial.csv")  # fmt: skip
+        yield from of("prism constant", f"the reflector's constant at set-up {setup_id}",
+                      Place("setup", (setup_id,), "value"), mine & lengths, along,
+                      "change the distances of its rows in terrestrial.csv")  # fmt: skip
     for target in dict.fromkeys(targets.tolist()):
-        yield ("target height", f"the target's height on point {target}", Place("point", (target,), "target_height_m"),
-               (targets == target) & tilted, up_to, "change target_height of its rows in terrestrial.csv")  # fmt: skip
-    yield ("prism constant", "the reflector's constant of all distances", Place("instrument", (), ""), lengths, along,
-           "give an instrument's distance_offset, or change all distances")  # fmt: skip
+        yield from of("target height", f"the target's height on point {target}",
+                      Place("point", (target,), "target_height_m"), (targets == target) & tilted, up_to,
+                      "change target_height of its rows in terrestrial.csv")  # fmt: skip
+    yield from of("prism constant", "the reflector's constant of all distances", Place("instrument", (), ""), lengths,
+                  along, "give an instrument's distance_offset, or change all distances")  # fmt: skip
 
 
-def _evidence(before: Screen, constant: _Constant) -> tuple[float, float]:
+def _evidence(scale: float, batch: TerrestrialBatch, constant: _Constant) -> tuple[float, float]:
     """How many times smaller the misfit of its readings becomes, and the constant's change (m)."""
-    batch = before.graph.terrestrial
-    if batch is None:
-        return 0.0, 0.0
     rows = constant.rows
     sigma, miss = batch.sigma[rows], -batch.residual[rows]  # observed minus predicted
     weight = np.abs(constant.by) / sigma
     if not (weight > 0).any() or not np.isfinite(miss).all():
         return 0.0, 0.0
-    metres = _weighted_median(miss[weight > 0] / constant.by[weight > 0], weight[weight > 0])
-    scale = before.scale
+    some = weight > 0
+    metres = float(np.quantile(miss[some] / constant.by[some], 0.5, weights=weight[some], method="inverted_cdf"))
     old = np.minimum((miss / sigma) ** 2 / scale, CAP).sum()
     new = np.minimum(((miss - constant.by * metres) / sigma) ** 2 / scale, CAP).sum()
     return float(old / (new + 0.1 * len(rows) + 1.0)), metres
 
 
-def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
-    order = np.argsort(values)
-    total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
-
-
 def _changed(survey: Survey, constant: _Constant, metres: float) -> Survey:
     """With the constant as it probably was; its readings then fit without it."""
-
-    def mended(r: Reading) -> Reading:
-        if constant.name == "instrument height":
-            return replace(r, instrument_height=r.instrument_height + metres)
-        if constant.name == "target height":
-            return replace(r, target_height=r.target_height + metres)
-        return replace(r, value=r.value - metres)
-
-    return with_rows(survey, "readings", {i: mended(survey.readings[i]) for i in constant.rows.tolist()})
+    heights = {"instrument height": "instrument_height", "target height": "target_height"}
+    field, by = (heights[constant.name], metres) if constant.name in heights else ("value", -metres)
+    mine = {i: survey.readings[i] for i in constant.rows.tolist()}
+    new: dict[int, Fields] = {i: {field: getattr(r, field) + by} for i, r in mine.items()}
+    return with_rows(survey, "readings", {i: replace(r, **new[i]) for i, r in mine.items()})

@@ -14,7 +14,7 @@ from gtsam import Pose3
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.screen import Screen, at_best, screen
-from adjust.diagnosis.sequences import Link, fitted, links, typical
+from adjust.diagnosis.sequences import Link, fitted, hand, links, typical
 from adjust.diagnosis.units.conventions import Scope, shrinking
 from adjust.diagnosis.units.motions import CONVENTIONS, Convention, Motion, edits_of, mended, miss, rotation_of
 from adjust.model.rewriting import with_rows
@@ -67,7 +67,7 @@ def _lengths(survey: Survey, hands: list[Link]) -> str:
     """How far camera and target are from hand and base: what no residual shows, a person sees."""
     out = []
     for link in hands[:1]:
-        fit = fitted(link.kind, link.first, _second(survey, link, {}))
+        fit = fitted(link.kind, link.first, hand(survey, *link.names, link.pairs, {}))
         if fit is not None:
             left, right = (float(np.linalg.norm(x[:3, 3])) for x in (fit.left, fit.right))
             out.append(f" (then the camera is {left:.3f} m from the hand and the target {right:.3f} m from the base; "
@@ -107,12 +107,12 @@ class _Judge:
 
 def _by_hands(survey: Survey, hands: list[Link]) -> _Judge:
     """The motions that join most poses stay what they are where fewer than half of these change: they are robust."""
-    joined = [fitted(link.kind, link.first, _second(survey, link, {})) for link in hands]
+    joined = [link.fit for link in hands]
 
     def misses(new: Mapping[int, Motion]) -> FloatArray:
         parts = []
         for link, fit in zip(hands, joined, strict=True):
-            second = _second(survey, link, new)
+            second = hand(survey, *link.names, link.pairs, new)
             if 2 * len(new.keys() & set(link.pairs)) >= len(link.pairs):
                 fit = fitted(link.kind, link.first, second)
             parts.append(np.full(len(link.epochs), np.inf) if fit is None else fit.misses(link.first, second))
@@ -126,18 +126,6 @@ def _by_hands(survey: Survey, hands: list[Link]) -> _Judge:
         return typical(base[some]) / typical(misses(new)[some]) if some.any() else 0.0
 
     return _Judge(rows[np.argsort(-base, kind="stable")], lambda sets: [evidence(new) for new in sets])
-
-
-def _second(survey: Survey, link: Link, new: Mapping[int, Motion]) -> FloatArray:
-    """The poses of the hand, in the direction that the link has them, from the pairs of a survey; new: other ones."""
-    out = []
-    on_hand = any(c.camera_id == link.names[0] and c.station_id == link.names[1] for c in survey.cameras)
-    for i in link.pairs:
-        pair, motion = survey.pairs[i], new.get(i, survey.pairs[i].b_from_a)
-        pose = motion.matrix() if isinstance(motion, Pose3) else np.eye(4)
-        forwards = pair.b.frame_id == link.names[1] and bool(pair.b.epoch_id)
-        out.append(pose if forwards == on_hand else np.linalg.inv(pose))
-    return np.array(out)
 
 
 def _by_start(case: Case) -> _Judge | None:

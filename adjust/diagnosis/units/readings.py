@@ -111,29 +111,34 @@ def mended(survey: Survey, rows: IntArray, misreading: Misreading) -> Survey:
 
 def _evidence(survey: Survey, before: Screen | None, values: FloatArray, ways: Sequence[_Way]) -> list[float]:
     """How many times smaller the bounded misfit becomes by each way to read."""
-    n, out = len(survey.readings), [0.0] * len(ways)
-    number = Counter(r.kind for r in survey.readings)
+    n, number = len(survey.readings), Counter(r.kind for r in survey.readings)
     whole = [
         len(scope.rows) == sum(number[k] for k in {survey.readings[i].kind for i in scope.rows}) for scope, _ in ways
     ]  # of all readings of its kinds
-    anew = [i for i, (scope, _) in enumerate(ways) if before is None or (
-        whole[i] and n <= _LARGE_START and not _fits_as_it_is(before, scope.rows))]  # fmt: skip
-    surveys = [mended(survey, ways[i][0].rows, ways[i][1]) for i in anew]
-    for i, after in zip(anew, before.afresh(surveys) if before else map(screen, surveys), strict=True):
-        if after is not None and before is None:
-            out[i] = improvement(CAP * n, after.misfit(after.scale), n)
-        elif after is not None and before is not None:
-            scale = min(before.scale, after.scale)
-            out[i] = improvement(before.misfit(scale), after.misfit(scale), n)
+    anew, there = list(range(len(ways))), list[int]()
     if before is not None:
-        there = [i for i, (scope, _) in enumerate(ways) if not whole[i] or (
-            n > _LARGE_START and not _fits_as_it_is(before, scope.rows))]  # fmt: skip
-        sets = [ways[i][0].rows for i in there]
-        read = [ways[i][1].mend(values[ways[i][0].rows]) for i in there]
-        after_each = before.alternatives(sets, observed=np.concatenate([np.zeros(0), *read]))
-        for i, rows, squares in zip(there, sets, after_each, strict=True):
-            out[i] = before.drop(rows, squares)
+        misread = [i for i, w in enumerate(whole) if w and not _fits_as_it_is(before, ways[i][0].rows)]
+        anew, there = (misread, []) if n <= _LARGE_START else ([], misread)
+        there += [i for i, w in enumerate(whole) if not w]
+    surveys, out = [mended(survey, ways[i][0].rows, ways[i][1]) for i in anew], [0.0] * len(ways)
+    for i, after in zip(anew, before.afresh(surveys) if before else map(screen, surveys), strict=True):
+        if after is not None:
+            scale = after.scale if before is None else min(before.scale, after.scale)
+            old = CAP * n if before is None else before.misfit(scale)
+            out[i] = improvement(old, after.misfit(scale), n)
+    for i, gain in () if before is None else _in_place(before, values, ways, there):
+        out[i] = gain
     return out
+
+
+def _in_place(
+    at: Screen, values: FloatArray, ways: Sequence[_Way], some: Sequence[int]
+) -> Iterator[tuple[int, float]]:
+    """How many times smaller the misfit becomes by some of the ways, where all else stays where it is."""
+    sets = [ways[i][0].rows for i in some]
+    read = [ways[i][1].mend(values[rows]) for i, rows in zip(some, sets, strict=True)]
+    after = at.alternatives(sets, observed=np.concatenate([np.zeros(0), *read]))
+    yield from ((i, at.drop(rows, squares)) for i, rows, squares in zip(some, sets, after, strict=True))
 
 
 def _without_worst(survey: Survey, before: Screen, values: FloatArray, ways: Sequence[_Way]) -> list[float]:
@@ -152,12 +157,8 @@ def _without_worst(survey: Survey, before: Screen, values: FloatArray, ways: Seq
     if apart is None:
         return []
     mine = [i for i, (scope, _) in enumerate(ways) if set(scope.rows.tolist()) <= set(worst.rows.tolist())]
-    read = [ways[i][1].mend(values[ways[i][0].rows]) for i in mine]
-    out = [0.0] * len(ways)
-    after = apart.alternatives([ways[i][0].rows for i in mine], observed=np.concatenate(read))
-    for i, squares in zip(mine, after, strict=True):
-        out[i] = apart.drop(ways[i][0].rows, squares)
-    return out
+    gains = dict(_in_place(apart, values, ways, mine))
+    return [gains.get(i, 0.0) for i in range(len(ways))]
 
 
 def _fits_as_it_is(before: Screen, rows: IntArray) -> bool:

@@ -1,6 +1,6 @@
 """The geometric observations of a survey as factors."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import gtsam
@@ -23,7 +23,14 @@ from adjust.model.observations import (
 )
 from adjust.model.result import ParameterName
 from adjust.model.survey import SURFACES, Beam, BoolArray, FloatArray, Surface, Survey, VectorParameter
-from adjust.observations.factors import ChainPose, ObservationFactor, Position, custom, positions_residual
+from adjust.observations.factors import (
+    ChainPose,
+    ObservationFactor,
+    Position,
+    custom,
+    known_components,
+    positions_factor,
+)
 from adjust.observations.geometry.fitting import fitted_beam, fitted_surface
 from adjust.observations.geometry.residuals import (
     alignment_residual,
@@ -162,53 +169,40 @@ class GeometryFactors:
             *self._on_surfaces(at),
         ]
 
-    def _differences(self, at: Mapping[PositionRef, Position]) -> list[ObservationFactor]:
-        out = []
+    def _differences(self, at: Mapping[PositionRef, Position]) -> Iterator[ObservationFactor]:
         for d in self.survey.coordinate_differences:
             ends = [(position_text(a), position_text(b)) for a, b in zip(d.at, d.to, strict=True)]
-            known = known_components(d.cov)
-            a, b = [at[ref] for ref in d.at], [at[ref] for ref in d.to]
-            keys = list(dict.fromkeys(k for p in (*a, *b) for k in p.keys))
-            _refuse_held(keys, f"the coordinate difference {ends[0][0]} to {ends[0][1]}")
-            signed = [((y, 1.0), (x, -1.0)) for x, y in zip(a, b, strict=True)]
-            factor = custom(keys, d.cov[np.ix_(known, known)], positions_residual(signed, d.values, known))
+            signed = [((at[b], 1.0), (at[a], -1.0)) for a, b in zip(d.at, d.to, strict=True)]
+            factor = positions_factor(signed, d.values, d.cov)
+            _keys(f"the coordinate difference {ends[0][0]} to {ends[0][1]}", factor.keys())
             names = tuple(f"{a} {b} {axis}" if len(ends) > 1 else axis for a, b in ends for axis in "xyz")
-            ids = tuple(dict.fromkeys(x for pair in ends for x in pair))
+            known, ids = known_components(d.cov), tuple(dict.fromkeys(x for pair in ends for x in pair))
             names, observed = tuple(np.array(names)[known]), d.values.ravel()[known]
-            out.append(ObservationFactor(factor, "coordinate_difference", d.group, ids, names, ("m",) * len(names),
-                                         observed, d.used))  # fmt: skip
-        return out
+            yield ObservationFactor(factor, "coordinate_difference", d.group, ids, names, ("m",) * len(names), observed,
+                                    d.used)  # fmt: skip
 
-    def _levels(self, state: State, values: gtsam.Values) -> list[ObservationFactor]:
-        out = []
+    def _levels(self, state: State, values: gtsam.Values) -> Iterator[ObservationFactor]:
         for level, chain in zip(self.survey.levels, self.level_chains, strict=True):
             if self.vertical is None:
                 break
-            pose, tilt = ChainPose(self.unknowns, state, chain), self.vertical.key
-            keys = pose.keys + ([tilt] if tilt is not None else [])
-            _refuse_held(keys, f"level {level.level_id!r}")
+            pose = ChainPose(self.unknowns, state, chain)
+            keys = _keys(f"level {level.level_id!r}", pose.keys, self.vertical.key)
             _check_level(level, pose(values)[0], self.vertical, values)
             factor = custom(keys, np.array([[level.sigma**2]]), level_residual(level, pose, self.vertical))
-            ids = (level.level_id, frame_text(level.frame))
-            out.append(ObservationFactor(factor, "level", level.group, ids, ("inclination",), ("rad",),
-                                         np.array([level.value]), level.used))  # fmt: skip
-        return out
+            yield ObservationFactor(factor, "level", level.group, (level.level_id, frame_text(level.frame)),
+                                    ("inclination",), ("rad",), np.array([level.value]), level.used)  # fmt: skip
 
-    def _alignments(self, state: State, values: gtsam.Values) -> list[ObservationFactor]:
-        out = []
+    def _alignments(self, state: State, values: gtsam.Values) -> Iterator[ObservationFactor]:
         for a, chain in zip(self.survey.alignments, self.alignment_chains, strict=True):
             pose, known = ChainPose(self.unknowns, state, chain), known_components(a.cov)
-            _refuse_held(pose.keys, f"alignment {a.alignment_id!r}")
+            keys = _keys(f"alignment {a.alignment_id!r}", pose.keys)
             _check_alignment(a, np.asarray(pose(values)[0].rotation().matrix()))
-            factor = custom(pose.keys, a.cov[np.ix_(known, known)], alignment_residual(a, pose, known))
+            factor = custom(keys, a.cov[np.ix_(known, known)], alignment_residual(a, pose, known))
             names = tuple(np.array(["across_1", "across_2"])[known])
-            ids = (a.alignment_id, frame_text(a.a), frame_text(a.b))
-            out.append(ObservationFactor(factor, "alignment", a.group, ids, names, ("rad",) * len(names),
-                                         a.value[known], a.used))  # fmt: skip
-        return out
+            yield ObservationFactor(factor, "alignment", a.group, (a.alignment_id, frame_text(a.a), frame_text(a.b)),
+                                    names, ("rad",) * len(names), a.value[known], a.used)  # fmt: skip
 
-    def _spots(self, state: State, values: gtsam.Values) -> list[ObservationFactor]:
-        out = []
+    def _spots(self, state: State, values: gtsam.Values) -> Iterator[ObservationFactor]:
         for spot, chain in zip(self.survey.laser_spots, self.spot_chains, strict=True):
             pose, beam = ChainPose(self.unknowns, state, chain), self.unknowns.vectors["beam", spot.beam_id]
             axes = beam_axes(self.beams[spot.beam_id].axis)
@@ -218,31 +212,20 @@ class GeometryFactors:
                     f"laser spot {spot.spot_id!r}: beam {spot.beam_id!r} runs along target {spot.target_id!r} at epoch "
                     f"{spot.epoch_id!r} instead of meeting it; correct its axis or the start of the target's pose"
                 )
-            keys = pose.keys + ([beam.key] if beam.key is not None else [])
-            _refuse_held(keys, f"laser spot {spot.spot_id!r}")
+            keys = _keys(f"laser spot {spot.spot_id!r}", pose.keys, beam.key)
             factor = custom(keys, spot.cov, spot_residual(spot, pose, beam, axes))
             ids = (spot.spot_id, spot.beam_id, frame_text(FrameRef("target", spot.target_id, spot.epoch_id)))
-            out.append(ObservationFactor(factor, "laser", spot.group, ids, ("x", "y"), ("m", "m"), spot.xy, spot.used))
-        return out
+            yield ObservationFactor(factor, "laser", spot.group, ids, ("x", "y"), ("m", "m"), spot.xy, spot.used)
 
-    def _on_surfaces(self, at: Mapping[PositionRef, Position]) -> list[ObservationFactor]:
-        out = []
+    def _on_surfaces(self, at: Mapping[PositionRef, Position]) -> Iterator[ObservationFactor]:
         for o in self.survey.on_surfaces:
-            surface, position = self.surfaces[o.surface_id], at[o.position]
+            surface, position, where = self.surfaces[o.surface_id], at[o.position], position_text(o.position)
             vector = self.unknowns.vectors["surface", o.surface_id]
-            n = 2 if surface.kind == "line" and o.offset == 0.0 else 1
-            keys = position.keys + ([vector.key] if vector.key is not None else [])
-            _refuse_held(keys, f"{position_text(o.position)} on surface {o.surface_id!r}")
+            names = ("across_1", "across_2") if surface.kind == "line" and o.offset == 0.0 else ("offset",)
+            n, keys = len(names), _keys(f"{where} on surface {o.surface_id!r}", position.keys, vector.key)
             factor = custom(keys, np.eye(n) * o.sigma**2, surface_residual(o, position, surface, vector))
-            ids, names = (o.surface_id, position_text(o.position)), ("across_1", "across_2") if n == 2 else ("offset",)
-            out.append(ObservationFactor(factor, "surface", o.group, ids, names, ("m",) * n, np.full(n, o.offset),
-                                         o.used))  # fmt: skip
-        return out
-
-
-def known_components(cov: FloatArray) -> BoolArray:
-    """Which components of an observation were observed: those with a finite variance."""
-    return np.asarray(np.isfinite(np.diag(cov)))
+            yield ObservationFactor(factor, "surface", o.group, (o.surface_id, where), names, ("m",) * n,
+                                    np.full(n, o.offset), o.used)  # fmt: skip
 
 
 def _base(vector: VectorMap, values: FloatArray) -> FloatArray:
@@ -250,9 +233,12 @@ def _base(vector: VectorMap, values: FloatArray) -> FloatArray:
     return np.array([0.0 if s in ("free", "prior", "tied") else v for s, v in zip(vector.status, values, strict=True)])
 
 
-def _refuse_held(keys: list[int], what: str) -> None:
+def _keys(what: str, own: Sequence[int], of_vector: int | None = None) -> list[int]:
+    """The unknowns of an observation. Raises SurveyError where there are none."""
+    keys = [*own, *([] if of_vector is None else [of_vector])]
     if not keys:
         raise SurveyError(f"{what} joins what is held; it can adjust nothing: free something or remove it")
+    return keys
 
 
 def _check_level(level: Level, pose: Pose3, vertical: VerticalMap, values: gtsam.Values) -> None:

@@ -85,7 +85,7 @@ class ImageBatch:
         """x_in_world: points (P, 3) m of the world, for blocks without a target."""
         self.state, self.blocks, points = state, blocks, ImagePoints.of(blocks)
         self.chains = Chains(chains)
-        self.ptr, self.used, self.n_points = points.ptr, points.used, len(points.uv)
+        self.ptr, self.point_idx, self.used, self.n_points = points.ptr, points.point_idx, points.used, len(points.uv)
         self._all = split_blocks(self.ptr)
         self.W_all = square_root_information(points.cov)
         self.W_all_columns = np.empty((3, self.n_points))

@@ -12,7 +12,6 @@ from itertools import accumulate
 
 import gtsam
 import numpy as np
-import scipy
 
 from adjust.frames.unknowns import Unknowns
 from adjust.model.errors import IndeterminateError
@@ -133,13 +132,19 @@ class PoseReduction:
         if not (diagonal > 0.0).all():
             return False
         scale = np.sqrt(diagonal)
-        U, info = scipy.linalg.lapack.dpotrf(N[:n, :n] / scale[:, None] / scale, lower=0, clean=1)
-        if info != 0 or not np.diag(U).min() ** 2 > WEAKEST_PIVOT:
+        A = np.empty((n + 1, n + 1))
+        A[:n, :n], A[n, :n] = N[:n, :n].T / scale[:, None] / scale, N[:n, n] / scale
+        A[n, n] = 2.0 * N[n, n] + 1.0  # above y'y in any case: y does not depend on it
+        try:
+            L = np.linalg.cholesky(A)
+        except np.linalg.LinAlgError:
             return False
-        y = scipy.linalg.lapack.dtrtrs(U, N[:n, n] / scale, lower=0, trans=1)[0]
+        if not np.diag(L)[:n].min() ** 2 > WEAKEST_PIVOT:
+            return False
+        y = L[n, :n]
         self._r[:n], self._r[n] = y, np.sqrt(max(0.0, N[n, n] - float(y @ y)))
         R = np.zeros((n + 1, n))
-        R[:n] = U * scale
+        R[:n] = L[:n, :n].T * scale
         ends = [*list(self.interface.at.values())[1:], n]
         self._views = [
             np.ascontiguousarray(R[:, at:end]) for at, end in zip(self.interface.at.values(), ends, strict=True)

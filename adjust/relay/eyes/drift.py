@@ -13,8 +13,8 @@ from scipy.sparse import csr_array
 
 from adjust.model.errors import NotConvergedError, SurveyError
 from adjust.model.survey import FloatArray
-from adjust.relay.eyes.eyes import EyeAdjustment, EyeOptions, adjust_eye_motions
-from adjust.relay.eyes.sequences import MotionSequence
+from adjust.relay.eyes.eyes import EyeAdjustment, EyeOptions, adjust_eyes
+from adjust.relay.eyes.sequences import EyeSequence
 from adjust.relay.eyes.solver import EyeProblem, EyeSolution, Weights, linearise
 from adjust.relay.eyes.trajectories import CommonMotions, Trajectory, common_motions
 from adjust.testing.distributions import norm
@@ -43,12 +43,12 @@ class DriftModel:
         return np.asarray(np.broadcast_to(np.diag(variance), (n, 6, 6)).copy())
 
 
-def sequences(common: CommonMotions, model: DriftModel) -> tuple[MotionSequence, ...]:
+def sequences(common: CommonMotions, model: DriftModel) -> tuple[EyeSequence, ...]:
     """Motions with the covariances of their drift."""
     length = float(common.times_s[0, 1] - common.times_s[0, 0])
     ids = common.interval_ids
     return tuple(
-        MotionSequence(eye, ids, m, model.cov(i, len(m), length))
+        EyeSequence(eye, ids, m, model.cov(i, len(m), length))
         for i, (eye, m) in enumerate(zip(common.eyes, common.motions, strict=True))
     )
 
@@ -70,14 +70,14 @@ def fit_drift(common: CommonMotions) -> tuple[DriftModel, EyeAdjustment]:
     length = float(common.times_s[0, 1] - common.times_s[0, 0])
     model = DriftModel(length, np.full(k, 3e-3), np.full(k, 1e-2), 0.0, 0.0, np.zeros((k, 2)))
     for _ in range(_MOST_ROUNDS):
-        adjusted = adjust_eye_motions(sequences(common, model), _FIT)
+        adjusted = adjust_eyes(sequences(common, model), (), _FIT)
         factor, redundancy = _components(adjusted.solution, k)
         model = DriftModel(
             length, model.rotation * np.sqrt(factor[:, 0]), model.position * np.sqrt(factor[:, 1]),
             *_autocorrelation(adjusted.solution, k), redundancy,
         )  # fmt: skip
         if np.abs(factor - 1.0).max() < 0.02:
-            return model, adjust_eye_motions(sequences(common, model), _FIT)
+            return model, adjust_eyes(sequences(common, model), (), _FIT)
     raise NotConvergedError(
         f"the variance components of {k} trackers did not settle; one of them may have no errors that the others see"
     )

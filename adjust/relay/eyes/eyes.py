@@ -1,7 +1,6 @@
 """The eyes of a relay station from what each of them saw: cameras without a common view, trackers, marker blocks.
 
->>> found = adjust_eyes((sequence_of_a, sequence_of_b))   # poses of each eye before its own target, A X = Z B
->>> found = adjust_eye_motions((motions_of_a, motions_of_b))   # motions between epochs, A X = X B
+>>> found = adjust_eyes((sequence_of_a, sequence_of_b))   # poses before own targets, A X = Z B, or motions, A X = X B
 >>> found.pair("a", "b")   # Pair a -> b with its covariance (6, 6), for adjust.relay
 
 Two eyes give one pair; more give the whole station at once, with the joint covariance of all eyes.
@@ -20,8 +19,8 @@ from adjust.model.survey import FloatArray
 from adjust.precision.precision import global_test
 from adjust.relay.eyes.checks import OutlierEpoch, refuse_undetermined
 from adjust.relay.eyes.screening import solve_screened
-from adjust.relay.eyes.sequences import KnownWorlds, MotionSequence, PoseSequence
-from adjust.relay.eyes.setup import EyeSetup, motion_setup, pose_setup
+from adjust.relay.eyes.sequences import EyeSequence, KnownWorlds
+from adjust.relay.eyes.setup import EyeSetup, eye_setup
 from adjust.relay.eyes.solver import EyeSolution
 from adjust.spatial.rigid_motions import Motions
 
@@ -109,26 +108,15 @@ class EyeAdjustment:
 
 
 def adjust_eyes(
-    sequences: Sequence[PoseSequence], known: Sequence[KnownWorlds] = (), options: EyeOptions = EyeOptions()
+    sequences: Sequence[EyeSequence], known: Sequence[KnownWorlds] = (), options: EyeOptions = EyeOptions()
 ) -> EyeAdjustment:
-    """The eyes of a station from poses of each in its own world; the worlds stay unmoved, the station moves.
+    """The eyes of a station from poses of each in its own world, which stays unmoved while the station moves.
 
-    Epochs are joined by their ids. Worlds of the same name are the same; of ``known`` ones the relation is an
-    observation. Raises SurveyError naming the undetermined direction where the turns do not suffice.
+    Or from their motions over the same intervals, for eyes whose worlds drift, as those of trackers. Epochs are joined
+    by their ids. Worlds of the same name are the same; of ``known`` ones the relation is an observation. Raises
+    SurveyError naming the undetermined direction where the turns do not suffice.
     """
-    return _adjusted(pose_setup(sequences, known), options)
-
-
-def adjust_eye_motions(sequences: Sequence[MotionSequence], options: EyeOptions = EyeOptions()) -> EyeAdjustment:
-    """The eyes of a station from their motions over the same intervals; errors of different intervals independent.
-
-    For eyes whose worlds drift, as those of trackers. Raises as :func:`adjust_eyes`.
-    """
-    return _adjusted(motion_setup(sequences, options.free_scales), options)
-
-
-def _adjusted(setup: EyeSetup, options: EyeOptions) -> EyeAdjustment:
-    setup = refuse_undetermined(setup, options.weakest_turn_sigmas)
+    setup = refuse_undetermined(eye_setup(sequences, known, options.free_scales), options.weakest_turn_sigmas)
     solution, outliers = solve_screened(setup, options.reject, options.alpha)
     k = len(setup.eyes)
     place = np.concatenate([solution.rows(i) for i in range(k)])

@@ -15,13 +15,13 @@ from adjust.model.observations import FrameRef, ImageBlock
 from adjust.model.result import Adjustment
 from adjust.model.survey import Camera, PoseParameter, Station, Survey, Target
 from adjust.relay.eyes.eyes import symmetric
-from adjust.relay.eyes.sequences import PoseSequence
+from adjust.relay.eyes.sequences import EyeSequence
 from adjust.spatial.rigid_motions import Motions
 
 ROOM = "room"  # the world of targets that the survey holds
 
 
-def camera_sequence(survey: Survey, camera_id: str) -> PoseSequence:
+def camera_sequence(survey: Survey, camera_id: str) -> EyeSequence:
     """Poses of one camera before the targets it saw, adjusted by itself, with the joint covariance of all epochs.
 
     Targets seen together in an epoch make one world, named after the first of them; targets that the survey holds stand
@@ -43,7 +43,7 @@ def camera_sequence(survey: Survey, camera_id: str) -> PoseSequence:
 
 def _sequence(
     alone: Adjustment, eye: FrameRef, kind: str, epochs: Sequence[str], world_of: Mapping[str, str]
-) -> PoseSequence:
+) -> EyeSequence:
     """The poses of an eye out of its own adjustment; world_of: by epoch."""
     every = [(kind, eye.frame_id, epoch) for epoch in epochs]
     names = [name for name in every if name in alone.estimates]
@@ -53,10 +53,10 @@ def _sequence(
     found = Motions.of(np.array([p.matrix() for p in poses if isinstance(p, Pose3)]))
     ids = tuple(name[2] for name in names)
     cov = symmetric(alone.precision.joint(names))
-    return PoseSequence(eye, ids, tuple(world_of[e] for e in ids), found, cov)
+    return EyeSequence(eye, ids, found, cov, tuple(world_of[e] for e in ids))
 
 
-def target_sequence(survey: Survey, target_id: str) -> PoseSequence:
+def target_sequence(survey: Survey, target_id: str) -> EyeSequence:
     """Poses of a marker block that a station carries, before a camera that stands still, with their joint covariance.
 
     Of several such cameras the one that saw the block at most epochs counts; it is the world, by its id, and its lens
@@ -153,7 +153,7 @@ def _alone(
     )
 
 
-def eye_sequences(survey: Survey | Adjustment, station_id: str | None = None) -> tuple[PoseSequence, ...]:
+def eye_sequences(survey: Survey | Adjustment, station_id: str | None = None) -> tuple[EyeSequence, ...]:
     """One sequence for each eye of a station (None: of the one station with two or more), cameras before blocks.
 
     Eyes are the station's cameras, and the marker blocks it carries that a camera of another station, which stands

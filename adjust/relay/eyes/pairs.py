@@ -12,8 +12,8 @@ from adjust.model.observations import Pair
 from adjust.model.survey import FloatArray
 from adjust.pose_network.loops import evaluate_loops
 from adjust.relay.conditions import ConditionAdjustment, adjust_conditions
-from adjust.relay.eyes.eyes import EyeAdjustment, EyeOptions, adjust_eye_motions, adjust_eyes, symmetric
-from adjust.relay.eyes.sequences import MotionSequence, PoseSequence
+from adjust.relay.eyes.eyes import EyeAdjustment, EyeOptions, adjust_eyes, symmetric
+from adjust.relay.eyes.sequences import EyeSequence
 from adjust.relay.network import network_from_pairs
 from adjust.relay.normal_equations import condition_matrix
 
@@ -46,17 +46,16 @@ class LoopedPairs:
     actual_cov: FloatArray
 
 
-def pairs_of(sequences: Sequence[PoseSequence] | Sequence[MotionSequence], options: EyeOptions = _EYES) -> EyePairs:
+def pairs_of(sequences: Sequence[EyeSequence], options: EyeOptions = _EYES) -> EyePairs:
     """Every two eyes by themselves. Raises SurveyError where no pair can be found."""
     found: list[tuple[Pair, EyeAdjustment, FloatArray]] = []
     refused = []
-    covs = [s.cov for s in sequences]
-    size = [6 * len(s.cov) if s.cov.ndim == 3 else len(s.cov) for s in sequences]
+    size = [6 * len(s.epoch_ids) for s in sequences]
     at = np.cumsum([0, *size])
     for i, j in combinations(range(len(sequences)), 2):
         a, b = sequences[i], sequences[j]
         try:
-            adjusted = _two(a, b, options)
+            adjusted = adjust_eyes((a, b), (), options)
         except SurveyError as error:
             refused.append(f"pair {a.eye.frame_id}-{b.eye.frame_id}: {error}")
             continue
@@ -67,19 +66,11 @@ def pairs_of(sequences: Sequence[PoseSequence] | Sequence[MotionSequence], optio
         found.append((adjusted.pair(*ids), adjusted, row))
     if not found:
         raise SurveyError("no two eyes make a pair: " + "; ".join(refused))
-    Q = scipy.linalg.block_diag(*(scipy.linalg.block_diag(*c) if c.ndim == 3 else c for c in covs))
+    Q = scipy.linalg.block_diag(*(s.joint_cov for s in sequences))
     G = np.concatenate([row for _, _, row in found])
     return EyePairs(
         tuple(p for p, _, _ in found), symmetric(G @ Q @ G.T), tuple(refused), tuple(x for _, x, _ in found)
     )
-
-
-def _two(a: PoseSequence | MotionSequence, b: PoseSequence | MotionSequence, options: EyeOptions) -> EyeAdjustment:
-    if isinstance(a, PoseSequence) and isinstance(b, PoseSequence):
-        return adjust_eyes((a, b), (), options)
-    if isinstance(a, MotionSequence) and isinstance(b, MotionSequence):
-        return adjust_eye_motions((a, b), options)
-    raise ValueError("poses of one eye and motions of the other make no pair")
 
 
 def close_loops(found: EyePairs) -> LoopedPairs:

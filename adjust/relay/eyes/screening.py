@@ -8,7 +8,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.relay.eyes.checks import OutlierEpoch
 from adjust.relay.eyes.setup import EyeSetup
-from adjust.relay.eyes.solver import EyeProblem, EyeSolution, linearise, solve_eyes
+from adjust.relay.eyes.solver import EyeProblem, EyeSolution, linearise, own_blocks, solve_eyes
 from adjust.testing.gross_errors import Search, State, Verdicts, one_group
 
 
@@ -45,16 +45,8 @@ def solve_screened(setup: EyeSetup, reject: bool, alpha: float) -> tuple[EyeSolu
 def _misfits(problem: EyeProblem, solution: EyeSolution) -> tuple[FloatArray, FloatArray]:
     """Misclosures (m, 6) of all conditions, used or not, and their covariance as if none had been used."""
     at = linearise(problem, solution.unknowns, solution.scales, np.zeros((len(problem.observed), 6)))
-    c, Q = problem.conditions, problem.cov
-    if Q.ndim == 3:
-        Qk, Ql = Q[c.k_idx], Q[c.l_idx]
-    else:
-        n = len(problem.observed)
-        blocks = Q.reshape(n, 6, n, 6)
-        Qk, Ql = blocks[c.k_idx, :, c.k_idx, :], blocks[c.l_idx, :, c.l_idx, :]
-    own = at.by_k @ Qk @ np.swapaxes(at.by_k, -1, -2) + at.by_l @ Ql @ np.swapaxes(at.by_l, -1, -2)
-    A = at.by.reshape(len(c), 6, -1)
-    return at.f, own + A @ solution.cov @ np.swapaxes(A, -1, -2)
+    A = at.by.reshape(len(at.f), 6, -1)
+    return at.f, own_blocks(problem, at) + A @ solution.cov @ np.swapaxes(A, -1, -2)
 
 
 def _all_tests(problem: EyeProblem, solution: EyeSolution, used: BoolArray) -> FloatArray:

@@ -1,7 +1,9 @@
-"""What eyes observed, as frozen values: poses before targets, motions between epochs, targets known to each other."""
+"""What eyes observed, as frozen values: poses or motions of eyes, targets known to each other."""
 
 from dataclasses import dataclass
 
+import numpy as np
+import scipy.linalg
 from gtsam import Pose3
 
 from adjust.model.observations import FrameRef
@@ -10,28 +12,24 @@ from adjust.spatial.rigid_motions import Motions
 
 
 @dataclass(frozen=True, eq=False)
-class PoseSequence:
-    """Poses of one eye in the world that it watches: n epochs.
+class EyeSequence:
+    """Poses of one eye in the world that it watches at n epochs, or its motions over n intervals.
 
-    world_ids: (n,) name of the frame each pose refers to, a target or the eye's own start. world_from_eye: (n,).
+    reference_from_eye: (n,) the poses, or motions ``before_from_after``, of which the errors are independent.
     cov: (n, 6, 6) in the tangents on the right (frame of the eye), or the joint one (6n, 6n), as from one adjustment.
+    world_ids: (n,) name of the frame each pose refers to, a target or the eye's own start; None for motions.
     """
 
     eye: FrameRef
     epoch_ids: tuple[str, ...]
-    world_ids: tuple[str, ...]
-    world_from_eye: Motions
+    reference_from_eye: Motions
     cov: FloatArray
+    world_ids: tuple[str, ...] | None = None
 
-
-@dataclass(frozen=True, eq=False)
-class MotionSequence:
-    """Motions ``before_from_after`` of one eye over n intervals, independent of each other; cov: (n, 6, 6)."""
-
-    eye: FrameRef
-    interval_ids: tuple[str, ...]
-    before_from_after: Motions
-    cov: FloatArray
+    @property
+    def joint_cov(self) -> FloatArray:
+        """(6n, 6n), whatever was given."""
+        return self.cov if self.cov.ndim == 2 else np.asarray(scipy.linalg.block_diag(*self.cov))
 
 
 @dataclass(frozen=True, eq=False)

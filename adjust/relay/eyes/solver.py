@@ -126,18 +126,12 @@ def linearise(problem: EyeProblem, U: Motions, scales: FloatArray, v: FloatArray
     f = C.log()
     J = right_jacobian_inverse(f)
     by_eye_k = J @ back.inverse().adjoint()
-    by_world_l = J @ Pl.inverse().adjoint()
     by_world_k = -J @ (U[c.world_k].inverse() @ U[c.world_l] @ Pl).inverse().adjoint()
     by_pose_k, by_pose_l = -by_eye_k, J
     by = np.zeros((len(c), 6, 6 * len(U) + problem.n_scales))
     row = np.arange(len(c))
-    parts = (
-        (c.eye_k, by_eye_k),
-        (c.eye_l, -J @ C.inverse().adjoint()),
-        (c.world_k, by_world_k),
-        (c.world_l, by_world_l),
-    )
-    for idx, D in parts:
+    parts = by_eye_k, -J @ C.inverse().adjoint(), by_world_k, J @ Pl.inverse().adjoint()
+    for idx, D in zip((c.eye_k, c.eye_l, c.world_k, c.world_l), parts, strict=True):
         for j in range(6):
             by[row, :, 6 * idx + j] += D[:, :, j]  # each row once, so nothing is lost
     for idx, pose, D in ((c.scale_k, Pk, by_pose_k), (c.scale_l, Pl, by_pose_l)):
@@ -172,40 +166,48 @@ def _stretch(pose: Motions) -> FloatArray:
     return np.concatenate([np.zeros_like(turned), turned], axis=1)
 
 
+def own_blocks(problem: EyeProblem, at: Linearised) -> FloatArray:
+    """Covariances (m, 6, 6) of the conditions by themselves; the two observations of one are of different eyes."""
+    c, Q, n = problem.conditions, problem.cov, len(problem.observed)
+    Q_k, Q_l = (Q[i] if Q.ndim == 3 else Q.reshape(n, 6, n, 6)[i, :, i, :] for i in (c.k_idx, c.l_idx))
+    return np.asarray(at.by_k @ Q_k @ np.swapaxes(at.by_k, -1, -2) + at.by_l @ Q_l @ np.swapaxes(at.by_l, -1, -2))
+
+
 class Weights:
     """M = B Q B' of the conditions, factorised, with Q block diagonal or full."""
 
     def __init__(self, problem: EyeProblem, at: Linearised) -> None:
         m, n = len(at.f), len(problem.observed)
-        index, ptr = np.arange(m), np.arange(m + 1)
-        shape = (6 * m, 6 * n)
-        order = (problem.conditions.k_idx, problem.conditions.l_idx)
-        parts = [
-            sp.bsr_array((np.ascontiguousarray(D), i, ptr), shape=shape)
-            for D, i in zip((at.by_k, at.by_l), order, strict=True)
-        ]
-        self.B = (parts[0] + parts[1]).tocsr()
+        order, ptr = ((at.by_k, problem.conditions.k_idx), (at.by_l, problem.conditions.l_idx)), np.arange(m + 1)
+        B_k, B_l = (sp.bsr_array((np.ascontiguousarray(D), i, ptr), shape=(6 * m, 6 * n)) for D, i in order)
+        self.B = (B_k + B_l).tocsr()
         if problem.cov.ndim == 3:
             Q = sp.bsr_array((np.ascontiguousarray(problem.cov), np.arange(n), np.arange(n + 1)), shape=(6 * n, 6 * n))
             self.QBt = (Q @ self.B.T).tocsc()
-            self.M = (self.B @ self.QBt).tocsc()
-            self.factor = positive_definite_lu(self.M)
-            self.solve = self.factor.solve
+            self.solve = positive_definite_lu((self.B @ self.QBt).tocsc()).solve
         else:
             self.QBt = np.asarray(problem.cov @ self.B.T.toarray())
-            self.M = np.asarray(self.B @ self.QBt)
-            root = scipy.linalg.cho_factor(self.M)
+            root = scipy.linalg.cho_factor(np.asarray(self.B @ self.QBt))
             self.solve = lambda right: scipy.linalg.cho_solve(root, right)
-        self.blocks = _diagonal_blocks(self.M, index)
 
 
-def _diagonal_blocks(M: FloatArray | sp.csc_array, index: IntArray) -> FloatArray:
-    if isinstance(M, np.ndarray):
-        m = len(index)
-        return np.asarray(M.reshape(m, 6, m, 6)[index, :, index, :])
-    rows = np.repeat(np.arange(6), 6)[None] + 6 * index[:, None]
-    cols = np.tile(np.arange(6), 6)[None] + 6 * index[:, None]
-    return np.asarray(M[rows.ravel(), cols.ravel()]).reshape(-1, 6, 6)
+class _Normals:
+    """The normal equations N x = -right of the unknowns, what is known of them included, at a linearisation."""
+
+    def __init__(self, problem: EyeProblem, U: Motions, scales: FloatArray, v: FloatArray) -> None:
+        self.at = linearise(problem, U, scales, v)
+        self.weights = Weights(problem, self.at)
+        self.w = self.at.f.ravel() - self.weights.B @ v.ravel()
+        self.MA = np.asarray(self.weights.solve(self.at.by))
+        self.N, self.right = self.at.by.T @ self.MA, self.MA.T @ self.w
+        self.omega_known = 0.0
+        for known in problem.known:
+            r = (known.motion.inverse() @ U[np.array([known.idx])]).log()
+            J, P = right_jacobian_inverse(r)[0], np.linalg.inv(known.cov)
+            rows = unknown_rows(problem.free, known.idx)
+            self.N[np.ix_(rows, rows)] += J.T @ P @ J
+            self.right[rows] += J.T @ P @ r[0]
+            self.omega_known += float(r[0] @ P @ r[0])
 
 
 def solve_eyes(problem: EyeProblem) -> EyeSolution:
@@ -214,19 +216,14 @@ def solve_eyes(problem: EyeProblem) -> EyeSolution:
     v = np.zeros((len(problem.observed), 6))
     n_free = 6 * int(problem.free.sum())
     for iteration in range(1, _MOST_STEPS + 1):
-        at = linearise(problem, U, scales, v)
-        weights = Weights(problem, at)
-        w = at.f.ravel() - weights.B @ v.ravel()
-        MA = weights.solve(at.by)
-        N, right = at.by.T @ MA, MA.T @ w
-        _add_known(problem, U, N, right)
-        root = scipy.linalg.cho_factor(N)
-        step = -scipy.linalg.cho_solve(root, right)
-        v = np.asarray(-(weights.QBt @ weights.solve(w + at.by @ step))).reshape(-1, 6)
+        normals = _Normals(problem, U, scales, v)
+        weights, by = normals.weights, normals.at.by
+        step = -scipy.linalg.cho_solve(scipy.linalg.cho_factor(normals.N), normals.right)
+        v = np.asarray(-(weights.QBt @ weights.solve(normals.w + by @ step))).reshape(-1, 6)
         delta = np.zeros((len(U), 6))
         delta[problem.free] = step[:n_free].reshape(-1, 6)
         U, scales = U.retract(delta), scales + step[n_free:]
-        moved = float(np.sqrt(step @ N @ step))
+        moved = float(np.sqrt(step @ normals.N @ step))
         if moved < _STILL or (iteration > 8 and moved < 1e-6):
             return _finish(problem, U, scales, v, iteration)
     raise NotConvergedError(
@@ -235,35 +232,13 @@ def solve_eyes(problem: EyeProblem) -> EyeSolution:
     )
 
 
-def _add_known(problem: EyeProblem, U: Motions, N: FloatArray, right: FloatArray) -> float:
-    """Adds what is known beforehand to the normal equations; gives its share of v'Pv."""
-    omega = 0.0
-    for known in problem.known:
-        r = (known.motion.inverse() @ U[np.array([known.idx])]).log()
-        J, P = right_jacobian_inverse(r)[0], np.linalg.inv(known.cov)
-        rows = unknown_rows(problem.free, known.idx)
-        N[np.ix_(rows, rows)] += J.T @ P @ J
-        right[rows] += J.T @ P @ r[0]
-        omega += float(r[0] @ P @ r[0])
-    return omega
-
-
 def _finish(problem: EyeProblem, U: Motions, scales: FloatArray, v: FloatArray, iterations: int) -> EyeSolution:
-    at = linearise(problem, U, scales, v)
-    weights = Weights(problem, at)
-    w = at.f.ravel() - weights.B @ v.ravel()
-    MA = np.asarray(weights.solve(at.by))
-    N = at.by.T @ MA
-    omega = _add_known(problem, U, N, np.zeros(len(N)))
-    cov = np.linalg.inv(N)
-    Mw = np.asarray(weights.solve(w))
-    omega += float(w @ Mw)
-    A = at.by.reshape(len(at.f), 6, -1)
-    left = weights.blocks - A @ cov @ np.swapaxes(A, -1, -2)
-    w = w.reshape(-1, 6)
+    normals = _Normals(problem, U, scales, v)
+    at, cov, w = normals.at, np.linalg.inv(normals.N), normals.w
+    omega = normals.omega_known + float(w @ np.asarray(normals.weights.solve(w)))
+    A, w = at.by.reshape(len(at.f), 6, -1), w.reshape(-1, 6)
+    left = own_blocks(problem, at) - A @ cov @ np.swapaxes(A, -1, -2)
     test = np.einsum("mi,mij,mj->m", w, np.linalg.pinv(left, rcond=1e-9, hermitian=True), w)
-    influence = -cov @ (weights.B.T @ MA).T
+    influence = np.asarray(-cov @ (normals.weights.B.T @ normals.MA).T)
     redundancy = 6 * len(at.f) + 6 * len(problem.known) - len(cov)
-    return EyeSolution(
-        problem, U, scales, cov, v, w, test, np.asarray(influence), omega, redundancy, iterations
-    )  # fmt: skip
+    return EyeSolution(problem, U, scales, cov, v, w, test, influence, omega, redundancy, iterations)

@@ -181,16 +181,16 @@ def _undetermined(axis: FloatArray, n: int) -> str:
     )
 
 
-def relative_motions(a: FloatArray, b: FloatArray, per_item: int = 4) -> tuple[FloatArray, FloatArray]:
+def relative_motions(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Motions between poses a, b (n, 4, 4) of ``a_i x = z b_i`` for :func:`solve_ax_xb`: a_j^-1 a_i and b_j^-1 b_i.
 
-    Of every pose with the ``per_item`` others nearest to a turn of 100 degrees, where the rotation axis is sharp and
+    Of every pose with the four others nearest to a turn of 100 degrees, where the rotation axis is sharp and
     the logarithm still unambiguous.
     """
     pairs: set[tuple[int, int]] = set()
     for i in range(len(a)):
         turns = np.linalg.norm(rotation_log(np.swapaxes(a[i, :3, :3], -1, -2) @ a[:, :3, :3]), axis=1)
         order = np.argsort(np.abs(turns - np.deg2rad(100.0)), kind="stable")
-        pairs |= {(min(i, j), max(i, j)) for j in order[order != i][:per_item].tolist()}
+        pairs |= {(min(i, j), max(i, j)) for j in order[order != i][:4].tolist()}
     first, second = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2).T
     return inverse(a[second]) @ a[first], inverse(b[second]) @ b[first]

@@ -40,9 +40,9 @@ def every_nth(images: Sequence[Sighting], n: int) -> list[Sighting]:
     return [images[int(i)] for i in np.unique(np.linspace(0, len(images) - 1, n).round())]
 
 
-def spread_out(images: Sequence[Sighting], n: int = MOST_IMAGES) -> list[Sighting]:
-    """At most n images that differ most in place, size and tilt of the target (farthest-point sampling)."""
-    if len(images) <= n:
+def spread_out(images: Sequence[Sighting]) -> list[Sighting]:
+    """``MOST_IMAGES`` at most, that differ most in place, size and tilt of the target (farthest-point sampling)."""
+    if len(images) <= MOST_IMAGES:
         return list(images)
     features = _features(images)
     features = (features - features.mean(axis=0)) / np.maximum(features.std(axis=0), 1e-9)
@@ -50,7 +50,7 @@ def spread_out(images: Sequence[Sighting], n: int = MOST_IMAGES) -> list[Sightin
     sizes = [len(s.x) for s in images]
     chosen = [sizes.index(max(sizes))]
     nearest = squares[chosen[0]]
-    while len(chosen) < n:
+    while len(chosen) < MOST_IMAGES:
         chosen.append(int(nearest.argmax()))
         nearest = np.minimum(nearest, squares[chosen[-1]])
     return [images[i] for i in sorted(chosen)]

@@ -7,7 +7,7 @@ import numpy as np
 
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.model.observations import ImageBlock, ReadingCovariance
-from adjust.model.rewriting import Fields
+from adjust.model.rewriting import Fields, with_rows
 from adjust.model.survey import BoolArray, IntArray, Survey
 
 FIELDS = {
@@ -31,11 +31,12 @@ class Candidates:
     n: int
     image_ptr: tuple[int, ...]
 
-    def mask(self, with_images: bool = True) -> BoolArray:
+    @property
+    def mask(self) -> BoolArray:
         """Which observations (n,) can be left out at all."""
         out = np.zeros(self.n, dtype=np.bool_)
         out[list(self.place)] = True
-        out[: self.n_image] = with_images
+        out[: self.n_image] = True
         return out
 
     def of(self, field: str, rows: IntArray) -> tuple[int, ...]:
@@ -74,47 +75,33 @@ def without(survey: Survey, found: Candidates, rejected: Iterable[int]) -> Surve
         field, i = found.place[row + found.n_image]
         by_field.setdefault(field, set()).add(i)
     for field, numbers in by_field.items():
-        changed[field] = tuple(
-            replace(x, used=False) if i in numbers else x for i, x in enumerate(getattr(survey, field))
-        )
+        every = enumerate(getattr(survey, field))
+        changed[field] = tuple(replace(x, used=False) if i in numbers else x for i, x in every)
     if _READINGS in by_field:
         lost = {survey.readings[i].reading_id for i in by_field[_READINGS]}
-        changed["reading_covariances"] = tuple(
-            part for c in survey.reading_covariances for part in _parts(c, lost)
-        )
+        joint = survey.reading_covariances
+        changed["reading_covariances"] = tuple(part for c in joint for part in _parts(c, lost))
     return replace(survey, **changed)
 
 
 def _blocks(survey: Survey, found: Candidates, out: BoolArray) -> tuple[ImageBlock, ...]:
     if not found.n_image:
         return survey.image_blocks
-    blocks = []
-    for b, block in enumerate(survey.image_blocks):
-        mine = out[found.image_ptr[b] : found.image_ptr[b + 1]]
-        if not mine.any():
-            blocks.append(block)
-            continue
-        used = block.mask
-        blocks.append(replace(block, used=used & ~mine))
-    return tuple(blocks)
+    gone = np.split(out[: found.n_image], found.image_ptr[1:-1])
+    each = zip(survey.image_blocks, gone, strict=True)
+    return tuple(replace(b, used=b.mask & ~mine) if mine.any() else b for b, mine in each)
 
 
 def _parts(c: ReadingCovariance, lost: set[str]) -> list[ReadingCovariance]:
     """The covariance of what is left, and that of what is out: all readings of one covariance are used, or none."""
-    ids = np.array(c.reading_ids)
-    gone = np.array([i in lost for i in c.reading_ids], dtype=np.bool_)
-    if not gone.any():
-        return [c]
-    parts = [np.flatnonzero(~gone), np.flatnonzero(gone)]
-    return [ReadingCovariance(tuple(ids[p].tolist()), c.cov[np.ix_(p, p)]) for p in parts if len(p)]
+    parts = c.of(set(c.reading_ids) - lost), c.of(lost)
+    return [part for part in parts if part.reading_ids]
 
 
 def as_given(survey: Survey, given: Survey) -> Survey:
     """The survey with those image points in use that are so in the one it was made of: to be screened anew."""
-    used = {b.place: b for b in given.image_blocks}
-    blocks = []
-    for b in survey.image_blocks:
-        before = used.get(b.place)
-        same = before is not None and np.array_equal(before.point_idx, b.point_idx)
-        blocks.append(replace(b, used=before.used) if before is not None and same else b)
-    return replace(survey, image_blocks=tuple(blocks))
+    before = {b.place: b for b in given.image_blocks}
+    same = {i: before[b.place] for i, b in enumerate(survey.image_blocks)
+            if b.place in before and np.array_equal(before[b.place].point_idx, b.point_idx)}  # fmt: skip
+    blocks = {i: replace(survey.image_blocks[i], used=b.used) for i, b in same.items()}
+    return with_rows(survey, "image_blocks", blocks)

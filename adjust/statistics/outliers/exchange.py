@@ -43,10 +43,10 @@ class Exchange:
 
 @dataclass(frozen=True, eq=False)
 class _Near:
-    """Pool (p,) of observations, those of them that are out, and g (r,), R (r, r) of their rows with all of them in."""
+    """Pool (p,) of observations, first the n that are out, and g (r,), R (r, r) of their rows with all of them in."""
 
     pool: list[int]
-    mine: frozenset[int]
+    n: int
     g: FloatArray
     R: FloatArray
     at: list[IntArray]
@@ -57,11 +57,8 @@ def better_set(snooping: Snooping, limits: FloatArray) -> Exchange | None:
     state = _state(snooping, limits)
     if state is None:
         return None
-    for o in snooping.out:
-        found = [x for x in _exchanges(state, o) if x.more < -1e-6]
-        if found:
-            return min(found, key=lambda x: x.more)
-    return None
+    every = ([x for x in _exchanges(state, o) if x.more < -1e-6] for o in snooping.out)
+    return next((min(found, key=lambda x: x.more) for found in every if found), None)
 
 
 def equal_sets(snooping: Snooping, limits: FloatArray) -> list[Exchange]:
@@ -139,7 +136,7 @@ def _exchanges(state: _State, o: int) -> list[Exchange]:
 
 def _exchanges_among(state: _State, near: _Near) -> list[Exchange]:
     J = _criteria(near, state.limits[near.pool])
-    n, here = len(near.mine), 2 ** len(near.mine) - 1  # what is out stands first
+    n, here = near.n, 2**near.n - 1
     if not np.isfinite(J[here]):
         return []
     more, out = J - J[here], []
@@ -221,4 +218,4 @@ def _joined(state: _State, mine: list[int], free: list[int], N: IntArray, of_N: 
     g = np.concatenate([of_N @ state.bias[N], snooping.g[F] + cross @ state.bias[N]])
     pool = [*mine, *free]
     ends = np.cumsum([0] + [int(snooping.sizes[x]) for x in pool])
-    return _Near(pool, frozenset(mine), g, R, [np.arange(a, b) for a, b in pairwise(ends)])
+    return _Near(pool, len(mine), g, R, [np.arange(a, b) for a, b in pairwise(ends)])

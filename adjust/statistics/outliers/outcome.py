@@ -7,7 +7,6 @@ import numpy as np
 
 from adjust.adjustment import AdjustOptions
 from adjust.model.result import Adjustment, Decision, ObservationResidual
-from adjust.model.survey import Survey
 from adjust.statistics.result import Alternative
 
 GLOBAL = 100.0**2
@@ -33,7 +32,7 @@ DEFAULT_SEARCH = SearchOptions()
 
 @dataclass(frozen=True, eq=False)
 class OutlierSearch:
-    """The clean least squares, its survey, and how it was found.
+    """The clean least squares, and how it was found.
 
     rejected: what is out in the end, worst first. log: every decision in order, also those taken back. suspects: what
     fails its test but cannot be left out, because something would be undetermined without it, or because it is a prior
@@ -43,7 +42,6 @@ class OutlierSearch:
     """
 
     adjustment: Adjustment
-    survey: Survey
     rejected: tuple[Decision, ...]
     log: tuple[Decision, ...]
     suspects: tuple[Decision, ...]
@@ -64,14 +62,10 @@ class OutlierSearch:
             f"that better than wrong observations do, and none was left out for it; {_to_check(f)}"
             for g, f in self.widened
         )
-        return notes + tuple(
-            f"fails its test, but {self._stays(d)}: {d.text().split(': ', 1)[1]}" for d in self.suspects
-        )
-
-    def _stays(self, suspect: Decision) -> str:
-        if suspect.group in self.cautious:
-            return f"stays, for the residuals of group {suspect.group} are together far smaller than its sigmas say"
-        return "cannot be left out"
+        stays = "stays, for the residuals of group {} are together far smaller than its sigmas say"
+        why = (stays.format(d.group) if d.group in self.cautious else "cannot be left out" for d in self.suspects)
+        said = (d.text().split(": ", 1)[1] for d in self.suspects)
+        return notes + tuple(f"fails its test, but {w}: {text}" for w, text in zip(why, said, strict=True))
 
 
 def _to_check(factor: float) -> str:

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from adjust.model.names import numbered
 from adjust.model.result import Adjustment, Decision
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.precision.precision import Precision, precision_of
@@ -44,7 +45,7 @@ class Round:
         self.found = candidates(precision.graph, images)
         points = 0 if images else int(now.image_residuals.used.sum())
         self.given = used_at(now, self.found) if given is None else given
-        allowed = self.found.mask() & self.given
+        allowed = self.found.mask & self.given
         if options.kinds is not None:
             kinds = ["image"] * self.found.n_image + precision.graph.of_others(lambda o: o.kind, lambda _: "pair")
             kinds += [r.kind for r in now.survey.readings]
@@ -211,7 +212,7 @@ class Round:
         suspects.sort(key=lambda i: -float(last.over[i]))
         mine = {names[g] for g in np.unique(now.group[now.candidates]).tolist()}
         return OutlierSearch(
-            adjustment, adjustment.survey, tuple(sorted(rejected, key=lambda d: -d.statistic / d.limit)), tuple(log),
+            adjustment, tuple(sorted(rejected, key=lambda d: -d.statistic / d.limit)), tuple(log),
             tuple(self._decision("rejected", i, now, "test") for i in suspects), self.number, converged,
             tuple(self._alternative(x) for x in equal_sets(now, self._limits())),
             tuple(n for n, timid in zip(names, self.cautious, strict=False) if timid),
@@ -248,12 +249,10 @@ def used_at(now: Adjustment, found: Candidates) -> BoolArray:
 def tests_of_all(now: Adjustment) -> Verdicts:
     """Tests (M,) of everything but image points and readings, each with the others as they are."""
     graph, others = precision_of(now).graph, now.other_arrays
-    names = groups_of_others(graph)
-    number = {name: i for i, name in enumerate(dict.fromkeys(names))}
+    names, group = numbered(groups_of_others(graph))
     tested = np.isfinite(others.test) & (~others.used | (others.redundancy > CONTROLLED))
     freedom = np.where(tested, others.n_components, 0)
     if graph.pairs is not None:
         freedom[graph.first_pair + graph.pairs.rows] = precision_of(now).pairs.freedom
-    none = np.full(len(number) + 1, np.nan)
-    return Verdicts(np.nan_to_num(others.test), freedom, others.used, np.ones(len(names), dtype=np.bool_),
-                    np.array([number[n] for n in names], dtype=np.int64), none, none)  # fmt: skip
+    none, possible = np.full(len(names) + 1, np.nan), np.ones(len(group), dtype=np.bool_)
+    return Verdicts(np.nan_to_num(others.test), freedom, others.used, possible, group, none, none)

@@ -17,6 +17,7 @@ from adjust.adjustment import adjust
 from adjust.graph.assembly import StartValues, values_of
 from adjust.model.errors import IndeterminateError, NotConvergedError
 from adjust.model.result import Adjustment, ParameterName
+from adjust.model.rewriting import with_rows
 from adjust.model.survey import BoolArray, Survey
 from adjust.precision.precision import precision_of
 from adjust.statistics.outliers.candidates import as_given, candidates, without
@@ -28,6 +29,8 @@ from adjust.testing.criteria import limits
 _ROUNDS = 12
 _BETTER = 0.25
 """What a round must bring it down to, to go on all the same: large errors show only once some of them are out."""
+_Leave = Callable[[tuple[int, ...], Adjustment], Adjustment]
+"""The survey adjusted without these, from the values of an adjustment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +54,9 @@ def search_outliers(
     def solved(part: Survey, start: StartValues | None) -> Adjustment:
         return adjust(part, start, options.adjust, progress)
 
+    def leave(these: tuple[int, ...], now: Adjustment) -> Adjustment:
+        return solved(without(survey, found, these), values_of(now))
+
     images, given, out = options.kinds is None or "image" in options.kinds, None, tuple[int, ...]()
     if wrong is None:
         now = first or solved(survey, start)
@@ -60,8 +66,7 @@ def search_outliers(
         found = candidates(precision_of(now).graph, images)
         given, out = used_at(now, found), found.of("pairs", np.flatnonzero(wrong.pairs))
         given[list(out)] = True
-        now, out = _taken_back(now, out, options, lambda these, now: solved(
-            without(survey, found, these), values_of(now)))  # fmt: skip
+        now, out = _taken_back(now, out, options, leave)
     round_ = first_round = Round(now, options, images, given)
     found, given, first_out, worst = round_.found, round_.given, out, np.inf
     if wrong is None and round_.crowded:
@@ -69,8 +74,7 @@ def search_outliers(
         if wrong is not None:
             mine, begin = found.of("pairs", np.flatnonzero(wrong.pairs)), wrong.start
             now, out = _left_out(now, (), mine, lambda these, _: solved(without(survey, found, these), begin))
-            now, out = _taken_back(now, out, options, lambda these, now: solved(
-                without(survey, found, these), values_of(now)))  # fmt: skip
+            now, out = _taken_back(now, out, options, leave)
             round_ = Round(now, options, images, given)
     log = [round_.rejected(o, round_.snooping, "robust") for o in out]
     seen: set[frozenset[int]] = {frozenset()}
@@ -87,8 +91,7 @@ def search_outliers(
         if converged or round_.number == _ROUNDS:
             return round_.result(state, out, needed, log, converged, now)
         seen.add(frozenset(new))
-        before, (now, out) = out, _left_out(now, out, new, lambda these, now: solved(
-            without(survey, found, these), values_of(now)))  # fmt: skip
+        before, (now, out) = out, _left_out(now, out, new, leave)
         needed |= set(new) - set(out)
         if out == before and set(new) <= set(out):  # what should come back has no solution either
             return round_.result(state, out, needed, log, True, now)
@@ -122,15 +125,12 @@ def disagreeing_pairs(survey: Survey, factor: float = 1.0, only_large: bool = Fa
 
 def _with_pairs(survey: Survey, wrong: BoolArray) -> Survey:
     """Without the wrong ones (E,)."""
-    return replace(survey, pairs=tuple(
-        replace(p, used=False) if out else p for p, out in zip(survey.pairs, wrong.tolist(), strict=True)
-    ))  # fmt: skip
+    return with_rows(survey, "pairs", {i: replace(survey.pairs[i], used=False) for i in np.flatnonzero(wrong).tolist()})
 
 
 def _left_out(
-    now: Adjustment, out: tuple[int, ...], new: tuple[int, ...],
-    leave: Callable[[tuple[int, ...], Adjustment], Adjustment],
-) -> tuple[Adjustment, tuple[int, ...]]:  # fmt: skip
+    now: Adjustment, out: tuple[int, ...], new: tuple[int, ...], leave: _Leave
+) -> tuple[Adjustment, tuple[int, ...]]:
     """Adjusted without ``new``; where there is no such solution, without those before and as many more as can go."""
     try:
         return leave(new, now), new
@@ -143,9 +143,8 @@ def _left_out(
 
 
 def _taken_back(
-    now: Adjustment, out: tuple[int, ...], options: SearchOptions,
-    leave: Callable[[tuple[int, ...], Adjustment], Adjustment],
-) -> tuple[Adjustment, tuple[int, ...]]:  # fmt: skip
+    now: Adjustment, out: tuple[int, ...], options: SearchOptions, leave: _Leave
+) -> tuple[Adjustment, tuple[int, ...]]:
     """Of more than can be followed one by one all that fits comes back at once, until little does."""
     for _ in range(_ROUNDS):
         tests = tests_of_all(now)

@@ -4,10 +4,11 @@ An observation that is not used is still predicted and tested, which needs every
 observation in use of an unknown is gone (the only image of an epoch, every sight of a beacon, all images of a camera),
 or fewer than three image points of an epoch's pose are left, the unknown would stand in the normal equations with
 nothing to determine it: it goes, with the observations that hang on it. What an unused observation does not touch is
-never dropped: a station that nobody has measured is an error of the survey, not a decision of its owner.
+never dropped: a station that nobody has measured is an error of the survey, not a decision of its owner. Points left
+without rays only once gross errors are out are dropped with a note, instead of stopping everything.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -15,19 +16,32 @@ import numpy as np
 
 from adjust.frames.tree import FrameTree
 from adjust.frames.unknowns import Link, Unknowns
-from adjust.model.errors import listed
-from adjust.model.observations import FrameRef, ImageBlock, PositionRef
-from adjust.model.result import ParameterName
+from adjust.model.errors import IndeterminateError, listed
+from adjust.model.observations import (
+    Alignment,
+    FrameRef,
+    ImageBlock,
+    LaserSpot,
+    Level,
+    Observation,
+    Pair,
+    PositionRef,
+    Reading,
+    TableReading,
+)
+from adjust.model.result import Adjustment, ParameterName
 from adjust.model.rewriting import Fields
+from adjust.model.subsets import positions_of, with_points
 from adjust.model.survey import Survey
 from adjust.observations.geometry.building import carrier_of
-from adjust.statistics.outliers.undetermined_points import without_named_points
 
 Item = TypeVar("Item")
 Needs = frozenset[ParameterName]
 _NOTHING: Needs = frozenset()
 _OF_A_POSE = 3
 """Image points that a pose needs at least."""
+_MOST = 50
+"""Points that may be lost."""
 
 
 def supported(survey: Survey) -> tuple[Survey, tuple[ParameterName, ...]]:
@@ -59,6 +73,7 @@ class _Needs:
         self._points = {p.point_id for p in survey.points if p.x_in_world.treatment == "free"}
         self._point_ids = [p.point_id for p in survey.points]
         self._lenses = {c.camera_id for c in survey.cameras if c.lens.free and c.lens.prior is None}
+        self._beams = {b.beam_id: b for b in survey.beams}
         self._of_slot: dict[int, Needs] = {}
         self._names: list[ParameterName] = []
         self.of_blocks = [self._of_block(b) for b in survey.image_blocks]
@@ -79,56 +94,40 @@ class _Needs:
         parameter = self._unknowns.parameters[name]
         return frozenset({name}) if parameter.treatment == "free" else _NOTHING
 
-    def of_frame(self, frame: FrameRef) -> Needs:
-        """Of a frame in the world."""
-        return self._of_chain(self._frames.world_from(frame))
-
-    def of_position(self, ref: PositionRef | None) -> Needs:
-        """Of a position in the world."""
-        if ref is None:
-            return _NOTHING
-        if ref.frame is not None:
-            return self.of_frame(ref.frame)
-        return frozenset({("point", str(ref.point_id))}) if ref.point_id in self._points else _NOTHING
-
-    def of_pair(self, a: FrameRef, b: FrameRef) -> Needs:
-        """Of the motion between two frames."""
-        return self._of_chain(self._frames.relative(a, b))
-
     def _of_block(self, block: ImageBlock) -> Needs:
         lens: Needs = frozenset({("lens", block.camera_id)}) if block.camera_id in self._lenses else _NOTHING
         return lens | self._of_chain(self._frames.of_image(block))
 
     def of_point(self, index: int) -> Needs:
         """Of a world point in an image."""
-        point_id = self._point_ids[index]
-        return frozenset({("point", point_id)}) if point_id in self._points else _NOTHING
+        return self._of_point(self._point_ids[index])
+
+    def _of_point(self, point_id: str | None) -> Needs:
+        return frozenset({("point", str(point_id))}) if point_id in self._points else _NOTHING
 
     def others(self) -> dict[str, list[Needs]]:
         """Of every observation that is no image point, by field of the survey."""
-        s, at = self.survey, self.of_position
-        beams = {b.beam_id: b for b in s.beams}
+        return {field: [self._of_other(o) for o in of] for field, of in self.survey.others.items()}
 
-        def every(refs: Iterable[PositionRef | None]) -> Needs:
-            return _NOTHING.union(*(at(ref) for ref in refs))
+    def _of_other(self, o: Observation) -> Needs:
+        match o:
+            case TableReading():
+                return frozenset({("table_angles", o.table_id, o.epoch_id)})
+            case Pair() | Alignment():
+                return self._of_chain(self._frames.relative(o.a, o.b))
+            case Level():
+                return self._of_chain(self._frames.world_from(o.frame))
+            case LaserSpot():
+                target = FrameRef("target", o.target_id, o.epoch_id)
+                return self._of_chain(self._frames.relative(carrier_of(self._beams, o), target))
+            case Reading(kind="direction"):
+                return frozenset({("orientation", o.setup_id)}).union(*map(self._of_position, positions_of(o)))
+        return _NOTHING.union(*map(self._of_position, positions_of(o)))
 
-        return {
-            "table_readings": [frozenset({("table_angles", r.table_id, r.epoch_id)}) for r in s.table_readings],
-            "pairs": [self.of_pair(p.a, p.b) for p in s.pairs],
-            "distances": [every((d.a, d.b)) for d in s.distances],
-            "coordinates": [every(c.positions) for c in s.coordinates],
-            "coordinate_differences": [every((*d.at, *d.to)) for d in s.coordinate_differences],
-            "readings": [
-                every((r.at, r.to, r.second)) | ({("orientation", r.setup_id)} if r.kind == "direction" else _NOTHING)
-                for r in s.readings
-            ],
-            "levels": [self.of_frame(x.frame) for x in s.levels],
-            "alignments": [self.of_pair(x.a, x.b) for x in s.alignments],
-            "laser_spots": [
-                self.of_pair(carrier_of(beams, x), FrameRef("target", x.target_id, x.epoch_id)) for x in s.laser_spots
-            ],
-            "on_surfaces": [at(o.position) for o in s.on_surfaces],
-        }
+    def _of_position(self, ref: PositionRef) -> Needs:
+        if ref.frame is not None:
+            return self._of_chain(self._frames.world_from(ref.frame))
+        return self._of_point(ref.point_id)
 
     def split(self) -> tuple[Needs, list[Needs]]:
         """All that observations in use need, and what each of the others needs."""
@@ -137,8 +136,7 @@ class _Needs:
         others = self.others()
         few = self._seen_by_too_few(others)
         for block, needs in zip(self.survey.image_blocks, self.of_blocks, strict=True):
-            taking = block.mask
-            taking = taking & (not needs & few)
+            taking = block.mask & (not needs & few)
             if taking.any():
                 used |= needs
             if not taking.all():
@@ -160,10 +158,9 @@ class _Needs:
         points: dict[ParameterName, int] = {}
         reduced: set[ParameterName] = set()
         for block, needs in zip(self.survey.image_blocks, self.of_blocks, strict=True):
-            n = block.n_used
             for name in (name for name in needs if _is_of_epoch(name)):
-                points[name] = points.get(name, 0) + n
-                if n < len(block.uv):
+                points[name] = points.get(name, 0) + block.n_used
+                if block.n_used < len(block.uv):
                     reduced.add(name)
         few = {n for n in reduced if 0 < points[n] < _OF_A_POSE and not self._unknowns.parameters[n].held}
         for kind, all_needs in others.items() if few else ():
@@ -193,23 +190,19 @@ def _without(survey: Survey, needs: _Needs, lost: Needs) -> Survey:
 
 def _without_owners(survey: Survey, lost: Needs) -> Survey:
     """Less cameras, targets and fixed stations that are not known any more."""
-
-    def gone(*name: str) -> bool:
-        return name in lost
-
-    cameras = tuple(
-        c for c in survey.cameras if not (gone("lens", c.camera_id) or gone("station_from_camera", c.camera_id))
-    )
-    targets = tuple(t for t in survey.targets if not gone("carrier_from_target", t.target_id))
+    cameras = tuple(c for c in survey.cameras
+                    if not {("lens", c.camera_id), ("station_from_camera", c.camera_id)} & lost)  # fmt: skip
+    targets = tuple(t for t in survey.targets if ("carrier_from_target", t.target_id) not in lost)
     carrying = {c.station_id for c in cameras} | {t.station_id for t in targets}
     stations = tuple(
-        s for s in survey.stations if s.station_id in carrying or not gone("world_from_station", s.station_id)
+        s for s in survey.stations if s.station_id in carrying or ("world_from_station", s.station_id) not in lost
     )
-    return replace(survey, cameras=cameras, targets=targets, stations=stations, datum=replace(
+    datum = replace(
         survey.datum,
-        points=tuple(p for p in survey.datum.points if not gone("point", p)),
-        stations=tuple(s for s in survey.datum.stations if not gone("world_from_station", s)),
-    ))  # fmt: skip
+        points=tuple(p for p in survey.datum.points if ("point", p) not in lost),
+        stations=tuple(s for s in survey.datum.stations if ("world_from_station", s) not in lost),
+    )
+    return replace(survey, cameras=cameras, targets=targets, stations=stations, datum=datum)
 
 
 def lost_notes(lost: Iterable[ParameterName]) -> tuple[str, ...]:
@@ -218,3 +211,39 @@ def lost_notes(lost: Iterable[ParameterName]) -> tuple[str, ...]:
     if not names:
         return ()
     return (f"left out, because every observation of it is left out, or too many are: {listed(names, 12)}",)
+
+
+def without_lost_points(survey: Survey, run: Callable[[Survey], Adjustment]) -> Adjustment:
+    """``run(survey)``; a point that it leaves undetermined is taken out with its image points, and it is run again.
+
+    A spot that two cameras saw and one of them mistook leaves nothing of its point. Such points are named in the
+    warnings. Raises what ``run`` raises for other reasons, and when nothing but lost points is found.
+    """
+    lost: list[str] = []
+    while True:
+        try:
+            result = run(survey)
+        except IndeterminateError as error:
+            names = [p.removeprefix("point ") for p in error.parameters if p.startswith("point ")]
+            if not names or len(names) != len(error.parameters) or len(lost) >= _MOST or not _spare(survey, set(names)):
+                raise
+            lost += names
+            survey = without_named_points(survey, set(names))
+            continue
+        if not lost:
+            return result
+        note = f"left out, because gross errors leave no intersection: point{'s' * (len(lost) > 1)} {', '.join(lost)}"
+        return replace(result, warnings=(*result.warnings, note))
+
+
+def _spare(survey: Survey, names: set[str]) -> bool:
+    """Whether these are points seen by two images or more (else they never had an intersection), and not all."""
+    blocks = [b.point_idx for b in survey.image_blocks if b.target_id is None]
+    counts = np.bincount(np.concatenate([*blocks, np.zeros(0, dtype=np.int64)]), minlength=len(survey.points))
+    mine = [i for i, p in enumerate(survey.points) if p.point_id in names]
+    return len(mine) == len(names) and bool(np.all(counts[mine] >= 2)) and len(survey.points) > 10 * len(names)
+
+
+def without_named_points(survey: Survey, names: set[str]) -> Survey:
+    """The survey without these world points, and all that was observed of them."""
+    return with_points(survey, [i for i, p in enumerate(survey.points) if p.point_id not in names])

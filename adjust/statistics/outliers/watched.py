@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from adjust.model.names import numbered
 from adjust.model.result import Adjustment
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.precision.precision import ObservationRows, Precision, precision_of
@@ -55,10 +56,8 @@ class WatchedSnooping(Snooping):
         precision = precision_of(now)
         others = [precision.graph.other(o) for o in index.tolist()]
         rows = [precision.rows(item) for item in others]
-        names = groups_of_others(precision.graph)
-        self.group_names = tuple(dict.fromkeys(names))
-        number = {name: i for i, name in enumerate(self.group_names)}
-        self.group = np.array([number[names[o]] for o in index.tolist()], dtype=np.int64)
+        names, group = numbered(groups_of_others(precision.graph))
+        self.group_names, self.group = tuple(names), group[index]
         self.sizes = np.array([len(r.e) for r in rows], dtype=np.int64)
         self.ptr = np.concatenate([[0], np.cumsum(self.sizes)]).astype(np.int64)
         self.row_of = np.repeat(np.arange(len(index)), self.sizes)

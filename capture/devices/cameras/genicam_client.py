@@ -36,7 +36,7 @@ class GenicamClientCamera(GenicamCamera):
         """See ``Camera``."""
         self._camera = self._connect()
         with suppress(CameraError):
-            self._serial = str(self.get("DeviceSerialNumber"))
+            self.serial = str(self.get("DeviceSerialNumber"))
 
     def close(self) -> None:
         """See ``Camera``."""

@@ -94,15 +94,15 @@ class GentlCamera(GenicamCamera):
             self._camera = harvester.create({"serial_number": self._wanted})
             self._camera.num_buffers = _BUFFERS
             self._camera.add_callback(ImageAcquirer.Events.INCOMPLETE_BUFFER, self._note_lost_parts)
-        self._serial = self._wanted
-        _OPEN.add((self._producers, self._serial))
+        self.serial = self._wanted
+        _OPEN.add((self._producers, self.serial))
 
     def close(self) -> None:
         """See ``Camera``."""
         acquirer, self._camera = self._camera, None
         self._armed = False
         if acquirer is not None:
-            _OPEN.discard((self._producers, self._serial))
+            _OPEN.discard((self._producers, self.serial))
             with suppress(gentl.GenericException, genapi.GenericException):
                 acquirer.destroy()
 

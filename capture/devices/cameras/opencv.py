@@ -65,7 +65,7 @@ class OpencvCamera(Camera):
                 raise InUseError(self.address, "it cannot be opened", "close the program that holds it, check rights")
             raise DisconnectedError(self.address, "OpenCV cannot read it", "give a film that OpenCV reads, such as AVI")
         self._capture = capture
-        self._serial = _serial(self._place.name) if self._is_device else self._place.name
+        self.serial = _serial(self._place.name) if self._is_device else self._place.name
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
 
     def close(self) -> None:

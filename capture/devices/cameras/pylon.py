@@ -54,7 +54,7 @@ class PylonCamera(GenicamCamera):
         with self._translated("open"):
             self._camera = pylon.InstantCamera(factory.CreateDevice(device))
             self._camera.Open()
-        self._serial, self._class = device.GetSerialNumber(), device.GetDeviceClass()
+        self.serial, self._class = device.GetSerialNumber(), device.GetDeviceClass()
 
     def _find(self, factory: Any) -> Any:
         devices = list(factory.EnumerateDevices())

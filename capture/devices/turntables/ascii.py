@@ -19,26 +19,17 @@ class AsciiController:
     def __init__(
         self, url: str, dialect: Dialect, channels: Sequence[str], signs: Sequence[int], zeros: Sequence[float]
     ) -> None:
-        self._url, self._dialect = url, dialect
+        self.address, self.modulo, self._dialect = url, dialect.modulo, dialect
         self._channels, self._signs, self._zeros = tuple(channels), tuple(signs), tuple(zeros)
         self._port: Port | None = None
-
-    @property
-    def address(self) -> str:
-        """The URL."""
-        return self._url
-
-    @property
-    def modulo(self) -> float | None:
-        """As the dialect says."""
-        return self._dialect.modulo
 
     def open(self) -> None:
         """Connect and send what the dialect wants first."""
         try:
-            self._port = open_port(self._url, self._dialect.reply_timeout_s, self._dialect.serial)
+            self._port = open_port(self.address, self._dialect.reply_timeout_s, self._dialect.serial)
         except (OSError, ValueError) as error:  # SerialException is an OSError
-            raise TableDisconnectedError(f"{self._url}: cannot be opened ({error}); check cable and address") from error
+            found = f"{self.address}: cannot be opened ({error})"
+            raise TableDisconnectedError(f"{found}; check cable and address") from error
         for line in self._dialect.init:
             self._send(self._port, line)
 
@@ -76,18 +67,15 @@ class AsciiController:
 
     def stop(self) -> None:
         """Stop all axes."""
-        self._each("stop")
+        command = self._dialect.commands["stop"]
+        for axis in range(len(self._channels)) if command.each_axis else (0,):
+            self._ask(command, axis)
 
     def home(self, axis: int) -> None:
         """Start to look for the reference."""
         if "home" not in self._dialect.commands:
-            raise TurntableError(f"{self._url}: the dialect {self._dialect.name!r} has no command 'home'; add it there")
+            raise TurntableError(f"{self.address}: the dialect {self._dialect.name!r} has no command 'home'; add it")
         self._ask(self._dialect.commands["home"], axis)
-
-    def _each(self, name: str) -> None:
-        command = self._dialect.commands[name]
-        for axis in range(len(self._channels)) if command.each_axis else (0,):
-            self._ask(command, axis)
 
     def _ask(self, command: Command, axis: int, value: float = 0.0, delta: float = 0.0) -> dict[str, str]:
         """Groups of the reply; raises ControllerError where it is a refusal or unknown."""
@@ -122,25 +110,24 @@ class AsciiController:
         return f"error {code} ({text})" if text else f"error {code}"
 
     def _error(self, problem: str) -> ControllerError:
-        return ControllerError(f"{self._url}: the controller {problem}; see its manual or the dialect's file")
+        return ControllerError(f"{self.address}: the controller {problem}; see its manual or the dialect's file")
 
     def _send(self, port: Port, line: str) -> None:
         port.write((line + self._dialect.send_end).encode(self._dialect.encoding))
 
     def _exchange(self, line: str, answered: bool) -> str:
         if self._port is None:
-            raise TableDisconnectedError(f"{self._url}: not connected; open it first")
+            raise TableDisconnectedError(f"{self.address}: not connected; open it first")
         port, end = self._port, self._dialect.reply_end.encode(self._dialect.encoding)
         try:
             port.reset_input_buffer()  # a reply that came too late must not answer this question
             self._send(port, line)
             reply = port.read_until(end) if answered else b""
         except OSError as error:
-            raise TableDisconnectedError(f"{self._url}: connection lost ({error}); check cable and power") from error
+            raise TableDisconnectedError(f"{self.address}: connection lost ({error}); check cable and power") from error
         if self._dialect.pause_s:
             time.sleep(self._dialect.pause_s)
         if answered and not reply.endswith(end):
             waited = f"{self._dialect.reply_timeout_s:g} s"
-            raise TableDisconnectedError(f"{self._url}: no reply to {line!r} within {waited}; check cable and power")
+            raise TableDisconnectedError(f"{self.address}: no reply to {line!r} within {waited}; check cable and power")
         return str(reply[: len(reply) - len(end)].decode(self._dialect.encoding, "replace")) if answered else ""
-

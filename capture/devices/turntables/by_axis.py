@@ -13,11 +13,7 @@ class ByAxis(ABC):
 
     def __init__(self, addresses: Sequence[str], signs: Sequence[int], zeros: Sequence[float]) -> None:
         self._addresses, self._signs, self._zeros = tuple(addresses), tuple(signs), tuple(zeros)
-
-    @property
-    def address(self) -> str:
-        """Of all axes."""
-        return " ".join(self._addresses)
+        self.address = " ".join(addresses)
 
     def stop(self) -> None:
         """Stop every axis, the others too where one does not answer."""

@@ -4,6 +4,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Sequence
+from concurrent.futures import Future
 
 import numpy as np
 
@@ -14,7 +15,6 @@ from capture.devices.turntable import (
     Controller,
     ControllerError,
     Location,
-    MoveStatus,
     NotSettledError,
     Settle,
     StalledError,
@@ -30,31 +30,23 @@ _LEAST = 3  # readings that tell rest from motion
 class MovingTable:
     """The turntable of a session, over a ``Controller``; usable from several threads, one more watches each move.
 
-    The shape is bluesky's (name, position, set -> status, stop, locate), without the dependency.
-    near: (n,) rad, where the table was last, for controllers whose readback does not count turns.
+    The shape is bluesky's (name, position, set -> status, stop, locate), without the dependency; a status is a future
+    whose ``result`` waits for the end and raises what went wrong.
+    axes: outermost first. near: (n,) rad, where the table was last, for controllers whose readback loses turns.
     """
 
     def __init__(
         self, name: str, axes: Sequence[Axis], controller: Controller, settle: Settle, near: FloatArray | None = None
     ) -> None:
-        self._name, self._axes, self._controller, self._settle = name, tuple(axes), controller, settle
+        self.name, self.axes = name, tuple(axes)
+        self._controller, self._settle = controller, settle
         self._io = threading.Lock()
         self._stopped = threading.Event()
         self._locked_out = False
-        self._status: MoveStatus | None = None
-        self._setpoint = np.full(len(self._axes), np.nan)
+        self._status: Future[None] | None = None
+        self._setpoint = np.full(len(self.axes), np.nan)
         self._last = None if near is None else np.array(near, float)
         self.stop_sent_ns: int | None = None  # monotonic; when the last stop had been acknowledged
-
-    @property
-    def name(self) -> str:
-        """For messages."""
-        return self._name
-
-    @property
-    def axes(self) -> tuple[Axis, ...]:
-        """The axes, outermost first."""
-        return self._axes
 
     @property
     def address(self) -> str:
@@ -86,7 +78,7 @@ class MovingTable:
     def close(self) -> None:
         """Stop what still turns, and disconnect; never raises."""
         try:
-            if self._status is not None and not self._status.done:
+            if self._status is not None and not self._status.done():
                 self.stop()
         except TurntableError:
             pass  # whoever closes has no use for a table that cannot be reached
@@ -95,7 +87,7 @@ class MovingTable:
     def states(self) -> tuple[AxisState, ...]:
         """What the controller says of all axes, turns counted."""
         with self._io:
-            found = [self._controller.read(i) for i in range(len(self._axes))]
+            found = [self._controller.read(i) for i in range(len(self.axes))]
             angles = self._unwrapped(np.array([state.angle for state in found]))
         return tuple(
             AxisState(float(angle), state.moving, state.fault) for angle, state in zip(angles, found, strict=True)
@@ -111,56 +103,56 @@ class MovingTable:
 
     def check(self, angles: Sequence[float] | FloatArray) -> None:
         """Raise LimitError where a position cannot be reached from here or from anywhere; sends nothing."""
-        self._targets(angles, np.zeros(len(self._axes)) if self._last is None else self._last)
+        self._targets(angles, np.zeros(len(self.axes)) if self._last is None else self._last)
 
     def _targets(self, angles: Sequence[float] | FloatArray, current: FloatArray) -> FloatArray:
-        if len(angles) != len(self._axes):
-            raise TurntableError(f"{self._name}: {len(angles)} angles for {len(self._axes)} axes; give one each")
-        rows = zip(self._axes, angles, current, strict=True)
+        if len(angles) != len(self.axes):
+            raise TurntableError(f"{self.name}: {len(angles)} angles for {len(self.axes)} axes; give one each")
+        rows = zip(self.axes, angles, current, strict=True)
         return np.array([axis.target(float(angle), float(now)) for axis, angle, now in rows])
 
-    def set(self, angles: Sequence[float] | FloatArray) -> MoveStatus:
+    def set(self, angles: Sequence[float] | FloatArray) -> Future[None]:
         """Start to turn to angles (n,) rad. Raises LimitError before the first axis is told anything."""
         self.check(angles)
         if self._locked_out:
-            raise StoppedError(f"{self._name}: stopped in an emergency; it moves again after release")
+            raise StoppedError(f"{self.name}: stopped in an emergency; it moves again after release")
         current = self.position
         targets = self._targets(angles, current)
         self._begin()
         self._setpoint = targets
-        status = MoveStatus()
+        status = Future[None]()
         self._status = status
         try:
-            for i in range(len(self._axes)):
+            for i in range(len(self.axes)):
                 with self._io:
                     self._require_released()
                     self._controller.move(i, float(targets[i]), float(targets[i] - current[i]))
         except BaseException as error:
             self._fail(status, error)
             raise
-        threading.Thread(target=self._watch, args=(status, targets), name=f"{self._name} moves", daemon=True).start()
+        threading.Thread(target=self._watch, args=(status, targets), name=f"{self.name} moves", daemon=True).start()
         return status
 
-    def home(self) -> MoveStatus:
+    def home(self) -> Future[None]:
         """Look for the references; the readback afterwards is the setpoint."""
         self._begin()
-        status = MoveStatus()
+        status = Future[None]()
         self._status = status
-        for i in range(len(self._axes)):
+        for i in range(len(self.axes)):
             with self._io:
                 self._require_released()
                 self._controller.home(i)
-        threading.Thread(target=self._watch, args=(status, None), name=f"{self._name} homes", daemon=True).start()
+        threading.Thread(target=self._watch, args=(status, None), name=f"{self.name} homes", daemon=True).start()
         return status
 
     def _begin(self) -> None:
-        if self._status is not None and not self._status.done:
-            raise TurntableError(f"{self._name}: it is still moving; wait for the move before, or stop it")
+        if self._status is not None and not self._status.done():
+            raise TurntableError(f"{self.name}: it is still moving; wait for the move before, or stop it")
         self._stopped.clear()
 
     def _require_released(self) -> None:
         if self._locked_out or self._stopped.is_set():
-            raise StoppedError(f"{self._name}: stopped before all axes were sent off")
+            raise StoppedError(f"{self.name}: stopped before all axes were sent off")
 
     def stop(self) -> None:
         """Stop all axes, a move under way ends with StoppedError; over a cut connection once more with a new one."""
@@ -187,21 +179,21 @@ class MovingTable:
         """Setpoint and readback."""
         return Location(self._setpoint.copy(), self.position, time.monotonic_ns(), time.time_ns())
 
-    def _fail(self, status: MoveStatus, error: BaseException) -> None:
+    def _fail(self, status: Future[None], error: BaseException) -> None:
         """Stop first, tell afterwards; a stop that fails too is part of the news."""
         try:
             self.stop()
         except TurntableError as second:
             error.add_note(f"the stop after it failed too: {second}")
-        status.finish(error)
+        status.set_exception(error)
 
-    def _watch(self, status: MoveStatus, targets: FloatArray | None) -> None:
+    def _watch(self, status: Future[None], targets: FloatArray | None) -> None:
         try:
             self._until_settled(targets)
         except BaseException as error:  # told to whoever waits
             self._fail(status, error)
         else:
-            status.finish()
+            status.set_result(None)
 
     def _until_settled(self, targets: FloatArray | None) -> None:
         settle, begin = self._settle, time.monotonic()
@@ -209,7 +201,7 @@ class MovingTable:
         while True:
             states, now = self.states(), time.monotonic()
             if self._stopped.is_set():
-                raise StoppedError(f"{self._name}: the move was stopped at {self._where(states)}")
+                raise StoppedError(f"{self.name}: the move was stopped at {self._where(states)}")
             self._require_no_fault(states)
             angles = np.array([state.angle for state in states])
             seen.append((now, angles))
@@ -226,7 +218,7 @@ class MovingTable:
             if now - begin > settle.timeout_s:
                 where = self._where(states)
                 raise NotSettledError(
-                    f"{self._name}: not at rest after {settle.timeout_s:g} s, at {where}; look for vibration, or give "
+                    f"{self.name}: not at rest after {settle.timeout_s:g} s, at {where}; look for vibration, or give "
                     "settle a larger tolerance_deg, still_deg or timeout_s"
                 )
             time.sleep(settle.poll_s)
@@ -247,15 +239,15 @@ class MovingTable:
         Where a slow line or a busy machine leaves few readings in them, older ones count too: one alone has no spread.
         """
         if now - seen[0][0] < span_s or len(seen) < _LEAST:
-            return np.full(len(self._axes), np.inf)
+            return np.full(len(self.axes), np.inf)
         n = max(_LEAST, sum(now - at <= span_s for at, _ in seen))
         return np.asarray(np.ptp(np.array([angles for _, angles in list(seen)[-n:]]), axis=0))
 
     def _require_no_fault(self, states: Sequence[AxisState]) -> None:
-        for axis, state in zip(self._axes, states, strict=True):
+        for axis, state in zip(self.axes, states, strict=True):
             if state.fault:
                 raise ControllerError(
-                    f"{self._name}: the controller reports {state.fault!r} of axis {axis.name!r} at "
+                    f"{self.name}: the controller reports {state.fault!r} of axis {axis.name!r} at "
                     f"{np.degrees(state.angle):.4f} deg; clear it there, then go on"
                 )
 
@@ -272,15 +264,15 @@ class MovingTable:
         spread = self._spread(seen, now, settle.stall_s)
         if targets is None:
             return  # a reference search may wait at its switch; its end is the time-out
-        for i, axis in enumerate(self._axes):
+        for i, axis in enumerate(self.axes):
             away = abs(states[i].angle - targets[i])
             if away > settle.tolerance and spread[i] <= settle.still:
                 what = "stands still while it should move" if moving else "has ended"
                 raise StalledError(
-                    f"{self._name}: axis {axis.name!r} {what} at {np.degrees(states[i].angle):.4f} deg, "
+                    f"{self.name}: axis {axis.name!r} {what} at {np.degrees(states[i].angle):.4f} deg, "
                     f"{np.degrees(away):.4f} deg from its setpoint {np.degrees(targets[i]):.4f} deg, for "
                     f"{settle.stall_s:g} s; the table was stopped; look for what blocks it"
                 )
 
     def _where(self, states: Sequence[AxisState]) -> str:
-        return degrees_text(self._axes, [state.angle for state in states])
+        return degrees_text(self.axes, [state.angle for state in states])

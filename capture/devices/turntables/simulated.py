@@ -18,16 +18,8 @@ class SimulatedController:
         self.received: list[tuple[float, str]] = []
         self.cut = False  # a pulled cable: nothing is answered until it is False again
         self._connected = False
-
-    @property
-    def address(self) -> str:
-        """For messages."""
-        return "simulated"
-
-    @property
-    def modulo(self) -> float | None:
-        """One turn where the encoders lose turns."""
-        return 2 * np.pi if self.simulated[0].physics.turns_lost else None
+        self.address = "simulated"
+        self.modulo: float | None = 2 * np.pi if physics[0].turns_lost else None
 
     def open(self) -> None:
         """Connect."""

@@ -4,13 +4,14 @@ Read here and not by pycolmap, because a damaged file must end in a message and 
 layouts are those of COLMAP 4: rigs and frames may be missing, as in models of COLMAP 3.
 """
 
-import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
@@ -19,12 +20,12 @@ from survey.folder.text import read_bytes
 from survey.interop.cameras.rig import pose_of_quaternion
 from survey.interop.networks.foreign import Where, number, text_of
 
-NO_POINT = 2**64 - 1
 MODELS = {
-    0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
-    5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 8: ("SIMPLE_RADIAL_FISHEYE", 4), 9: ("RADIAL_FISHEYE", 5),
+    "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,
+    "FULL_OPENCV": 12, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5,
 }  # fmt: skip
-_COUNTS = dict(MODELS.values())
+"""How many parameters each model has."""
+_NUMBERS = dict(zip((0, 1, 2, 3, 4, 5, 6, 8, 9), MODELS, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +63,9 @@ class ColmapModel:
 
 def read_model(folder: Path) -> ColmapModel:
     """The model in a folder. Raises SurveyError with file and place for what cannot be read."""
-    for ending, reader in ((".bin", _binary), (".txt", _text)):
-        if (folder / f"cameras{ending}").is_file():
-            model = reader(folder)
+    for kind in (_Bytes, _Words):
+        if (folder / f"cameras{kind.ending}").is_file():
+            model = _read(folder, kind)
             _check(model, folder)
             return model
     raise SurveyError(f"{folder}: holds neither cameras.bin nor cameras.txt; give the folder of a sparse model")
@@ -87,128 +88,79 @@ def _check(model: ColmapModel, folder: Path) -> None:
                 raise SurveyError(f"{folder}: frame {frame_id}: image {i} is of a camera outside rig {rig_id}")
 
 
-def _camera(where: Where, model: str, size: tuple[float, float], params: FloatArray) -> ColmapCamera:
-    if model not in _COUNTS:
-        raise where.error(f"the camera model {model} has no lens here; {', '.join(_COUNTS)} are read")
-    if len(params) != _COUNTS[model]:
-        raise where.error(f"found {len(params)} parameters, {model} has {_COUNTS[model]}; correct the camera")
-    if not (np.isfinite(params).all() and np.abs(params).max() < 1e9 and params[0] > 0.0):
-        raise where.error("the parameters must be finite and the focal length positive; correct the camera")
-    if not (1 <= size[0] <= 1e6 and 1 <= size[1] <= 1e6):
-        raise where.error(f"the image size {size[0]:.0f} x {size[1]:.0f} cannot be meant; correct the camera")
-    return ColmapCamera(where, model, (int(size[0]), int(size[1])), params)
+class _Words:
+    """A file of lines read entry by entry, in the order of its words."""
 
+    ending = ".txt"
 
-def _pose(row: FloatArray, where: Where) -> Pose3:
-    """Quaternion wxyz, translation."""
-    if not (np.isfinite(row).all() and np.abs(row).max() < 1e12):
-        raise where.error("a pose is not finite; correct it")
-    return pose_of_quaternion(row[[1, 2, 3, 0]], row[4:7], where)
+    def __init__(self, path: Path) -> None:
+        self.where, self._words = Where(path, 1), list[str]()
+        self._lines = iter([(Where(path, line), raw.split()) for line, raw in enumerate(text_of(path).splitlines(), 1)
+                            if not raw.startswith("#")])  # fmt: skip
 
+    def entries(self, least_bytes: int) -> Iterator[None]:
+        """One line after the other; what nobody takes of a line does not matter."""
+        for where, words in self._lines:
+            self.where, self._words = where, words[::-1]
+            if words:
+                yield
 
-# ---------------------------------------------------------------------------------------------------------------- text
+    def fail(self, problem: str) -> SurveyError:
+        return self.where.error(problem)
 
+    def _take(self, n: int) -> list[str]:
+        if len(self._words) < n:
+            raise self.fail(f"the line ends where {n} more words are expected; correct it")
+        return [self._words.pop() for _ in range(n)]
 
-def _rows(path: Path, optional: bool = False) -> Iterator[tuple[Where, list[str]]]:
-    """Lines that are no comments, by their words."""
-    if optional and not path.is_file():
-        return
-    for line, raw in enumerate(text_of(path).splitlines(), 1):
-        if not raw.startswith("#"):
-            yield Where(path, line), raw.split()
+    def id(self, layout: str = "I") -> int:
+        """A whole number of 53 bits at most."""
+        (word,) = self._take(1)
+        value = number(word, "id", self.where)
+        if value != int(value) or not 0 <= value < 2**53:
+            raise self.fail(f"found {word!r} where an id is expected; correct it")
+        return int(value)
 
+    def count(self, least_bytes: int, layout: str = "I") -> int:
+        return self.id()
 
-def _numbers(words: list[str], where: Where) -> FloatArray:
-    return np.array([number(w, "model", where) for w in words])
+    def floats(self, n: int) -> FloatArray:
+        return np.array([number(word, "model", self.where) for word in self._take(n)])
 
+    def model(self) -> str:
+        return self._take(1)[0]
 
-def _id(word: str, where: Where) -> int:
-    value = number(word, "id", where)
-    if value != int(value) or not 0 <= value < 2**53:
-        raise where.error(f"found {word!r} where an id is expected; correct it")
-    return int(value)
+    def parameters(self, model: str) -> FloatArray:
+        return self.floats(len(self._words))
 
+    def is_camera(self, layout: str = "i") -> bool:
+        return self._take(1) == ["CAMERA"]
 
-def _text(folder: Path) -> ColmapModel:
-    model = ColmapModel()
-    for where, words in _rows(folder / "cameras.txt"):
-        if words:
-            _long(words, 5, where)
-            size = _numbers(words[2:4], where)
-            model.cameras[_id(words[0], where)] = _camera(where, words[1], tuple(size), _numbers(words[4:], where))
-    for where, words in _rows(folder / "rigs.txt", True):
-        if words:
-            _text_rig(model, words, where)
-    for where, words in _rows(folder / "frames.txt", True):
-        if words:
-            _text_frame(model, words, where)
-    _text_images(model, folder / "images.txt")
-    for where, words in _rows(folder / "points3D.txt", True):
-        if words:
-            _long(words, 4, where)
-            model.points[_id(words[0], where)] = _numbers(words[1:4], where)
-    return model
+    def name(self) -> str:
+        found = " ".join(self._words[::-1])
+        self._words = []
+        return found
 
+    def end(self) -> None:
+        """Nothing more may stand in the line."""
+        if self._words:
+            raise self.fail(f"found {len(self._words)} words more than its counts say; correct the line")
 
-def _long(words: list[str], least: int, where: Where) -> None:
-    if len(words) < least:
-        raise where.error(f"found {len(words)} words, expected at least {least}; correct the line")
-
-
-def _text_rig(model: ColmapModel, words: list[str], where: Where) -> None:
-    _long(words, 4, where)
-    _sensor(words[2], where)
-    rig = {_id(words[3], where): Pose3()}
-    rest = words[4:]
-    while rest:
-        _long(rest, 3, where)
-        _sensor(rest[0], where)
-        camera = _id(rest[1], where)
-        if rest[2] != "1":
-            raise where.error(f"camera {camera} has no pose in its rig; give it one")
-        _long(rest, 10, where)
-        rig[camera] = _pose(_numbers(rest[3:10], where), where)
-        rest = rest[10:]
-    model.rigs[_id(words[0], where)] = rig
-
-
-def _sensor(word: str, where: Where) -> None:
-    if word != "CAMERA":
-        raise where.error(f"the sensor {word!r} is no camera; only cameras are read")
-
-
-def _text_frame(model: ColmapModel, words: list[str], where: Where) -> None:
-    _long(words, 10, where)
-    count = _id(words[9], where)
-    if len(words) != 10 + 3 * count:
-        raise where.error(f"found {len(words) - 10} words after the pose, expected {3 * count}; correct the line")
-    images = tuple(_id(words[k + 2], where) for k in range(10, len(words), 3))
-    pose = _pose(_numbers(words[2:9], where), where)
-    model.frames[_id(words[0], where)] = (_id(words[1], where), pose, images)
-
-
-def _text_images(model: ColmapModel, path: Path) -> None:
-    rows = _rows(path)
-    for where, words in rows:
-        if not words:
-            continue
-        _long(words, 10, where)
-        _, seen = next(rows, (where, []))
+    def points(self) -> tuple[FloatArray, IntArray]:
+        """The line behind: x, y, and the 3-D point of each image point, -1 for none."""
+        _, seen = next(self._lines, (self.where, []))
         if len(seen) % 3:
-            raise where.error(f"found {len(seen)} words of image points, expected x y id of each; correct them")
-        xy = np.array([[number(seen[k], "x", where), number(seen[k + 1], "y", where)] for k in range(0, len(seen), 3)])
-        points = np.array([-1 if seen[k] == "-1" else _id(seen[k], where) for k in range(2, len(seen), 3)], np.int64)
-        pose = _pose(_numbers(words[1:8], where), where)
-        name = " ".join(words[9:])
-        image = ColmapImage(where, _id(words[8], where), name, pose, xy.reshape(-1, 2), points)
-        model.images[_id(words[0], where)] = image
-
-
-# -------------------------------------------------------------------------------------------------------------- binary
+            raise self.fail(f"found {len(seen)} words of image points, expected x y id of each; correct them")
+        rows = np.array([number(word, "image point", self.where) for word in seen]).reshape(-1, 3)
+        if not ((rows[:, 2] == np.round(rows[:, 2])) & (rows[:, 2] >= -1) & (rows[:, 2] < 2**53)).all():
+            raise self.fail("found no id of a point where one is expected; correct it")
+        return rows[:, :2], rows[:, 2].astype(np.int64)
 
 
 class _Bytes:
     """A binary file read in order; what it says of lengths is believed only as far as the file reaches."""
+
+    ending = ".bin"
 
     def __init__(self, path: Path) -> None:
         self.data, self.at, self.path = read_bytes(path)[0], 0, path
@@ -218,25 +170,14 @@ class _Bytes:
         """The place, its bytes counted as lines."""
         return Where(self.path, self.at)
 
+    def entries(self, least_bytes: int) -> Iterator[None]:
+        """So many as the file says, each of at least so many bytes."""
+        yield from repeat(None, self.count(least_bytes, "Q"))
+
     def fail(self, problem: str) -> SurveyError:
         return SurveyError(f"{self.path}, byte {self.at}: {problem}")
 
-    def take(self, layout: str) -> tuple[Any, ...]:
-        size = struct.calcsize("<" + layout)
-        if self.at + size > len(self.data):
-            raise self.fail("the file ends in the middle of an entry; write it again")
-        out = struct.unpack_from("<" + layout, self.data, self.at)
-        self.at += size
-        return out
-
-    def count(self, least_bytes: int, layout: str = "Q") -> int:
-        """A number of entries, each of at least so many bytes."""
-        (n,) = self.take(layout)
-        if n * least_bytes > len(self.data) - self.at:
-            raise self.fail(f"found a count of {n}, more than the file can hold; write it again")
-        return int(n)
-
-    def array(self, dtype: Any, n: int) -> Any:
+    def _array(self, dtype: npt.DTypeLike, n: int) -> npt.NDArray[Any]:
         size = np.dtype(dtype).itemsize * n
         if self.at + size > len(self.data):
             raise self.fail("the file ends in the middle of an entry; write it again")
@@ -244,10 +185,30 @@ class _Bytes:
         self.at += size
         return out
 
-    def pose(self) -> Pose3:
-        return _pose(np.array(self.take("7d")), self.where)
+    def id(self, layout: str = "I") -> int:
+        return int(self._array(f"<{layout}", 1)[0])
 
-    def text(self) -> str:
+    def count(self, least_bytes: int, layout: str = "I") -> int:
+        """A number of entries, each of at least so many bytes."""
+        n = self.id(layout)
+        if n * least_bytes > len(self.data) - self.at:
+            raise self.fail(f"found a count of {n}, more than the file can hold; write it again")
+        return n
+
+    def floats(self, n: int) -> FloatArray:
+        return np.array(self._array("<f8", n))
+
+    def model(self) -> str:
+        kind = self.id("i")
+        return _NUMBERS.get(kind, f"number {kind}")
+
+    def parameters(self, model: str) -> FloatArray:
+        return self.floats(MODELS.get(model, 0))
+
+    def is_camera(self, layout: str = "i") -> bool:
+        return self.id(layout) == 0
+
+    def name(self) -> str:
         end = self.data.find(b"\0", self.at)
         if end < 0 or end - self.at > 4096:
             raise self.fail("a name has no end; write the file again")
@@ -257,65 +218,91 @@ class _Bytes:
         except UnicodeDecodeError:
             raise self.fail("a name is not UTF-8; write the file again") from None
 
+    def points(self) -> tuple[FloatArray, IntArray]:
+        rows = self._array([("xy", "<f8", 2), ("id", "<u8")], self.count(24, "Q"))
+        return np.array(rows["xy"]), rows["id"].astype(np.int64)  # the largest of 64 bits, no point, becomes -1
 
-def _binary(folder: Path) -> ColmapModel:
+    def skip(self, n_bytes: int) -> None:
+        self._array("u1", n_bytes)
+
+    def end(self) -> None:
+        """An entry has no end of its own here."""
+
+
+def _read(folder: Path, kind: type[_Words] | type[_Bytes]) -> ColmapModel:
     model = ColmapModel()
-    file = _Bytes(folder / "cameras.bin")
-    for _ in range(file.count(24)):
-        camera, kind, width, height = file.take("IiQQ")
-        if kind not in MODELS:
-            names = ", ".join(name for name, _ in MODELS.values())
-            raise file.fail(f"the camera model number {kind} has no lens here; {names} are read")
-        name, count = MODELS[kind]
-        model.cameras[camera] = _camera(file.where, name, (width, height), np.array(file.take(f"{count}d")))
-    if (folder / "rigs.bin").is_file():
-        _binary_rigs(model, _Bytes(folder / "rigs.bin"))
-    if (folder / "frames.bin").is_file():
-        _binary_frames(model, _Bytes(folder / "frames.bin"))
-    _binary_images(model, _Bytes(folder / "images.bin"))
-    if (folder / "points3D.bin").is_file():
-        file = _Bytes(folder / "points3D.bin")
-        for _ in range(file.count(51)):
-            point, *xyz = file.take("Q3d3xd")
-            if not np.isfinite(xyz[:3]).all():
-                raise file.fail(f"point {point} is not finite; correct it")
-            model.points[point] = np.array(xyz[:3])
-            file.array("<u8", file.count(8))
+    for name, read in (("cameras", _cameras), ("rigs", _rigs), ("frames", _frames), ("images", _images),
+                       ("points3D", _points)):  # fmt: skip
+        path = folder / f"{name}{kind.ending}"
+        if path.is_file() or name in ("cameras", "images"):
+            read(model, kind(path))
     return model
 
 
-def _binary_rigs(model: ColmapModel, file: _Bytes) -> None:
-    for _ in range(file.count(8)):
-        rig_id, count = file.take("II")
-        rig: dict[int, Pose3] = {}
-        for k in range(count):
-            kind, camera = file.take("iI")
-            if kind != 0:
+def _cameras(model: ColmapModel, file: _Words | _Bytes) -> None:
+    for _ in file.entries(24):
+        camera, name = file.id(), file.model()
+        if name not in MODELS:
+            raise file.fail(f"the camera model {name} has no lens here; {', '.join(MODELS)} are read")
+        size = file.id("Q"), file.id("Q")
+        params = file.parameters(name)
+        if len(params) != MODELS[name]:
+            raise file.fail(f"found {len(params)} parameters, {name} has {MODELS[name]}; correct the camera")
+        if not (np.isfinite(params).all() and np.abs(params).max() < 1e9 and params[0] > 0.0):
+            raise file.fail("the parameters must be finite and the focal length positive; correct the camera")
+        if not (1 <= size[0] <= 1e6 and 1 <= size[1] <= 1e6):
+            raise file.fail(f"the image size {size[0]} x {size[1]} cannot be meant; correct the camera")
+        model.cameras[camera] = ColmapCamera(file.where, name, size, params)
+
+
+def _pose(file: _Words | _Bytes) -> Pose3:
+    """Quaternion wxyz, translation."""
+    row = file.floats(7)
+    if not (np.isfinite(row).all() and np.abs(row).max() < 1e12):
+        raise file.fail("a pose is not finite; correct it")
+    return pose_of_quaternion(row[[1, 2, 3, 0]], row[4:7], file.where)
+
+
+def _rigs(model: ColmapModel, file: _Words | _Bytes) -> None:
+    for _ in file.entries(8):
+        rig_id, rig = file.id(), dict[int, Pose3]()
+        for k in range(file.count(8)):
+            if not file.is_camera():
                 raise file.fail("a sensor is no camera; only cameras are read")
-            if k and file.take("B")[0] != 1:
+            camera = file.id()
+            if k and file.id("B") != 1:
                 raise file.fail(f"camera {camera} has no pose in its rig; give it one")
-            rig[camera] = file.pose() if k else Pose3()
+            rig[camera] = _pose(file) if k else Pose3()
+        file.end()
         model.rigs[rig_id] = rig
 
 
-def _binary_frames(model: ColmapModel, file: _Bytes) -> None:
-    for _ in range(file.count(68)):
-        frame, rig = file.take("II")
-        pose = file.pose()
-        images = tuple(int(file.take("iIQ")[2]) for _ in range(file.count(16, "I")))
-        model.frames[frame] = (rig, pose, images)
+def _frames(model: ColmapModel, file: _Words | _Bytes) -> None:
+    for _ in file.entries(68):
+        frame, rig, pose, images = file.id(), file.id(), _pose(file), []
+        for _ in range(file.count(16)):
+            file.is_camera()
+            file.id()
+            images.append(file.id("Q"))
+        file.end()
+        model.frames[frame] = (rig, pose, tuple(images))
 
 
-def _binary_images(model: ColmapModel, file: _Bytes) -> None:
-    layout = np.dtype([("xy", "<f8", 2), ("id", "<u8")])
-    for _ in range(file.count(73)):
-        (image,) = file.take("I")
-        pose = file.pose()
-        (camera,) = file.take("I")
-        name = file.text()
-        rows = file.array(layout, file.count(24))
-        if not np.isfinite(rows["xy"]).all():
+def _images(model: ColmapModel, file: _Words | _Bytes) -> None:
+    for _ in file.entries(73):
+        image, pose, camera, name = file.id(), _pose(file), file.id(), file.name()
+        where, (xy, points) = file.where, file.points()
+        if not np.isfinite(xy).all():
             raise file.fail(f"image {name!r}: an image point is not finite; correct it")
-        ids = np.where(rows["id"] == NO_POINT, np.uint64(0), rows["id"]).astype(np.int64)
-        ids = np.where(rows["id"] == NO_POINT, -1, ids)
-        model.images[image] = ColmapImage(file.where, camera, name, pose, np.array(rows["xy"]), ids)
+        model.images[image] = ColmapImage(where, camera, name, pose, xy, points)
+
+
+def _points(model: ColmapModel, file: _Words | _Bytes) -> None:
+    for _ in file.entries(51):
+        point, xyz = file.id("Q"), file.floats(3)
+        if not np.isfinite(xyz).all():
+            raise file.fail(f"point {point} is not finite; correct it")
+        model.points[point] = xyz
+        if isinstance(file, _Bytes):
+            file.skip(11)  # colour and error
+            file.skip(8 * file.count(8, "Q"))

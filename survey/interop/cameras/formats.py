@@ -7,14 +7,17 @@ from pathlib import Path
 from adjust.model.clocks import clock_text, clocks_of
 from adjust.model.errors import SurveyError
 from survey.folder.whole import whole_folder
-from survey.interop.cameras.colmap import read_colmap, write_colmap
+from survey.interop.cameras import kalibr, mrcal, ros
+from survey.interop.cameras import opencv_files as opencv
+from survey.interop.cameras.colmap import read_colmap
+from survey.interop.cameras.colmap_writer import write_colmap
 from survey.interop.cameras.kalibr import kalibr_files, read_kalibr, target_text
 from survey.interop.cameras.mrcal import mrcal_files, read_mrcal
 from survey.interop.cameras.nerf import nerf_files, read_nerf
 from survey.interop.cameras.opencv_files import mc_calib_files, opencv_files, read_mc_calib, read_opencv
 from survey.interop.cameras.robots import read_sdf, read_urdf, sdf_files, urdf_files
-from survey.interop.cameras.ros import industrial_files, read_industrial, read_ros, ros_files
-from survey.interop.cameras.values import CameraValues
+from survey.interop.cameras.ros import industrial_files, industrial_notes, read_industrial, read_ros, ros_files
+from survey.interop.cameras.values import CameraValues, RigValues, rig_values
 from survey.interop.networks.foreign import ForeignNetwork
 from survey.interop.scene import glb_files, ply_files
 from survey.interop.trajectories import kitti_files, read_kitti, read_tum, tum_files
@@ -32,13 +35,28 @@ class CameraFormat:
     folder: bool = False
 
 
+def _rig(
+    name: str, read: Callable[[Path], ForeignNetwork], files: Callable[[RigValues], Mapping[str, str]],
+    choices: Mapping[str, tuple[str, ...]], folder: bool = False,
+    said: Callable[[RigValues], tuple[str, ...]] = lambda _: (),
+) -> CameraFormat:  # fmt: skip
+    """A format of the cameras of one station, with lenses in the forms that it has; said: what is to be known."""
+
+    def write(values: CameraValues, station: str | None) -> Files:
+        found = rig_values(values, station, name, choices)
+        return files(found), (*found.notes, *said(found))
+
+    return CameraFormat(read, write, folder)
+
+
 FORMATS: Mapping[str, CameraFormat] = {
-    "kalibr": CameraFormat(read_kalibr, kalibr_files),
-    "opencv": CameraFormat(read_opencv, opencv_files),
-    "ros": CameraFormat(read_ros, ros_files, folder=True),
-    "ros-industrial": CameraFormat(read_industrial, industrial_files, folder=True),
-    "mrcal": CameraFormat(read_mrcal, mrcal_files, folder=True),
-    "mc-calib": CameraFormat(read_mc_calib, mc_calib_files),
+    "kalibr": _rig("kalibr", read_kalibr, kalibr_files, kalibr.CHOICES),
+    "opencv": _rig("opencv", read_opencv, opencv_files, opencv.CHOICES),
+    "ros": _rig("ros", read_ros, ros_files, ros.CHOICES, folder=True),
+    "ros-industrial": _rig("ros-industrial", read_industrial, industrial_files, ros.INDUSTRIAL_CHOICES, True,
+                           industrial_notes),
+    "mrcal": _rig("mrcal", read_mrcal, mrcal_files, mrcal.CHOICES, folder=True),
+    "mc-calib": _rig("mc-calib", read_mc_calib, mc_calib_files, opencv.MC_CALIB_CHOICES),
     "nerf": CameraFormat(read_nerf, nerf_files),
     "urdf": CameraFormat(read_urdf, urdf_files),
     "sdf": CameraFormat(read_sdf, sdf_files),
@@ -46,7 +64,7 @@ FORMATS: Mapping[str, CameraFormat] = {
     "kitti": CameraFormat(read_kitti, kitti_files),
     "ply": CameraFormat(None, ply_files),
     "glb": CameraFormat(None, glb_files),
-}
+}  # fmt: skip
 COLMAP = ("colmap", "colmap-text")
 KALIBR_TARGET = "kalibr-target"
 READERS: Mapping[str, Callable[[Path], ForeignNetwork]] = {
@@ -88,8 +106,9 @@ def _written(
             return write_colmap(values, place, text=format == "colmap-text")
     if format == KALIBR_TARGET:
         files, notes = _target_files(values)
-    elif format == "opencv":
-        files, notes = opencv_files(values, station, json=target.suffix.lower() == ".json")
+    elif format == "opencv" and target.suffix.lower() == ".json":
+        found = rig_values(values, station, format, opencv.CHOICES)
+        files, notes = opencv_files(found, json=True), found.notes
     else:
         files, notes = FORMATS[format].write(values, station)
     if "" in files:

@@ -13,7 +13,7 @@ from gtsam import Pose3
 from adjust.model.errors import SurveyError
 from adjust.model.survey import LensParameter, Survey, Target
 from survey.interop.cameras.rig import Rig, RigCamera, lens_of, pose_of, rig_network
-from survey.interop.cameras.values import BROWN_4, FISHEYE_4, CameraValues, RigValues, rig_values
+from survey.interop.cameras.values import BROWN_4, FISHEYE_4, RigValues
 from survey.interop.networks.foreign import ForeignNetwork, Where
 from survey.interop.safe_yaml import Entry, read_yaml, yaml_text
 from survey.project.targets import Checkerboard, MarkerBlock, PointList, TargetKind
@@ -38,9 +38,6 @@ def read_kalibr(path: Path) -> ForeignNetwork:
     notes: tuple[str, ...] = ()
     for name in names:
         entry = root.get(name)
-        size = [item.count(10**6) for item in entry.get("resolution").items]
-        if len(size) != 2:
-            raise entry.get("resolution").error("expected width and height; correct it")
         pose: Pose3 | None = None
         if chained:
             pose = Pose3() if not cameras else (cameras[-1].rig_from_camera or Pose3()) * _motion(entry, "T_cn_cnm1")
@@ -48,7 +45,7 @@ def read_kalibr(path: Path) -> ForeignNetwork:
             pose = _motion(entry, "T_cam_imu")
         else:
             raise entry.error("has neither T_cn_cnm1 nor T_cam_imu; every camera after the first needs one")
-        cameras.append(RigCamera(name, (size[0], size[1]), _lens(entry), pose))
+        cameras.append(RigCamera(name, entry.get("resolution").size(), _lens(entry), pose))
     if any("T_cam_imu" in root.get(n) for n in names) and chained:
         notes = ("left out: the IMU and its time shifts",)
     return rig_network(Rig("rig", tuple(cameras), notes), path)
@@ -65,41 +62,33 @@ def _lens(entry: Entry) -> LensParameter:
     if model.text != "pinhole":
         raise model.error(f"found {model.text!r}; only pinhole is read: omni, ds and eucm have no such lens here")
     fu, fv, pu, pv = entry.get("intrinsics").numbers(4).tolist()
-    if not (fu > 0.0 and fv > 0.0):
-        raise entry.get("intrinsics").error("the focal lengths must be positive; correct them")
     kind = entry.get("distortion_model")
     plain = {"fx": fu, "fy": fv, "u0": pu, "v0": pv}
     if kind.text == "none":
-        return lens_of("brown", **plain)
+        return lens_of("brown", entry, **plain)
     if kind.text not in ("radtan", "equidistant"):
         raise kind.error(f"found {kind.text!r}; radtan, equidistant and none are read: fov has no such lens here")
     names, name = (_RADTAN, "brown") if kind.text == "radtan" else (_EQUIDISTANT, "fisheye")
     k = entry.get("distortion_coeffs").numbers(4).tolist()
-    return lens_of(name, **plain, **dict(zip(names, k, strict=True)))
+    return lens_of(name, entry, **plain, **dict(zip(names, k, strict=True)))
 
 
-def kalibr_files(values: CameraValues, station: str | None) -> tuple[dict[str, str], tuple[str, ...]]:
-    """The camchain of one station, and what was approximated."""
-    found = rig_values(values, station, "kalibr", CHOICES)
-    return {"": camchain_text(found)}, found.notes
-
-
-def camchain_text(found: RigValues) -> str:
+def kalibr_files(found: RigValues) -> dict[str, str]:
     """The camchain: cameras in order as cam0, cam1 ..., their own names as topics."""
     chain: dict[str, object] = {}
     before: Pose3 | None = None
     for i, (camera, lens) in enumerate(zip(found.rig.cameras, found.lenses, strict=True)):
-        fisheye, pose = lens.model == "fisheye", camera.rig_from_camera or Pose3()
+        pose = camera.rig_from_camera or Pose3()
         chain[f"cam{i}"] = {
             "cam_overlaps": [k for k in range(len(found.lenses)) if k != i], "camera_model": "pinhole",
-            "distortion_coeffs": lens.array(*(_EQUIDISTANT if fisheye else _RADTAN)).tolist(),
-            "distortion_model": "equidistant" if fisheye else "radtan",
+            "distortion_coeffs": lens.distortion()[:4].tolist(),
+            "distortion_model": "equidistant" if lens.model == "fisheye" else "radtan",
             "intrinsics": lens.array("fx", "fy", "u0", "v0").tolist(), "resolution": list(camera.image_size),
             "rostopic": f"/{camera.camera_id}/image_raw",
             **({} if before is None else {"T_cn_cnm1": (pose.inverse() * before).matrix().tolist()}),
         }  # fmt: skip
         before = pose
-    return yaml_text(chain)
+    return {"": yaml_text(chain)}
 
 
 def _target_network(root: Entry, path: Path) -> ForeignNetwork:

@@ -9,7 +9,6 @@ optimisation (``optimization_inputs``), which is neither read nor made up here.
 
 import ast
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 from gtsam import Pose3
@@ -17,12 +16,13 @@ from scipy.spatial.transform import Rotation
 
 from adjust.lenses.models import MODELS
 from adjust.model.errors import SurveyError
-from adjust.model.survey import FloatArray, LensParameter
+from adjust.model.survey import FloatArray
 from adjust.spatial.rigid import skew
 from survey.folder.text import decode, read_bytes
 from survey.interop.cameras.rig import Rig, RigCamera, lens_of, pose_of, rig_network
-from survey.interop.cameras.values import BROWN_8, CameraValues, MappedLens, rig_values
+from survey.interop.cameras.values import BROWN_8, MappedLens, RigValues
 from survey.interop.networks.foreign import ForeignNetwork, Where
+from survey.interop.safe_yaml import Entry
 
 CHOICES = {"brown": BROWN_8}
 ENDING = ".cameramodel"
@@ -35,7 +35,7 @@ _NAMES = {
     "LENSMODEL_OPENCV12": BROWN_8,
 }
 _MAX_BYTES = 256_000_000
-_MAX_VALUES = 10_000
+_NO_MODEL = "is no dictionary; give a camera model of mrcal"
 _MOST_FILES = 1000
 
 
@@ -52,108 +52,68 @@ def read_mrcal(path: Path) -> ForeignNetwork:
     return rig_network(Rig("reference", tuple(camera for camera, _ in read), notes), path)
 
 
-class _Model:
+def _read_model(path: Path) -> Entry:
     """The dictionary of a model file: literals only, nothing is evaluated."""
+    data = read_bytes(path)[0]
+    if len(data) > _MAX_BYTES:
+        raise SurveyError(f"{path}: has {len(data)} bytes, more than {_MAX_BYTES} are not read")
+    try:
+        tree = ast.parse(decode(path, data).strip("\n \t") + "\n", mode="eval").body
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        raise Where(path, getattr(error, "lineno", None) or 1).error(f"this {_NO_MODEL}") from None
+    if not isinstance(tree, ast.Dict):
+        raise Where(path, tree.lineno).error(f"this {_NO_MODEL}")
+    return _entry(tree, path, "")
 
-    def __init__(self, path: Path) -> None:
-        data = read_bytes(path)[0]
-        if len(data) > _MAX_BYTES:
-            raise SurveyError(f"{path}: has {len(data)} bytes, more than {_MAX_BYTES} are not read")
-        self.path = path
-        try:
-            tree = ast.parse(decode(path, data).strip("\n \t") + "\n", mode="eval").body
-        except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-            line = getattr(error, "lineno", None) or 1
-            raise Where(path, line).error("this is no dictionary; give a camera model of mrcal") from None
-        if not isinstance(tree, ast.Dict):
-            self.fail(tree, "this is no dictionary; give a camera model of mrcal")
-        self.entries: dict[str, ast.expr] = {}
-        for key, value in zip(tree.keys, tree.values, strict=True):
-            if not (isinstance(key, ast.Constant) and isinstance(key.value, str)):
-                self.fail(key or tree, "a key must be a text; correct the file")
-            self.entries[str(key.value)] = value
 
-    def fail(self, node: ast.AST, problem: str) -> NoReturn:
-        raise Where(self.path, getattr(node, "lineno", 1)).error(problem)
-
-    def entry(self, key: str) -> ast.expr:
-        if key not in self.entries:
-            raise Where(self.path, 1).error(f"{key!r} is missing; give a camera model of mrcal")
-        return self.entries[key]
-
-    def text(self, key: str) -> str:
-        node = self.entry(key)
-        if not (isinstance(node, ast.Constant) and isinstance(node.value, str)):
-            self.fail(node, f"{key}: expected a text; correct it")
-        return str(node.value)
-
-    def numbers(self, key: str, count: int) -> FloatArray:
-        """So many numbers, in a list or in nested ones."""
-        node, out = self.entry(key), []
-        waiting = [node]
-        while waiting:
-            item = waiting.pop()
-            if isinstance(item, (ast.List, ast.Tuple)):
-                waiting += item.elts[::-1]
-            else:
-                out.append(self._number(item, key))
-            if len(out) > _MAX_VALUES or len(waiting) > _MAX_VALUES:
-                self.fail(node, f"{key}: more than {_MAX_VALUES} numbers; correct it")
-        if len(out) != count:
-            self.fail(node, f"{key}: found {len(out)} numbers, expected {count}; correct it")
-        return np.array(out)
-
-    def _number(self, node: ast.expr, key: str) -> float:
-        sign = 1.0
-        while isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.USub, ast.UAdd)):
-            sign *= -1.0 if isinstance(node.op, ast.USub) else 1.0
-            node = node.operand
-        value = node.value if isinstance(node, ast.Constant) else None
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e15:
-            self.fail(node, f"{key}: expected a finite number; correct it")
-        return sign * float(value)
+def _entry(node: ast.expr, path: Path, name: str) -> Entry:
+    """A literal as text, list or mapping; bytes, which only mrcal itself understands, as an empty text."""
+    where = Where(path, node.lineno)
+    match node:
+        case ast.Dict():
+            keys = [ast.unparse(key or node) if not isinstance(key, ast.Constant) else str(key.value)
+                    for key in node.keys]  # fmt: skip
+            return Entry(where, name, {k: _entry(v, path, k) for k, v in zip(keys, node.values, strict=True)})
+        case ast.List() | ast.Tuple():
+            return Entry(where, name, [_entry(item, path, name) for item in node.elts])
+    try:
+        value = ast.literal_eval(node)
+    except (ValueError, TypeError, RecursionError, MemoryError):
+        value = np.inf
+    if isinstance(value, float) and not np.isfinite(value):
+        raise where.error(f"{name}: expected a text, or finite numbers; correct it")
+    return Entry(where, name, value if isinstance(value, str) else "" if isinstance(value, bytes) else repr(value))
 
 
 def _read(path: Path) -> tuple[RigCamera, tuple[str, ...]]:
-    model = _Model(path)
-    kind = model.text("lensmodel")
-    if kind not in _NAMES:
-        model.fail(
-            model.entry("lensmodel"),
-            f"found {kind}; {', '.join(_NAMES)} are read: convert it with mrcal-convert-lensmodel",
-        )
-    names = _NAMES[kind]
-    n = len(names) + (4 if kind == "LENSMODEL_OPENCV12" else 0)
-    values = model.numbers("intrinsics", n)
+    model = _read_model(path)
+    kind = model.get("lensmodel")
+    if kind.text not in _NAMES:
+        raise kind.error(f"found {kind.text}; {', '.join(_NAMES)} are read: convert it with mrcal-convert-lensmodel")
+    names, intrinsics = _NAMES[kind.text], model.get("intrinsics")
+    values = intrinsics.numbers(len(names) + (4 if kind.text == "LENSMODEL_OPENCV12" else 0))
     if values[len(names) :].any():
-        model.fail(model.entry("intrinsics"), "its thin prism terms are in no lens model here; calibrate without them")
-    if not (values[:2] > 0.0).all():
-        model.fail(model.entry("intrinsics"), "the focal lengths must be positive; correct them")
-    size = model.numbers("imagersize", 2)
-    if not (size == np.round(size)).all() or size.min() < 1.0 or size.max() > 1e6:
-        model.fail(model.entry("imagersize"), "expected width and height in whole pixels; correct them")
-    rt = model.numbers("extrinsics" if "extrinsics" in model.entries else "rt_cam_ref", 6)
-    where = Where(path, model.entry("imagersize").lineno)
+        raise intrinsics.error("its thin prism terms are in no lens model here; calibrate without them")
+    lens = lens_of("brown", intrinsics, **dict(zip(names, values.tolist(), strict=False)))
+    extrinsics = model.get("extrinsics" if "extrinsics" in model else "rt_cam_ref")
+    rt = extrinsics.numbers(6)
     camera_from_rig = np.column_stack([Rotation.from_rotvec(rt[:3]).as_matrix(), rt[3:]])
-    lens = lens_of("brown", **dict(zip(names, values.tolist(), strict=False)))
-    pose = pose_of(camera_from_rig, where).inverse()
-    notes = ("left out: mrcal's optimisation inputs",) if "optimization_inputs" in model.entries else ()
-    camera = RigCamera(
-        path.stem, (int(size[0]), int(size[1])), lens, pose, _lens_cov(model, lens, names), _pose_cov(model, rt)
-    )
-    return camera, notes
+    pose = pose_of(camera_from_rig, extrinsics.where).inverse()
+    notes = ("left out: mrcal's optimisation inputs",) if "optimization_inputs" in model else ()
+    lens_cov, pose_cov = _lens_cov(model, names), _pose_cov(model, rt)
+    return RigCamera(path.stem, model.get("imagersize").size(), lens, pose, lens_cov, pose_cov), notes
 
 
-def _symmetric(model: _Model, key: str, n: int) -> FloatArray | None:
-    if key not in model.entries:
+def _symmetric(model: Entry, key: str, n: int) -> FloatArray | None:
+    if key not in model:
         return None
-    cov = model.numbers(key, n * n).reshape(n, n)
+    cov = model.get(key).numbers(n, n)
     if np.abs(cov - cov.T).max() > 1e-9 * np.abs(cov).max() or np.linalg.eigvalsh(cov)[0] < -1e-12 * np.trace(cov):
-        model.fail(model.entry(key), f"{key}: the matrix is no covariance; correct it")
+        raise model.get(key).error("the matrix is no covariance; correct it")
     return cov
 
 
-def _lens_cov(model: _Model, lens: LensParameter, names: tuple[str, ...]) -> FloatArray | None:
+def _lens_cov(model: Entry, names: tuple[str, ...]) -> FloatArray | None:
     cov = _symmetric(model, COVARIANCES[0], len(names))
     if cov is None:
         return None
@@ -163,7 +123,7 @@ def _lens_cov(model: _Model, lens: LensParameter, names: tuple[str, ...]) -> Flo
     return full
 
 
-def _pose_cov(model: _Model, rt: FloatArray) -> FloatArray | None:
+def _pose_cov(model: Entry, rt: FloatArray) -> FloatArray | None:
     cov = _symmetric(model, COVARIANCES[1], 6)
     if cov is None or not cov.any():
         return None
@@ -188,13 +148,9 @@ def rt_by_tangent(rt: FloatArray) -> FloatArray:
     return J
 
 
-def mrcal_files(values: CameraValues, station: str | None) -> tuple[dict[str, str], tuple[str, ...]]:
-    """One model per camera of a station, whose frame is mrcal's reference; what was approximated."""
-    found = rig_values(values, station, "mrcal", CHOICES)
-    texts = {c.camera_id: mrcal_text(c, lens) for c, lens in zip(found.rig.cameras, found.lenses, strict=True)}
-    if len(texts) == 1:
-        return {"": next(iter(texts.values()))}, found.notes
-    return {f"{name}{ENDING}": text for name, text in texts.items()}, found.notes
+def mrcal_files(found: RigValues) -> dict[str, str]:
+    """One model per camera of a station, whose frame is mrcal's reference."""
+    return found.files(mrcal_text, ENDING)
 
 
 def rt_of(pose: Pose3) -> FloatArray:

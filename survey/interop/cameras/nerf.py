@@ -78,19 +78,18 @@ def _lens(root: Entry, frame: Entry) -> tuple[LensParameter, tuple[int, int]]:
             raise frame.error(f"{key!r} is missing, here and at the top; add it")
     value = {k: e.number for k, e in found.items() if k != "camera_model"}
     value.setdefault("fl_y", value["fl_x"])
-    if not (value["fl_x"] > 0.0 and value["fl_y"] > 0.0):
-        raise found["fl_x"].error("the focal lengths must be positive; correct them")
     kind = found["camera_model"].text if "camera_model" in found else "OPENCV"
     plain = {"fx": value["fl_x"], "fy": value["fl_y"], "u0": value["cx"] - HALF_PIXEL, "v0": value["cy"] - HALF_PIXEL}
     size = (found["w"].count(), found["h"].count())
     if kind == "OPENCV_FISHEYE":
-        return lens_of("fisheye", **plain, **{n: value.get(n, 0.0) for n in ("k1", "k2", "k3", "k4")}), size
+        terms = {n: value.get(n, 0.0) for n in ("k1", "k2", "k3", "k4")}
+        return lens_of("fisheye", found["fl_x"], **plain, **terms), size
     if kind not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE"):
         raise found["camera_model"].error(f"found {kind!r}; OPENCV, OPENCV_FISHEYE, PINHOLE are read")
     if value.get("k4", 0.0) != 0.0:
         raise found["k4"].error("a fourth radial term is in no lens model here; calibrate without it")
     terms = {n: value[n] for n in ("k1", "k2", "p1", "p2", "k3") if n in value and kind == "OPENCV"}
-    return lens_of("brown", **plain, **terms), size
+    return lens_of("brown", found["fl_x"], **plain, **terms), size
 
 
 def nerf_files(values: CameraValues, station: str | None) -> tuple[dict[str, str], tuple[str, ...]]:

@@ -18,12 +18,11 @@ from gtsam import Pose3
 
 from adjust.model.survey import FloatArray
 from survey.interop.cameras.rig import Rig, RigCamera, opencv_lens, pose_of, rig_network
-from survey.interop.cameras.values import BROWN_5, BROWN_8, FISHEYE_4, CameraValues, MappedLens, RigValues, rig_values
+from survey.interop.cameras.values import BROWN_5, BROWN_8, FISHEYE_4, MappedLens, RigValues
 from survey.interop.networks.foreign import ForeignNetwork
 from survey.interop.safe_yaml import Entry, quoted, read_yaml, yaml_text
 
 CHOICES = {"brown": ("skew", *BROWN_8), "fisheye": FISHEYE_4}
-_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _MATRIX = ("camera_matrix", "cameraMatrix", "K", "M", "intrinsic_matrix")
 _DISTORTION = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D", "distortion")
 
@@ -93,46 +92,36 @@ def _listed(entry: Entry) -> Rig:
     return Rig("rig", tuple(cameras))
 
 
-def opencv_files(
-    values: CameraValues, station: str | None, json: bool = False
-) -> tuple[dict[str, str], tuple[str, ...]]:
-    """The file of one station's cameras, and what was approximated."""
-    found = rig_values(values, station, "opencv", CHOICES)
-    return {"": opencv_text(found, json)}, found.notes
-
-
-def opencv_text(found: RigValues, json: bool = False) -> str:
-    """What cv2.FileStorage reads, as YAML or JSON."""
+def opencv_files(found: RigValues, json: bool = False) -> dict[str, str]:
+    """The file of one station's cameras that cv2.FileStorage reads, as YAML or JSON."""
     cameras, lenses = found.rig.cameras, found.lenses
     base = cameras[0].rig_from_camera or Pose3()
     poses = [(c.rig_from_camera or Pose3()).inverse() * base for c in cameras]
-    text = _Json().document if json else opencv_yaml
+    out: dict[str, Value] = {}
     if len(cameras) == 1:
-        return text(_camera_values(cameras[0], lenses[0]))
-    if len(cameras) == 2 and lenses[0].model == lenses[1].model:
-        out: dict[str, Value] = {"fisheye_model": int(lenses[0].model == "fisheye")}
+        out = _camera_values(cameras[0], lenses[0])
+    elif len(cameras) == 2 and lenses[0].model == lenses[1].model:
+        out = {"fisheye_model": int(lenses[0].model == "fisheye")}
         for i, (camera, lens) in enumerate(zip(cameras, lenses, strict=True), 1):
             own = _camera_values(camera, lens)
             out |= {f"name{i}": camera.camera_id, f"image_width{i}": camera.image_size[0],
                     f"image_height{i}": camera.image_size[1], f"M{i}": own["camera_matrix"],
                     f"D{i}": own["distortion_coefficients"]}  # fmt: skip
-        return text(out | _motion(poses[1]))
-    return text({"cameras": [_camera_values(c, lens) | _motion(pose)
-                             for c, lens, pose in zip(cameras, lenses, poses, strict=True)]})  # fmt: skip
+        out |= _motion(poses[1])
+    else:
+        out["cameras"] = [_camera_values(c, lens) | _motion(pose)
+                          for c, lens, pose in zip(cameras, lenses, poses, strict=True)]  # fmt: skip
+    return {"": f"{_json(out)}\n" if json else opencv_yaml(out)}
 
 
 Value = str | int | FloatArray | list[dict[str, "Value"]]
 
 
 def _camera_values(camera: RigCamera, lens: MappedLens) -> dict[str, Value]:
-    names = ("k1", "k2", "k3", "k4") if lens.model == "fisheye" else _NAMES
-    k = lens.array(*names)
-    if lens.model == "brown" and not k[5:].any():
-        k = k[:5]
     return {
         "name": camera.camera_id, "image_width": camera.image_size[0], "image_height": camera.image_size[1],
         "fisheye_model": int(lens.model == "fisheye"), "camera_matrix": camera_matrix(lens),
-        "distortion_coefficients": k.reshape(1, -1),
+        "distortion_coefficients": lens.distortion()[None],
     }  # fmt: skip
 
 
@@ -151,23 +140,19 @@ def opencv_yaml(values: Mapping[str, object]) -> str:
     return "%YAML:1.0\n---\n" + yaml_text(values)
 
 
-class _Json:
-    def document(self, values: dict[str, Value]) -> str:
-        return self._map(values, "") + "\n"
-
-    def _map(self, values: dict[str, Value], indent: str) -> str:
+def _json(value: "Value | dict[str, Value]", indent: str = "") -> str:
+    """As cv2.FileStorage wants it: matrices in one line, and a point in each of their numbers."""
+    if isinstance(value, dict):
         inner = indent + "    "
-        rows = [f'{inner}"{key}": {self._value(value, inner)}' for key, value in values.items()]
-        return "{\n" + ",\n".join(rows) + f"\n{indent}}}"
-
-    def _value(self, value: Value, indent: str) -> str:
-        if isinstance(value, list):
-            return "[ " + ", ".join(self._map(item, indent) for item in value) + " ]"
-        if isinstance(value, np.ndarray):
-            rows, cols = value.shape
-            data = f'"rows": {rows}, "cols": {cols}, "dt": "d", "data": [ {_numbers(value)} ]'
-            return f'{{ "type_id": "opencv-matrix", {data} }}'
-        return str(value) if isinstance(value, int) else quoted(value)
+        rows = ",\n".join(f'{inner}"{key}": {_json(item, inner)}' for key, item in value.items())
+        return f"{{\n{rows}\n{indent}}}"
+    if isinstance(value, list):
+        return f"[ {', '.join(_json(item, indent) for item in value)} ]"
+    if isinstance(value, np.ndarray):
+        n, cols = value.shape
+        data = f'"rows": {n}, "cols": {cols}, "dt": "d", "data": [ {_numbers(value)} ]'
+        return f'{{ "type_id": "opencv-matrix", {data} }}'
+    return str(value) if isinstance(value, int) else quoted(value)
 
 
 def _numbers(matrix: FloatArray) -> str:
@@ -202,23 +187,15 @@ def read_mc_calib(path: Path) -> ForeignNetwork:
     return rig_network(Rig("rig", tuple(cameras), (note,)), path)
 
 
-def mc_calib_files(values: CameraValues, station: str | None) -> tuple[dict[str, str], tuple[str, ...]]:
-    """The cameras of one station, relative to the first, and what was approximated."""
-    found = rig_values(values, station, "mc-calib", MC_CALIB_CHOICES)
-    return {"": mc_calib_text(found)}, found.notes
-
-
-def mc_calib_text(found: RigValues) -> str:
-    """What MC-Calib and cv2.FileStorage read."""
+def mc_calib_files(found: RigValues) -> dict[str, str]:
+    """The cameras of one station, relative to the first, as MC-Calib and cv2.FileStorage read them."""
     base = (found.rig.cameras[0].rig_from_camera or Pose3()).inverse()
     document: dict[str, object] = {"nb_camera": len(found.lenses)}
     for i, (camera, lens) in enumerate(zip(found.rig.cameras, found.lenses, strict=True)):
-        fisheye = lens.model == "fisheye"
-        k = lens.array(*(("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")))
         document[f"camera_{i}"] = {
-            "camera_matrix": camera_matrix(lens), "distortion_vector": k.reshape(1, -1),
-            "distortion_type": int(fisheye), "camera_group": 0,
+            "camera_matrix": camera_matrix(lens), "distortion_vector": lens.distortion()[None],
+            "distortion_type": int(lens.model == "fisheye"), "camera_group": 0,
             "img_width": camera.image_size[0], "img_height": camera.image_size[1],
             "camera_pose_matrix": np.asarray((base * (camera.rig_from_camera or Pose3())).matrix()),
         }  # fmt: skip
-    return opencv_yaml(document)
+    return {"": opencv_yaml(document)}

@@ -2,12 +2,14 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from gtsam import Pose3, Rot3
 from scipy.spatial.transform import Rotation
 
 from adjust.lenses.models import MODELS
+from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import Camera, FloatArray, LensParameter, Point, PoseParameter, Station, Survey, VectorPrior
 from adjust.spatial.rigid import nearest_rotation
@@ -41,8 +43,18 @@ class Rig:
     notes: tuple[str, ...] = ()
 
 
-def lens_of(model: str, **values: float) -> LensParameter:
-    """A lens whose named parameters are given and free; the others are zero."""
+class Placed(Protocol):
+    """A place in a file."""
+
+    def error(self, problem: str) -> SurveyError:
+        """What makes an error of a problem there."""
+        ...
+
+
+def lens_of(model: str, where: Placed, /, **values: float) -> LensParameter:
+    """A lens whose named parameters are given and free; the others are zero. Raises SurveyError for no focal length."""
+    if not (values["fx"] > 0.0 and values["fy"] > 0.0):
+        raise where.error("the focal lengths must be positive; correct them")
     names = MODELS[model].names
     free = tuple(n for n in names if n in values and n != "skew")
     return LensParameter(model, free, np.array([float(values.get(n, 0.0)) for n in names]))
@@ -69,12 +81,12 @@ def opencv_lens(matrix: FloatArray, distortion: FloatArray, fisheye: bool, where
         names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")[: len(k)]
     matrix = np.asarray(matrix, dtype=float).reshape(3, 3)
     lower = abs(matrix[1, 0]) + abs(matrix[2, 0]) + abs(matrix[2, 1])
-    if lower > 1e-12 or abs(matrix[2, 2] - 1.0) > 1e-12 or matrix[0, 0] <= 0.0 or matrix[1, 1] <= 0.0:
-        raise where.error("the camera matrix must be [fx skew cx; 0 fy cy; 0 0 1] with positive fx, fy; correct it")
+    if lower > 1e-12 or abs(matrix[2, 2] - 1.0) > 1e-12:
+        raise where.error("the camera matrix must be [fx skew cx; 0 fy cy; 0 0 1]; correct it")
     values = dict(zip(names, k.tolist(), strict=False)) | {
         "fx": matrix[0, 0], "fy": matrix[1, 1], "skew": matrix[0, 1], "u0": matrix[0, 2], "v0": matrix[1, 2]
     }  # fmt: skip
-    return lens_of("fisheye" if fisheye else "brown", **values)
+    return lens_of("fisheye" if fisheye else "brown", where, **values)
 
 
 def pose_of(matrix: FloatArray, where: Where) -> Pose3:

@@ -41,28 +41,28 @@ def read_urdf(path: Path) -> ForeignNetwork:
     root = read_xml(path, "robot")
     links = []
     skipped = 0
-    for joint in (e for e in root.children if e.tag == "joint"):
+    for joint in root.all("joint"):
         if joint.get("type") != "fixed":
             skipped += 1
             continue
-        origin = _child(joint, "origin")
+        origin = next(iter(joint.all("origin")), None)
         xyz, rpy = (_numbers(origin, name, 3) if origin is not None else np.zeros(3) for name in ("xyz", "rpy"))
-        links.append(Link(_link(joint, "child"), _link(joint, "parent"), _pose(xyz, rpy), joint.where))
+        child, parent = (joint.one(tag).get("link") for tag in ("child", "parent"))
+        links.append(Link(child, parent, _pose(xyz, rpy), joint.where))
     return _network(path, links, (f"left out, joints that move: {skipped}",) if skipped else ())
 
 
 def read_sdf(path: Path) -> ForeignNetwork:
     """Links and frames of a model as stations. Raises SurveyError with file and line for what cannot be read."""
     root = read_xml(path, "sdf")
-    models = [e for e in root.children if e.tag == "model"]
-    models += [m for w in root.children if w.tag == "world" for m in w.children if m.tag == "model"]
+    models = [*root.all("model"), *(model for world in root.all("world") for model in world.all("model"))]
     if len(models) != 1:
         raise root.error(f"found {len(models)} models; one is expected")
     links = []
     for entry in models[0].children:
         if entry.tag not in ("link", "frame"):
             continue
-        pose, numbers, parent = _child(entry, "pose"), np.zeros(6), _WORLD
+        pose, numbers, parent = next(iter(entry.all("pose")), None), np.zeros(6), _WORLD
         if pose is not None:
             words = pose.text.split()
             if len(words) != 6:
@@ -73,17 +73,6 @@ def read_sdf(path: Path) -> ForeignNetwork:
         if entry.get("name") != _WORLD:
             links.append(Link(entry.get("name"), parent, _pose(numbers[:3], numbers[3:]), entry.where))
     return _network(path, links, ())
-
-
-def _child(parent: Element, tag: str) -> Element | None:
-    return next((e for e in parent.children if e.tag == tag), None)
-
-
-def _link(joint: Element, tag: str) -> str:
-    found = _child(joint, tag)
-    if found is None:
-        raise joint.error(f"has no <{tag}>; add it")
-    return found.get("link")
 
 
 def _numbers(origin: Element, name: str, count: int) -> FloatArray:

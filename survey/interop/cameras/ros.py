@@ -15,7 +15,7 @@ from gtsam import Pose3
 from scipy.spatial.transform import Rotation
 
 from adjust.model.errors import SurveyError
-from adjust.model.survey import FloatArray, LensParameter
+from adjust.model.survey import FloatArray
 from survey.interop.cameras.opencv_files import camera_matrix
 from survey.interop.cameras.rig import (
     Rig,
@@ -27,7 +27,7 @@ from survey.interop.cameras.rig import (
     quaternion_xyzw,
     rig_network,
 )
-from survey.interop.cameras.values import BROWN_5, BROWN_8, FISHEYE_4, CameraValues, MappedLens, rig_values
+from survey.interop.cameras.values import BROWN_5, BROWN_8, FISHEYE_4, MappedLens, RigValues
 from survey.interop.networks.foreign import ForeignNetwork
 from survey.interop.safe_yaml import Entry, matrix_entry, read_yaml, yaml_text
 
@@ -36,7 +36,7 @@ FRAME = "_optical_frame"
 CHOICES = {"brown": BROWN_8, "fisheye": FISHEYE_4}
 INDUSTRIAL_CHOICES = {"brown": BROWN_5}
 _MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
-_DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 _MOST_FILES = 1000
 
 
@@ -92,26 +92,19 @@ def _transform(entry: Entry) -> Pose3:
     return pose_of_quaternion(xyzw, np.array([t.get(a).number for a in "xyz"]), q.where)
 
 
-def ros_files(values: CameraValues, station: str | None) -> tuple[dict[str, str], tuple[str, ...]]:
-    """camera_info of one station's cameras, with extrinsics where there are several; what was approximated."""
-    found = rig_values(values, station, "ros", CHOICES)
-    texts = {c.camera_id: camera_info_text(c, lens) for c, lens in zip(found.rig.cameras, found.lenses, strict=True)}
-    if len(texts) == 1:
-        return {"": next(iter(texts.values()))}, found.notes
-    files = {f"{name}.yaml": text for name, text in texts.items()}
+def ros_files(found: RigValues) -> dict[str, str]:
+    """camera_info of one station's cameras, with extrinsics where there are several."""
+    files = found.files(camera_info_text, ".yaml")
     if EXTRINSICS in files:
         raise SurveyError("a camera called 'extrinsics' cannot be written beside extrinsics.yaml; rename it")
-    return {**files, EXTRINSICS: extrinsics_text(found.rig)}, found.notes
+    return files if "" in files else {**files, EXTRINSICS: extrinsics_text(found.rig)}
 
 
 def camera_info_text(camera: RigCamera, lens: MappedLens) -> str:
     """One camera as camera_calibration_parsers writes it; rectified to itself."""
     matrix = camera_matrix(lens)
-    if lens.model == "fisheye":
-        name, k = "equidistant", lens.array("k1", "k2", "k3", "k4")
-    else:
-        k = lens.array(*_DISTORTION)
-        name, k = ("rational_polynomial", k) if k[5:].any() else ("plumb_bob", k[:5])
+    k = lens.distortion()
+    name = {4: "equidistant", 5: "plumb_bob", 8: "rational_polynomial"}[len(k)]
     return yaml_text({
         "image_width": camera.image_size[0], "image_height": camera.image_size[1], "camera_name": camera.camera_id,
         "camera_matrix": matrix_entry(matrix), "distortion_model": name,
@@ -143,12 +136,13 @@ def read_industrial(path: Path) -> ForeignNetwork:
     own = root.get("intrinsics")
     values = {ours: own.get(key).number for ours, key in _PINHOLE}
     if "distortions" in root:
-        values |= {n: root.get("distortions").get(n).number for n in _DISTORTION[:5]}
+        values |= {n: root.get("distortions").get(n).number for n in _DISTORTION}
     key = next((k for k in ("camera_mount_to_camera", "camera_mount_to_camera_guess") if k in root), None)
     pose = _industrial_pose(root.get(key)) if key is not None else None
     size = _industrial_size(root, values)
     name = root.get("camera_name").text if "camera_name" in root else path.stem
-    return rig_network(Rig("camera_mount", (RigCamera(name, size[0], _positive(values, own), pose),), size[1]), path)
+    camera = RigCamera(name, size[0], lens_of("brown", own, **values), pose)
+    return rig_network(Rig("camera_mount", (camera,), size[1]), path)
 
 
 _PINHOLE = (("fx", "fx"), ("fy", "fy"), ("u0", "cx"), ("v0", "cy"))
@@ -179,29 +173,27 @@ def _industrial_camera(entry: Entry) -> RigCamera:
     t = np.array([entry.get(f"position_{a}").number for a in "xyz"])
     pose = pose_of(np.column_stack([turn, t]), entry.where).inverse()
     size = _industrial_size(entry, values)[0]
-    return RigCamera(entry.get("camera_name").text, size, _positive(values, entry), pose)
+    return RigCamera(entry.get("camera_name").text, size, lens_of("brown", entry, **values), pose)
 
 
-def _positive(values: dict[str, float], entry: Entry) -> LensParameter:
-    if not (values["fx"] > 0.0 and values["fy"] > 0.0):
-        raise entry.error("the focal lengths must be positive; correct them")
-    return lens_of("brown", **values)
+def industrial_files(found: RigValues) -> dict[str, str]:
+    """One file per camera: intrinsics, distortions and its pose on the station."""
+    return found.files(_industrial_text, ".yaml")
 
 
-def industrial_files(values: CameraValues, station: str | None) -> tuple[dict[str, str], tuple[str, ...]]:
-    """One file per camera: intrinsics, distortions and its pose on the station; what is to be known."""
-    found = rig_values(values, station, "ros-industrial", INDUSTRIAL_CHOICES)
-    files = {}
-    for camera, lens in zip(found.rig.cameras, found.lenses, strict=True):
-        pose = camera.rig_from_camera or Pose3()
-        files[f"{camera.camera_id}.yaml"] = yaml_text({
-            "camera_name": camera.camera_id, "image_width": camera.image_size[0], "image_height": camera.image_size[1],
-            "intrinsics": {key: lens.values[ours] for ours, key in _PINHOLE},
-            "distortions": {n: lens.values[n] for n in _DISTORTION[:5]},
-            "camera_mount_to_camera": _named("xyz", pose.translation())
-            | _named(("qx", "qy", "qz", "qw"), quaternion_xyzw(pose)),
-        })  # fmt: skip
-    notes = [f"camera {c.camera_id}: distortions are written, but ROS-Industrial's extrinsic tools take lenses without"
-             for c, lens in zip(found.rig.cameras, found.lenses, strict=True) if lens.array(*_DISTORTION).any()]
-    single = {"": next(iter(files.values()))} if len(files) == 1 else files
-    return single, (*found.notes, *notes[:1])
+def industrial_notes(found: RigValues) -> tuple[str, ...]:
+    """What is to be known of distortions, of the first camera that has any."""
+    notes = (f"camera {c.camera_id}: distortions are written, but ROS-Industrial's extrinsic tools take lenses without"
+             for c, lens in zip(found.rig.cameras, found.lenses, strict=True) if lens.distortion().any())  # fmt: skip
+    return tuple(notes)[:1]
+
+
+def _industrial_text(camera: RigCamera, lens: MappedLens) -> str:
+    pose = camera.rig_from_camera or Pose3()
+    return yaml_text({
+        "camera_name": camera.camera_id, "image_width": camera.image_size[0], "image_height": camera.image_size[1],
+        "intrinsics": {key: lens.values[ours] for ours, key in _PINHOLE},
+        "distortions": {n: lens.values[n] for n in _DISTORTION},
+        "camera_mount_to_camera": _named("xyz", pose.translation())
+        | _named(("qx", "qy", "qz", "qw"), quaternion_xyzw(pose)),
+    })  # fmt: skip

@@ -3,7 +3,7 @@
 Lenses are in the parameters of other programs exactly where they can be, else the nearest with its difference.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import cast
 
@@ -52,6 +52,13 @@ class MappedLens:
     def array(self, *names: str) -> FloatArray:
         """Values of the named parameters."""
         return np.array([self.values[n] for n in names])
+
+    def distortion(self) -> FloatArray:
+        """Coefficients in OpenCV's order: four of a fisheye, else five, or eight where the rational ones are needed."""
+        if self.model == "fisheye":
+            return self.array("k1", "k2", "k3", "k4")
+        k = self.array("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+        return k if k[5:].any() else k[:5]
 
 
 def mapped_lens(
@@ -218,6 +225,11 @@ class RigValues:
     def notes(self) -> tuple[str, ...]:
         """What was approximated, for people."""
         return tuple(lens.note for lens in self.lenses if lens.note)
+
+    def files(self, text: Callable[[RigCamera, MappedLens], str], ending: str) -> dict[str, str]:
+        """A text for each camera by the name of its file, "" where there is one alone."""
+        texts = {c.camera_id: text(c, lens) for c, lens in zip(self.rig.cameras, self.lenses, strict=True)}
+        return {f"{name}{ending}" if len(texts) > 1 else "": found for name, found in texts.items()}
 
 
 def rig_values(

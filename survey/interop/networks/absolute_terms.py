@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from adjust.model.errors import listed
-from adjust.model.observations import Reading, ReadingCovariance, ReadingKind
+from adjust.model.observations import Reading, ReadingKind
 from adjust.model.survey import Bearings, FloatArray, Survey
 from survey.interop.networks.foreign import MM
 from survey.project.tables.terrestrial import ANGLES
@@ -43,7 +43,8 @@ def within_tolerance(survey: Survey, tolerance: float, unit_weight: float) -> tu
     limit = f"tol-abs = {tolerance / MM:g} mm"
     note = f"not used (used = false), beyond {limit} from the file's coordinates: {listed(named, _MOST_NAMED)}"
     kept = tuple(replace(r, used=False) if r.reading_id in gone else r for r in survey.readings)
-    joint = tuple(c for whole in survey.reading_covariances if len((c := _without(whole, gone)).reading_ids) > 1)
+    used = {r.reading_id for r in kept if r.used}
+    joint = tuple(c for whole in survey.reading_covariances if len((c := whole.of(used)).reading_ids) > 1)
     return replace(survey, readings=kept, reading_covariances=joint), (note, *left)
 
 
@@ -66,11 +67,6 @@ def _not_tested(survey: Survey, x: Mapping[str, FloatArray], tolerance: float, n
     if far:
         notes += (f"tol-abs was not applied to baselines and coordinates; beyond it are {listed(far, _MOST_NAMED)}",)
     return notes
-
-
-def _without(whole: ReadingCovariance, gone: Mapping[str, object]) -> ReadingCovariance:
-    rows = [k for k, name in enumerate(whole.reading_ids) if name not in gone]
-    return ReadingCovariance(tuple(whole.reading_ids[k] for k in rows), whole.cov[np.ix_(rows, rows)])
 
 
 def absolute_terms(

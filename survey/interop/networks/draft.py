@@ -79,7 +79,7 @@ class NetworkDraft:
     def __init__(self) -> None:
         self.points: dict[str, DraftPoint] = {}
         self.readings: list[Reading] = []
-        self.covariances: list[tuple[list[str], FloatArray]] = []
+        self.covariances: list[ReadingCovariance] = []
         self.setups: list[Setup] = []
         self.differences: list[Vectors] = []
         self.coordinates: list[Vectors] = []
@@ -149,7 +149,7 @@ class NetworkDraft:
         sigma = dict(zip(names, np.sqrt(np.diagonal(cov)).tolist(), strict=True))
         self.readings = [replace(r, sigma=sigma.get(r.reading_id, r.sigma)) for r in self.readings]
         if np.count_nonzero(cov) > len(cov):
-            self.covariances.append((names, cov))
+            self.covariances.append(ReadingCovariance(tuple(names), cov))
 
     def survey(self, bearings: Bearings) -> Survey:
         """The survey. What touches points without coordinates or status is left out, and said.
@@ -175,7 +175,7 @@ class NetworkDraft:
             bearings=bearings,
             setups=tuple(s for s in self.setups if s.setup_id in used),
             readings=readings,
-            reading_covariances=tuple(_kept_cov(ids, cov, kept) for ids, cov in self.covariances if kept & set(ids)),
+            reading_covariances=tuple(c.of(kept) for c in self.covariances if kept.intersection(c.reading_ids)),
             coordinate_differences=tuple(CoordinateDifferences(_refs(a), _refs(t), v, c) for a, t, v, c in differences),
             coordinates=tuple(Coordinates(_refs(t), v, c) for _, t, v, c in observed),
         )
@@ -226,11 +226,6 @@ def _ends(reading: Reading) -> list[str]:
 
 def _refs(ids: Sequence[str]) -> tuple[PositionRef, ...]:
     return tuple(PositionRef(i) for i in ids)
-
-
-def _kept_cov(ids: Sequence[str], cov: FloatArray, kept: set[str]) -> ReadingCovariance:
-    rows = [k for k, name in enumerate(ids) if name in kept]
-    return ReadingCovariance(tuple(ids[k] for k in rows), cov[np.ix_(rows, rows)])
 
 
 def _split(

@@ -64,7 +64,7 @@ _CURVATURE = ("latitude", "ellipsoid")
 def read_gama(path: Path) -> ForeignNetwork:
     """A network from a .gkf file. Raises SurveyError with file and line for what cannot be read."""
     root = read_xml(path, "gama-local")
-    networks = [e for e in root.children if e.tag == "network"]
+    networks = root.all("network")
     if len(networks) != 1 or len(root.children) != 1:
         raise root.error(f"expected one <network>, found {[e.tag for e in root.children][:5]}")
     return _Reader(networks[0]).network()
@@ -182,13 +182,13 @@ class _Reader:
     def _cluster(self, cluster: Element) -> None:
         cluster.allow("from", "orientation", "from_dh", "extern")
         cov, names, units, setup = None, [], [], ""
-        if any(child.tag == "direction" for child in cluster.children):
+        if cluster.all("direction"):
             setup = self.draft.setup(self._directions_from(cluster))
         for child in cluster.children:
             if child.tag == "cov-mat":
                 cov = child
             elif child.tag in KINDS:
-                name, unit = self._observation(cluster, child, setup, any(c.tag == "cov-mat" for c in cluster.children))
+                name, unit = self._observation(cluster, child, setup, bool(cluster.all("cov-mat")))
                 names.append(name)
                 units.append(unit)
             else:
@@ -200,7 +200,7 @@ class _Reader:
             self.draft.correlate(names, matrix)
 
     def _directions_from(self, cluster: Element) -> str:
-        stations = {c.get("from", cluster.attributes.get("from")) for c in cluster.children if c.tag == "direction"}
+        stations = {c.get("from", cluster.attributes.get("from")) for c in cluster.all("direction")}
         if len(stations) != 1:
             raise cluster.error(f"directions of one set start at one point, found {sorted(stations)[:4]}; split it")
         return stations.pop()
@@ -265,7 +265,7 @@ class _Reader:
         return float(sigma)
 
     def _vectors(self, element: Element) -> None:
-        vectors = [e for e in element.children if e.tag == "vec"]
+        vectors = element.all("vec")
         for e in vectors:
             e.allow("from", "to", "dx", "dy", "dz", "from_dh", "to_dh", "extern")
         values = np.array([[e.number(f"d{a}") for a in AXES] for e in vectors]).reshape(-1, 3)
@@ -276,7 +276,7 @@ class _Reader:
         self.draft.differences.append(Vectors(element.where, at, to, values, cov))
 
     def _coordinates(self, element: Element) -> None:
-        points = [e for e in element.children if e.tag == "point"]
+        points = element.all("point")
         values, rows = np.zeros((len(points), 3)), []
         for k, e in enumerate(points):
             e.allow("id", "x", "y", "z", "fix", "adj", "extern")
@@ -292,7 +292,7 @@ class _Reader:
         self.draft.coordinates.append(Vectors(element.where, [], [e.get("id") for e in points], values, cov))
 
     def _matrix(self, element: Element, what: str) -> Element:
-        matrices = [e for e in element.children if e.tag == "cov-mat"]
+        matrices = element.all("cov-mat")
         others = [e for e in element.children if e.tag not in ("cov-mat", what)]
         if others:
             raise others[0].error(f"is not known here; {what} and cov-mat are")

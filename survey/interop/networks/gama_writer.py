@@ -12,7 +12,7 @@ from adjust.model.survey import FloatArray, Point, Survey
 from survey.interop.networks.draft import AXES
 from survey.interop.networks.foreign import CC, GON, MM
 from survey.interop.networks.gama import KINDS
-from survey.interop.networks.values import NetworkValues, between_points, point_of
+from survey.interop.networks.values import NetworkValues, readings_of, triples_of
 from survey.project.tables.terrestrial import ANGLES
 
 _TAGS = {kind: tag for tag, kind in KINDS.items()}
@@ -24,7 +24,7 @@ _AXES_XY = {("x", False): "ne", ("x", True): "nw", ("y", True): "en", ("y", Fals
 def gama_text(network: NetworkValues) -> str:
     """The .gkf file of a network. Raises SurveyError for correlated direction sets, which Gama keeps apart."""
     survey, actual = network.survey, "apriori" if network.sigmas == "a_priori" else "aposteriori"
-    body = [*_points(network), *_clusters(survey), *_vectors(survey), *_coordinates(network)]
+    body = [*_points(network), *_clusters(survey), *_triples(network)]
     return "\n".join(
         [
             '<?xml version="1.0" ?>',
@@ -83,7 +83,7 @@ def _element(tag: str, attributes: dict[str, Any]) -> str:
 
 def _clusters(survey: Survey) -> list[str]:
     """One <obs> per setup; what is correlated stands in one."""
-    readings = {r.reading_id: r for r in survey.readings if r.used and between_points(r)}
+    readings = {r.reading_id: r for r in readings_of(survey)}
     home = {i: _home(r) for i, r in readings.items()}
     for joint in survey.reading_covariances:
         ids = [i for i in joint.reading_ids if i in readings]
@@ -96,11 +96,6 @@ def _clusters(survey: Survey) -> list[str]:
     lines = []
     for members in clusters.values():
         lines += _cluster(survey, members)
-    for distance in survey.distances:
-        a, b = point_of(distance.a), point_of(distance.b)
-        if distance.used and a is not None and b is not None:
-            values = {"from": a, "to": b, "val": repr(distance.value), "stdev": repr(distance.sigma / MM)}
-            lines += ["<obs>", _element("s-distance", values), "</obs>"]
     return lines
 
 
@@ -122,9 +117,9 @@ def _cluster(survey: Survey, members: Sequence[Reading]) -> list[str]:
     units = np.array([CC if r.kind in ANGLES else MM for r in members])
     cov = np.diag(np.array([r.sigma for r in members]) ** 2)
     for joint in survey.reading_covariances:
-        rows = [k for k, i in enumerate(joint.reading_ids) if i in place]
-        idx = [place[joint.reading_ids[k]] for k in rows]
-        cov[np.ix_(idx, idx)] = joint.cov[np.ix_(rows, rows)]
+        here = joint.of(place)
+        idx = [place[name] for name in here.reading_ids]
+        cov[np.ix_(idx, idx)] = here.cov
     if np.count_nonzero(cov) > len(cov):
         lines += _matrix(cov / np.outer(units, units))
     return [*lines, "</obs>"]
@@ -154,36 +149,23 @@ def _matrix(cov: FloatArray) -> list[str]:
     return [f'<cov-mat dim="{len(cov)}" band="{len(cov) - 1}">', *rows, "</cov-mat>"]
 
 
-def _vectors(survey: Survey) -> list[str]:
+def _triples(network: NetworkValues) -> list[str]:
+    """Baselines; observed coordinates and the priors of points."""
+    baselines, coordinates = triples_of(network.survey, priors=True)
     lines = []
-    for baselines in survey.coordinate_differences:
-        ends = [(point_of(a), point_of(t)) for a, t in zip(baselines.at, baselines.to, strict=True)]
-        if not baselines.used or any(a is None or t is None for a, t in ends):
-            continue
+    for t in baselines:
         lines.append("<vectors>")
-        for (at, to), row in zip(ends, baselines.values, strict=True):
+        for at, to, row in zip(t.at, t.to, t.values, strict=True):
             differences = {f"d{a}": repr(float(v)) for a, v in zip(AXES, row, strict=True)}
             lines.append(_element("vec", {"from": at, "to": to, **differences}))
-        lines += [*_matrix(baselines.cov / MM**2), "</vectors>"]
-    return lines
-
-
-def _coordinates(network: NetworkValues) -> list[str]:
-    """Observed coordinates, and the priors of points."""
-    survey = network.survey
-    sets = [([point_of(p) for p in c.positions], c.values, c.cov) for c in survey.coordinates if c.used]
-    for point in survey.points:
-        prior = point.x_in_world
-        if prior.treatment == "prior" and prior.value is not None and prior.prior_cov is not None:
-            sets.append(([point.point_id], prior.value[None], prior.prior_cov))
-    lines = []
-    for ids, values, cov in sets:
-        seen = np.flatnonzero(np.isfinite(np.diagonal(cov)))
-        if any(i is None for i in ids) or not len(seen):
+        lines += [*_matrix(t.cov / MM**2), "</vectors>"]
+    for t in coordinates:
+        seen = np.flatnonzero(np.isfinite(np.diagonal(t.cov)))
+        if not len(seen):
             continue
         lines.append("<coordinates>")
-        for k, name in enumerate(ids):
-            axes = {AXES[j % 3]: repr(float(values[k, j % 3])) for j in seen.tolist() if j // 3 == k}
+        for k, name in enumerate(t.to):
+            axes = {AXES[j % 3]: repr(float(t.values[k, j % 3])) for j in seen.tolist() if j // 3 == k}
             lines += [_element("point", {"id": name, **axes})] if axes else []
-        lines += [*_matrix(cov[np.ix_(seen, seen)] / MM**2), "</coordinates>"]
+        lines += [*_matrix(t.cov[np.ix_(seen, seen)] / MM**2), "</coordinates>"]
     return lines

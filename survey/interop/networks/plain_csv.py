@@ -7,17 +7,15 @@ names the axes that keep them, ``datum`` is yes for the points of inner constrai
 counterclockwise as ``to_id``; ``adjusted`` rows are results and not read. Covariances between rows are not held.
 """
 
-import csv
-import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import get_args
 
 import numpy as np
 
-from adjust.model.observations import CoordinateDifferences, Coordinates, Reading, ReadingKind
-from adjust.model.survey import Bearings, FloatArray
-from survey.folder.text import csv_text, suggestion
+from adjust.model.observations import Reading, ReadingKind
+from adjust.model.survey import Bearings, FloatArray, Survey
+from survey.folder.text import csv_rows, csv_text, suggestion
 from survey.interop.networks.draft import AXES, NetworkDraft, Vectors
 from survey.interop.networks.foreign import (
     ARCSEC,
@@ -31,7 +29,7 @@ from survey.interop.networks.foreign import (
     positive,
     text_of,
 )
-from survey.interop.networks.values import NetworkValues, between_points, point_of
+from survey.interop.networks.values import NetworkValues, point_of, readings_of, triples_of
 from survey.project.tables.terrestrial import ANGLES, HEIGHTS
 
 COLUMNS = (
@@ -48,23 +46,15 @@ _SIGMAS = {"sigma_mm": MM, "sigma_cc": CC, "sigma_arcsec": ARCSEC}
 def read_plain_csv(path: Path) -> ForeignNetwork:
     """A network from one table. Raises SurveyError with file and line for what cannot be read."""
     reader = _Reader()
-    rows = csv.reader(io.StringIO(text_of(path)), strict=True)
-    names: list[str] = []
-    try:
-        for words in rows:
-            where = Where(path, rows.line_num)
-            if not any(word.strip() for word in words):
-                continue
-            if not names:
-                names = _header(words, where)
-                continue
-            if len(words) != len(names):
-                raise where.error(f"found {len(words)} cells, the header has {len(names)}; correct the row")
-            reader.row({k: w.strip() for k, w in zip(names, words, strict=True) if w.strip()}, where)
-    except csv.Error as error:
-        raise Where(path, rows.line_num).error(f"this is no CSV ({error}); correct it") from None
-    if not names:
+    rows = ((Where(path, line), words) for line, words in csv_rows(path, text_of(path)) if any(map(str.strip, words)))
+    first = next(rows, None)
+    if first is None:
         raise Where(path, 1).error(f"the table is empty; its first line names the columns, as {', '.join(COLUMNS[:4])}")
+    names = _header(first[1], first[0])
+    for where, words in rows:
+        if len(words) != len(names):
+            raise where.error(f"found {len(words)} cells, the header has {len(names)}; correct the row")
+        reader.row({k: w.strip() for k, w in zip(names, words, strict=True) if w.strip()}, where)
     survey = reader.draft.survey(reader.bearings)
     return ForeignNetwork(survey, path.stem, reject=True, notes=tuple(reader.draft.notes))
 
@@ -185,8 +175,7 @@ def plain_csv(network: NetworkValues) -> str:
         in_datum = {"datum": "yes"} if datum.kind == "inner" and point.point_id in chosen and held != AXES else {}
         rows.append({"kind": "point", "from_id": point.point_id, **_xyz(network.x.get(point.point_id)),
                      "hold": held, **in_datum})  # fmt: skip
-    rows += [_reading_row(r) for r in survey.readings if r.used and between_points(r)]
-    rows += _vector_rows(network)
+    rows += [*map(_reading_row, readings_of(survey)), *_vector_rows(survey)]
     for name, cov in network.covs.items():
         sigma = dict(zip((f"sigma_{a}_mm" for a in AXES), _texts(np.sqrt(np.diag(cov)) / MM), strict=True))
         rows.append({"kind": "adjusted", "from_id": name, **_xyz(network.x[name]), **sigma})
@@ -212,26 +201,17 @@ def _reading_row(r: Reading) -> dict[str, str]:
     return out | {f"{name}_m": repr(height) for name in HEIGHTS if (height := getattr(r, name))}
 
 
-def _vector_rows(network: NetworkValues) -> list[dict[str, str]]:
-    survey, rows = network.survey, []
-    vectors: tuple[CoordinateDifferences | Coordinates, ...] = (*survey.coordinate_differences, *survey.coordinates)
-    for o in vectors:
-        if isinstance(o, CoordinateDifferences):
-            kind, at, to = "coordinate_difference", [point_of(p) for p in o.at], [point_of(p) for p in o.to]
-        else:
-            kind, at, to = "coordinates", [""] * len(o.values), [point_of(p) for p in o.positions]
-        for k, (a, t) in enumerate(zip(at, to, strict=True)):
-            if not o.used or t is None or a is None:
-                continue
-            sigma = np.sqrt(np.diagonal(o.cov)[3 * k : 3 * k + 3])
-            x = np.where(np.isfinite(sigma), o.values[k], np.nan)
-            named = dict(zip((f"sigma_{i}_mm" for i in AXES), _texts(sigma / MM), strict=True))
-            rows.append({"kind": kind, "from_id": a or t, "to_id": t if a else "", **_xyz(x), **named})
-    for distance in survey.distances:
-        a, b = point_of(distance.a), point_of(distance.b)
-        if distance.used and a is not None and b is not None:
-            rows.append({"kind": "slope_distance", "id": distance.distance_id, "from_id": a, "to_id": b,
-                         "value_m": repr(distance.value), "sigma_mm": repr(distance.sigma / MM)})  # fmt: skip
+def _vector_rows(survey: Survey) -> list[dict[str, str]]:
+    rows = []
+    baselines, coordinates = triples_of(survey)
+    for t in (*baselines, *coordinates):
+        sigma = np.sqrt(np.diagonal(t.cov)).reshape(-1, 3)
+        for k, to in enumerate(t.to):
+            ends = {"from_id": t.at[k], "to_id": to} if t.at else {"from_id": to}
+            named = dict(zip((f"sigma_{i}_mm" for i in AXES), _texts(sigma[k] / MM), strict=True))
+            x = np.where(np.isfinite(sigma[k]), t.values[k], np.nan)
+            kind = "coordinate_difference" if t.at else "coordinates"
+            rows.append({"kind": kind, **ends, **_xyz(x), **named})
     return rows
 
 

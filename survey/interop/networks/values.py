@@ -1,6 +1,6 @@
 """A terrestrial network on its way out of the program: the survey, where its points are, and how well that is known."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -47,6 +47,48 @@ def between_points(reading: Reading) -> bool:
     """Whether all ends of a reading are world points."""
     ends = (reading.at, reading.to, *([reading.second] if reading.second else []))
     return all(point_of(e) is not None for e in ends)
+
+
+def readings_of(survey: Survey) -> list[Reading]:
+    """Readings in use between world points; distances among them, of no instrument."""
+    names = {r.reading_id for r in survey.readings}
+    found = [r for r in survey.readings if r.used]
+    for d in survey.distances:
+        name = f"distance-{d.distance_id}" if d.distance_id in names else d.distance_id
+        found += [Reading(name, "slope_distance", d.a, d.b, d.value, d.sigma)] if d.used else []
+    return [r for r in found if between_points(r)]
+
+
+@dataclass(frozen=True, eq=False)
+class Triples:
+    """Baselines from ``at`` to ``to``, or coordinates of ``to`` (n): values (n, 3) m, cov (3n, 3n), inf: unobserved."""
+
+    at: tuple[str, ...]
+    to: tuple[str, ...]
+    values: FloatArray
+    cov: FloatArray
+
+
+def triples_of(survey: Survey, priors: bool = False) -> tuple[list[Triples], list[Triples]]:
+    """Baselines and coordinates in use of world points; priors: those of points among the latter."""
+    differences, coordinates = [], []
+    for d in survey.coordinate_differences:
+        at, to = _world(d.at), _world(d.to)
+        if d.used and len(at) == len(to) == len(d.values):
+            differences.append(Triples(at, to, d.values, d.cov))
+    for c in survey.coordinates:
+        to = _world(c.positions)
+        if c.used and len(to) == len(c.values):
+            coordinates.append(Triples((), to, c.values, c.cov))
+    for point in survey.points if priors else ():
+        x = point.x_in_world
+        if x.treatment == "prior" and x.value is not None and x.prior_cov is not None:
+            coordinates.append(Triples((), (point.point_id,), x.value[None], x.prior_cov))
+    return differences, coordinates
+
+
+def _world(positions: Iterable[PositionRef]) -> tuple[str, ...]:
+    return tuple(name for p in positions if (name := point_of(p)) is not None)
 
 
 def left_out(survey: Survey) -> tuple[str, ...]:

@@ -35,10 +35,10 @@ class _Row:
 def read_dbat(path: Path) -> ForeignNetwork:
     """A network from a DBAT script. Raises SurveyError with file and line for what cannot be read."""
     root = read_xml(path, "document")
-    source = _child(root, "input")
+    source = root.one("input")
     listed = _table(source, "images", "id path")
     images = {row.words["id"]: Path(row.words["path"].replace("\\", "/")).stem for row in listed}
-    camera = _camera(source, _child(root, "operations"))
+    camera = _camera(source, root.one("operations"))
     control = [_control(row) for row in _table(source, "ctrl_pts", "id x y z", optional=True)]
     points = {p.point_id: p for p in control}
     rows: dict[tuple[str, str], list[tuple[str, float, float, float]]] = {}
@@ -68,33 +68,22 @@ def _datum(points: list[Point]) -> Datum:
 
 
 def _title(root: Element, path: Path) -> str:
-    metas = [e for e in root.children if e.tag == "meta"]
-    names = [e.text.strip() for meta in metas for e in meta.children if e.tag == "name"]
+    names = [e.text.strip() for meta in root.all("meta") for e in meta.all("name")]
     return names[0] if names else path.stem
 
 
-def _child(parent: Element, tag: str) -> Element:
-    found = [e for e in parent.children if e.tag == tag]
-    if len(found) != 1:
-        raise parent.error(f"expected one <{tag}>, found {len(found)}; correct it")
-    return found[0]
-
-
 def _text(parent: Element, tag: str, default: str | None = None) -> str:
-    found = [e for e in parent.children if e.tag == tag]
-    if not found and default is not None:
+    if default is not None and not parent.all(tag):
         return default
-    return _child(parent, tag).text.strip()
+    return parent.one(tag).text.strip()
 
 
 def _table(source: Element, tag: str, needed: str, optional: bool = False) -> list[_Row]:
     """The rows of all files that <tag> names, by the columns of their format."""
-    if optional and not any(e.tag == tag for e in source.children):
+    if optional and not source.all(tag):
         return []
     rows = []
-    for file in _child(source, tag).children:
-        if file.tag != "file":
-            continue
+    for file in source.one(tag).all("file"):
         columns = [c.strip() for c in file.get("format").split(",")]
         for column in columns:
             if column not in _COLUMNS:
@@ -132,7 +121,7 @@ def _control(row: _Row) -> Point:
 
 
 def _camera(source: Element, operations: Element) -> tuple[Camera, Station]:
-    cameras = [e for e in _child(source, "cameras").children if e.tag == "camera"]
+    cameras = source.one("cameras").all("camera")
     if len(cameras) != 1:
         raise source.error(f"expected one <camera> written out in the script, found {len(cameras)}")
     camera = cameras[0]
@@ -168,8 +157,8 @@ def _pixel_mm(camera: Element, size: tuple[int, int]) -> float:
 
 def _free(camera: Element, operations: Element) -> tuple[str, ...]:
     """The lens parameters that the script estimates."""
-    wanted = [p for o in operations.children for p in o.children if p.tag == "set_bundle_estimate_params"]
-    flags = {e.tag: e.text.strip() for p in wanted for io in p.children if io.tag == "io" for e in io.children}
+    wanted = [p for o in operations.children for p in o.all("set_bundle_estimate_params")]
+    flags = {e.tag: e.text.strip() for p in wanted for io in p.all("io") for e in io.children}
     names = dict(_FREE)
     for tag, letter in (("nK", "K"), ("nP", "P")):
         n = int(number(_text(camera, tag, "0"), tag, camera.where))
@@ -184,7 +173,7 @@ def _free(camera: Element, operations: Element) -> tuple[str, ...]:
 
 
 def _least_rays(root: Element) -> int:
-    for operation in _child(root, "operations").children:
+    for operation in root.one("operations").children:
         if operation.text.strip() == "check_ray_count":
             return max(2, int(operation.number("min_rays", 2.0)))
     return 2

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from adjust.model.errors import SurveyError
 from survey.folder.replacing import changing, replace_parts
-from survey.jobs.detecting import detect_in, detect_job, remember_images
+from survey.jobs.detecting.job import detect_in, detect_job, remember_images
 from survey.project import read
 from survey.project.project import RESULTS
 from survey.report.language import ENGLISH_PAGE, ReportOptions
@@ -71,9 +71,7 @@ def adjust_job(
     return outcome.at(target)
 
 
-def _load(images: bool) -> None:
+def _load() -> None:
     """What large tables are read with, and their project adjusted and tested."""
-    algebra = ("scipy.linalg",) if images else ()
-    jobs = ("survey.jobs.adjusting.outcome", "survey.jobs.adjusting.steps")
-    for name in ("pyarrow.csv", "scipy.special", *algebra, *jobs):
+    for name in ("pyarrow.csv", "scipy.special", "survey.jobs.adjusting.outcome", "survey.jobs.adjusting.steps"):
         import_module(name)

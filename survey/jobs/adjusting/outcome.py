@@ -1,8 +1,6 @@
 """What becomes of an adjusted project: its statistics, its result files, its place among the runs."""
 
-import platform
 from dataclasses import asdict, dataclass, field, replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -11,19 +9,18 @@ from adjust.model.result import Adjustment
 from adjust.native.parallel import Beside
 from survey.folder.replacing import replace_parts
 from survey.folder.text import atomic_write, time_text
-from survey.jobs.detecting import author_name
+from survey.jobs.excluding import author_name
 from survey.project import Project
 from survey.project.project import RESULTS
 from survey.report.language import ENGLISH_PAGE, ReportOptions
 from survey.report.results import RunInfo, begun_results, finished_results, summary_text
 from survey.report.unsolved import JSON, PAGE, unsolved_files
-from survey.solution.earlier.runs import Clock, plain_name, record_run
+from survey.solution.earlier.runs import Clock, installed_versions, plain_name, record_run
 from survey.solution.quantities import USUAL, scale_of
 from survey.solution.statistics import Statistics, statistics_of
 
 UNSOLVED = (JSON, PAGE)
 """Files of an adjustment that failed."""
-_PACKAGES = ("labsurvey", "gtsam", "numpy", "scipy", "opencv-contrib-python-headless")
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,21 +104,11 @@ def made(
 
 def run_info(project: Project, seconds: dict[str, float], command: str = "") -> RunInfo:
     """What was run, for result files. command: as it was given."""
-    versions = {"python": platform.python_version()}
-    for package in _PACKAGES:
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            continue
     chosen = replace(project.options, tolerances=(), identification=())
     options = {k: v for k, v in asdict(chosen).items() if v not in ((), None)} | {"datum": project.survey.datum.kind}
-    date = time_text()
-    name = plain_name(project.folder)
-    said = project.options.identification
-    sigmas = project.options.sigmas or USUAL
-    images = {"/".join(key): entry for key, entry in project.detected.items() if key in project.images}
     return RunInfo(
-        name, project.title, project.inputs, options, versions, date, seconds, sigmas, said, command=command,
-        images=images, left_out=project.left_out, n_left_out=project.n_left_out,
-        n_unused_in_files=project.n_unused_in_files,
+        plain_name(project.folder), project.title, project.inputs, options, installed_versions(), time_text(), seconds,
+        project.options.sigmas or USUAL, project.options.identification, command,
+        {"/".join(key): entry for key, entry in project.detected.items() if key in project.images},
+        project.left_out, project.n_left_out, project.n_unused_in_files,
     )  # fmt: skip

@@ -14,12 +14,11 @@ from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.subsets import with_points
 from adjust.model.survey import Survey
-from adjust.statistics.outliers.supported import lost_notes, supported
-from adjust.statistics.outliers.undetermined_points import without_lost_points
+from adjust.statistics.outliers.supported import lost_notes, supported, without_lost_points
 from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
-from survey.jobs.adjusting.image_defects import blurred, defect_warnings
 from survey.jobs.adjusting.probable_causes import explaining, with_probable_causes
 from survey.jobs.adjusting.symmetric_boards import consistent_turns
+from survey.jobs.detecting.image_defects import blurred, defect_warnings
 from survey.jobs.identify import identify_spots, without_points
 from survey.project import Project
 from survey.project.detected import DetectedImage

@@ -9,11 +9,12 @@ from adjust.model.errors import DiagnosedError, SurveyError
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write
 from survey.jobs.adjusting.edits import changed_files, left_out
-from survey.jobs.adjusting.image_defects import blurred
 from survey.jobs.adjusting.steps import adjust_project
+from survey.jobs.detecting.image_defects import blurred
 from survey.jobs.excluding import FILE, new_rows
 from survey.project import read
 from survey.project.exclusions import appended
+from survey.project.finding import find
 from survey.project.observed import Observed
 from survey.project.project import Project
 from survey.project.reading import read_all
@@ -82,7 +83,7 @@ def _readable(folder: Path, texts: Mapping[str, str]) -> Project:
 def in_use(now: Project, names: Sequence[str]) -> tuple[str, ...]:
     """Those names of which something is not left out already, by people or in a table."""
     observed = Observed(now.survey, now.spots)
-    return tuple(name for name in names if observed.is_used(observed.find(name)))
+    return tuple(name for name in names if observed.is_used(find(observed, name)))
 
 
 def reason_of(chosen: Hypothesis) -> str:

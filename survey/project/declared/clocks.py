@@ -5,9 +5,9 @@ from typing import Any
 
 from adjust.model.errors import SurveyError
 from adjust.model.survey import Clock, VectorParameter
-from survey.folder.units import from_si
 from survey.project.declared.bodies import CLOCK_UNITS
 from survey.project.declared.node import Node
+from survey.project.declared.toml_text import in_units
 from survey.project.declared.vectors import key_of, read_vector, vector_to_toml
 
 
@@ -43,8 +43,7 @@ def clock_to_toml(clock: Clock | None, timed: bool, where: str) -> dict[str, Any
     table = {key: value for key, value in vector_to_toml(clock.parameters, units, where).items() if key not in zero}
     if not timed and table.keys() - {"free"}:
         raise SurveyError(f"{where}: has values, but the times of the epochs are not known; give them")
-    if clock.jitter > 0.0:
-        table |= {"jitter_ms": float(from_si(clock.jitter, "ms"))} if timed else {"jitter_intervals": clock.jitter}
+    table |= in_units(**{"jitter_ms" if timed else "jitter_intervals": clock.jitter or None})
     return {"clock": table}
 
 

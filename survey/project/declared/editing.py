@@ -16,8 +16,9 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Estimate
 from adjust.model.survey import Survey
 from survey.folder.units import from_si
-from survey.project.declared.owners import geometry_key, geometry_unit
+from survey.project.declared.owners import geometry_units
 from survey.project.declared.poses import quaternion_wxyz
+from survey.project.declared.vectors import key_of
 
 LENGTHS = ("square_mm", "marker_mm", "gap_mm", "markers")
 """The keys of a target that say how large it is."""
@@ -85,25 +86,24 @@ def with_sigma_scale(text: str, group: str, factor: float) -> str:
     """With the factor on all sigmas of a group ([sigmas.scale]); 1 takes it out. Raises SurveyError."""
     if not (np.isfinite(factor) and factor > 0.0):
         raise SurveyError(f"group {group}: the factor of its sigmas is {factor:g}; it must be positive")
-    document: Any = tomlkit.parse(text)
-    scale = _table(document, "sigmas", "scale")
-    if factor == 1.0:
-        scale.pop(group, None)
-    else:
-        scale[group] = float(factor)
-    return tomlkit.dumps(document)
+    return _with_keys(text, ("sigmas", "scale"), {group: None if factor == 1.0 else float(factor)})
 
 
 def with_datum(text: str, kind: str, points: Sequence[str] = (), stations: Sequence[str] = ()) -> str:
     """With this datum ([datum]): ``given``, or ``inner`` over these points and stations, over all where none."""
+    named = {key: list(names) or None for key, names in (("points", points), ("stations", stations))}
+    return _with_keys(text, ("datum",), {"kind": kind, **(named if kind == "inner" else dict.fromkeys(named))})
+
+
+def _with_keys(text: str, path: Sequence[str], keys: Mapping[str, object]) -> str:
+    """With these keys in the table at a path, without those that are None."""
     document: Any = tomlkit.parse(text)
-    datum = _table(document, "datum")
-    datum["kind"] = kind
-    for key, names in (("points", points), ("stations", stations)):
-        if names and kind == "inner":
-            datum[key] = list(names)
+    table = _table(document, *path)
+    for key, value in keys.items():
+        if value is None:
+            table.pop(key, None)
         else:
-            datum.pop(key, None)
+            table[key] = value
     return tomlkit.dumps(document)
 
 
@@ -154,8 +154,9 @@ def _of_vector(document: Any, estimate: Estimate, component: str, treatment: str
         return
     values = dict(zip(names, np.asarray(estimate.value, dtype=float).tolist(), strict=True))
     if kind == "table_geometry":
-        for key in wanted:
-            entry[geometry_key(key)] = float(from_si(values[key], geometry_unit(key)))
+        units = geometry_units(wanted)
+        for key, unit in units.items():
+            entry[key_of(key, units)] = float(from_si(values[key], unit))
         return
     known = _table(entry, "values")
     for key in values if not known else wanted:

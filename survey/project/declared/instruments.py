@@ -11,7 +11,7 @@ from survey.folder.text import suggestion
 from survey.folder.units import from_si
 from survey.project.declared.declarations import BEAM_UNITS, INSTRUMENT_UNITS, SURFACE_UNITS, TILT_UNITS
 from survey.project.declared.node import Node
-from survey.project.declared.toml_text import Section
+from survey.project.declared.toml_text import Section, in_units
 from survey.project.declared.vectors import read_vector, vector_keys, vector_to_toml
 from survey.project.project import Accuracy
 
@@ -84,14 +84,12 @@ def read_setups(root: Node, instruments: tuple[str, ...], accuracies: Mapping[st
 def vertical_sections(vertical: Vertical, bearings: Bearings) -> list[Section]:
     """[vertical] and [bearings], where they are not as usual."""
     sections: list[Section] = []
-    tilt = vector_to_toml(vertical.tilt, TILT_UNITS, "vertical")
-    usual = Vertical()
     plain = not vertical.tilt.free and not np.any(vertical.tilt.values) and vertical.radius is None
-    if not plain or not np.array_equal(vertical.up_in_world, usual.up_in_world):
-        radius = {} if vertical.radius is None else {"radius_m": vertical.radius}
-        sections.append((("vertical",), {"up_in_world": vertical.up_in_world.tolist(), **radius, **tilt}))
+    if not plain or not np.array_equal(vertical.up_in_world, Vertical().up_in_world):
+        tilt = vector_to_toml(vertical.tilt, TILT_UNITS, "vertical")
+        sections.append((("vertical",), in_units(up_in_world=vertical.up_in_world, radius_m=vertical.radius) | tilt))
     if bearings != Bearings():
-        sections.append((("bearings",), {"zero": bearings.zero, "clockwise": bearings.clockwise}))
+        sections.append((("bearings",), asdict(bearings)))
     return sections
 
 
@@ -102,19 +100,15 @@ def instrument_sections(
     sections: list[Section] = []
     for instrument in instruments:
         path = ("instruments", instrument.instrument_id)
-        values = vector_to_toml(instrument.parameters, INSTRUMENT_UNITS, ".".join(path))
         given = asdict(accuracies[instrument.instrument_id]) if instrument.instrument_id in accuracies else {}
-        for name, sigma in given.items():
-            if sigma:
-                key, units = _ACCURACY[name]
-                values[f"{key}_{units[0]}"] = float(from_si(sigma, units[0]))
+        keys = {f"{_ACCURACY[name][0]}_{_ACCURACY[name][1][0]}": sigma or None for name, sigma in given.items()}
+        values = vector_to_toml(instrument.parameters, INSTRUMENT_UNITS, ".".join(path)) | in_units(**keys)
         sections.append((path, values))
-    for setup in setups:
-        values = {} if setup.instrument_id is None else {"instrument": setup.instrument_id}
-        values |= {"levelled": setup.levelled, "sigma_centring_mm": float(from_si(setup.centring_sigma, "mm"))}
-        values["sigma_height_mm"] = float(from_si(setup.height_sigma, "mm"))
-        sections.append((("setups", setup.setup_id), values))
-    return sections
+    return sections + [
+        (("setups", x.setup_id), in_units(instrument=x.instrument_id, levelled=x.levelled,
+                                          sigma_centring_mm=x.centring_sigma, sigma_height_mm=x.height_sigma))
+        for x in setups
+    ]  # fmt: skip
 
 
 def setup_problem(setup_id: str, setups: tuple[Setup, ...]) -> str | None:
@@ -175,10 +169,8 @@ def body_sections(beams: tuple[Beam, ...], surfaces: tuple[Surface, ...]) -> lis
         values: dict[str, Any] = {beam.carrier_kind: beam.carrier_id, "axis": beam.axis}
         sections.append((path, values | vector_to_toml(beam.parameters, BEAM_UNITS, ".".join(path))))
     for surface in surfaces:
-        path = ("surfaces", surface.surface_id)
-        values = {"kind": surface.kind}
-        if surface.reference is not None and surface.kind in _REFERENCE:
-            values[_REFERENCE[surface.kind]] = np.asarray(surface.reference).tolist()
+        path, key = ("surfaces", surface.surface_id), _REFERENCE.get(surface.kind)
+        values = in_units(kind=surface.kind, **({} if key is None else {key: surface.reference}))
         if surface.parameters is not None:
             values |= vector_to_toml(surface.parameters, SURFACE_UNITS[surface.kind], ".".join(path))
         sections.append((path, values))

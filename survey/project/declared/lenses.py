@@ -8,6 +8,7 @@ from adjust.lenses.models import MODELS
 from adjust.model.survey import FloatArray, ImageCrop, LensDrift, LensParameter, LensSharing, Tie, VectorPrior
 from survey.project.declared.bodies import CROP_UNITS
 from survey.project.declared.node import Node
+from survey.project.declared.toml_text import in_units
 from survey.project.declared.vectors import read_vector, vector_to_toml
 from survey.project.tables.covariance import covariance_problem
 
@@ -143,46 +144,32 @@ def _ties(node: Node, names: tuple[str, ...], free: tuple[str, ...]) -> tuple[Ti
 
 def lens_to_toml(lens: LensParameter) -> dict[str, Any]:
     """The table that ``read_lens`` reads."""
-    names = MODELS[lens.model].names
+    names, prior = MODELS[lens.model].names, lens.prior
     table: dict[str, Any] = {"model": lens.model, "free": list(lens.free)}
     if lens.values is not None:
         table["values"] = dict(zip(names, lens.values.tolist(), strict=True))
-    if lens.prior is not None:
-        is_diagonal = not (lens.prior.cov - np.diag(np.diagonal(lens.prior.cov))).any()
-        sigmas = np.sqrt(np.diagonal(lens.prior.cov)).tolist()
-        means = lens.prior.mean.tolist()
-        table["prior"] = {
-            name: {"value": mean, "sigma": sigma} if is_diagonal else {"value": mean}
-            for name, mean, sigma in zip(lens.prior.names, means, sigmas, strict=True)
-        }
-        if not is_diagonal:
-            table["prior_covariance"] = lens.prior.cov.tolist()
-    if lens.ties:
-        table["tie"] = {tie.name: {"to": tie.to, "factor": tie.factor} for tie in lens.ties}
+    if prior is not None:
+        alone = not (prior.cov - np.diag(np.diagonal(prior.cov))).any()
+        rows = zip(prior.names, prior.mean.tolist(), np.sqrt(np.diagonal(prior.cov)).tolist(), strict=True)
+        table["prior"] = {name: {"value": x} | ({"sigma": sigma} if alone else {}) for name, x, sigma in rows}
+        table |= {} if alone else {"prior_covariance": prior.cov.tolist()}
     if lens.pixel_size_mm is not None:
         table["pixel_size_mm"] = lens.pixel_size_mm
     if lens.balance_radius_mm:
         table["balance_radius_mm"] = lens.balance_radius_mm
-    if lens.drift is not None:
-        table["drift"] = _drift_to_toml(lens.drift)
-    if lens.shared is not None:
-        table["shared"] = {"camera": lens.shared.camera_id, "parameters": list(lens.shared.parameters)}
-    if lens.crops:
-        table["crops"] = {epoch: _crop_to_toml(epoch, crop) for epoch, crop in lens.crops.items()}
-    return table
-
-
-def _crop_to_toml(epoch: str, crop: ImageCrop) -> dict[str, Any]:
-    table = vector_to_toml(crop.parameters, CROP_UNITS, f"crop at epoch {epoch}")
-    table["free"] = list(table["free"])
-    return table | ({} if crop.size is None else {"size_px": list(crop.size)})
+    shared, crops = lens.shared, lens.crops.items()
+    return table | in_units(
+        tie={tie.name: {"to": tie.to, "factor": tie.factor} for tie in lens.ties},
+        drift=None if lens.drift is None else _drift_to_toml(lens.drift),
+        shared=None if shared is None else {"camera": shared.camera_id, "parameters": list(shared.parameters)},
+        crops={epoch: vector_to_toml(crop.parameters, CROP_UNITS, f"crop at epoch {epoch}")
+               | in_units(size_px=crop.size) for epoch, crop in crops},
+    )  # fmt: skip
 
 
 def _drift_to_toml(drift: LensDrift) -> dict[str, Any]:
     out: dict[str, Any] = {"parameters": list(drift.parameters)}
     if drift.reference_temperature is not None:
         return out | {"with_temperature": True, "reference_degC": drift.reference_temperature}
-    out["begins"] = list(drift.begins)
-    if drift.step_sigmas is not None:
-        out["sigma"] = dict(zip(drift.parameters, drift.step_sigmas.tolist(), strict=True))
-    return out
+    steps = () if drift.step_sigmas is None else zip(drift.parameters, drift.step_sigmas.tolist(), strict=True)
+    return out | {"begins": list(drift.begins)} | in_units(sigma=dict(steps))

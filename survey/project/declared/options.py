@@ -12,7 +12,7 @@ from adjust.model.tables import unit_of
 from survey.folder.units import from_si, to_si
 from survey.project.declared.node import Node
 from survey.project.declared.poses import quaternion_wxyz, read_rotation
-from survey.project.declared.toml_text import Section
+from survey.project.declared.toml_text import Section, in_units
 from survey.project.project import (
     DEMANDED,
     POSITION,
@@ -84,17 +84,13 @@ def tolerance_sections(tolerances: tuple[Tolerance, ...]) -> list[Section]:
     """The inverse of :func:`read_options`; components are written in the unit that their name has in results."""
     sections: list[Section] = []
     for x in tolerances:
-        values: dict[str, Any] = {"of": x.of} | ({"ids": x.ids} if x.ids else {})
+        values: dict[str, Any] = in_units(of=x.of, ids=x.ids)
         if x.quantity in _SAID:
-            unit = _SAID[x.quantity][0]
-            values[f"expanded_{unit}"] = None if x.expanded is None else float(from_si(x.expanded, unit))
+            values |= in_units(**{f"expanded_{_SAID[x.quantity][0]}": x.expanded})
         else:
-            values["component"] = x.quantity
-            unit = _unit_of(x)
-            for key, value in (("expanded", x.expanded), ("nominal", x.nominal), ("tolerance", x.within)):
-                if value is not None:
-                    shown = value if unit in ("px", "1") else float(from_si(value, unit))
-                    values[key if unit == "1" else f"{key}_{unit}"] = shown
+            said, unit = {"expanded": x.expanded, "nominal": x.nominal, "tolerance": x.within}, _unit_of(x)
+            keys = {key if unit == "1" else f"{key}_{unit}": value for key, value in said.items()}
+            values |= {"component": x.quantity} | in_units(**keys)
         sections.append((("tolerances", x.name), values))
     return sections
 
@@ -127,13 +123,9 @@ def _closure(name: str, node: Node) -> Closure:
 
 def closure_sections(closures: tuple[Closure, ...]) -> list[Section]:
     """The inverse of :func:`read_options`."""
-    return [
-        (("closures", c.closure_id), {
-            "pairs": c.pair_ids, "sigma_arcsec": float(from_si(c.rotation_sigma, "arcsec")),
-            "sigma_mm": float(from_si(c.translation_sigma, "mm")),
-        })
-        for c in closures
-    ]  # fmt: skip
+    return [(("closures", c.closure_id),
+             in_units(pairs=c.pair_ids, sigma_arcsec=c.rotation_sigma, sigma_mm=c.translation_sigma))
+            for c in closures]  # fmt: skip
 
 
 def read_alignment_tasks(root: Node, survey: Survey) -> tuple[AlignmentTask, ...]:
@@ -157,14 +149,12 @@ def task_sections(tasks: Iterable[AlignmentTask]) -> list[Section]:
     """The tables that ``read_alignment_tasks`` reads."""
     sections: list[Section] = []
     for task in tasks:
-        values: dict[str, Any] = {"body": frame_text(task.body), "onto": frame_text(task.onto)}
-        if not task.onto_from_body.equals(Rot3(), 0.0):
-            values["rotation_quaternion_wxyz"] = quaternion_wxyz(task.onto_from_body)
-        if task.feet:
-            values["feet_mm"] = {f.name: from_si([f.x, f.y], "mm").tolist() for f in task.feet}
-        if task.pitch is not None:
-            values["pitch_mm"] = float(from_si(task.pitch, "mm"))
-        if task.tolerance is not None:
-            values["tolerance_arcsec"] = float(from_si(task.tolerance, "arcsec"))
+        turned = not task.onto_from_body.equals(Rot3(), 0.0)
+        values = in_units(
+            body=frame_text(task.body), onto=frame_text(task.onto),
+            rotation_quaternion_wxyz=quaternion_wxyz(task.onto_from_body) if turned else None,
+            feet_mm={f.name: from_si([f.x, f.y], "mm").tolist() for f in task.feet}, pitch_mm=task.pitch,
+            tolerance_arcsec=task.tolerance,
+        )  # fmt: skip
         sections.append((("align", task.task_id), values))
     return sections

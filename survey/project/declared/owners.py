@@ -1,8 +1,7 @@
 """Cameras, stations and tables of ``survey.toml``."""
 
+from collections.abc import Iterable
 from typing import Literal
-
-import numpy as np
 
 from adjust.lenses.crops import crop_size
 from adjust.model.survey import (
@@ -13,13 +12,13 @@ from adjust.model.survey import (
     Station,
     Table,
     VectorParameter,
-    VectorPrior,
 )
 from adjust.model.tables import HARMONICS, HIGHEST, harmonic_names, in_order, unit_of
 from survey.project.declared.clocks import read_clock
 from survey.project.declared.lenses import read_lens, read_size
 from survey.project.declared.node import Node
 from survey.project.declared.poses import read_pose
+from survey.project.declared.vectors import key_of, read_vector
 
 _GEOMETRY_UNITS = {"non_orthogonality": "arcsec", "axis_offset": "mm", "zero_1": "deg", "zero_2": "deg"}
 
@@ -94,37 +93,24 @@ def read_tables(root: Node, timed: bool) -> tuple[tuple[Table, ...], dict[str, F
     return tuple(tables), sigmas
 
 
-def geometry_unit(name: str) -> str:
-    """The unit of a geometry parameter in a project: of harmonics arcsec or mm."""
-    return _GEOMETRY_UNITS.get(name) or {"rad": "arcsec", "m": "mm"}[unit_of(name)]
-
-
-def geometry_key(name: str) -> str:
-    """The key of a geometry parameter: its name with the unit."""
-    return f"{name}_{geometry_unit(name)}"
+def geometry_units(names: Iterable[str]) -> dict[str, str]:
+    """The units of geometry parameters in a project: of harmonics arcsec or mm."""
+    return {name: _GEOMETRY_UNITS.get(name) or {"rad": "arcsec", "m": "mm"}[unit_of(name)] for name in names}
 
 
 def _read_geometry(node: Node, n_axes: int) -> VectorParameter:
+    """Its own parameters always, harmonics where they are free or not zero."""
     base = TABLE_GEOMETRY if n_axes == 2 else ("zero_1",)
     geometry, sigma = node.table("geometry"), node.table("geometry_sigma")
     known = (*base, *(n for kind in HARMONICS for i in range(n_axes) for n in harmonic_names(kind, i, HIGHEST)))
-    keys = {geometry_key(name): name for name in known}
-    geometry.allow("free", *keys)
+    units = geometry_units(known)
+    geometry.allow("free", *(key_of(n, units) for n in known))
+    sigma.allow(*(key_of(n, units) for n in known))
     free = geometry.references("free", known, "table parameter", base[:2] if n_axes == 2 else ())
     free = (*free, *(n for n in _harmonics(node.table("harmonics"), n_axes) if n not in free))
-    values = {name: geometry.si(key, 0.0) for key, name in keys.items()}
-    sigma.allow(*keys)
-    for key in sigma.values:
-        if keys[key] not in free:
-            raise sigma.error(f"{keys[key]} has a sigma but is not free; add it to geometry.free", key)
-    names = tuple(in_order([n for n in known if n in base or n in free or values[n]]))
-    chosen, given = np.array([values[n] for n in names]), tuple(n for n in names if geometry_key(n) in sigma.values)
-    free = tuple(n for n in names if n in free)
-    if not given:
-        return VectorParameter(names, chosen, free)
-    sigmas = np.array([sigma.si(geometry_key(n)) for n in given])
-    mean = np.array([values[name] for name in given])
-    return VectorParameter(names, chosen, free, VectorPrior(given, mean, np.diag(sigmas**2)))
+    asked = in_order([n for n in known if n in base or n in free or geometry.number(key_of(n, units), 0.0)
+                      or sigma.has(key_of(n, units))])  # fmt: skip
+    return read_vector(geometry, geometry_units(asked), (), 0.0, tuple(n for n in asked if n in free), sigma)
 
 
 def _harmonics(node: Node, n_axes: int) -> list[str]:

@@ -23,11 +23,11 @@ from survey.project.declared.clocks import clock_to_toml
 from survey.project.declared.instruments import body_sections, instrument_sections, vertical_sections
 from survey.project.declared.lenses import lens_to_toml
 from survey.project.declared.options import closure_sections, tolerance_sections
-from survey.project.declared.owners import geometry_key, geometry_unit
+from survey.project.declared.owners import geometry_units
 from survey.project.declared.poses import quaternion_wxyz
 from survey.project.declared.targets import board_key
-from survey.project.declared.toml_text import Section
-from survey.project.declared.vectors import check_vector, vector_to_toml
+from survey.project.declared.toml_text import Section, in_units
+from survey.project.declared.vectors import vector_to_toml
 from survey.project.project import FORMAT, AdjustmentOptions, Sigmas, SpotsRequest
 from survey.project.targets import BOARDS, MarkerBlock, PointList, TargetKind
 
@@ -49,67 +49,54 @@ def survey_sections(survey: Survey, kinds: Mapping[str, TargetKind], sigmas: Sig
     sections += vertical_sections(survey.vertical, survey.bearings)
     sections += instrument_sections(survey.instruments, survey.setups, sigmas.instruments)
     sections += body_sections(survey.beams, survey.surfaces)
-    if survey.temperatures:
-        sections.append((("temperatures_degC",), dict(survey.temperatures)))
-    if survey.times:
-        sections.append((("times_s",), dict(survey.times)))
-    datum: dict[str, Any] = {"kind": survey.datum.kind}
-    datum |= {"points": survey.datum.points} if survey.datum.points else {}
-    datum |= {"stations": survey.datum.stations} if survey.datum.stations else {}
-    return [*sections, (("datum",), datum)]
+    for name, by_epoch in (("temperatures_degC", survey.temperatures), ("times_s", survey.times)):
+        if by_epoch:
+            sections.append(((name,), dict(by_epoch)))
+    datum = survey.datum
+    return [*sections, (("datum",), in_units(kind=datum.kind, points=datum.points, stations=datum.stations))]
 
 
 def head_section(title: str, tie_points: bool, survey: Survey) -> Section:
     """The keys before the first table."""
-    step = {} if survey.epoch_interval is None else {"epoch_interval_s": survey.epoch_interval}
-    return (), {"format": FORMAT, "title": title, "tie_points": tie_points, **step}
+    return (), {"format": FORMAT, "title": title, "tie_points": tie_points,
+                **in_units(epoch_interval_s=survey.epoch_interval)}  # fmt: skip
 
 
 def option_sections(options: AdjustmentOptions, request: SpotsRequest | None, sigmas: Sigmas) -> list[Section]:
     """The sections [spots], [sigmas], [adjustment], [closures] and [tolerances]."""
-    sections: list[Section] = []
-    if request is not None:
-        spots: dict[str, Any] = {"cameras": request.cameras, "diameter_px": request.diameter_px}
-        spots["gate_px"] = request.gate_px
-        if request.epochs is not None:
-            spots["epochs"] = request.epochs
-        sections.append((("spots",), spots))
-    if sigmas.image_px is not None:
-        sections.append((("sigmas",), {"image_px": sigmas.image_px}))
-    flags: dict[str, Any] = {"reject_blocks": options.reject_blocks, "reject_points": options.reject_points}
-    flags["reject_pairs"] = options.reject_pairs
-    if options.variance_components:
-        flags["variance_components"] = True
-    if options.sigmas is not None:
-        flags["sigmas"] = options.sigmas
-    if options.pairs != "poses":
-        flags["pairs"] = options.pairs
-    sections.append((("adjustment",), {"alpha": options.alpha, **flags}))
-    sections += closure_sections(options.closures)
-    if options.identification:
-        sections.append((("identification",), dict(options.identification)))
-    return sections + tolerance_sections(options.tolerances)
+    x = options
+    spots = {} if request is None else in_units(
+        cameras=request.cameras, diameter_px=request.diameter_px, gate_px=request.gate_px, epochs=request.epochs
+    )  # fmt: skip
+    adjustment = in_units(
+        alpha=x.alpha, reject_blocks=x.reject_blocks, reject_points=x.reject_points, reject_pairs=x.reject_pairs,
+        variance_components=x.variance_components or None, sigmas=x.sigmas,
+        pairs=None if x.pairs == "poses" else x.pairs,
+    )  # fmt: skip
+    before = [("spots", spots), ("sigmas", in_units(image_px=sigmas.image_px)), ("adjustment", adjustment)]
+    found: list[Section] = [((name,), values) for name, values in before if values] + closure_sections(x.closures)
+    if x.identification:
+        found.append((("identification",), dict(x.identification)))
+    return found + tolerance_sections(x.tolerances)
 
 
 def pose_to_toml(pose: PoseParameter, where: str) -> dict[str, Any]:
     """The table that ``read_pose`` reads; empty for a free pose without start."""
-    result: dict[str, Any] = {} if pose.treatment == "free" else {"treatment": pose.treatment}
-    if pose.held:
-        result["held"] = pose.held
-    if pose.value is not None:
-        result["translation_mm"] = from_si(pose.value.translation(), "mm").tolist()
-        result["rotation_quaternion_wxyz"] = quaternion_wxyz(pose.value.rotation())
+    x = pose.value
+    result = in_units(
+        treatment=None if pose.treatment == "free" else pose.treatment, held=pose.held,
+        translation_mm=None if x is None else np.asarray(x.translation()),
+        rotation_quaternion_wxyz=None if x is None else quaternion_wxyz(x.rotation()),
+    )  # fmt: skip
     if pose.treatment != "prior":
         return result
     if pose.prior_cov is None:
         raise SurveyError(f"{where}: a prior without covariance cannot be written; give it one")
     cov = _without_vague_rows(pose.prior_cov)
     if np.count_nonzero(cov) > 6:
-        return {**result, "covariance_rad_m": cov.tolist()}
+        return result | in_units(covariance_rad_m=cov)
     sigma = np.sqrt(np.diagonal(cov))
-    result["sigma_rotation_arcsec"] = from_si(sigma[:3], "arcsec").tolist()
-    result["sigma_translation_mm"] = from_si(sigma[3:], "mm").tolist()
-    return result
+    return result | in_units(sigma_rotation_arcsec=sigma[:3], sigma_translation_mm=sigma[3:])
 
 
 def _without_vague_rows(cov: FloatArray) -> FloatArray:
@@ -128,10 +115,9 @@ def _poses(poses: Mapping[str, PoseParameter], where: str) -> dict[str, Any]:
 
 
 def _epochs(path: tuple[str, ...], poses: Mapping[str, PoseParameter]) -> list[Section]:
-    if not poses:
-        return []
     where = ".".join((*path, "epochs"))
-    return [((*path, "epochs"), {key: pose_to_toml(pose, f"{where}.{key}") for key, pose in poses.items()})]
+    found = {key: pose_to_toml(pose, f"{where}.{key}") for key, pose in poses.items()}
+    return [((*path, "epochs"), found)] if found else []
 
 
 def _camera(camera: Camera, timed: bool) -> list[Section]:
@@ -143,44 +129,32 @@ def _camera(camera: Camera, timed: bool) -> list[Section]:
 
 
 def _station(station: Station, timed: bool) -> list[Section]:
-    path = ("stations", station.station_id)
-    values: dict[str, Any] = {"motion": station.motion}
+    path, on_table = ("stations", station.station_id), station.motion == "table"
     poses = {"world_from_station": station.world_from_station}
-    if station.motion == "table":
-        values["table"] = station.table_id
-        poses["mount_from_station"] = station.mount_from_station
+    poses |= {"mount_from_station": station.mount_from_station} if on_table else {}
+    values = in_units(motion=station.motion, table=station.table_id if on_table else None)
     values |= _poses(poses, ".".join(path)) | clock_to_toml(station.clock, timed, f"{'.'.join(path)}.clock")
     return [(path, values), *_epochs(path, station.epochs)]
 
 
 def _table(table: Table, sigma: FloatArray | None, timed: bool) -> dict[str, Any]:
-    values: dict[str, Any] = {"axes": table.axes}
-    if sigma is not None:
-        values["sigma_arcsec"] = from_si(sigma, "arcsec").tolist()
-    values |= _poses({"world_from_table": table.world_from_table}, f"tables.{table.table_id}")
-    geometry, where = table.geometry, f"tables.{table.table_id}.geometry"
-    check_vector(geometry, where)
-    numbers = {
-        geometry_key(name): float(from_si(value, geometry_unit(name)))
-        for name, value in zip(geometry.names, geometry.values, strict=True)
-    }
-    values["geometry"] = {"free": geometry.free, **numbers}
-    if geometry.prior is not None:
-        sigmas = zip(geometry.prior.names, np.sqrt(np.diagonal(geometry.prior.cov)), strict=True)
-        values["geometry_sigma"] = {geometry_key(n): float(from_si(s, geometry_unit(n))) for n, s in sigmas}
-    return values | clock_to_toml(table.clock, timed, f"tables.{table.table_id}.clock")
+    where = f"tables.{table.table_id}"
+    geometry = vector_to_toml(table.geometry, geometry_units(table.geometry.names), f"{where}.geometry")
+    values = in_units(axes=table.axes, sigma_arcsec=sigma, geometry_sigma=geometry.pop("sigma", None))
+    values |= {"geometry": geometry} | _poses({"world_from_table": table.world_from_table}, where)
+    return values | clock_to_toml(table.clock, timed, f"{where}.clock")
 
 
 def _target(target: Target, kind: TargetKind) -> list[Section]:
-    path = ("targets", target.target_id)
-    values = {**_kind(target.target_id, kind), "motion": target.motion}
-    if target.station_id is not None:
-        values["station"] = target.station_id
-    values |= _poses({"pose": target.carrier_from_target}, ".".join(path))
+    path, warp = ("targets", target.target_id), None
     if target.warp is not None:
+        reference = None if target.reference_temperature == 20.0 else target.reference_temperature
         units = {name: WARP_UNITS[name] for name in target.warp.names}
-        reference = {} if target.reference_temperature == 20.0 else {"reference_degC": target.reference_temperature}
-        values["warp"] = vector_to_toml(target.warp, units, f"targets.{target.target_id}.warp") | reference
+        warp = vector_to_toml(target.warp, units, f"{'.'.join(path)}.warp") | in_units(reference_degC=reference)
+    values = _kind(target.target_id, kind) | in_units(
+        motion=target.motion, station=target.station_id, warp=warp,
+        pose=pose_to_toml(target.carrier_from_target, f"{'.'.join(path)}.pose"),
+    )  # fmt: skip
     return [(path, values), *_epochs(path, target.epochs)]
 
 
@@ -195,20 +169,15 @@ def _kind(target_id: str, kind: TargetKind) -> dict[str, Any]:
     if isinstance(kind, MarkerBlock):
         markers = {str(marker): from_si(kind.corners[marker], "mm").tolist() for marker in sorted(kind.corners)}
         return {"kind": "marker_block", "dictionary": kind.dictionary, "markers": markers}
-    said = {board_key(f.name): getattr(kind, f.name) for f in fields(kind)}
-    said |= {board_key(f.name): float(from_si(getattr(kind, f.name), "mm")) for f in fields(kind) if f.type is float}
-    return {"kind": next(name for name, board in BOARDS.items() if type(kind) is board), **said}
+    name = next(name for name, board in BOARDS.items() if type(kind) is board)
+    return {"kind": name} | in_units(**{board_key(f.name): getattr(kind, f.name) for f in fields(kind)})
 
 
 def _point(point: PointParameter) -> dict[str, Any]:
-    result: dict[str, Any] = {} if point.treatment == "free" else {"treatment": point.treatment}
-    if point.held:
-        result["held"] = point.held
-    if point.value is not None:
-        result["x_mm"] = from_si(point.value, "mm").tolist()
-    if point.treatment == "prior" and point.prior_cov is not None:
-        cov = _without_vague_rows(point.prior_cov)
-        if np.count_nonzero(cov) > 3:
-            return {**result, "covariance_mm2": from_si(cov, "mm2").tolist()}
-        result["sigma_mm"] = from_si(np.sqrt(np.diagonal(cov)), "mm").tolist()
-    return result
+    cov = None if point.prior_cov is None or point.treatment != "prior" else _without_vague_rows(point.prior_cov)
+    correlated = cov is not None and np.count_nonzero(cov) > 3
+    return in_units(
+        treatment=None if point.treatment == "free" else point.treatment, held=point.held, x_mm=point.value,
+        covariance_mm2=cov if correlated else None,
+        sigma_mm=None if cov is None or correlated else np.sqrt(np.diagonal(cov)),
+    )  # fmt: skip

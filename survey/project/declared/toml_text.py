@@ -1,12 +1,16 @@
 """TOML: tables as text, and the lines on which the keys of a text stand."""
 
-import bisect
 import json
 import re
 import tomllib
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
 from typing import Any
+
+import numpy as np
+
+from survey.folder.units import from_si, unit_in
 
 Section = tuple[tuple[str, ...], Mapping[str, Any]]
 
@@ -44,6 +48,13 @@ def _value(value: Any) -> str:
     if isinstance(value, list | tuple):
         return f"[{', '.join(_value(item) for item in value)}]"
     raise TypeError(f"no TOML for {type(value)}")
+
+
+def in_units(**values: Any) -> dict[str, Any]:
+    """Keys with what they hold: numbers in SI as the unit at the end of the key wants them; without what is empty."""
+    found = {key: from_si(x, unit_in(key)).tolist() if isinstance(x, float | np.ndarray) else x
+             for key, x in values.items()}  # fmt: skip
+    return {key: x for key, x in found.items() if x is not None and x not in ((), [], {})}
 
 
 _HEADER = re.compile(r"\[([A-Za-z0-9_-]+(?:\.[A-Za-z0-9_-]+)*)\]")
@@ -120,7 +131,14 @@ def _no_constant(name: str) -> Any:
 _JSON = json.JSONDecoder(object_pairs_hook=_once, parse_constant=_no_constant)
 KeyPath = tuple[str | int, ...]
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
-_SCALAR_END = re.compile(r"[,\]}\n#]")
+_TOKEN = re.compile(
+    r'"""(?:[^"\\]|\\.|"{1,2}(?!"))*"{3,5}'
+    r"|'''(?:[^']|'{1,2}(?!'))*'{3,5}"
+    r'|"(?:[^"\\\n]|\\.)*"'
+    r"|'[^'\n]*'|#[^\n]*|[][{},.=\n]|[^][{},.=\s#\"']+",
+    re.DOTALL,
+)
+_END = (",", "]", "}", "\n", "")
 
 
 def key_lines(text: str) -> dict[KeyPath, int]:
@@ -151,120 +169,85 @@ class KeyLines(Mapping[KeyPath, int]):
 
 
 class _Scanner:
-    """Walks over a valid document; it checks nothing, because ``tomllib`` has."""
+    """Walks over the tokens of a valid document; it checks nothing, because ``tomllib`` has."""
 
     def __init__(self, text: str) -> None:
-        self.text = text
-        self.at = 0
         self.lines: dict[KeyPath, int] = {}
-        self._newlines = [match.start() for match in re.finditer("\n", text)]
         self._items: dict[KeyPath, int] = {}
+        self._tokens, line = deque[tuple[str, int]](), 1
+        for match in _TOKEN.finditer(text):
+            token = match.group()
+            if not token.startswith("#"):
+                self._tokens.append((token, line))
+            line += token.count("\n")
+        self._tokens.append(("", line))
+
+    @property
+    def _next(self) -> str:
+        return self._tokens[0][0]
+
+    def _take(self) -> str:
+        return self._tokens.popleft()[0]
 
     def document(self) -> None:
         table: KeyPath = ()
-        while self._skip_blank():
-            if self.text[self.at] == "[":
+        while self._next:
+            if self._next == "\n":
+                self._take()
+            elif self._next == "[":
                 table = self._header()
             else:
                 self._key_value(table)
 
     def _header(self) -> KeyPath:
-        line = self._line()
-        is_array = self.text.startswith("[[", self.at)
-        self.at += 2 if is_array else 1
+        line, brackets = self._tokens[0][1], 0
+        while self._next == "[":
+            self._take()
+            brackets += 1
         path = self._key()
-        self.at += 2 if is_array else 1
-        if is_array:
-            item = self._items.get(path, -1) + 1
-            self._items[path] = item
-            path = (*path, item)
+        for _ in range(brackets):
+            self._take()
+        if brackets == 2:
+            self._items[path] = self._items.get(path, -1) + 1
+            path = (*path, self._items[path])
         self._record((), path, line)
         return path
 
     def _key_value(self, table: KeyPath) -> None:
-        line = self._line()
+        line = self._tokens[0][1]
         key = self._key()
         self._record(table, key, line)
-        self.at += 1  # the equals sign
+        self._take()  # the equals sign
         self._value(table + key)
 
     def _record(self, table: KeyPath, key: KeyPath, line: int) -> None:
         for length in range(1, len(key) + 1):
             self.lines.setdefault(table + key[:length], line)
 
-    def _line(self) -> int:
-        return bisect.bisect_left(self._newlines, self.at) + 1
-
-    def _skip_blank(self) -> bool:
-        """Go to the next character that is neither blank nor comment; False at the end."""
-        while self.at < len(self.text):
-            character = self.text[self.at]
-            if character == "#":
-                end = self.text.find("\n", self.at)
-                self.at = len(self.text) if end < 0 else end
-            elif character in " \t\n":
-                self.at += 1
-            else:
-                return True
-        return False
-
     def _key(self) -> KeyPath:
         parts: list[str] = []
         while True:
-            self._skip_blank()
-            if self.text[self.at] in "\"'":
-                start = self.at
-                self._string()
-                parts.append(tomllib.loads("k = " + self.text[start : self.at])["k"])
-            else:
-                match = _BARE.match(self.text, self.at)
-                self.at = match.end() if match else self.at + 1
-                parts.append(match.group() if match else "")
-            self._skip_blank()
-            if self.at >= len(self.text) or self.text[self.at] != ".":
+            part = self._take()
+            parts.append(tomllib.loads(f"k = {part}")["k"] if part[0] in "\"'" else part)
+            if self._next != ".":
                 return tuple(parts)
-            self.at += 1
+            self._take()
 
     def _value(self, path: KeyPath) -> None:
-        self._skip_blank()
-        character = self.text[self.at]
-        if character in "\"'":
-            self._string()
-        elif character == "[":
-            self._array(path)
-        elif character == "{":
-            self._inline_table(path)
-        else:
-            end = _SCALAR_END.search(self.text, self.at)
-            self.at = end.start() if end else len(self.text)
-
-    def _string(self) -> None:
-        quote = self.text[self.at]
-        mark = quote * 3 if self.text.startswith(quote * 3, self.at) else quote
-        self.at += len(mark)
-        while not self.text.startswith(mark, self.at):
-            self.at += 2 if quote == '"' and self.text[self.at] == "\\" else 1
-        self.at += len(mark)
-        while len(mark) == 3 and self.text.startswith(quote, self.at):
-            self.at += 1  # quotes may stand before the closing three
-
-    def _array(self, path: KeyPath) -> None:
-        self.at += 1
+        closing = {"[": "]", "{": "}"}.get(self._next)
+        if closing is None:
+            while self._next not in _END:
+                self._take()
+            return
+        self._take()
         item = 0
-        while self._skip_blank() and self.text[self.at] != "]":
-            if self.text[self.at] == ",":
-                self.at += 1
-                continue
-            self.lines.setdefault((*path, item), self._line())
-            self._value((*path, item))
-            item += 1
-        self.at += 1
-
-    def _inline_table(self, path: KeyPath) -> None:
-        self.at += 1
-        while self._skip_blank() and self.text[self.at] != "}":
-            if self.text[self.at] == ",":
-                self.at += 1
-                continue
-            self._key_value(path)
-        self.at += 1
+        while self._next != closing:
+            if self._next in _END:
+                self._take()
+            elif closing == "}":
+                self._key_value(path)
+            else:
+                self.lines.setdefault((*path, item), self._tokens[0][1])
+                self._value((*path, item))
+                item += 1
+        self._take()

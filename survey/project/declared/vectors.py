@@ -29,37 +29,35 @@ def key_of(name: str, units: Units) -> str:
 
 def read_vector(
     node: Node, units: Units, free: tuple[str, ...], missing: float | FloatArray = 0.0,
-    chosen: tuple[str, ...] | None = None,
+    chosen: tuple[str, ...] | None = None, priors: Node | None = None,
 ) -> VectorParameter:  # fmt: skip
     """The parameters of a table; ``free`` where it does not say, ``missing`` for what has no value.
 
-    chosen: those that are free, where the caller has read that.
+    chosen: those that are free, where the caller has read that. priors: the table of sigmas, where it is not ``sigma``.
     """
-    names = tuple(units)
+    names, keys = tuple(units), {key_of(name, units): name for name in units}
     chosen = node.references("free", names, "parameter", free) if chosen is None else chosen
     values = np.full(len(names), missing)
-    for i, name in enumerate(names):
-        if node.has(key_of(name, units)):
-            values[i] = node.si(key_of(name, units))
-    table = node.table("sigma")
-    keys = {key_of(name, units): name for name in names}
+    for i, key in enumerate(keys):
+        if node.has(key):
+            values[i] = node.si(key)
+    table, given = node.table("sigma") if priors is None else priors, dict(zip(names, values.tolist(), strict=True))
     table.allow(*keys)
     for key in table.values:
         if keys[key] not in chosen:
             raise table.error(f"{keys[key]} has a sigma but is not free; add it to free", key)
-        if np.isnan(values[names.index(keys[key])]):
+        if np.isnan(given[keys[key]]):
             raise table.error(f"{keys[key]} has a sigma but no value; add {key}", key)
-    known = tuple(name for name in names if key_of(name, units) in table.values)
+    known = {name: table.si(key, positive=True) for key, name in keys.items() if key in table.values}
     if not known:
         return VectorParameter(names, values, chosen)
-    sigmas = np.array([table.si(key_of(n, units), positive=True) for n in known])
-    mean = np.array([values[names.index(name)] for name in known])
-    return VectorParameter(names, values, chosen, VectorPrior(known, mean, np.diag(sigmas**2)))
+    mean, sigmas = np.array([given[name] for name in known]), np.array(list(known.values()))
+    return VectorParameter(names, values, chosen, VectorPrior(tuple(known), mean, np.diag(sigmas**2)))
 
 
 def vector_to_toml(vector: VectorParameter, units: Units, where: str) -> dict[str, Any]:
     """The keys that ``read_vector`` reads."""
-    check_vector(vector, where)
+    _check(vector, where)
     result: dict[str, Any] = {"free": vector.free}
     for name, value in zip(vector.names, vector.values, strict=True):
         if not np.isnan(value):
@@ -70,7 +68,7 @@ def vector_to_toml(vector: VectorParameter, units: Units, where: str) -> dict[st
     return result
 
 
-def check_vector(vector: VectorParameter, where: str) -> None:
+def _check(vector: VectorParameter, where: str) -> None:
     """Raise for what the format has no words for."""
     prior = vector.prior
     if vector.ties:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from adjust.model.errors import SurveyError
 from adjust.model.survey import BoolArray, FloatArray
-from adjust.native.parallel import workers
+from adjust.native.parallel import side_by_side, workers
 from survey.folder.text import LARGEST_NUMBER, csv_text, utf8
 from survey.project.tables.reading import LARGEST_ROWS, Columns, Layout, TextColumn, check_header, check_rows, first_row
 
@@ -51,12 +51,10 @@ def csv_columns(data: bytes, layout: Layout) -> dict[str, TextColumn | FloatArra
         return None
     if read.num_rows > LARGEST_ROWS:
         return None
-    out: dict[str, TextColumn | FloatArray] = {}
-    for name in header:
-        column = _text(read[name]) if layout.is_text(name) else _numbers(read[name])
-        if column is None or (name in layout.required and _has_blank(column)):
-            return None
-        out[name] = column
+    found = side_by_side(lambda name: _text(read[name]) if layout.is_text(name) else _numbers(read[name]), header)
+    out = {name: column for name, column in zip(header, found, strict=True) if column is not None}
+    if len(out) < len(header) or any(_has_blank(out[name]) for name in layout.required):
+        return None
     return out
 
 

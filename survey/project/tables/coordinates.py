@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from adjust.model.names import natural_key
 from adjust.model.observations import CoordinateDifferences, Coordinates, position_text
@@ -27,23 +28,25 @@ DIFFERENCES = Layout(
 DIFFERENCES_COVARIANCE = Layout(
     "coordinate_differences_covariance", ("a_id", "a_axis", "b_id", "b_axis"), ("covariance_mm2",)
 )
-_ALONE = "\0"  # no id holds this character
-_GROUPS = {"coordinates": "coordinates", "coordinate_differences": "coordinate_difference"}
 
 
 @dataclass(eq=False)
 class _Set:
-    """Rows that are one observation, and the covariances between them (m^2) by (row and axis, row and axis)."""
+    """Rows that are one observation, in the natural order of their names. of_set: its name, blank for a single row.
 
-    name: str
+    entries: the covariances between them (m^2) by (row and axis, row and axis).
+    """
+
+    of_set: str
     rows: list[int] = field(default_factory=list)
     entries: dict[tuple[int, int], float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
 class _Joint:
-    """A set as an observation: rows (n,) in their order, values (n, 3) m, cov (3n, 3n) m^2."""
+    """A set as an observation: rows (n,), values (n, 3) m, cov (3n, 3n) m^2."""
 
+    of_set: str
     rows: list[int]
     values: FloatArray
     cov: FloatArray
@@ -55,116 +58,93 @@ def read_coordinates(table: Table, names: Names, sigmas: Sigmas) -> tuple[Coordi
     """Coordinates sorted by set and position; a row without set_id is an observation of its own."""
     texts = table.text("point_id").values()
     positions = [timed_position(text, names, table.fail(row, "point_id")) for row, text in enumerate(texts)]
-    sets: dict[str, _Set] = {}
-    members: dict[tuple[str, str], int] = {}
-    for row, (set_id, text) in enumerate(zip(table.text("set_id").values(), texts, strict=True)):
-        if (set_id, text) in members:
-            line = table.lines[members[set_id, text]]
-            raise table.error(row, f"point_id: {text!r} stands already in line {line}; remove one, or give set_ids")
-        members[set_id, text] = row
-        sets.setdefault(set_id or f"{_ALONE}{text}", _Set(set_id)).rows.append(row)
-    if table.beside is not None:
-        _add_coordinate_entries(table.beside, sets, members)
-    own = read_triples(table, _XYZ)
-    ordered = [sets[name] for name in sorted(sets, key=natural_key)]
+    found = _joined(table, texts, _XYZ, "coordinates", "point", sigmas)
+    found.sort(key=lambda j: (bool(j.of_set), natural_key(j.of_set)))
     return tuple(
-        Coordinates(tuple(positions[row] for row in j.rows), j.values, j.cov, j.group, j.used, one.name)
-        for one, j in zip(ordered, _joined(table, ordered, texts, own, sigmas, "coordinates"), strict=True)
+        Coordinates(tuple(positions[row] for row in j.rows), j.values, j.cov, j.group, j.used, j.of_set) for j in found
     )
 
 
-def _add_coordinate_entries(extra: Table, sets: Mapping[str, _Set], members: Mapping[tuple[str, str], int]) -> None:
-    """Put the covariances between different points into their sets."""
-    columns = [extra.text(name).values() for name in COORDINATES_COVARIANCE.ids]
-    known = dict.fromkeys(name for name in sets if not name.startswith(_ALONE))
-    values = to_si(extra.numbers("covariance_mm2"), "mm2").tolist()
-    for row, (set_id, a, a_axis, b, b_axis) in enumerate(zip(*columns, strict=True)):
-        extra.require(row, "set_id", "set", set_id, known)
-        for point in (a, b):
-            if (set_id, point) not in members:
-                raise extra.error(row, f"a_id, b_id: set {set_id!r} has no coordinates of {point!r} in coordinates.csv")
-        ends = (a, a_axis, members[set_id, a]), (b, b_axis, members[set_id, b])
-        _enter(extra, row, sets[set_id], ends, values[row], "points")
-
-
-def _enter(
-    extra: Table, row: int, one: _Set, ends: tuple[tuple[str, str, int], tuple[str, str, int]], value: float, what: str
-) -> None:
-    """Put the covariance of two coordinates into a set. ends: name, axis and row of both."""
-    (a, a_axis, i), (b, b_axis, j) = ends
-    if a == b or a_axis not in tuple("xyz") or b_axis not in tuple("xyz"):
-        raise extra.error(row, f"expected two different {what} with axes x, y or z; correct a_id to b_axis")
-    key = 3 * i + "xyz".index(a_axis), 3 * j + "xyz".index(b_axis)
-    if key in one.entries or one.entries.get(key[::-1], value) != value:
-        raise extra.error(row, f"the covariance of {a} {a_axis} and {b} {b_axis} is given twice; keep one")
-    one.entries[key] = value
-
-
 def read_differences(table: Table, names: Names, sigmas: Sigmas) -> tuple[CoordinateDifferences, ...]:
-    """Differences sorted by set and id; a row without set_id is an observation of its own."""
+    """Differences sorted by id, sets by their first; a row without set_id is an observation of its own."""
     ids = table.unique_ids("difference_id")
-    own = read_triples(table, _DIFFERENCE)
     ends = [read_ends(table, row, pair, names, "difference") for row, pair in enumerate(
         zip(table.text("from_id").values(), table.text("to_id").values(), strict=True))]  # fmt: skip
-    sets: dict[tuple[str, str], _Set] = {}
-    of_row = {}
-    for row, set_id in enumerate(table.text("set_id").values()):
-        of_row[row] = sets.setdefault((set_id, "" if set_id else ids[row]), _Set(set_id))
-        of_row[row].rows.append(row)
-    if table.beside is not None:
-        _add_difference_entries(table.beside, ids, of_row)
-    ordered = list(sets.values())
-    result = [
+    return tuple(
         CoordinateDifferences(
             tuple(ends[row][0] for row in j.rows), tuple(ends[row][1] for row in j.rows), j.values, j.cov,
-            j.group, j.used, one.name or ids[j.rows[0]],
+            j.group, j.used, j.of_set or ids[j.rows[0]],
         )
-        for one, j in zip(ordered, _joined(table, ordered, ids, own, sigmas, "coordinate_differences"), strict=True)
-    ]  # fmt: skip
-    first = [min(natural_key(ids[row]) for row in one.rows) for one in ordered]
-    return tuple(result[k] for k in sorted(range(len(result)), key=first.__getitem__))
+        for j in _joined(table, ids, _DIFFERENCE, "coordinate_difference", "difference", sigmas)
+    )  # fmt: skip
 
 
-def _add_difference_entries(extra: Table, ids: tuple[str, ...], of_row: dict[int, _Set]) -> None:
-    """Put the covariances between different rows into their sets."""
-    row_of = {name: row for row, name in enumerate(ids)}
-    columns = [extra.text(name).values() for name in DIFFERENCES_COVARIANCE.ids]
+def _sets(table: Table, ids: Sequence[str], what: str) -> list[_Set]:
+    """The sets in the natural order of their first rows, with what stands in the table of covariances beside them."""
+    sets: dict[tuple[str, str], _Set] = {}
+    members: dict[tuple[str, str], tuple[_Set, int]] = {}
+    named = table.beside is None or "set_id" in table.beside.layout.ids
+    set_ids = table.text("set_id").values()
+    for row in sorted(range(len(ids)), key=lambda row: natural_key(ids[row])):
+        of_set, name = set_ids[row], ids[row]
+        one = sets.setdefault((of_set, "" if of_set else name), _Set(of_set))
+        first = members.setdefault((of_set if named else "", name), (one, row))[1]
+        if first != row:
+            line = table.lines[first]
+            raise table.error(row, f"point_id: {name!r} stands already in line {line}; remove one, or give set_ids")
+        one.rows.append(row)
+    if table.beside is not None:
+        _add_entries(table.beside, members, what, named)
+    return list(sets.values())
+
+
+def _add_entries(
+    extra: Table, members: Mapping[tuple[str, str], tuple[_Set, int]], what: str, named: bool
+) -> None:
+    """Put the covariances between different rows into their sets. named: whether the table says of which set."""
+    columns = [extra.text(name).values() for name in ("set_id", "a_id", "a_axis", "b_id", "b_axis")]
     values = to_si(extra.numbers("covariance_mm2"), "mm2").tolist()
-    for row, (a, a_axis, b, b_axis) in enumerate(zip(*columns, strict=True)):
+    for row, (of_set, a, a_axis, b, b_axis) in enumerate(zip(*columns, strict=True)):
+        if named:
+            extra.require(row, "set_id", "set", of_set, dict.fromkeys(known for known, _ in members if known))
         for column, name in (("a_id", a), ("b_id", b)):
-            extra.require(row, column, "difference", name, row_of)
-        if of_row[row_of[a]] is not of_row[row_of[b]]:
+            if (of_set, name) not in members:
+                extra.require(row, column, what, name, [known for where, known in members if where == of_set])
+        (one, i), (other, j) = members[of_set, a], members[of_set, b]
+        if one is not other:
             raise extra.error(row, f"{a!r} and {b!r} are not in one set; give them the same set_id")
-        ends = (a, a_axis, row_of[a]), (b, b_axis, row_of[b])
-        _enter(extra, row, of_row[row_of[a]], ends, values[row], "differences")
+        if a == b or a_axis not in tuple("xyz") or b_axis not in tuple("xyz"):
+            raise extra.error(row, f"expected two different {what}s with axes x, y or z; correct a_id to b_axis")
+        key = 3 * i + "xyz".index(a_axis), 3 * j + "xyz".index(b_axis)
+        if key in one.entries or one.entries.get(key[::-1], values[row]) != values[row]:
+            raise extra.error(row, f"the covariance of {a} {a_axis} and {b} {b_axis} is given twice; keep one")
+        one.entries[key] = values[row]
 
 
 def _joined(
-    table: Table, sets: Iterable[_Set], ids: Sequence[str], own: tuple[FloatArray, FloatArray], sigmas: Sigmas,
-    kind: str,
-) -> list[_Joint]:  # fmt: skip
-    """The sets with their rows in natural order of ``ids``. own: values and covariances of all rows by themselves.
+    table: Table, ids: Sequence[str], columns: tuple[str, ...], kind: str, what: str, sigmas: Sigmas
+) -> list[_Joint]:
+    """The sets as observations. columns: of values, sigmas and correlations; what: the rows are, for messages.
 
     Raises SurveyError for a set of different groups, or whose joint covariance is none.
     """
-    groups, used, scale = marks(table, _GROUPS[kind], sigmas.scale)
+    sets, (values, own) = _sets(table, ids, what), read_triples(table, columns)
+    groups, used, scale = marks(table, kind, sigmas.scale)
     out = []
     for one in sets:
-        rows = sorted(one.rows, key=lambda row: natural_key(ids[row]))
+        first, rows = one.rows[0], one.rows
         for row in rows:
-            if (groups[row], used[row]) != (groups[rows[0]], used[rows[0]]):
-                raise table.error(row, f"set {one.name!r} has different 'group' or 'used'; make them the same")
-        cov = np.zeros((3 * len(rows), 3 * len(rows)))
-        for i, row in enumerate(rows):
-            cov[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = own[1][row]
+            if (groups[row], used[row]) != (groups[first], used[first]):
+                raise table.error(row, f"set {one.of_set!r} has different 'group' or 'used'; make them the same")
+        cov = block_diag(*own[rows])
         at = {3 * row + axis: 3 * i + axis for i, row in enumerate(rows) for axis in range(3)}
         for (a, b), value in one.entries.items():
             cov[at[a], at[b]] = cov[at[b], at[a]] = value
         problem = joint_problem(cov) if one.entries else None
         if problem:
-            raise table.error(rows[0], f"set {one.name!r}: {problem}; correct {kind}_covariance")
-        cov[np.isfinite(cov)] *= scale[rows[0]] ** 2
-        out.append(_Joint(rows, own[0][rows], cov, groups[rows[0]], used[rows[0]]))
+            raise table.error(first, f"set {one.of_set!r}: {problem}; correct {table.layout.name}_covariance")
+        cov[np.isfinite(cov)] *= scale[first] ** 2
+        out.append(_Joint(one.of_set, rows, values[rows], cov, groups[first], used[first]))
     return out
 
 

@@ -35,25 +35,22 @@ Chunk = tuple[IntArray, Sequence[Sequence[str]]]
 
 @dataclass(frozen=True, eq=False)
 class Begun:
-    """A table of CSV that is being read: its bytes, their sha256, and its columns as of :func:`csv_columns`."""
+    """A file that is being read: its bytes, and their sha256."""
 
     data: Callable[[], bytes]
     digest: Callable[[], str]
-    columns: Callable[[], dict[str, TextColumn | FloatArray] | None]
 
 
-def begin_tables(folder: Path, layouts: Mapping[str, Layout], beside: Beside) -> dict[Path, Begun]:
-    """The large ones of these tables, read ``beside`` what comes next; none where nothing is done beside it."""
-    paths = [] if beside.alone else sorted(folder.glob("*.csv"))
-    return {path: begun_table(path, layouts[path.stem], beside) for path in paths
-            if path.stem in layouts and path.is_file() and path.stat().st_size >= LARGE}  # fmt: skip
+def large_tables(folder: Path, layouts: Mapping[str, Layout]) -> list[Path]:
+    """Those of these tables that take time to read."""
+    return [path for path in sorted(folder.glob("*.csv"))
+            if path.stem in layouts and path.is_file() and path.stat().st_size >= LARGE]  # fmt: skip
 
 
-def begun_table(path: Path, layout: Layout, beside: Beside, instead: str | None = None) -> Begun:
-    """:func:`read_table`, begun."""
+def begun_table(path: Path, beside: Beside, instead: str | None = None) -> Begun:
+    """:func:`read_table`, begun ``beside`` what comes next."""
     data = beside.of(lambda: content(path) if instead is None else instead.encode())
-    digest = beside.of(lambda: with_digest(data())[1])
-    return Begun(data, digest, beside.of(lambda: csv_columns(data(), layout) if path.suffix == ".csv" else None))
+    return Begun(data, beside.of(lambda: with_digest(data())[1]))
 
 
 def read_table(path: Path, layout: Layout, instead: str | None = None, begun: Begun | None = None) -> Table:
@@ -62,7 +59,7 @@ def read_table(path: Path, layout: Layout, instead: str | None = None, begun: Be
     instead: what is to stand in it, not yet written. begun: what was begun of it.
     """
     with Beside() as beside:
-        return _read(path, layout, begun or begun_table(path, layout, beside, instead))
+        return _read(path, layout, begun or begun_table(path, beside, instead))
 
 
 def _read(path: Path, layout: Layout, begun: Begun) -> Table:
@@ -70,7 +67,7 @@ def _read(path: Path, layout: Layout, begun: Begun) -> Table:
         columns = parquet_columns(path, begun.data(), layout)
         lines = np.arange(1, len(next(iter(columns.values()))) + 1)
         return _table(path, layout, begun.digest(), lines, columns)
-    plain = begun.columns()
+    plain = csv_columns(begun.data(), layout)
     if plain is not None:
         return _table(path, layout, begun.digest(), np.arange(2, len(next(iter(plain.values()))) + 2), plain)
     text = decode(path, begun.data())

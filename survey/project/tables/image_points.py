@@ -1,6 +1,7 @@
 """Tables of image points into one block per camera, epoch and target, without a step per row."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -42,14 +43,16 @@ def read_image_blocks(table: Table, names: Names, sigmas: Sigmas) -> tuple[Image
     cameras, epochs = table.ids("camera_id"), table.ids("epoch_id")
     targets, groups = table.text("target_id"), _groups(table)
     uv, cov = _measured(table, cameras, names, sigmas, groups)
-    point_idx = _point_positions(table, targets, names)
-    seen = one_code(_ranks(cameras), _ranks(epochs), _ranks(targets, blank_last=True))
-    order, ptr = _arranged(table, "point_id", seen, point_idx, _ranks(groups))
+    columns = (cameras, False), (epochs, False), (targets, True), (groups, False)
+    parts: list[Callable[[], IntArray]] = [partial(_point_positions, table, targets, names)]
+    parts += [partial(_ranks, *column) for column in columns]
+    point_idx, *ranks, of_group = side_by_side(lambda part: part(), parts)
+    order, ptr = _arranged(table, "point_id", one_code(*ranks), point_idx, of_group)
     first, used = order[ptr[:-1]], table.flags("used")
     texts = [TextColumn(c.names, c.codes[first]).values() for c in (cameras, epochs, targets, groups)]
     if (order != np.arange(len(order))).any():
         point_idx, uv, cov, used = point_idx[order], uv[order], cov[order], used[order]
-    all_used = np.logical_and.reduceat(used, ptr[:-1]).tolist() if len(first) else []
+    all_used = [True] * len(first) if used.all() else np.logical_and.reduceat(used, ptr[:-1]).tolist()
     blocks = []
     ranges = pairwise(ptr.tolist())
     for (i, j), whole, camera, epoch, target_id, group_name in zip(ranges, all_used, *texts, strict=True):
@@ -89,19 +92,28 @@ def _arranged(table: Table, column: str, seen: IntArray, item: IntArray, group: 
 
     Raises SurveyError where the same item of ``column`` was seen twice.
     """
-    every = one_code(seen, item)
-    order = np.argsort(every, kind="stable")  # of what is in order already, as this program writes it, next to nothing
-    same = np.flatnonzero(np.diff(every[order]) == 0)
+    every, order = one_code(seen, item), np.arange(len(seen))
+    if (every[1:] <= every[:-1]).any():  # not in order already, as this program writes it
+        order = np.argsort(every, kind="stable")
+        _check_once(table, column, every[order], order)
+    block = seen
+    if group.any():
+        block = one_code(seen, group)
+        order = order[np.argsort(block[order], kind="stable")]
+    block = block[order]
+    ends = np.flatnonzero(block[1:] != block[:-1]) + 1
+    return order, np.concatenate([[0], ends, [len(block)]] if len(block) else [[0]])
+
+
+def _check_once(table: Table, column: str, every: IntArray, order: IntArray) -> None:
+    """Raises SurveyError where two of the rows in this order have the same code."""
+    same = np.flatnonzero(every[1:] == every[:-1])
     if len(same):
         i = same[np.argmin(order[same + 1])]
         name = table.text(column).values()[order[i]]
         line = table.lines[order[i]]
         problem = f"{name!r} stands already in line {line} for this camera, epoch and target; remove one"
         raise table.error(int(order[i + 1]), f"{column}: {problem}")
-    block = one_code(seen, group)
-    order = order[np.argsort(block[order], kind="stable")] if group.any() else order
-    ends = np.flatnonzero(np.diff(block[order], append=-1))
-    return order, np.concatenate([[0], ends + 1])
 
 
 def _groups(table: Table) -> TextColumn:

@@ -9,13 +9,13 @@ from adjust.model.errors import SurveyError
 from adjust.model.names import natural_key
 from adjust.model.observations import FrameRef, Pair, frame_text
 from adjust.model.survey import BoolArray, FloatArray
-from adjust.observations.pairs import pair_arrays
+from adjust.observations.pair_arrays import pair_arrays
 from adjust.spatial.rotation_forms import euler_from_matrix, tangent_cov_from_euler
-from survey.folder.units import from_si, to_si
+from survey.folder.units import from_si, to_si, unit_in
 from survey.project.declared.poses import is_unit, quaternion_wxyz, rotation_from_euler
 from survey.project.project import Sigmas
 from survey.project.tables.covariance import covariance_from_sigmas, covariance_problem
-from survey.project.tables.reading import FLAGS, Columns, Layout, Table, first_row, group_columns, marks
+from survey.project.tables.reading import FLAGS, Columns, Layout, Table, first_row, group_columns, marks, one_of
 from survey.project.tables.references import Names, check_epochs, read_frame
 
 QUATERNION = ("qw", "qx", "qy", "qz")
@@ -157,14 +157,9 @@ def _full_covariances(table: Table, given: BoolArray, is_pose: BoolArray) -> Flo
 
 def _sigmas(table: Table, part: str) -> FloatArray:
     """Sigmas (n, 3) rad or m from whichever columns give them; nan where none does."""
-    result = np.full((len(table), 3), np.nan)
-    for columns in SIGMA_COLUMNS[part]:
-        values = to_si(np.stack([table.positive(name) for name in columns], axis=1), columns[0].rpartition("_")[2])
-        twice = ~np.isnan(values).all(axis=1) & ~np.isnan(result).all(axis=1)
-        if twice.any():
-            raise table.error(first_row(twice), f"{columns[0]}: the sigma of the {part} is given twice; keep one")
-        result = np.where(np.isnan(values), result, values)
-    return result
+    given = {columns[0]: to_si(np.stack([table.positive(name) for name in columns], axis=1), unit_in(columns[0]))
+             for columns in SIGMA_COLUMNS[part]}  # fmt: skip
+    return one_of(table, given, f"sigma of the {part}")
 
 
 def _all_or_none(table: Table, columns: tuple[str, ...]) -> BoolArray:

@@ -206,27 +206,14 @@ def check_header(path: Path, header: Sequence[str], layout: Layout) -> None:
 
 def quantity(table: Table, name: str, units: Sequence[str], positive: bool = False) -> FloatArray:
     """Values (n,) in SI from whichever column ``name_unit`` gives them, nan where none does; raises where two do."""
-    out = np.full(len(table), np.nan)
-    source = ""
-    for unit in units:
-        column = f"{name}_{unit}"
-        values = to_si(table.positive(column) if positive else table.numbers(column), unit)
-        twice = ~np.isnan(values) & ~np.isnan(out)
-        if twice.any():
-            raise table.error(first_row(twice), f"{column}: {source} is given too; keep one of the two")
-        if not np.isnan(values).all():
-            source = column
-        out = np.where(np.isnan(values), out, values)
-    return out
+    read = table.positive if positive else table.numbers
+    return one_of(table, {f"{name}_{unit}": to_si(read(f"{name}_{unit}"), unit) for unit in units}, name)
 
 
 def both_or_each(table: Table, both: str, each: Sequence[str]) -> FloatArray:
     """Positive numbers (n, k) from the columns ``each`` or, for all of them, from ``both``; raises where two say it."""
-    one, own = table.positive(both), np.stack([table.positive(name) for name in each], axis=1)
-    twice = ~np.isnan(one) & ~np.isnan(own).all(axis=1)
-    if twice.any():
-        raise table.error(first_row(twice), f"{both} and {each[0]} are both given; keep one of the two")
-    return np.where(np.isnan(own), one[:, None], own)
+    own = np.stack([table.positive(name) for name in each], axis=1)
+    return one_of(table, {both: np.broadcast_to(table.positive(both)[:, None], own.shape), each[0]: own}, "sigma")
 
 
 def dms_angles(table: Table, column: str) -> FloatArray:
@@ -249,13 +236,14 @@ def dms_angles(table: Table, column: str) -> FloatArray:
     return np.asarray(values[text.codes])
 
 
-def one_of(table: Table, parts: Mapping[str, FloatArray]) -> FloatArray:
-    """The value (n,) of each row from the one of ``parts`` that has it; raises where two have."""
-    out = np.full(len(table), np.nan)
+def one_of(table: Table, parts: Mapping[str, FloatArray], what: str = "value") -> FloatArray:
+    """What of each row the one of ``parts`` says, (n,) or (n, k), that has anything; raises where two have."""
+    out = np.full(next(iter(parts.values())).shape, np.nan)
     for name, values in parts.items():
-        twice = ~np.isnan(values) & ~np.isnan(out)
-        if twice.any():
-            raise table.error(first_row(twice), f"{name}: the value is given twice; keep one of {', '.join(parts)}")
+        given, before = (~np.isnan(x).all(axis=tuple(range(1, x.ndim))) for x in (values, out))
+        if (given & before).any():
+            problem = f"{name}: the {what} is given twice; keep one of {', '.join(parts)}"
+            raise table.error(first_row(given & before), problem)
         out = np.where(np.isnan(values), out, values)
     return out
 

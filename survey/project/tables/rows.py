@@ -1,8 +1,6 @@
 """Tables of image points and spots as rows of text: what stays in them stays to the letter."""
 
-import csv
 import hashlib
-import io
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from survey.folder.text import csv_text, read_text
+from survey.folder.text import csv_rows, csv_text, read_text
 from survey.project.detected import ImageKey
 from survey.project.tables.files import cells_of, read_table
 from survey.project.tables.reading import Columns, Layout, Table
@@ -131,8 +129,8 @@ def row_table(folder: Path | None, layout: Layout, columns: Columns | None = Non
     csv_path, parquet = ((folder or Path()) / f"{layout.name}.{ending}" for ending in ("csv", "parquet"))
     if csv_path.is_file():
         read_table(csv_path, layout)  # its faults, with their lines
-        reader = csv.reader(io.StringIO(read_text(csv_path), newline=""), strict=True)
-        return RowTable(layout, tuple(next(reader)), tuple(row for row in reader if row))
+        header, *rows = (cells for _, cells in csv_rows(csv_path, read_text(csv_path)))
+        return RowTable(layout, tuple(header), tuple(rows))
     if parquet.is_file():
         table = read_table(parquet, layout)
         found = _columns(table)

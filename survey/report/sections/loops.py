@@ -88,6 +88,8 @@ def loops(c: Context) -> Markup:
         form=t("all loops closed as conditions" if found["solved_by"] == "conditions" else
                "each by the poses of its frames"),
     )
+    if len(rows) < found["n_loops"]:
+        note += " " + t("{n} more in solution.json.", n=m.count(found["n_loops"] - len(rows)))
     classes = ["" if e["closes"] else "suspect" for e in entries]
     return m.section("loops", "Loop closures", m.table(columns, rows, "", classes), note) + _mounts(c)
 

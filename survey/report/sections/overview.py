@@ -45,10 +45,10 @@ def header(c: Context) -> Markup:
     if out["by_people"] + out["in_files"]:
         n = m.count(out["by_people"] + out["in_files"])
         problems.append(t('<a href="#excluded">{n} observations</a> are left out by people or their tables.', n=n))
-    unmet = [v for v in c.statistics.verdicts if not v.met] if c.statistics is not None else []
-    if unmet:
-        most = m.count(len(c.statistics.verdicts) if c.statistics is not None else 0)
-        n = m.count(len(unmet))
+    verdicts = () if c.statistics is None else c.statistics.verdicts
+    n_unmet = sum(not v.met for v in verdicts)
+    if n_unmet:
+        n, most = m.count(n_unmet), m.count(len(verdicts))
         said = t('<a href="#tolerances">{n} of {most} demands</a> on the results are not met.', n=n, most=most)
         problems.insert(0, said)
     calm = m.element("p", t("No warnings, nothing suspect, nothing left out."), "calm")
@@ -140,9 +140,7 @@ def groups(c: Context) -> Markup:
 
 def parts(c: Context) -> Markup:
     """Every part of the survey tested for itself, the least likely first; what the statistics leave out."""
-    s = c.statistics
-    if s is None:
-        return Markup()
+    s = c.found
     tested, out = s.consistency, Markup()
     if tested is not None and tested.parts:
         rows = [
@@ -174,9 +172,9 @@ def identification(c: Context) -> Markup:
 
 def tolerances(c: Context) -> Markup:
     """What the project demands of its results, the hardest to meet first."""
-    if c.statistics is None or not c.statistics.verdicts:
+    if not c.found.verdicts:
         return Markup()
-    found = sorted(c.statistics.verdicts, key=lambda v: -v.found / v.allowed)
+    found = sorted(c.found.verdicts, key=lambda v: -v.found / v.allowed)
     rows = [_verdict_row(v) for v in found[:_MOST_VERDICTS]]
     columns = ("<Demand", "<Result", "<Quantity", "<", "Found", "Allowed", "<Unit", "Used [%]", "<")
     classes = ["" if v.met else "suspect" for v in found[:_MOST_VERDICTS]]

@@ -27,8 +27,8 @@ def name_text(name: ParameterName) -> str:
 
 def components(c: Context) -> Markup:
     """Variance components with their own sigma and test; nothing where they were not estimated."""
-    found = c.statistics and c.statistics.components
-    if not found:
+    found = c.found.components
+    if found is None:
         return Markup()
     rows = [_component_row(x) for x in found.components]
     columns = ("<Group", "Factor of variance", "σ of it", "Factor of σ", "n", "Redundancy", "p of 1", "<")
@@ -57,9 +57,7 @@ def _component_row(x: Component) -> tuple[str, ...]:
 
 def reliability(c: Context) -> Markup:
     """What a gross error that no test finds could do, worst first, and what is not controlled at all."""
-    if c.statistics is None:
-        return Markup()
-    r = c.statistics.reliability
+    r = c.found.reliability
     uncontrolled = _titled("Not controlled", _most(r.uncontrolled[:_MOST_WEAK], len(r.uncontrolled)))
     rows = [_influence_row(c, x) for x in r.influences[:_MOST_WEAK]]
     columns = ("<Observation", "MDB [σ]", "λ̄", "<Moves most", "by", "<Unit", "in its σ", "<Position", "by [mm]")
@@ -74,14 +72,12 @@ def reliability(c: Context) -> Markup:
 
 
 def _influence_row(c: Context, x: Influence) -> tuple[str, ...]:
-    tests = c.statistics.reliability.tests if c.statistics is not None else None
-    row = observation_text(c, x.row)
-    unit, factor = sigma_unit_for_people(x.unit)
-    detectable = float(tests.detectable[x.row]) if tests is not None else float("nan")
-    external = float(tests.external[x.row]) if tests is not None else float("nan")
+    tests, (unit, factor) = c.found.reliability.tests, sigma_unit_for_people(x.unit)
+    detectable, external = float(tests.detectable[x.row]), float(tests.external[x.row])
     place = name_text(x.position) if x.position else m.MISSING
     return (
-        row, m.fixed(detectable, 1), m.fixed(external, 2), m.joined((name_text(x.name), m.code(x.component)), " "),
+        observation_text(c, x.row), m.fixed(detectable, 1), m.fixed(external, 2),
+        m.joined((name_text(x.name), m.code(x.component)), " "),
         m.general(x.shift * factor, 2), unit, m.fixed(x.ratio, 2), place,
         m.general(1e3 * x.position_shift, 2) if x.position else m.MISSING,
     )  # fmt: skip
@@ -99,9 +95,9 @@ def observation_text(c: Context, row: int) -> str:
 
 def relative(c: Context) -> Markup:
     """Precision of neighbours relative to each other, least precise first."""
-    if c.statistics is None or not c.statistics.relative:
+    if not c.found.relative:
         return Markup()
-    found = sorted(c.statistics.relative, key=lambda r: -float(r.ellipsoid.semi_axes[0]))
+    found = sorted(c.found.relative, key=lambda r: -float(r.ellipsoid.semi_axes[0]))
     rows = [_relative_row(r) for r in found[:_MOST_ROWS]]
     columns = ("<From", "<To", "Distance [mm]", "σ [mm]", "a [mm]", "b [mm]", "c [mm]", "Rotation σ [″]")
     level = m.fixed(100 * found[0].ellipsoid.level, 0)
@@ -124,9 +120,9 @@ def _relative_row(r: RelativePrecision) -> list[str]:
 
 def budget(c: Context) -> Markup:
     """Uncertainty budget of the results: standard uncertainty, its sources, expanded uncertainty."""
-    if c.statistics is None or not c.statistics.budget:
+    entries = c.found.budget
+    if not entries:
         return Markup()
-    entries = c.statistics.budget
     sources = list(dict.fromkeys(line.source for e in entries for line in e.lines))
     kinds = {line.source: line.kind for e in entries for line in e.lines}
     rows = [_budget_row(e, sources) for e in entries[:_MOST_ROWS]]
@@ -156,9 +152,7 @@ def _budget_row(e: BudgetEntry, sources: list[str]) -> list[str]:
 
 def correlations(c: Context) -> Markup:
     """The correlation matrix as a picture, pairs above 95 % and weak directions by name."""
-    if c.statistics is None:
-        return Markup()
-    s = c.statistics
+    s = c.found
     drawn = m.element("figure", heat_map(s.correlations)) if s.correlations is not None else Markup()
     pairs = _most([_correlated(x) for x in s.correlated[:_MOST_WEAK]], len(s.correlated))
     strong = _titled("Correlated above 95 %", pairs)
@@ -204,7 +198,7 @@ def normality(c: Context) -> Markup:
 
 
 def standardized_by_group(adjustment: Adjustment) -> dict[str, FloatArray]:
-    """Standardized residuals of every group's used observations in ascending order; none that is no number."""
+    """Standardized residuals of every group's used observations; none that is no number."""
     found, readings = adjustment.image_residuals, adjustment.reading_residuals
     out: dict[str, list[FloatArray]] = {}
 
@@ -222,4 +216,4 @@ def standardized_by_group(adjustment: Adjustment) -> dict[str, FloatArray]:
     if readings is not None:
         add([r.group for r in adjustment.survey.readings], 1, readings.used, readings.standardized)
     joint = {name: np.concatenate(parts) for name, parts in out.items()}
-    return {name: np.sort(w[np.isfinite(w)]) for name, w in joint.items()}
+    return {name: w[np.isfinite(w)] for name, w in joint.items()}

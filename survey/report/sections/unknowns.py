@@ -7,83 +7,23 @@ from typing import Any, TypeVar
 import numpy as np
 from markupsafe import Markup
 
-from adjust.model.survey import IntArray
 from survey.report import charts
 from survey.report import markup as m
 from survey.report.context import Context
 from survey.report.language import known, t
-from survey.solution.quantities import Status
+from survey.report.sections.components import components_of, status_pill, tests_of, value_in, vector_table
 from survey.solution.records import having, keys_of
 
 _MOST_ROWS, _MOST_CAMERAS, _MOST_BLOCKS = 250, 40, 100
 _MANY_EPOCHS = 12
 T = TypeVar("T")
 _Pose = tuple[str, str, str, Callable[[], dict[str, Any]]]
-"""A thing, the name of its pose, the epoch, and what gives the entry: few of many are shown."""
-"""Thing, name of its pose, epoch or nothing, entry."""
+"""A thing, the name of its pose, the epoch or nothing, and what gives the entry: few of many are shown."""
 _POSE_COLUMNS = ("<Pose", "<Epoch", "x [mm]", "y [mm]", "z [mm]", "rx [°]", "ry [°]", "rz [°]", "<Status")
 _POSE_NOTE = (
     "A pose a_from_b is the origin of b in a and R = Rz Ry Rx. Below each coordinate its sigma along the axes of a in "
     "mm, below each angle the sigma of a small rotation about the same axis of b in arcseconds."
 )
-
-
-def status_pill(status: Status) -> Markup:
-    """The status of a component, or of a whole parameter."""
-    if isinstance(status, dict):
-        return m.joined((m.joined((k, status_pill(v)), " ") for k, v in status.items()), " ")
-    return m.pill(
-        {"free": "quiet", "held": "plain", "prior": "soft", "tied": "soft"}.get(status, "quiet"), known(status)
-    )
-
-
-def _components(entry: dict[str, Any]) -> Iterator[tuple[str, float | None, str, float | None, str, str]]:
-    """Name, value, unit, sigma, its unit and status of every component of a vector entry."""
-    for name, status in entry["status"].items():
-        value_key = next(k for k in entry if k == name or k.startswith(f"{name}_"))
-        sigma_key = next(k for k in entry if k == f"sigma_{name}" or k.startswith(f"sigma_{name}_"))
-        unit, sigma_unit = value_key[len(name) + 1 :], sigma_key[len(name) + 7 :]
-        yield name, entry[value_key], unit, entry[sigma_key], sigma_unit, status
-
-
-def _value_in(unit: str, value: float | None, sigma: float | None, sigma_unit: str) -> str:
-    """A value with decimals that suit a sigma in another unit."""
-    same = sigma / 3600.0 if (unit, sigma_unit) == ("deg", "arcsec") and sigma else sigma
-    return m.value_text(value, same)
-
-
-def vector_table(entry: dict[str, Any], ratios: dict[str, float] | None = None) -> Markup:
-    """Components of a lens, a table or a warp; ``ratios`` adds the column of significance."""
-    rows, idle = [], []
-    for name, value, unit, sigma, sigma_unit, status in _components(entry):
-        if status == "held" and not value:
-            idle.append(m.code(name))
-            continue
-        row: list[str] = [m.code(name), _value_in(unit, value, sigma, sigma_unit), m.sigma_text(sigma)]
-        shown = unit if unit == sigma_unit else f"{unit} (σ {sigma_unit})"
-        row += [shown.replace("_", " "), status_pill(status)]
-        if ratios is not None:
-            ratio = ratios.get(name)
-            weak = name in entry.get("not_significant", ())
-            row.append(m.pill("warn", m.fixed(ratio, 1)) if weak else m.fixed(ratio, 1))
-        rows.append(row)
-    columns = ["<Parameter", "Value", "σ", "<Unit", "<Status"] + ([] if ratios is None else ["|value| / σ"])
-    at_zero = m.note(t("Held at zero: {names}.", names=m.joined(idle, ", "))) if idle else Markup()
-    return (m.table(columns, rows) if rows else Markup()) + at_zero + _tests(entry.get("significance", {}))
-
-
-def _tests(found: dict[str, Any]) -> Markup:
-    """Which terms of a model differ from zero, and which do not."""
-    parts = []
-    for term, test in found.items():
-        kind = m.pill("quiet", t("significant")) if test["significant"] else m.pill("warn", t("not significant"))
-        if term == "lens_shared":
-            kind = m.pill("warn", t("does not hold")) if test["significant"] else m.pill("quiet", t("holds"))
-        said = t("{term}: {statistic} with {freedom} degrees of freedom, p {p}", term=term.replace("_", " "),
-                 statistic=m.general(test["statistic"], 4), freedom=", ".join(map(m.count, test["freedom"])),
-                 p=m.general(test["p_value"], 2))  # fmt: skip
-        parts.append(m.note(m.joined((kind, said), " ")))
-    return m.joined(parts)
 
 
 def _pose_row(pose: _Pose) -> list[str]:
@@ -97,7 +37,7 @@ def _pose_row(pose: _Pose) -> list[str]:
     least = min((s for s in entry["sigma_rotation_arcsec"] if s), default=None)
     for angle, sigma in zip(entry["rotation_euler_xyz_deg"], entry["sigma_rotation_arcsec"], strict=True):
         below = f"± {m.sigma_text(sigma)}″" if sigma else t("held")
-        cells.append(m.part("below", _value_in("deg", angle, least, "arcsec"), below))
+        cells.append(m.part("below", value_in("deg", angle, least, "arcsec"), below))
     return [m.joined((m.element("b", thing_id), m.code(name)), " "), epoch, *cells, status_pill(entry["status"])]
 
 
@@ -130,21 +70,14 @@ def _more(n: int) -> Markup:
 
 def cameras(c: Context) -> Markup:
     """Every camera: lens, pose, residuals."""
-    found = c.adjustment.image_residuals
-    camera_of_block = np.array([b.camera_id for b in c.adjustment.survey.image_blocks], dtype=object)
     entries, parts = c.solution["cameras"], []
     # of very many cameras those with the largest residuals are shown whole
     by_size = sorted(entries, key=lambda k: -(entries[k]["rms_residual_px"] or 0.0))
     shown, others = set(by_size[:_MOST_CAMERAS]), by_size[_MOST_CAMERAS:]
     for camera in c.adjustment.survey.cameras:
-        if camera.camera_id not in shown:
-            continue
-        mine = _rows_of(np.flatnonzero(camera_of_block == camera.camera_id), found.block_ptr)
-        residuals = charts.CameraResiduals(
-            camera.camera_id, camera.image_size, c.rows.uv[mine], found.residuals[mine], found.standardized[mine],
-            found.used[mine], c.suspect[mine],
-        )  # fmt: skip
-        parts.append(_camera(camera.camera_id, entries[camera.camera_id], residuals))
+        if camera.camera_id in shown:
+            residuals = charts.camera_residuals(c.adjustment, c.rows, c.suspect, camera)
+            parts.append(_camera(camera.camera_id, entries[camera.camera_id], residuals))
     if others:
         n = m.count(len(others))
         title = t("{n} more cameras, with smaller residuals; their lenses and poses in solution.json", n=n)
@@ -155,13 +88,6 @@ def cameras(c: Context) -> Markup:
         "A pattern in the mean per cell is what the lens model leaves over; empty cells hold no points."
     )
     return m.section("cameras", "Cameras", m.joined(parts), said)
-
-
-def _rows_of(blocks: IntArray, ptr: IntArray) -> IntArray | slice:
-    """Rows of these blocks, as a slice where they follow each other: then nothing is copied."""
-    if len(blocks) and blocks[-1] - blocks[0] == len(blocks) - 1:
-        return slice(int(ptr[blocks[0]]), int(ptr[blocks[-1] + 1]))
-    return np.concatenate([np.zeros(0, dtype=np.int64), *(np.arange(ptr[b], ptr[b + 1]) for b in blocks)])
 
 
 def _camera_row(camera_id: str, entry: dict[str, Any]) -> list[str]:
@@ -195,7 +121,7 @@ def _changes(entry: dict[str, Any], key: str) -> Markup:
     """How the lens changes, images are cropped or a shared lens would differ: a table for each, and what is clear."""
     changes = [(entry["camera"], entry[key])] if key == "differences" else list(entry[key].items())
     parts = [m.note(_change_head(key, name)) + vector_table(change) for name, change in changes]
-    return m.joined((*parts[:_MOST_BLOCKS], _more(len(parts) - _MOST_BLOCKS))) + _tests(entry["significance"])
+    return m.joined((*parts[:_MOST_BLOCKS], _more(len(parts) - _MOST_BLOCKS))) + tests_of(entry["significance"])
 
 
 def _change_head(key: str, name: str) -> Markup | str:
@@ -214,8 +140,8 @@ def _clock(entry: dict[str, Any], owner: str = "") -> Markup:
     clock = entry.get("clock")
     if clock is None:
         return Markup()
-    own = [(epoch, *found) for epoch, e in clock.get("epochs", {}).items() for found in _components(e)]
-    rows = [[e, _value_in(unit, v, s, s_unit), m.sigma_text(s), unit] for e, _, v, unit, s, s_unit, _ in own]
+    own = [(epoch, *found) for epoch, e in clock.get("epochs", {}).items() for found in components_of(e)]
+    rows = [[e, value_in(unit, v, s, s_unit), m.sigma_text(s), unit] for e, _, v, unit, s, s_unit, _ in own]
     head = t("Clock of {name}", name=owner) if owner else t("Clock")
     title = t("{n} epochs: times of their own", n=m.count(len(rows)))
     shown = m.element("h3", head) + vector_table(clock)
@@ -278,7 +204,7 @@ def tables(c: Context) -> Markup:
 
 def _angles_row(epoch: tuple[str, dict[str, Any]]) -> list[str]:
     name, angles = epoch
-    parts = ((_value_in(unit, v, s, s_unit), m.sigma_text(s)) for _, v, unit, s, s_unit, _ in _components(angles))
+    parts = ((value_in(unit, v, s, s_unit), m.sigma_text(s)) for _, v, unit, s, s_unit, _ in components_of(angles))
     return [name, *(x for both in parts for x in both)]
 
 
@@ -295,13 +221,8 @@ def targets(c: Context) -> Markup:
 def _target_row(target: tuple[str, dict[str, Any]]) -> list[str]:
     target_id, entry = target
     carrier = t("station {name}", name=entry["station"]) if "station" in entry else t("the world")
-    return [
-        target_id,
-        m.count(entry["n_points"]),
-        carrier,
-        known(entry["motion"]),
-        m.count(len(entry.get("epochs", {}))),
-    ]
+    epochs = m.count(len(entry.get("epochs", {})))
+    return [target_id, m.count(entry["n_points"]), carrier, known(entry["motion"]), epochs]
 
 
 def points(c: Context) -> Markup:

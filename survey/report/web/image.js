@@ -1,6 +1,7 @@
 // One image: the picture, detected (o) and predicted (+) points, residual vectors enlarged, what is left out dashed.
 
 import { button, colour, make, roundBelow, ruler, surface } from "./dom.js";
+import { obey } from "./hand.js";
 import { count, number, significant, t } from "./words.js";
 import { current, names, select } from "./store.js";
 import { pointId, rowOf, rowsOfImage, rowsOfPoint, rowsWhere } from "./columns.js";
@@ -35,37 +36,15 @@ export class ImageView {
         steady ? null : [button("−", () => this.enlarge(-1), "-", { "aria-label": t("shorter vectors") }), button("+", () => this.enlarge(1), "+", { "aria-label": t("longer vectors") })],
         button("⤢", () => this.whole(), "0", { "aria-label": t("Whole") }), button("1:1", () => this.zoomTo(1 / (devicePixelRatio || 1)), "", { "aria-label": "1:1" })),
       make("div", { class: "stage" }, canvas, this.note), steady ? null : this.strip);
-    this.listen(canvas);
+    obey(canvas, {
+      nearer: (by, x, y) => this.zoom(by, x, y), drag: (dx, dy) => this.pan(dx, dy), arrow: (right, down) => this.pan(40 * right, 40 * down),
+      point: (x, y) => this.point(x, y), leave: () => { this.hover = -1; if (this.bitmap) this.note.textContent = ""; }, click: (event) => this.click(event),
+    });
     this.follow();
   }
 
   /** What fetches a picture, where there are any. */
   get picture() { return this.bench.pictured === false ? null : this.fetch; }
-
-  listen(canvas) {
-    canvas.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      this.zoom(Math.exp(-event.deltaY * 0.0015), event.offsetX, event.offsetY);
-    }, { passive: false });
-    const held = new Map();
-    canvas.addEventListener("pointerdown", (event) => { canvas.setPointerCapture(event.pointerId); held.set(event.pointerId, event); this.moved = 0; });
-    canvas.addEventListener("pointermove", (event) => {
-      const before = held.get(event.pointerId);
-      if (!before) { this.point(event.offsetX, event.offsetY); return; }
-      if (held.size === 2) this.pinch(held, event);
-      else { this.moved += Math.abs(event.movementX) + Math.abs(event.movementY); this.pan(event.clientX - before.clientX, event.clientY - before.clientY); }
-      held.set(event.pointerId, event);
-    });
-    for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (event) => {
-      held.delete(event.pointerId);
-      if (name === "pointerup" && this.moved < 5) this.click(event);
-    });
-    canvas.addEventListener("pointerleave", () => { this.hover = -1; if (this.bitmap) this.note.textContent = ""; });
-    canvas.addEventListener("keydown", (event) => {
-      const by = { ArrowLeft: [40, 0], ArrowRight: [-40, 0], ArrowUp: [0, 40], ArrowDown: [0, -40] }[event.key];
-      if (by) { event.preventDefault(); this.pan(by[0], by[1]); }
-    });
-  }
 
   /** What is looked at follows the selection. */
   follow() {
@@ -201,12 +180,6 @@ export class ImageView {
   }
 
   pan(dx, dy) { this.fit = false; this.ox += dx; this.oy += dy; this.surface.redraw(); }
-
-  pinch(held, event) {
-    const [a, b] = [...held.values()], other = a.pointerId === event.pointerId ? b : a, old = a.pointerId === event.pointerId ? a : b;
-    const span = (p) => Math.hypot(p.clientX - other.clientX, p.clientY - other.clientY);
-    this.zoom(span(event) / Math.max(1, span(old)), other.offsetX, other.offsetY);
-  }
 
   keepInSight() {
     const data = this.bench.points, canvas = this.surface.canvas, x = this.ox + (data.u[this.row] + 0.5) * this.s, y = this.oy + (data.v[this.row] + 0.5) * this.s;

@@ -1,6 +1,8 @@
 // The survey in space: cameras, targets, points with their ellipsoids; in perspective, as a plan and as elevations.
 
 import { button, colour, fill, make, roundBelow, ruler, surface } from "./dom.js";
+import { matrix, eyeOf, sections } from "./ellipsoids.js";
+import { obey } from "./hand.js";
 import { number, significant, t } from "./words.js";
 import { current, names, select } from "./store.js";
 import { rowsOfPoint } from "./columns.js";
@@ -8,7 +10,6 @@ import { rowsOfPoint } from "./columns.js";
 /** Right and up of the flat views, by axes of the world. */
 const FLAT = { plan: [0, 1], south: [0, 2], east: [1, 2] };
 export const NAMES = { plan: "Plan", south: "Elevation from the south", east: "Elevation from the east" };
-const CIRCLE = Array.from({ length: 33 }, (_, k) => [Math.cos((k * Math.PI) / 16), Math.sin((k * Math.PI) / 16)]);
 const MOST = 1e5; // points drawn at once
 
 /** Between the signs above and the rulers below: how high (px), and its middle. @param {number} height */
@@ -23,7 +24,6 @@ export class SceneView {
   constructor(bench, mode, calm = false) {
     this.bench = bench;
     this.mode = mode;
-    this.calm = calm;
     Object.assign(this, { azimuth: -1.08, elevation: 0.47, zoom: 1, dx: 0, dy: 0, hover: null, factor: null });
     this.surface = surface(t("The survey in space"), (context, width, height) => this.paint(context, width, height));
     this.note = make("p", { class: "note floating", "aria-live": "polite" });
@@ -34,7 +34,12 @@ export class SceneView {
         button("−", () => this.enlarge(0.5), "-", { "aria-label": t("smaller ellipsoids") }), button("+", () => this.enlarge(2), "+", { "aria-label": t("larger ellipsoids") }),
         button("⤢", () => this.whole(), "0", { "aria-label": t("Whole") })),
       make("div", { class: "stage" }, this.surface.canvas, this.legend, this.note));
-    this.listen(this.surface.canvas);
+    const { canvas } = this.surface;
+    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+    obey(canvas, {
+      nearer: (by, x, y) => this.nearer(by, x, y), drag: (dx, dy, event) => this.drag(dx, dy, event), arrow: (right, down) => this.arrow(right, down),
+      point: (x, y) => this.point(x, y), leave: () => { this.note.textContent = ""; }, click: (event) => this.click(event),
+    }, calm);
     this.measure();
   }
 
@@ -49,7 +54,7 @@ export class SceneView {
     const { scene } = this;
     if (!scene) { fill(this.legend, t("Known once the survey is adjusted.")); return; }
     const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
-    const places = [...this.ends(), ...scene.shots.map((shot) => [shot.pose[3], shot.pose[7], shot.pose[11]]), ...scene.outlines.flatMap((line) => line.x)];
+    const places = [...this.ends(), ...scene.shots.map((shot) => eyeOf(shot.pose)), ...scene.outlines.flatMap((line) => line.x)];
     for (const x of places) for (let k = 0; k < 3; k++) { low[k] = Math.min(low[k], x[k]); high[k] = Math.max(high[k], x[k]); }
     fill(this.legend, ...this.signs());
     this.low = low;
@@ -81,34 +86,15 @@ export class SceneView {
 
   follow() { this.measure(); this.surface.redraw(); }
 
-  listen(canvas) {
-    const held = new Map();
-    canvas.addEventListener("wheel", (event) => { if (this.calm && !event.ctrlKey && !event.metaKey) return; event.preventDefault(); this.nearer(Math.exp(-event.deltaY * 0.0012), event.offsetX, event.offsetY); }, { passive: false });
-    canvas.addEventListener("pointerdown", (event) => { canvas.setPointerCapture(event.pointerId); held.set(event.pointerId, event); this.moved = 0; });
-    canvas.addEventListener("pointermove", (event) => {
-      const before = held.get(event.pointerId);
-      if (!before) { this.point(event.offsetX, event.offsetY); return; }
-      const dx = event.clientX - before.clientX, dy = event.clientY - before.clientY;
-      this.moved += Math.abs(dx) + Math.abs(dy);
-      if (held.size === 2) {
-        const other = [...held.values()].find((e) => e.pointerId !== event.pointerId), span = (e) => Math.hypot(e.clientX - other.clientX, e.clientY - other.clientY);
-        this.nearer(span(event) / Math.max(1, span(before)), other.offsetX, other.offsetY);
-      } else if (this.mode === "scene" && !event.shiftKey && event.buttons !== 2) this.turn(-dx * 0.008, dy * 0.008);
-      else { this.dx += dx; this.dy += dy; this.surface.redraw(); }
-      held.set(event.pointerId, event);
-    });
-    canvas.addEventListener("pointerup", (event) => { held.delete(event.pointerId); if (this.moved < 5) this.click(event); });
-    canvas.addEventListener("pointercancel", (event) => held.delete(event.pointerId));
-    canvas.addEventListener("pointerleave", () => { this.note.textContent = ""; });
-    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-    canvas.addEventListener("keydown", (event) => {
-      const turn = { ArrowLeft: [0.1, 0], ArrowRight: [-0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[event.key];
-      if (!turn) return;
-      event.preventDefault();
-      if (this.mode === "scene") this.turn(turn[0], turn[1]);
-      else { this.dx += 300 * turn[0]; this.dy += 300 * turn[1]; this.surface.redraw(); }
-    });
+  /** Turned by hand, or moved: flat views always, the scene with Shift or the right button. */
+  drag(dx, dy, event) {
+    if (this.mode === "scene" && !event.shiftKey && event.buttons !== 2) this.turn(-dx * 0.008, dy * 0.008);
+    else this.pan(dx, dy);
   }
+
+  arrow(right, down) { if (this.mode === "scene") this.turn(0.1 * right, 0.1 * down); else this.pan(30 * right, 30 * down); }
+
+  pan(dx, dy) { this.dx += dx; this.dy += dy; this.surface.redraw(); }
 
   turn(azimuth, elevation) {
     this.azimuth += azimuth;
@@ -212,7 +198,7 @@ export class SceneView {
     for (const id of ids) {
       const { what, ids: parts } = names(id);
       if (kind === "camera") cameras.add(parts[0]);
-      else if (kind === "image" || (kind === "obs" && what === "image_point")) { image = this.placeOf(parts[0], parts[1]); if (parts.length === 3) points.add(parts[2]); }
+      else if (kind === "image" || (kind === "obs" && what === "image_point")) { image = this.mainOf(parts[0], parts[1]); if (parts.length === 3) points.add(parts[2]); }
       else if (kind === "point" || kind === "station" || kind === "target") points.add(id);
       else if (kind === "param") points.add(parts[1]);
       else if (kind === "reading" || kind === "obs") for (const part of parts) for (const name of part.split("-")) points.add(name);
@@ -221,7 +207,7 @@ export class SceneView {
   }
 
   /** The image that stands for the place of this one: of equal places only one is drawn. */
-  placeOf(camera, epoch) {
+  mainOf(camera, epoch) {
     const pose = this.scene.poses[`${camera}/${epoch}`];
     return this.scene.shots.find((shot) => shot.camera === camera && pose && shot.pose.every((x, k) => Math.abs(x - pose[k]) < 1e-4))?.image ?? "";
   }
@@ -230,7 +216,7 @@ export class SceneView {
   shot(context, line, to, shot, here) {
     context.strokeStyle = context.fillStyle = colour(here ? "point-here" : "blue");
     if (!here && !shot.main) {
-      const [u, v] = to([shot.pose[3], shot.pose[7], shot.pose[11]]);
+      const [u, v] = to(eyeOf(shot.pose));
       context.globalAlpha = 0.55;
       context.fillRect(u - 1.5, v - 1.5, 3, 3);
       context.globalAlpha = 1;
@@ -254,19 +240,19 @@ export class SceneView {
     for (const spot of points ? scene.spots : []) if (spot.kind === "point" && chosen.points.has(spot.id)) {
       for (const i of rowsOfPoint(points, null, spot.id)) {
         const block = points.blocks[points.block[i]], pose = scene.poses[`${block.camera}/${block.epoch}`];
-        if (pose) line([[pose[3], pose[7], pose[11]], spot.x]);
+        if (pose) line([eyeOf(pose), spot.x]);
       }
     }
     context.setLineDash([]);
   }
 
   spot(context, line, to, spot, here) {
-    const [u, v] = to(spot.x), axes = axesOf(spot.cov);
+    const [u, v] = to(spot.x);
     context.strokeStyle = colour(here ? "point-here" : spot.kind === "point" ? "point-bad" : "point-good");
     context.fillStyle = context.strokeStyle;
     context.lineWidth = here ? 1.8 : 0.9;
     context.globalAlpha = 0.8;
-    for (const [a, b] of [[0, 1], [0, 2], [1, 2]]) line(CIRCLE.map(([c, s]) => spot.x.map((x, k) => x + this.factor * this.region * (c * axes[a][k] + s * axes[b][k]))));
+    for (const section of sections(spot.x, spot.cov, this.factor * this.region)) line(section);
     context.globalAlpha = 1;
     context.beginPath();
     if (spot.kind === "point") context.arc(u, v, here ? 5 : 3, 0, 7);
@@ -282,7 +268,7 @@ export class SceneView {
     context.strokeStyle = colour("soft");
     for (const [image, pose] of Object.entries(cameras)) {
       this.shot(context, line, to, { camera: image.split("/")[0], image, pose, main: true, half: this.scene.cameras[image.split("/")[0]]?.half_angles_rad ?? [0.4, 0.3] }, true);
-      const [u, v] = to([pose[3], pose[7], pose[11]]);
+      const [u, v] = to(eyeOf(pose));
       context.fillText(image, u + 7, v + 12);
     }
     context.strokeStyle = context.fillStyle = colour("soft");
@@ -292,9 +278,9 @@ export class SceneView {
     context.lineWidth = 1.4;
     line(path.map((p) => p.x));
     for (const { x, cov, status } of path) {
-      const [u, v] = to(x), axes = axesOf([cov.slice(0, 3), cov.slice(3, 6), cov.slice(6, 9)].map((row) => row.map((c) => c ?? 0)));
+      const [u, v] = to(x), known = matrix(cov.map((c) => c ?? 0));
       context.strokeStyle = colour(status === "fixed" ? "soft" : "point-bad");
-      for (const [a, b] of [[0, 1], [0, 2], [1, 2]]) line(CIRCLE.map(([c, s]) => x.map((y, k) => y + this.factor * (c * axes[a][k] + s * axes[b][k]))));
+      for (const section of sections(x, known, this.factor)) line(section);
       context.fillRect(u - 2, v - 2, 4, 4);
     }
   }
@@ -303,7 +289,7 @@ export class SceneView {
     const { scene } = this, taken = [];
     context.font = "11px system-ui, sans-serif";
     context.lineJoin = "round";
-    const first = new Map(scene.shots.filter((shot) => shot.main !== false).map((shot) => [shot.camera, { id: shot.camera, x: [shot.pose[3], shot.pose[7], shot.pose[11]] }]));
+    const first = new Map(scene.shots.filter((shot) => shot.main !== false).map((shot) => [shot.camera, { id: shot.camera, x: eyeOf(shot.pose) }]));
     const boards = scene.outlines.map((o) => ({ id: o.id, x: [0, 1, 2].map((k) => o.x.reduce((sum, x) => sum + x[k], 0) / o.x.length) }));
     for (const { id, x } of [...scene.spots, ...first.values(), ...boards]) {
       const [u, v] = to(x), width = context.measureText(id).width + 6;
@@ -330,7 +316,7 @@ export class SceneView {
   nearest(x, y) {
     if (!this.to) return null;
     const { scene } = this, things = [...scene.spots.map((s) => ({ kind: s.kind === "point" ? "point" : "station", id: s.id, x: s.x, spot: s })),
-      ...scene.shots.map((s) => ({ kind: "image", id: s.image, x: [s.pose[3], s.pose[7], s.pose[11]] })), ...scene.outlines.map((o) => ({ kind: "target", id: o.id, x: o.x[0] }))];
+      ...scene.shots.map((s) => ({ kind: "image", id: s.image, x: eyeOf(s.pose) })), ...scene.outlines.map((o) => ({ kind: "target", id: o.id, x: o.x[0] }))];
     let best = null, least = 12;
     for (const thing of things) { const [u, v] = this.to(thing.x), far = Math.hypot(u - x, v - y); if (far < least) { least = far; best = thing; } }
     return best;
@@ -347,16 +333,3 @@ export class SceneView {
 }
 
 const lengthText = (metres) => { const [size, unit] = metres >= 1 ? [metres, "m"] : metres >= 1e-3 ? [1e3 * metres, "mm"] : [1e6 * metres, "µm"]; return `${significant(size, 1)} ${unit}`; };
-
-/** Principal axes (one sigma, m) of a covariance (3, 3): Jacobi's rotations. @param {number[][]} cov @returns {number[][]} */
-export function axesOf(cov) {
-  const a = cov.map((row) => row.slice()), v = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
-  for (let sweep = 0; sweep < 12; sweep++) for (const [p, q] of [[0, 1], [0, 2], [1, 2]]) {
-    if (Math.abs(a[p][q]) <= 1e-30) continue;
-    const theta = 0.5 * Math.atan2(2 * a[p][q], a[q][q] - a[p][p]), c = Math.cos(theta), s = Math.sin(theta);
-    for (let k = 0; k < 3; k++) { const [x, y] = [a[k][p], a[k][q]]; a[k][p] = c * x - s * y; a[k][q] = s * x + c * y; }
-    for (let k = 0; k < 3; k++) { const [x, y] = [a[p][k], a[q][k]]; a[p][k] = c * x - s * y; a[q][k] = s * x + c * y; }
-    for (let k = 0; k < 3; k++) { const [x, y] = [v[k][p], v[k][q]]; v[k][p] = c * x - s * y; v[k][q] = s * x + c * y; }
-  }
-  return [0, 1, 2].map((k) => [0, 1, 2].map((j) => v[j][k] * Math.sqrt(Math.max(0, a[k][k]))));
-}

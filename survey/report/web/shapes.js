@@ -1,6 +1,7 @@
 // From the server's answers to what the views draw.
 
 import { rowAt } from "./columns.js";
+import { matrix } from "./ellipsoids.js";
 import { parts } from "./store.js";
 
 /** Until there is a solution, what the results in the folder say stands for it. @param {any} raw answer of /api/state */
@@ -39,7 +40,6 @@ export function sceneOf(raw) {
     first.add(camera);
     shots.push({ camera, image, pose, main, half: raw.cameras[camera]?.half_angles_rad ?? [0.4, 0.3] });
   }
-  const matrix = (c) => [c.slice(0, 3), c.slice(3, 6), c.slice(6, 9)];
   return { ...raw, shots, poses: raw.images, spots: raw.spots.map((s) => ({ ...s, cov: matrix(s.cov) })),
     outlines: raw.outlines.map((o) => ({ id: o.target, x: o.x })), clouds: raw.clouds.map((c) => ({ id: c.target, x: c.x })) };
 }

@@ -1,7 +1,7 @@
 """Runs of a project, kept under ``runs/NNNN`` so that any two can be compared and any can come back.
 
 ``run.json``: when, by whom, what came out, what was excluded, hashes of all inputs. ``survey.toml``: as it was then.
-``estimates.npz``: every parameter with its covariance a priori. ``solution.json``: as in the results. A run of the
+``estimates.npz``: the ``covariance.npz`` of the results. ``solution.json``: as in the results. A run of the
 same inputs, options and versions as the last one is not kept again; of runs that nobody pinned the last ``MOST`` stay.
 Images are never kept.
 """
@@ -9,28 +9,26 @@ Images are never kept.
 import hashlib
 import json
 import os
+import platform
 import re
 import shlex
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from gtsam import Pose3
-
 from adjust.model.errors import SurveyError
-from adjust.model.result import Adjustment, Estimate, ParameterName
-from survey.folder.arrays import packed_arrays, read_arrays
+from adjust.model.result import Adjustment
 from survey.folder.plain import plain
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import NOT_OURS, atomic_write, json_text, read_bytes, read_text
 from survey.project.exclusions import Exclusion, Name
 from survey.project.project import DEFINITION_FILE, RESULTS
-from survey.solution.covariances import covariance_arrays
+from survey.solution.covariances import read_estimates
 from survey.solution.earlier.changes import Snapshot, snapshot
 
 if TYPE_CHECKING:  # loads what adjusts
@@ -38,8 +36,8 @@ if TYPE_CHECKING:  # loads what adjusts
 
 RUNS, MOST = "runs", 50
 _RUN, _ESTIMATES, _SOLUTION = "run.json", "estimates.npz", "solution.json"
+_PACKAGES = ("labsurvey", "gtsam", "numpy", "scipy", "opencv-contrib-python-headless")
 _FILES = (_RUN, _ESTIMATES, _SOLUTION, DEFINITION_FILE)
-_ARRAYS = ("parameters", "names", "units", "status", "start", "block", "covariance", "value_start", "values")
 
 
 class Clock:
@@ -54,6 +52,15 @@ class Clock:
         begin = time.perf_counter()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+
+
+def installed_versions() -> dict[str, str]:
+    """Versions of Python and of the packages that results depend on, as far as they are installed."""
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        with suppress(PackageNotFoundError):
+            found[package] = version(package)
+    return found
 
 
 def command_line(command: str, folder: Path, *words: str | Path, **flags: object) -> str:
@@ -114,8 +121,8 @@ def record_run(
                tuple(one.exclusion for one in run.left_out), fingerprint)  # fmt: skip
     into = place / RUNS / f"{number:04d}"
     atomic_write(into / _RUN, json_text(said.as_dict()))
-    atomic_write(into / _SOLUTION, (place / RESULTS / _SOLUTION).read_bytes())
-    atomic_write(into / _ESTIMATES, _estimates_npz(adjustment.estimates.values()))
+    for name, result in ((_SOLUTION, _SOLUTION), (_ESTIMATES, "covariance.npz")):
+        atomic_write(into / name, (place / RESULTS / result).read_bytes())
     atomic_write(into / DEFINITION_FILE, read_bytes(folder / DEFINITION_FILE)[0])
     light = [r.number for r in runs if not r.pinned]
     return tuple(f"{RUNS}/{n:04d}/{name}" for n in light[: max(0, len(light) + 1 - MOST)] for name in _FILES)
@@ -175,7 +182,7 @@ def load_run(folder: Path, number: int) -> Snapshot:
     """The solution of a run. Raises SurveyError."""
     run, path = find_run(folder, number), folder / RUNS / f"{number:04d}" / _ESTIMATES
     try:
-        return Snapshot({e.name: e for e in _estimates(read_arrays(path, _ARRAYS))}, run.summary)
+        return Snapshot(read_estimates(path), run.summary)
     except NOT_OURS as error:
         raise SurveyError(f"{path}: cannot be read as a run ({error}); remove its folder") from error
 
@@ -196,33 +203,3 @@ def remove_empty(folder: Path, gone: Iterable[str]) -> None:
             place.rmdir()
         except OSError:  # somebody keeps a file of their own in it
             continue
-
-
-def _estimates_npz(estimates: Iterable[Estimate]) -> bytes:
-    every = list(estimates)
-    values = [e.value.matrix()[:3].ravel() if isinstance(e.value, Pose3) else np.asarray(e.value, dtype=float).ravel()
-              for e in every]  # fmt: skip
-    return packed_arrays(
-        **covariance_arrays(every),
-        names=np.array([c for e in every for c in e.components], dtype=str),
-        status=np.array([s for e in every for s in e.status], dtype=str),
-        value_start=np.cumsum([0, *map(len, values)]),
-        values=np.concatenate([*values, np.empty(0)]),
-    )
-
-
-def _estimates(found: Mapping[str, Any]) -> Iterable[Estimate]:
-    """What :func:`_estimates_npz` wrote: 12 numbers are a pose with 6 components."""
-    start, block, ends = found["start"], found["block"], found["value_start"]
-    for k, name in enumerate(found["parameters"].tolist()):
-        i, j = int(start[k]), int(start[k + 1])
-        value = np.asarray(found["values"][ends[k] : ends[k + 1]], dtype=float)
-        pose = len(value) == 12 and j - i == 6
-        if not pose and len(value) != j - i:
-            raise ValueError(f"{name} has {len(value)} values of {j - i} components")
-        named: ParameterName = tuple(name.split("/"))
-        texts = (tuple(found[x][i:j].tolist()) for x in ("names", "units", "status"))
-        components, units, status = texts
-        cov = found["covariance"][block[k] : block[k + 1]].reshape(j - i, j - i)
-        matrix = np.vstack([value.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]]) if pose else np.eye(4)
-        yield Estimate(named, Pose3(matrix) if pose else value, components, units, cov, status)

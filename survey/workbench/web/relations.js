@@ -107,7 +107,7 @@ export class LoopsView extends Asked {
     if (!loops.length) return [make("p", { class: "quiet" }, t("No loops: the survey measures no pairs."))];
     const closing = (loop, unit) => (loop[`misclosure_${unit}`] === undefined ? "–" : `${estimated({ value: loop[`misclosure_${unit}`], sigma: loop[`sigma_misclosure_${unit}`] })} ± ${significant(loop[`sigma_misclosure_${unit}`], 2)}`);
     const rows = loops.map((loop) => [make("div", { class: "wide" }, make("span", { class: loop.closes ? "" : "bad" }, `${loop.closes ? "" : "■ "}${loop.stations.join(" → ")}`), make("div", {}, ...loop.pairs.flatMap((pair) => [link(anchor("reading", `pairs:${pair}`), pair, { class: "whole" }), " "]))), closing(loop, "arcsec"), closing(loop, "mm"), significant(loop.test, 3), significant(loop.p_value, 2)]);
-    return [make("h2", {}, t("Loops"), " ", make("span", { class: "quiet" }, count(found.n_loops))), plainTable(t("Loops"), [`${t("loop")}, ${t("Pairs")}`, t("misclosure, arcsec"), t("misclosure, mm"), t("Test"), "p"], rows, [1, 2, 3, 4])];
+    return [make("h2", {}, t("Loops"), " ", make("span", { class: "quiet" }, count(found.n_loops))), ...(loops.length < found.n_loops ? [make("p", { class: "quiet" }, t("{n} more in solution.json.", { n: count(found.n_loops - loops.length) }))] : []), plainTable(t("Loops"), [`${t("loop")}, ${t("Pairs")}`, t("misclosure, arcsec"), t("misclosure, mm"), t("Test"), "p"], rows, [1, 2, 3, 4])];
   }
 }
 

@@ -1,7 +1,7 @@
 """What the views of the workbench show, as plain values: state, findings, parameters, scene, exclusions."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from gtsam import Pose3
@@ -12,7 +12,6 @@ from adjust.model.result import Adjustment
 from survey.folder.plain import attributes, plain
 from survey.folder.text import suggestion
 from survey.project.observed import Observed, name_of_residual
-from survey.report.anchors import ANCHORED, anchor, anchors_in
 from survey.report.language import message
 from survey.solution.earlier.changes import snapshot
 from survey.solution.earlier.runs import list_runs
@@ -28,14 +27,9 @@ from survey.solution.quantities import (
 from survey.solution.verdict import suspects
 from survey.workbench.jobs import Jobs
 from survey.workbench.places import Places, refs_of
-from survey.workbench.rows import BY_THIS_RUN, IN_USE, columns, reading_rows
+from survey.workbench.rows import columns, reading_rows
 
-if TYPE_CHECKING:
-    from adjust.diagnosis.hypothesis import Place
-
-_MOST_FINDINGS = 100
-_MOST_FITTING = 20
-_CAUSE = "probable cause: "
+_MOST_LOOPS = 1000
 
 
 def limits(bench: Jobs) -> tuple[float, float]:
@@ -53,10 +47,10 @@ def state(bench: Jobs) -> dict[str, Any]:
         "version": bench.version, "folder": str(bench.folder), "title": now.project.title,
         "read_only": bench.read_only, "lock": bench.holder(), "changed_files": bench.changed_files(),
         "unsaved": bench.n_unsaved, "undo": [*map(message, bench.undoable)], "redo": [*map(message, bench.redoable)],
-        "solution": None if solved is None else _summary(solved) | {
+        "solution": None if solved is None else summary_of(solved) | {
             "mode": now.mode, "seconds": now.seconds, "sigmas": bench.scale.sigmas},
         "kept": None if bench.kept is None else in_words(bench.kept.summary) | {"date": bench.kept.date},
-        "warnings": [message(w) for w in _warnings(bench)],
+        "warnings": [message(w) for w in warnings_of(bench)],
         "failure": None if bench.failure is None or empty else message(str(bench.failure)),
         "empty": empty, "n_looked_at": len(now.everything.detected),
         "n_pictures": len(now.everything.images),
@@ -70,7 +64,8 @@ def state(bench: Jobs) -> dict[str, Any]:
     }))  # fmt: skip
 
 
-def _summary(solved: Adjustment) -> dict[str, Any]:
+def summary_of(solved: Adjustment) -> dict[str, Any]:
+    """Of a solution, in the language that is spoken."""
     return in_words(snapshot(solved).summary)
 
 
@@ -79,7 +74,7 @@ def in_words(summary: Mapping[str, Any]) -> dict[str, Any]:
     return {**summary, "reason": message(str(summary["reason"]))}
 
 
-def _warnings(bench: Jobs) -> Sequence[str]:
+def warnings_of(bench: Jobs) -> Sequence[str]:
     """Of the solution, or of the results until there is one."""
     found = bench.situation.adjustment or bench.kept
     return () if found is None else found.warnings
@@ -159,109 +154,6 @@ def _coded(values: Sequence[str]) -> dict[str, list[Any]]:
     return {"texts": list(places), "codes": codes}
 
 
-def findings(bench: Jobs) -> dict[str, Any]:
-    """The verdict, warnings, and what is suspect or was left out by this run, worst first, each with its remedies.
-
-    remedies: what the diagnosis says would mend it; also of a survey that cannot be adjusted, of which nothing else is
-    known.
-    """
-    solved = bench.situation.adjustment
-    known: dict[str, Any] = {"verdict": "failed", "reason": message(str(bench.failure or "")), "warnings": [],
-                             "causes": [], "n_failing": 0, "findings": []}  # fmt: skip
-    kept = bench.kept
-    if solved is not None or kept is not None:
-        known = _of_solution(bench, in_words(kept.summary) if kept is not None else _summary(bench.adjustment))
-    return dict(plain({"version": bench.version, **known, "remedies": remedies(bench)}))
-
-
-def remedies(bench: Jobs) -> list[dict[str, Any]]:
-    """The candidates of the diagnosis, the best first: cause, change, evidence, and whether a program can do it."""
-    out = []
-    for number, candidate in enumerate(bench.remedies, start=1):
-        h = candidate.hypothesis
-        out.append({
-            "number": number, "name": h.name, "cause": message(h.cause), "change": message(h.change),
-            "possible": bool(h.edits), "anchor": _anchor_of(h.place),
-            **attributes(candidate, "where", "explained", "statistic", "critical", "probability", "sigma0"),
-        })  # fmt: skip
-    return out
-
-
-def _anchor_of(place: "Place") -> str | None:
-    """Where a hypothesis sits, as a place of the page."""
-    return anchor(place.kind, "/".join(place.ids)) if place.kind in ANCHORED and place.ids else None
-
-
-def _of_solution(bench: Jobs, summary: Mapping[str, Any]) -> dict[str, Any]:
-    (image_limit, limit), warnings = limits(bench), _warnings(bench)
-    found = [*_of_points(bench, image_limit), *_of_readings(bench, limit)]
-    worst = sorted(found, key=lambda f: -(f["share"] or 0.0))
-    failing = [f for f in worst if f["why"] == BY_THIS_RUN or (f["share"] or 0.0) > 1.0]
-    fitting = [f for f in worst if f["why"] == IN_USE and (f["share"] or 0.0) <= 1.0]
-    told = bench.diagnosis.lines if bench.diagnosis is not None else ()
-    causes = [w.removeprefix(_CAUSE) for w in warnings if w.startswith(_CAUSE)]
-    shown = [*_of_images(bench, failing), *failing[:_MOST_FINDINGS], *fitting[:_MOST_FITTING]]
-    return {
-        **{k: v for k, v in summary.items() if k in ("verdict", "reason")},
-        "warnings": [_said(w) for w in warnings if not w.startswith(_CAUSE)],
-        "causes": [_said(c) for c in causes if c not in told], "n_failing": len(failing), "findings": shown,
-    }  # fmt: skip
-
-
-def _said(text: str) -> dict[str, Any]:
-    """A message in the reader's language, with the places it names."""
-    return {"text": message(text), "anchors": anchors_in(text)}
-
-
-def _of_points(bench: Jobs, limit: float) -> Iterable[dict[str, Any]]:
-    rows = bench.rows
-    test = np.where((rows.why == IN_USE) | (rows.why == BY_THIS_RUN), np.nan_to_num(rows.test, nan=-1.0), -1.0)
-    most = min(_MOST_FINDINGS + _MOST_FITTING, len(test))
-    largest = np.sort(np.argpartition(-test, most - 1)[:most]) if most else np.zeros(0, dtype=np.int64)
-    for row in largest[np.argsort(-test[largest], kind="stable")].tolist():
-        if test[row] >= 0.0:
-            name, w = rows.id_of(row), float(np.sqrt(test[row]))
-            yield {
-                "kind": "image_point", "id": f"image_point:{name}", "anchor": anchor("obs", f"image_point:{name}"),
-                "image": "/".join(name.split("/")[:2]), "w": w, "limit": limit, "share": w / limit,
-                "redundancy": rows.redundancy[row].mean(), "residual": rows.residuals[row], "unit": "px",
-                "why": int(rows.why[row]), "remedies": [_exclude(bench, f"image_point:{name}", row)],
-            }  # fmt: skip
-
-
-def _exclude(bench: Jobs, name: str, row: int | None = None) -> dict[str, Any]:
-    if row is not None and row >= sum(len(b.uv) for b in bench.situation.everything.survey.image_blocks):
-        name = bench.spot_name(row)
-    return {"label": f"exclude {name}", "changes": [{"name": name, "excluded": True}]}
-
-
-def _of_readings(bench: Jobs, limit: float) -> Iterable[dict[str, Any]]:
-    for row in readings(bench)["rows"]:
-        if row["w"] is not None and row["why"] in (IN_USE, BY_THIS_RUN):
-            yield {
-                "kind": "reading", "id": row["id"], "anchor": anchor("reading", row["id"]), "image": None,
-                "component": row["component"], "limit": limit, "unit": row["sigma_unit"],
-                **{k: row[k] for k in ("w", "share", "redundancy", "residual", "why")},
-                "remedies": [_exclude(bench, row["id"])],
-            }  # fmt: skip
-
-
-def _of_images(bench: Jobs, failing: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Images of which a fifth of the points or more do not fit: the image is wrong rather than each of them."""
-    counts: dict[str, int] = {}
-    for f in failing:
-        if f["image"]:
-            counts[f["image"]] = counts.get(f["image"], 0) + 1
-    out = []
-    for image, n in counts.items():
-        rows = bench.rows.in_image(*image.split("/"))
-        if n >= 4 and 5 * n >= len(rows):
-            out.append({"kind": "image", "id": f"image:{image}", "anchor": anchor("image", image), "image": image,
-                        "w": None, "share": None, "why": BY_THIS_RUN, "n_points": n, "n_in_image": len(rows),
-                        "remedies": [_exclude(bench, f"image:{image}")]})  # fmt: skip
-    return out
-
-
 def runs(bench: Jobs) -> dict[str, Any]:
     """The runs that were kept, the last first."""
     found = [r.as_dict() for r in reversed(list_runs(bench.folder))]
@@ -276,11 +168,14 @@ def scene(bench: Jobs) -> dict[str, Any]:
 
 
 def loops(bench: Jobs) -> dict[str, Any]:
-    """Loops of measured pairs and how they close, the worst first; None where there are none."""
+    """The loops of measured pairs that close worst, and how many there are; None where there are none."""
     from survey.solution.dictionary import solution_dict
 
     solution = solution_dict(bench.adjustment, bench.run(), None)
-    return {"version": bench.version, "loops": solution.get("loops"), "network": solution.get("network")}
+    found = solution.get("loops")
+    if found is not None:
+        found = found | {"worst_first": found["worst_first"][:_MOST_LOOPS]}
+    return {"version": bench.version, "loops": found, "network": solution.get("network")}
 
 
 def table_residuals(bench: Jobs) -> dict[str, Any]:

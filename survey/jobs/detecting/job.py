@@ -5,21 +5,20 @@ image is another one; all other rows, and those that a person has changed since,
 person decided about a row that is replaced (``used = false``) goes into ``observations/exclusions.csv``.
 """
 
-import getpass
-import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from adjust.lenses.crops import possible_sizes
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write, time_text
-from survey.jobs.adjusting.board_sizes import wrong_sizes
-from survey.jobs.adjusting.image_defects import defect_warnings, defects
+from survey.jobs.detecting.board_sizes import wrong_sizes
+from survey.jobs.detecting.image_defects import defect_warnings, defects
+from survey.jobs.detecting.outcome import DetectOutcome, missed
 from survey.project import Definition, SpotBlock, read_definition
 from survey.project.detected import (
     DETECTED_FILE,
@@ -42,68 +41,6 @@ if TYPE_CHECKING:  # brings in OpenCV, which a folder that is detected already d
     from survey.detection import ImageReport
 
 PICTURES = "detected"
-
-
-@dataclass(frozen=True)
-class DetectOutcome:
-    """What detection did: one report per image that was looked at, the files written, and what people should know.
-
-    n_same: images that are as they were, whose rows stay. notes: on rows of people, on images that are gone.
-    defects: images that are wrong as such.
-    """
-
-    folder: Path
-    reports: "tuple[ImageReport, ...]"
-    paths: tuple[Path, ...]
-    n_same: int = 0
-    notes: tuple[str, ...] = ()
-    wrong_sizes: Mapping[str, str] = field(default_factory=dict)
-    defects: tuple[str, ...] = ()
-
-    @property
-    def messages(self) -> tuple[str, ...]:
-        """One line per image that was looked at."""
-        return tuple(f"{r.path}: {r.status}{': ' + r.message if r.message else ''}" for r in self.reports)
-
-    @property
-    def problems(self) -> tuple[str, ...]:
-        """Boards of a wrong size; images that are wrong as such; those without targets, or not readable."""
-        lines = (m for m, r in zip(self.messages, self.reports, strict=True) if r.status != "found" and self._news(r))
-        return (*self.wrong_sizes.values(), *self.defects, *lines)
-
-    def _news(self, report: "ImageReport") -> bool:
-        missed = _missed(report)
-        return report.status == "failed" or not missed or not missed <= self.wrong_sizes.keys()
-
-    def summary(self) -> dict[str, Any]:
-        """Counts as plain values."""
-        return {
-            "folder": str(self.folder),
-            "images": len(self.reports),
-            "images_unchanged": self.n_same,
-            "found": sum(r.status == "found" for r in self.reports),
-            "nothing": sum(r.status == "nothing" for r in self.reports),
-            "failed": sum(r.status == "failed" for r in self.reports),
-            "image_points": sum(len(d) for r in self.reports for d in r.detections.values()),
-            "spots": sum(len(r.spots) for r in self.reports if r.spots is not None),
-            "notes": list(self.notes),
-            "warnings": [*self.wrong_sizes.values(), *self.defects],
-            "written": [str(p) for p in self.paths],
-        }
-
-    def text(self) -> str:
-        """The counts, and every image that gave nothing, for people."""
-        s = self.summary()
-        head = f"{self.folder}: {s['found']} of {s['images']} images show {s['image_points']} target points"
-        head += f" and {s['spots']} spots" if s["spots"] else ""
-        if self.n_same:
-            same = f"{self.n_same} images are as they were, their points stay (--all finds them anew)"
-            head = f"{head}\n  {same}" if self.reports else f"{self.folder}: {same}"
-        return "\n".join([head, *(f"  {line}" for line in (*self.problems, *self.notes))])
-
-
-def _missed(report: "ImageReport") -> set[str]:
-    return {target_id for target_id, found in report.detections.items() if not len(found)}
 
 
 def _without_folder(folder: Path, texts: Mapping[str, str]) -> dict[str, str]:
@@ -299,15 +236,6 @@ def _keep_decisions(folder: Path, place: Path, state: _State, gone: RowTable) ->
                            f"{OBSERVATIONS_FOLDER}/{EXCLUSIONS_FILE} lists them now")  # fmt: skip
 
 
-def author_name(said: Iterable[tuple[str, str]] = ()) -> str:
-    """Who decides: $LABSURVEY_AUTHOR, the surveyor of [identification], or the user of the computer."""
-    surveyor = next((value for key, value in said if key == "surveyor"), "")
-    try:
-        return os.environ.get("LABSURVEY_AUTHOR", "") or surveyor or getpass.getuser()
-    except (OSError, KeyError):  # a user without a name, as in a container
-        return ""
-
-
 def _known_now(
     state: _State, files: Mapping[ImageKey, DetectedImage], reports: "Sequence[ImageReport]",
     wrong_sizes: Mapping[str, str], defects: Mapping[ImageKey, str],
@@ -321,7 +249,7 @@ def _known_now(
             files[key], looked_for=state.sought[key].digest(), status=report.status, message=report.message,
             rows=state.rows_digest(key), n_image_points=sum(map(len, report.detections.values())),
             n_spots=0 if report.spots is None else len(report.spots),
-            wrong_size=next((text for t, text in wrong_sizes.items() if t in _missed(report)), ""),
+            wrong_size=next((text for t, text in wrong_sizes.items() if t in missed(report)), ""),
             defect=defects.get(key, ""),
         )  # fmt: skip
     return known | _given(state, known)

@@ -1,0 +1,122 @@
+"""Corridors of thousands of stations, where the normal matrix has no digits left for the far end."""
+
+import gtsam
+import numpy as np
+import pytest
+
+from adjust.graph.assembly import AdjustmentGraph
+from adjust.graph.pair_normals import PairLinear, PairNormals
+from adjust.native.pairs import compose_poses
+from adjust.pose_network import pose_network
+from adjust.pose_network.solve import minimize
+from adjust.spatial.rigid_motions import Motions, exp
+from tests.adjust import pose_networks
+from tests.adjust.pose_networks import solve_network
+from tests.adjust.test_pair_normals import of_network
+
+
+def system(graph: AdjustmentGraph) -> tuple[PairNormals, PairLinear]:
+    normals = PairNormals(graph, [])
+    return normals, normals.linearized(graph.prepare(graph.start, True))
+
+
+@pytest.mark.parametrize(("nx", "extra"), [(1, 1), (3, 3), (20, 20), (40, 240)])
+def test_reflections_of_the_rows_give_the_factor_of_the_normal_matrix(nx: int, extra: int) -> None:
+    """Of networks with enough digits in either, also with what is known of single poses."""
+    normals, plain = system(of_network(5, nx, extra))
+    rng = np.random.default_rng(nx)
+    own = np.zeros_like(plain.own)
+    some = rng.normal(size=(len(own[::3]), 6, 6))
+    own[::3] = np.swapaxes(some, 1, 2) @ some
+    own[0] = np.diag([4.0, 0.0, 0.0, 9.0, 0.0, 1.0])
+    for known in (plain.own, own):
+        rows = normals.b, normals.a, plain.by_b, plain.by_a, known
+        assert normals.factor.eliminate(*rows) == -1
+        expected = normals.factor.data.copy()
+        normals.factor.data[:] = np.nan
+        assert normals.factor.eliminate_rows(*rows) == -1
+        np.testing.assert_allclose(normals.factor.data, expected, rtol=1e-7, atol=1e-8 * np.abs(expected).max())
+
+
+def test_a_pose_that_nothing_tells_of_is_without_a_pivot_in_rows() -> None:
+    normals, linear = system(of_network(1))
+    linear.by_b[normals.b == 7], linear.by_a[normals.a == 7] = 0.0, 0.0
+    assert normals.factor.eliminate_rows(normals.b, normals.a, linear.by_b, linear.by_a, linear.own) == 7
+
+
+def test_the_clique_after_all_below_it_beside_each_other() -> None:
+    pattern = system(of_network(2, 12))[0].factor.pattern
+    order, parents = pattern.leaves_first.tolist(), pattern.parents.tolist()
+    assert sorted(order) == list(range(len(parents)))
+    waiting = list[int]()
+    for c in order:
+        below = {i for i, p in enumerate(parents) if p == c}
+        assert set(waiting[len(waiting) - len(below) :]) == below
+        waiting = [*waiting[: len(waiting) - len(below)], c]
+
+
+@pytest.mark.slow
+def test_the_far_end_of_a_chain_has_the_sigmas_that_its_pairs_add_up_to() -> None:
+    """Each pair measured twice: half of the sum of their covariances, carried to the end; Cholesky loses 8e-5 of it."""
+    rng, n = np.random.default_rng(4), 6000
+    motions = exp(np.c_[rng.normal(size=(n - 1, 3)) * 0.02, 10.0 + rng.normal(size=(n - 1, 1)), np.zeros((n - 1, 2))])
+    sigmas = np.r_[np.full(3, 1e-3), np.full(3, 1e-2)]
+    twice = Motions(*(np.tile(x, (2, *[1] * (x.ndim - 1))) for x in (motions.rotation, motions.shifts)))
+    seen = twice @ exp(rng.normal(size=(2 * (n - 1), 6)) * sigmas)
+    ids, first = tuple(f"s{i}" for i in range(n)), np.tile(np.arange(n - 1), 2)
+    names, cov = tuple(f"p{i}" for i in range(2 * (n - 1))), np.tile(np.diag(sigmas**2), (2 * (n - 1), 1, 1))
+    network = pose_network(ids, names, first + 1, first, seen.rotation, seen.shifts, cov, held={0: np.eye(4)})
+    solved = solve_network(network)
+    poses = solved.world_from_station
+    # of a_from_b = before_from_after the error stands in the frame after it; to the end from there
+    last = poses[np.array([n - 1])].inverse()
+    to_end = Motions(np.repeat(last.rotation, n - 1, 0), np.repeat(last.shifts, n - 1, 0)) @ poses[np.arange(1, n)]
+    A = to_end.adjoint()
+    expected = (A @ np.diag(sigmas**2 / 2.0) @ np.swapaxes(A, 1, 2)).sum(axis=0)
+    found = solved.joint([n - 1])
+    unit = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(found / np.outer(unit, unit), expected / np.outer(unit, unit), atol=5e-6)
+
+
+def test_a_corridor_that_bends_turns_and_shifts_every_pair_by_its_share() -> None:
+    """By some thousandths of a radian each, which add up; moved each for itself, poses end up apart by far more."""
+    graph, rng = of_network(7, 60, extra=0), np.random.default_rng(0)
+    normals = PairNormals(graph, [])
+    keys, (order, parent) = normals.keys.tolist(), normals._along_tree
+    before = Motions.of(np.array([graph.start.atPose3(k).matrix() for k in keys]))
+    share, x, delta = rng.normal(size=(len(keys), 6)) * 3e-3, np.zeros((len(keys), 6)), gtsam.VectorValues()
+    below = np.flatnonzero(parent >= 0)
+    pairs = before[parent[below]].inverse() @ before[below]
+    carried = dict(zip(below.tolist(), pairs.inverse().adjoint(), strict=True))
+    for i in order.tolist():
+        x[i] = share[i] + (carried[i] @ x[parent[i]] if parent[i] >= 0 else 0.0)
+        delta.insert(keys[i], x[i])
+    assert np.abs(x[:, :3]).max() > 20 * 3e-3
+    bent, straight = (Motions.of(np.array([values.atPose3(k).matrix() for k in keys]))
+                      for values in (normals.bent(graph.start, delta), graph.start.retract(delta)))  # fmt: skip
+    expected = (pairs @ exp(share[below])).matrices()
+    np.testing.assert_allclose((bent[parent[below]].inverse() @ bent[below]).matrices(), expected, atol=1e-9)
+    assert np.abs((straight[parent[below]].inverse() @ straight[below]).matrices() - expected).max() > 1e-3
+
+
+def test_rotations_stay_so_along_thousands_of_pairs() -> None:
+    rng, n = np.random.default_rng(0), 20_000
+    each = exp(np.c_[rng.normal(size=(n, 3)), np.zeros((n, 3))])
+    R, t = each.rotation.copy(), np.ones((n, 3))
+    compose_poses(np.arange(n), np.arange(n) - 1, R, t)
+    np.testing.assert_allclose(np.swapaxes(R, 1, 2) @ R, np.broadcast_to(np.eye(3), R.shape), atol=1e-15)
+    first, second, third = each.rotation[:3]
+    np.testing.assert_allclose(R[2], first @ second @ third, atol=1e-14)
+    np.testing.assert_allclose(t[2], 1.0 + first @ (1.0 + second @ np.ones(3)), atol=1e-14)
+
+
+@pytest.mark.slow
+def test_a_long_corridor_is_solved_in_few_steps_from_wherever_it_begins() -> None:
+    network = pose_networks.simulate(4000, 2).network
+    cold = minimize(network)
+    assert cold.solved.iterations <= 5
+    sigma, rng = np.array([1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2]), np.random.default_rng(1)
+    shaken = Motions(cold.rotations, cold.translations) @ exp(rng.normal(size=(network.n_stations, 6)) * sigma)
+    warm = minimize(network, (shaken.rotation, shaken.shifts))
+    assert warm.solved.iterations <= 5
+    assert warm.omega == pytest.approx(cold.omega, rel=1e-9)
