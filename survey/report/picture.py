@@ -13,6 +13,8 @@ from survey.report.scene import Scene, Shot, enlargement
 
 WIDTH, HEIGHT, MARGIN = 540.0, 450.0, 36.0
 _MOST_LABELS = 60
+_AXES = 0.07
+"""Length of the axes of the world, as a share of all there is to be seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,8 +110,9 @@ def _frustum(view: View, shot: Shot, depth: float) -> str:
 class _Labels:
     """Places labels beside their points, tries four sides, leaves out what would cover another label."""
 
-    def __init__(self, taken: FloatArray) -> None:
-        self.boxes = np.concatenate([taken - 2, taken + 2], axis=1)
+    def __init__(self, points: FloatArray, letters: FloatArray) -> None:
+        taken = ((points, 2.0), (letters, 5.0))
+        self.boxes = np.concatenate([np.concatenate([x - half, x + half], axis=1) for x, half in taken])
 
     def place(self, xy: FloatArray, words: str, colour: str, size: float = 10.5, gap: float = 5.0) -> str:
         w, h = 0.6 * size * len(words), size
@@ -143,27 +146,26 @@ def _tables(view: View, scene: Scene, reach: float) -> list[str]:
     return parts
 
 
-def _world_axes(view: View, reach: float) -> list[str]:
+def _world_axes(view: View, extent: float) -> tuple[list[str], FloatArray]:
+    """The axes that lie in the picture and do not point at its eye, and where their letters (n, 2) stand."""
     start = view.to_picture(np.zeros((1, 3)))[0]
     inside = 0 <= start[0] <= WIDTH and 0 <= start[1] <= HEIGHT
-    parts = []
+    parts, letters = list[str](), list[FloatArray]()
     for i, (name, colour) in enumerate((("x", d.X_AXIS), ("y", d.Y_AXIS), ("z", d.Z_AXIS))):
-        end = view.to_picture(reach * np.eye(3)[i])[0]
+        end = view.to_picture(_AXES * extent * np.eye(3)[i])[0]
         if inside and np.hypot(*(end - start)) > 3.0:
             parts.append(d.arrows(start[None], end[None], colour, 1.6, 5.0))
             tip = start + (end - start) * (1 + 8.0 / np.hypot(*(end - start)))
             parts.append(d.text(tip[0], tip[1] + 3.5, name, "middle", 10.5, colour))
-    return parts
+            letters.append(tip)
+    return parts, np.array(letters).reshape(-1, 2)
 
 
 def draw(scene: Scene, view: View, everything: FloatArray, enlarged: float, ellipsoid: float) -> Markup:
     """One view of the scene as SVG."""
     extent = float(np.linalg.norm(np.ptp(everything, axis=0)))
-    parts = [
-        d.heading(view.name),
-        *_ground(view, everything),
-        *_world_axes(view, 0.07 * extent),
-    ]
+    axes, letters = _world_axes(view, extent)
+    parts = [d.heading(view.name), *_ground(view, everything), *axes]
     if view.stands:
         feet = scene.spot_places().repeat(2, axis=0)
         feet[1::2, 2] = everything[:, 2].min()
@@ -181,15 +183,15 @@ def draw(scene: Scene, view: View, everything: FloatArray, enlarged: float, elli
         colour, size = (d.RED, 2.2) if spot.kind == "point" else (d.GREEN, 3.0)
         parts.append(d.ellipse(xy[i], ellipses[i], colour, colour))
         parts.append(d.dot(xy[i, 0], xy[i, 1], size, colour))
-    parts += _labels(view, scene, 0.09 * extent)
+    parts += _labels(view, scene, 0.09 * extent, letters)
     step = d.round_below(0.25 * WIDTH / view.unit)
     parts.append(d.scale_bar(2, HEIGHT - 8, step * view.unit, localised(f"{step:g} m")))
     return d.svg(WIDTH, HEIGHT, parts, view.name)
 
 
-def _labels(view: View, scene: Scene, ahead: float) -> list[str]:
-    """Names; those of cameras stand ``ahead`` of them, m."""
-    labels, parts = _Labels(view.to_picture(scene.spot_places())), []
+def _labels(view: View, scene: Scene, ahead: float, letters: FloatArray) -> list[str]:
+    """Names; those of cameras stand ``ahead`` of them, m. letters: of the axes, which stay readable."""
+    labels, parts = _Labels(view.to_picture(scene.spot_places()), letters), []
     for label, x in scene.outlines + scene.clouds:
         parts.append(labels.place(view.to_picture(x).mean(axis=0), label, d.INK) if label else "")
     for shot in scene.shots:
@@ -214,5 +216,7 @@ def pictures(scene: Scene, ellipsoid: float) -> tuple[tuple[Markup, ...], float]
         return (), 1.0
     extent = float(np.linalg.norm(np.ptp(everything, axis=0)))
     enlarged = enlargement(scene, ellipsoid, extent)
-    views = (plan(everything), perspective(everything))
+    around = (everything.min(axis=0) <= 0.0).all() and (everything.max(axis=0) >= 0.0).all()
+    shown = np.concatenate([everything, _AXES * extent * np.eye(3)]) if around else everything
+    views = (plan(shown), perspective(shown))
     return tuple(draw(scene, v, everything, enlarged, ellipsoid) for v in views), enlarged

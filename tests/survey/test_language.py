@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from itertools import product
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from jinja2 import Environment, nodes
@@ -13,6 +14,10 @@ from jinja2 import Environment, nodes
 import adjust
 import survey
 from adjust.model import observations
+from adjust.model.result import Decision
+from adjust.relay.loops import LoopKind, loop_basis
+from adjust.relay.network import topology
+from adjust.statistics.result import Alternative
 from survey.batch.record import CAUSES
 from survey.project.tables.terrestrial import READING_KINDS
 from survey.report.language import (
@@ -178,6 +183,29 @@ def test_groups_named_after_their_kind_are_said_in_the_language_and_others_as_th
         assert [x for x in GROUPS_BY_KIND if group_name(x) == x.replace("_", " ")] == []
         assert group_name("points") == "points"  # a name that people gave
     assert group_name("slope_distance") == "slope distance"
+
+
+@pytest.mark.parametrize("language", OTHERS)
+def test_warnings_of_an_adjustment_have_their_translation(language: str) -> None:
+    """As they come; the words of each are looked for in the program by another test."""
+    decision = Decision("rejected", "pair", "pair", ("A-B", "A", "B"), 40.0, 6, 1e-6, 22.5, 9.0, 1, "test")
+    pair = Alternative((("pair", "A-B"),), (("pair", "C-D"),), 1.5)
+    said = [
+        decision.text(), f"fails its test, but cannot be left out: {decision.text().split(': ', 1)[1]}", pair.text(),
+        "left out: pair A-B: off by 0.5 deg and 0.01 m, test 70.1, p 3e-12",
+        "pair K10-E1 closes no loop: nobody would notice an error in it; measure a second way to what it leads to",
+        "camera X: its distortion folds back at 700 px from the principal point, inside the observed 800 px; free "
+        "fewer coefficients or cover the image better",
+        "variance component of group image: sigmas were 0.10 times those given (factor 0.01 +- 0.001, p 1e-300)",
+        "group pair: its typical observation contradicts the rest; sigmas 6.3 times as large explain that better than "
+        "wrong observations do, and none was left out for it; check its units, the sense of its angles and the names "
+        "in it",
+    ]  # fmt: skip
+    triangle = topology([("p", "A", "B"), ("q", "B", "C"), ("r", "C", "A")])
+    said += [loop_basis(triangle, kind).note for kind in get_args(LoopKind)]
+    with speaking(language):
+        assert [x for x in said if message(x) == x] == []
+        assert [x for x in map(message, said) if re.search(r"\b(the|is|are|its|of|and|or|to|from|off)\b", x)] == []
 
 
 def test_german_messages_have_german_numbers() -> None:

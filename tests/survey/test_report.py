@@ -18,7 +18,7 @@ from survey.report.charts import CameraResiduals, histogram, mean_field, vector_
 from survey.report.context import worst
 from survey.report.language import esc
 from survey.report.page import report_html
-from survey.report.picture import perspective, pictures, plan
+from survey.report.picture import HEIGHT, WIDTH, perspective, pictures, plan
 from survey.report.scene import Scene, Spot, enlargement, scene_of
 from survey.report.sections import observations, unknowns
 from survey.report.terminal import summary_text
@@ -280,6 +280,17 @@ def test_plan_is_true_to_scale_and_y_points_up() -> None:
     assert b - a == pytest.approx((view.unit, 0.0))
     assert up - a == pytest.approx((0.0, -view.unit))
     np.testing.assert_allclose(view.jacobian(np.zeros(3)), view.unit * np.array([[1, 0, 0], [0, -1, 0]]), atol=1e-6)
+
+
+def test_axes_at_the_edge_are_inside_the_picture() -> None:
+    """The world's origin is the farthest point to the right and above."""
+    far = np.array([(0.0, 0.0, 0.0), (-8.0, -6.0, -2.0)])
+    scene = Scene()
+    scene.outlines.append(("", far))
+    for page in pictures(scene, 2.8)[0]:
+        letters = re.findall(r'<text x="([-\d.]+)" y="([-\d.]+)"[^>]*>([xyz])</text>', page)
+        assert letters
+        assert all(8.0 < float(x) < WIDTH - 8.0 and 12.0 < float(y) < HEIGHT for x, y, _ in letters), letters
 
 
 def test_everything_is_inside_the_perspective_and_near_things_are_larger() -> None:

@@ -8,7 +8,7 @@ from markupsafe import Markup
 
 from survey.report import markup as m
 from survey.report.context import Context
-from survey.report.language import t
+from survey.report.language import message, t
 
 _MOST_LOOPS = 60
 _MOST_PAIRS = 150
@@ -80,7 +80,7 @@ def loops(c: Context) -> Markup:
         "of the misclosure, along its direction, from the covariances of the pairs. Test: w′C⁻¹w, chi-square with "
         "{freedom} degrees of freedom; a loop is open where its p is too small for chance at {alpha} % for all loops "
         "together ({failed} are).",
-        shown=shown, note=found["note"], freedom=6 if poses else 3, alpha=m.general(100 * found["alpha"]),
+        shown=shown, note=message(found["note"]), freedom=6 if poses else 3, alpha=m.general(100 * found["alpha"]),
         failed=m.count(found["n_failed"]),
     )  # fmt: skip
     note += " " + t(
