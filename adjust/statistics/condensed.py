@@ -132,21 +132,23 @@ def _known(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> _Part:
     images, entries = graph.images, Entries()
     number = graph.image_numbers
     shapes, columns, sets = _shapes(graph), columns_of_blocks(graph, key_columns), images.alike()
-    at, lengths, e, own = 0, [np.zeros(0, dtype=np.int64)], [np.zeros(0)], [np.zeros((0, _OWN[-1]))]
-    made = side_by_side(lambda mine: _condensed(graph, mine, shapes), sets)
-    for mine, (by_key, by_own, residual) in zip(sets, made, strict=True):
-        g, k = residual.shape
-        entries.add_blocks(at + np.arange(g * k).reshape(g, k), columns(mine), by_key)
-        own.append(by_own.reshape(g * k, -1))
-        e.append(residual.ravel())
-        lengths.append(np.full(g, k))
-        at += g * k
+    heights = [images.condensed_height(int(mine[0])) for mine in sets]
+    ends = np.cumsum([0, *(len(mine) * k for mine, k in zip(sets, heights, strict=True))]).tolist()
+    own, e = np.zeros((ends[-1], _OWN[-1])), np.empty(ends[-1])
+
+    def condensed(i: int) -> FloatArray:
+        """Rows by the keys of the i-th set, the rest of which goes where it belongs."""
+        rows, shape = slice(ends[i], ends[i + 1]), (len(sets[i]), heights[i])
+        return _condensed(graph, sets[i], shapes, own[rows].reshape(*shape, -1), e[rows].reshape(shape))
+
+    for i, by_key in enumerate(side_by_side(condensed, range(len(sets)))):
+        entries.add_blocks(np.arange(ends[i], ends[i + 1]).reshape(-1, heights[i]), columns(sets[i]), by_key)
     order = np.concatenate([np.zeros(0, dtype=np.int64), *sets])
     groups = [images.blocks[b].group for b in order.tolist()]
-    A, of_blocks = entries.matrix((at, n)), np.concatenate(lengths)
+    A, of_blocks = entries.matrix((len(e), n)), np.repeat(np.array(heights, dtype=np.int64), list(map(len, sets)))
     A.eliminate_zeros()  # rows that are triangular leave half of it empty
-    rows = ImageRows(A, np.concatenate(e), of_blocks, np.ones(len(groups), dtype=np.bool_), groups)
-    return _Part(rows, number[order], np.repeat(number[order], of_blocks), np.concatenate(own))
+    rows = ImageRows(A, e, of_blocks, np.ones(len(groups), dtype=np.bool_), groups)
+    return _Part(rows, number[order], np.repeat(number[order], of_blocks), own)
 
 
 def _shapes(graph: AdjustmentGraph) -> Callable[[IntArray], FloatArray]:
@@ -162,22 +164,24 @@ def _shapes(graph: AdjustmentGraph) -> Callable[[IntArray], FloatArray]:
 
 
 def _condensed(
-    graph: AdjustmentGraph, mine: IntArray, shapes: Callable[[IntArray], FloatArray]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Of g blocks that are alike, k rows each, by the columns of their keys (g, k, w), own (g, k, 30) and e (g, k)."""
+    graph: AdjustmentGraph, mine: IntArray, shapes: Callable[[IntArray], FloatArray], own: FloatArray, e: FloatArray
+) -> FloatArray:
+    """Of g blocks that are alike, k rows each, by the columns of their keys (g, k, w); into own (g, k, 30), e (g, k).
+
+    own: of zeros.
+    """
     images, width = graph.images, int(graph.images.n_rows[mine[0]]) - 1
     points = images.ptr[mine][:, None] + np.arange(len(images.blocks[mine[0]].uv))
     rows = images.condensed_rows(mine, shapes(points))
     nl = images.state.lenses.n_free[images.camera[mine]]
-    own = np.zeros((*rows.shape[:2], _OWN[-1]))
     lens, camera, pose, shape = np.split(own, _OWN[:-1], axis=2)
     for count in np.unique(nl):  # warps make up for lens parameters in the number of columns
         those = nl == count
         lens[those, :, :count] = rows[those][:, :, :count]
         pose[those] = rows[those][:, :, count : count + 6]
     camera[:] = pose @ adjoint_of_inverse(images.chains.R[mine], images.chains.t[mine])
-    shape[:] = rows[:, :, width:-1]
-    return rows[:, :, :width] @ images.local_from_keys(mine), own, rows[:, :, -1].copy()
+    shape[:], e[:] = rows[:, :, width:-1], rows[:, :, -1]
+    return rows[:, :, :width] @ images.local_from_keys(mine)
 
 
 def _shape_factors(x: FloatArray) -> FloatArray:

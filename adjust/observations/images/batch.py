@@ -237,10 +237,14 @@ class ImageBatch:
 
         The same normal equations as all their rows; factors as :func:`adjust.native.images.condensed_rows` has them.
         """
-        k = int(self.n_rows[which[0]]) + N_SHAPE
-        out = np.zeros((len(which), min(2 * factors.shape[1], k), k))
+        b = int(which[0])
+        out = np.zeros((len(which), self.condensed_height(b), int(self.n_rows[b]) + N_SHAPE))
         condensed_rows(which, self.at(self._used_weights), factors, out)
         return out
+
+    def condensed_height(self, b: int) -> int:
+        """How many rows these are for a block like ``b``."""
+        return min(2 * int(self.ptr[b + 1] - self.ptr[b]), int(self.n_rows[b]) + N_SHAPE)
 
     @property
     def _used_weights(self) -> FloatArray:
