@@ -22,8 +22,8 @@ TESTS = (
     "adjust/test_native.py", "adjust/test_native_fuzz.py", "adjust/test_lens_kernels.py", "adjust/test_lens.py",
     "adjust/test_core_bundle.py", "adjust/test_core_jacobians.py", "adjust/test_core_precision.py",
     "adjust/test_image_reduction.py", "adjust/test_image_segments.py", "adjust/test_navigation.py",
-    "adjust/test_pose_network.py", "adjust/test_pair_normals.py", "survey/test_detection.py",
-    "survey/test_detection_spots.py", "survey/test_rendering.py",
+    "adjust/test_pose_network.py", "adjust/test_pair_normals.py", "adjust/test_long_corridors.py",
+    "survey/test_detection.py", "survey/test_detection_spots.py", "survey/test_rendering.py",
 )  # fmt: skip
 
 
