@@ -11,9 +11,6 @@ from adjust.lenses.models import MODELS
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 
-FOCAL, CENTRE = ("fx", "fy", "c"), ("u0", "v0", "xp", "yp")
-"""Components of lenses that focus or zoom change, and another crop of the sensor."""
-
 
 @dataclass(frozen=True)
 class Place:

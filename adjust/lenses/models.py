@@ -49,6 +49,10 @@ class LensModel:
         return len(self.names)
 
 
+FOCAL, CENTRE = ("fx", "fy", "c", "ck"), ("u0", "v0", "xp", "yp", "px", "py", "xh", "yh")
+"""What the models call principal distance and principal point."""
+
+
 def _model(name: str, kind: int, names_and_units: str, backward: bool = False) -> LensModel:
     """A model from "name:unit name:unit ..."."""
     pairs = [entry.split(":") for entry in names_and_units.split()]

@@ -9,6 +9,7 @@ from adjust.adjustment import AdjustOptions, adjust
 from adjust.graph.assembly import StartValues, values_of
 from adjust.model.errors import NotConvergedError, SurveyError, listed
 from adjust.model.result import Adjustment, Component, VarianceComponents
+from adjust.model.subsets import positions_of
 from adjust.model.survey import Survey
 from adjust.statistics.group_sums import scaled_survey
 from adjust.statistics.outliers.outcome import OutlierSearch, SearchOptions
@@ -119,10 +120,8 @@ def _searchable(now: Adjustment, n: int) -> bool:
 
 def _blamed_on_rays(survey: Survey, found: Adjustment) -> bool:
     """Whether rays to points, or images from stations, were left out that observations of another kind touch."""
-    touched = {r.point_id for d in survey.distances if d.used for r in (d.a, d.b) if r.frame is None}
-    touched |= {r.point_id for c in survey.coordinates if c.used for r in c.positions if r.frame is None}
-    touched |= {r.point_id for d in survey.coordinate_differences if d.used for r in (*d.at, *d.to) if r.frame is None}
-    touched |= {p.point_id for x in survey.readings if x.used for p in (x.at, x.to) if p.frame is None}
+    others = (o for kind in survey.others.values() for o in kind if o.used)
+    touched = {r.point_id for o in others for r in positions_of(o) if r.frame is None}
     names = [p.point_id for p in found.survey.points]
     paired = {r.frame_id for p in survey.pairs if p.used for r in (p.a, p.b) if r.kind == "station"}
     carrying = {c.camera_id for c in survey.cameras if c.station_id in paired}

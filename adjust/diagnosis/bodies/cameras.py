@@ -9,8 +9,6 @@ from gtsam import Pose3
 from adjust.diagnosis.bodies.series import Step
 from adjust.diagnosis.bodies.split import split_camera
 from adjust.diagnosis.hypothesis import (
-    CENTRE,
-    FOCAL,
     Edit,
     Hypothesis,
     LeaveOut,
@@ -21,6 +19,7 @@ from adjust.diagnosis.hypothesis import (
     motion_text,
 )
 from adjust.diagnosis.images import TURNED, turned
+from adjust.lenses.models import CENTRE, FOCAL
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 from adjust.spatial.rigid import rotation_log

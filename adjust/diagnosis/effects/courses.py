@@ -7,8 +7,8 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.diagnosis.case import Case
-from adjust.diagnosis.hypothesis import CENTRE, FOCAL
 from adjust.diagnosis.prediction import Linear
+from adjust.lenses.models import CENTRE, FOCAL
 from adjust.model.names import numbered
 from adjust.model.result import ParameterName
 from adjust.model.survey import IntArray, Survey

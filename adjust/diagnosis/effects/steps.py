@@ -11,7 +11,6 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.courses import MOVED, Course, affordable, alike, courses, standing
 from adjust.diagnosis.effects.effect import Effect
 from adjust.diagnosis.hypothesis import (
-    CENTRE,
     Edit,
     Hypothesis,
     LeaveOut,
@@ -22,6 +21,7 @@ from adjust.diagnosis.hypothesis import (
     motion_text,
 )
 from adjust.diagnosis.prediction import Linear, Prediction, adjusted_values
+from adjust.lenses.models import CENTRE
 from adjust.model.observations import ImageBlock, Pair
 from adjust.model.result import Adjustment
 from adjust.model.rewriting import with_rows

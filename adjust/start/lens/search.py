@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.lenses.models import (
+    CENTRE,
+    FOCAL,
     LensModel,
     camera_constants,
     default_start,
@@ -30,8 +32,6 @@ _GOOD_START = 0.01  # of the image width: with less error a closed form needs no
 _SEVERAL, _OTHER_STARTS = 3, 4  # images, and starts that are tried beside the first where that leads nowhere
 _LEVELS = ("focal centre k1 k2", "focal centre k1", "focal k1", "focal")
 _SIMPLE_PX = 2.0
-FOCAL = {"fx", "fy", "c", "ck"}
-_CENTRE = {"u0", "v0", "xp", "yp", "px", "py", "xh", "yh"}
 _RADIAL = {"k1": 1, "k2": 2, "K1": 1, "K2": 2, "A1": 1, "A2": 2}
 
 
@@ -84,7 +84,7 @@ class LensSearch:
         self.tied = {tie.name: tie for tie in camera.lens.ties}
         free = set(camera.lens.free) | {t.name for t in camera.lens.ties if t.to in camera.lens.free}
         for name in model.names:
-            if name in (FOCAL | {"u0", "v0", "px", "py"}) and name not in free and name not in self.prior:
+            if name in (*FOCAL, "u0", "v0", "px", "py") and name not in free and name not in self.prior:
                 raise SurveyError(
                     f"camera {camera.camera_id!r}: {name} is held but has no value; give lens values or free it"
                 )
@@ -243,7 +243,7 @@ class LensSearch:
     def _directions(self, level: str) -> FloatArray:
         """Columns (n, p) of the lens components that this level frees, with ties; fx, fy apart only with the centre."""
         wanted = set(FOCAL)
-        wanted |= _CENTRE if "centre" in level else set()
+        wanted |= set(CENTRE if "centre" in level else ())
         wanted |= {name for name, order in _RADIAL.items() if f"k{order}" in level}
         names, columns = self.model.names, []
         wanted = set(names) if level == "all" else wanted
@@ -268,7 +268,7 @@ class LensSearch:
         width = max(self.size)
         sigma = np.sqrt(np.einsum("ij,jk,ik->i", directions, fit.cov, directions))
         pixel = 1.0 / self.constants[0] if self.model.in_mm else 1.0
-        limits = {**dict.fromkeys(FOCAL, 0.1 * focal), **dict.fromkeys(_CENTRE, 0.1 * width)}
+        limits = {**dict.fromkeys(FOCAL, 0.1 * focal), **dict.fromkeys(CENTRE, 0.1 * width)}
         known = all(s * pixel <= limits[n] for n, s in zip(self.model.names, sigma, strict=True) if n in limits)
         centre = principal_point_px(self.model, fit.values, self.constants)
         inside = np.all(np.abs(centre - self.constants[1:3]) < 0.3 * width)

@@ -8,10 +8,10 @@ from types import MappingProxyType
 
 import numpy as np
 
-from adjust.lenses.models import LensModel, lens_model
+from adjust.lenses.models import FOCAL, LensModel, lens_model
 from adjust.model.errors import SurveyError
 from adjust.model.survey import Camera, FloatArray
-from adjust.start.lens.search import FOCAL, LensSearch, LensStart
+from adjust.start.lens.search import LensSearch, LensStart
 from adjust.start.views import Sighting
 
 

@@ -4,7 +4,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from adjust.model.names import natural_key
 from adjust.model.observations import CoordinateDifferences, Coordinates, position_text
@@ -136,7 +135,10 @@ def _joined(
         for row in rows:
             if (groups[row], used[row]) != (groups[first], used[first]):
                 raise table.error(row, f"set {one.of_set!r} has different 'group' or 'used'; make them the same")
-        cov = block_diag(*own[rows])
+        n, numbers = len(rows), np.arange(len(rows))
+        blocks = np.zeros((n, 3, n, 3))
+        blocks[numbers, :, numbers] = own[rows]
+        cov = blocks.reshape(3 * n, 3 * n)
         at = {3 * row + axis: 3 * i + axis for i, row in enumerate(rows) for axis in range(3)}
         for (a, b), value in one.entries.items():
             cov[at[a], at[b]] = cov[at[b], at[a]] = value
