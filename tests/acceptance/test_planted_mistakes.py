@@ -13,6 +13,7 @@ from adjust.diagnosis.budget import Budget
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.diagnosis import diagnose
 from adjust.model.errors import SurveyError
+from adjust.model.survey import LensParameter
 from survey.cli import main
 from survey.project.writing import write_project
 from survey.simulate.parts import wall_grid
@@ -69,6 +70,18 @@ def test_size_that_makes_it_worse_is_taken_back() -> None:
     """Found at values that the mistake has spoilt, it is no size at those that it has led to."""
     mistake = next(m for m in MISTAKES if m.name == "focus touched")
     assert outcome_of(mistake, "stereo", 0.03, 90210)["outcome"] == "first"
+
+
+@pytest.mark.parametrize(("model", "free"), [
+    ("aicon", "ck xh yh A1 A2"), ("brown_backward", "c xp yp K1 K2"), ("brown_backward_dbat", "c px py K1 K2"),
+])  # fmt: skip
+def test_focus_is_named_whatever_the_lens_calls_it(model: str, free: str) -> None:
+    survey, truth = survey_of("stereo", 3)
+    lens = LensParameter(model, tuple(free.split()), pixel_size_mm=0.005)
+    survey = replace(survey, cameras=tuple(replace(c, lens=lens) for c in survey.cameras))
+    mistake = next(m for m in MISTAKES if m.name == "focus touched")
+    first = diagnosed(mistake.plant(survey, truth, 0.01)).candidates[0].hypothesis
+    assert (first.name, first.place.ids) == ("focus touched", (mistake.about(survey),))
 
 
 @pytest.mark.parametrize(("name", "kind", "size"), [
