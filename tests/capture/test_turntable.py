@@ -2,6 +2,7 @@
 
 import math
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -216,6 +217,18 @@ def test_cable_that_stays_out_is_said():
     with pytest.raises(TableDisconnectedError) as caught:
         status.result(2.0)
     assert any("the stop after it failed too" in note for note in caught.value.__notes__)
+
+
+def test_a_move_that_ends_after_the_table_was_let_go_takes_no_new_connection(monkeypatch):
+    table, controller = make(AxisPhysics(5 * DEG, 50 * DEG), settle=replace(QUICK, poll_s=0.05))
+    status = table.set([50 * DEG, 0.0])
+    time.sleep(0.02)  # the one who watches the move sleeps until the next reading
+    opened = []
+    monkeypatch.setattr(controller, "open", lambda: opened.append(1))
+    table.close()
+    with pytest.raises(TurntableError):
+        status.result(5.0)
+    assert opened == []
 
 
 def test_second_move_waits_for_the_first():

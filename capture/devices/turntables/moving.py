@@ -42,7 +42,7 @@ class MovingTable:
         self._controller, self._settle = controller, settle
         self._io = threading.Lock()
         self._stopped = threading.Event()
-        self._locked_out = False
+        self._locked_out = self._closed = False
         self._status: Future[None] | None = None
         self._setpoint = np.full(len(self.axes), np.nan)
         self._last = None if near is None else np.array(near, float)
@@ -61,6 +61,7 @@ class MovingTable:
     def open(self) -> None:
         """Connect; nothing moves."""
         with self._io:
+            self._closed = False
             self._controller.open()
         try:
             self.states()
@@ -72,6 +73,7 @@ class MovingTable:
         """Connect anew, after a cable was pulled; the count of turns goes on."""
         with self._io:
             self._controller.close()
+            self._closed = False
             self._controller.open()
         self.states()
 
@@ -82,7 +84,9 @@ class MovingTable:
                 self.stop()
         except TurntableError:
             pass  # whoever closes has no use for a table that cannot be reached
-        self._controller.close()
+        with self._io:
+            self._closed = True
+            self._controller.close()
 
     def states(self) -> tuple[AxisState, ...]:
         """What the controller says of all axes, turns counted."""
@@ -158,6 +162,8 @@ class MovingTable:
             try:
                 self._controller.stop()
             except TableDisconnectedError:
+                if self._closed:  # by whoever let go of the table: a move that notices it late takes no new connection
+                    raise
                 self._controller.close()
                 self._controller.open()
                 self._controller.stop()
