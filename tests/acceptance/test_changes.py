@@ -32,6 +32,8 @@ def test_a_table_group_that_a_large_survey_dilutes_is_named(tmp_path, capsys):
     out = capsys.readouterr().out
     assert "FAILED" in out
     assert "group table does not fit" in out
+    assert main(["runs", str(tmp_path / "F200ecc12")]) == 0
+    assert "  failed  sigma0 " in capsys.readouterr().out  # as the results say, though the whole passes
 
 
 def test_a_focal_length_that_changes_half_way_is_named(tmp_path, capsys):

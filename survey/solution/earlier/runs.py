@@ -117,7 +117,9 @@ def record_run(
     if runs and runs[-1].fingerprint == fingerprint:
         return ()
     number = max(there, default=0) + 1
-    said = Run(number, run.date, author, run.command, False, snapshot(adjustment).summary, dict(run.input_hashes),
+    # the verdict is that of the results, on every part of the survey
+    summary = {**snapshot(adjustment).summary, **{key: solution["summary"][key] for key in ("verdict", "reason")}}
+    said = Run(number, run.date, author, run.command, False, summary, dict(run.input_hashes),
                tuple(one.exclusion for one in run.left_out), fingerprint)  # fmt: skip
     into = place / RUNS / f"{number:04d}"
     atomic_write(into / _RUN, json_text(said.as_dict()))
