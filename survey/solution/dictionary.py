@@ -9,6 +9,7 @@ import numpy as np
 from adjust.epochs.states import datum_carriers, open_directions
 from adjust.model.result import Adjustment, GroupSummary
 from adjust.precision.precision import in_conditions
+from adjust.statistics.result import Consistency
 from survey.folder.plain import attributes, plain
 from survey.project.detected import DetectedImage
 from survey.project.observed import IMAGES, Hits, Observed, name_of_residual
@@ -18,7 +19,7 @@ from survey.solution.instruments import instrument_entries
 from survey.solution.statistics import Statistics
 from survey.solution.statistics_dict import statistics_dict
 from survey.solution.unknowns import unknown_entries
-from survey.solution.verdict import findings, fit_of, suspects, verdict
+from survey.solution.verdict import fit_of, suspects, verdict, warnings_with
 
 CONVENTIONS = {
     "poses": "a_from_b takes coordinates in b to coordinates in a; camera x right, y down, z forward",
@@ -63,7 +64,7 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
     solution: dict[str, Any] = plain(
         {
             "format": 1,
-            "summary": _summary(adjustment, run, scale, None),
+            "summary": summary_dict(adjustment, run.title, scale),
             "conventions": CONVENTIONS,
             **unknown_entries(adjustment, scale),
             "pairs": _pairs(adjustment, scale),
@@ -96,15 +97,12 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
 def with_statistics(
     solution: dict[str, Any], adjustment: Adjustment, run: RunInfo, found: Statistics
 ) -> dict[str, Any]:
-    """The solution of :func:`solution_dict`, with its statistics before what went in, and judged by them.
-
-    Its warnings: causes that were tried first, then what tests of parts found, then the rest.
-    """
-    scale, warnings = q.scale_of(adjustment, run.sigmas), adjustment.warnings
-    tried = len(adjustment.diagnosis.lines) if adjustment.diagnosis is not None else 0
+    """The solution of :func:`solution_dict`, with its statistics before what went in, and judged by them."""
+    scale, tested = q.scale_of(adjustment, run.sigmas), found.consistency
+    n_unmet = sum(not v.met for v in found.verdicts)
     told: dict[str, Any] = plain({
-        "summary": _summary(adjustment, run, scale, found),
-        "warnings": [*warnings[:tried], *findings(found.consistency), *warnings[tried:]],
+        "summary": summary_dict(adjustment, run.title, scale, tested, n_unmet),
+        "warnings": warnings_with(adjustment, tested),
         **statistics_dict(adjustment, found, scale),
     })  # fmt: skip
     out, names = solution | told, list(solution)
@@ -120,13 +118,14 @@ def _free_datum(adjustment: Adjustment) -> dict[str, Any]:
     return {"free_datum": {"open_motions": directions.T.tolist(), "carried_by": carriers}}
 
 
-def _summary(adjustment: Adjustment, run: RunInfo, scale: q.Scale, statistics: Statistics | None) -> dict[str, Any]:
+def summary_dict(
+    adjustment: Adjustment, title: str, scale: q.Scale, tested: Consistency | None = None, n_unmet: int = 0
+) -> dict[str, Any]:
+    """How an adjustment went and what is to be thought of it; ``tested``, ``n_unmet`` as :func:`verdict` has them."""
     found, test = suspects(adjustment), adjustment.global_test
-    n_unmet = sum(not v.met for v in statistics.verdicts) if statistics is not None else 0
-    tested = statistics.consistency if statistics is not None else None
     level, reason = verdict(adjustment, found, n_unmet, tested)
     return {
-        "title": run.title,
+        "title": title,
         "verdict": level,
         "reason": reason,
         "fit": fit_of(adjustment, tested),

@@ -71,13 +71,23 @@ MOST_BUDGETS = 60
 MOST_NEIGHBOURS = 150
 
 
-def statistics_of(adjustment: Adjustment, tolerances: tuple[Tolerance, ...], scale: Scale) -> Statistics:
-    """All of them, at every size. Raises SurveyError for a tolerance that is about nothing."""
-    judged = verdicts(adjustment, tolerances, scale)
-    alpha = adjustment.global_test.alpha if adjustment.global_test is not None else 0.05
+def tested_parts(adjustment: Adjustment) -> Consistency:
+    """Of the statistics only what a verdict needs: every part with the rest, and through time."""
+    condensed = None if _is_large_network(adjustment) else condensed_system(precision_of(adjustment))
+    return consistency(adjustment, condensed, _alpha(adjustment))
+
+
+def statistics_of(
+    adjustment: Adjustment, tolerances: tuple[Tolerance, ...], scale: Scale, tested: Consistency | None = None
+) -> Statistics:
+    """All of them, at every size. Raises SurveyError for a tolerance that is about nothing.
+
+    tested: what :func:`tested_parts` found, where that is known.
+    """
+    judged, alpha = verdicts(adjustment, tolerances, scale), _alpha(adjustment)
     drawn, near = correlation_matrix(adjustment), neighbours(adjustment, scale)
-    if adjustment.survey.is_pose_network and len(adjustment.other_residuals) > LARGEST_NETWORK:
-        tested = consistency(adjustment, None, alpha)
+    if _is_large_network(adjustment):
+        tested = tested or consistency(adjustment, None, alpha)
         return Statistics(reliability(adjustment), adjustment.variance_components, (), (), near, (), drawn,
                           adjustment.decisions, judged, tested, (*tested.left_out, _LARGE_NETWORK))  # fmt: skip
     condensed = condensed_system(precision_of(adjustment))
@@ -85,7 +95,7 @@ def statistics_of(adjustment: Adjustment, tolerances: tuple[Tolerance, ...], sca
     names = _budgeted(adjustment)
     _ = system.structured, system.sigmas  # all of these ask for them
     with Beside() as made:
-        consistent = made.of(lambda: consistency(adjustment, condensed, alpha))
+        consistent = made.of(lambda: tested or consistency(adjustment, condensed, alpha))
         reliable = made.of(lambda: reliability(adjustment, system=condensed))
         weak = made.of(lambda: weak_directions(adjustment, system=system))
         correlated = made.of(lambda: correlations(adjustment, system=system))
@@ -94,6 +104,14 @@ def statistics_of(adjustment: Adjustment, tolerances: tuple[Tolerance, ...], sca
             reliable(), components, correlated(), weak(), near, budget(), drawn, adjustment.decisions, judged,
             consistent(), (*consistent().left_out, *_left_out(adjustment, system, len(names))),
         )  # fmt: skip
+
+
+def _is_large_network(adjustment: Adjustment) -> bool:
+    return adjustment.survey.is_pose_network and len(adjustment.other_residuals) > LARGEST_NETWORK
+
+
+def _alpha(adjustment: Adjustment) -> float:
+    return adjustment.global_test.alpha if adjustment.global_test is not None else 0.05
 
 
 _LARGE_NETWORK = (

@@ -68,10 +68,15 @@ def misfits(summary: Mapping[str, Any]) -> bool:
     return bool(summary.get("fit", before) == MISFIT)
 
 
-def findings(tested: Consistency | None) -> tuple[str, ...]:
+def warnings_with(adjustment: Adjustment, tested: Consistency | None) -> tuple[str, ...]:
+    """For people: causes that were tried first, then what tests of parts found, then the rest."""
+    tried = len(adjustment.diagnosis.lines) if adjustment.diagnosis is not None else 0
+    found = () if tested is None else _findings(tested)
+    return (*adjustment.warnings[:tried], *found, *adjustment.warnings[tried:])
+
+
+def _findings(tested: Consistency) -> tuple[str, ...]:
     """For people: changes, and the parts that do not fit, the clearest first."""
-    if tested is None:
-        return ()
     out = [c.text() for c in tested.changes[:_MOST_PARTS]] + [p.text() for p in tested.failing[:_MOST_PARTS]]
     more = len(tested.changes) + len(tested.failing) - len(out)
     return (*out, f"and {more} more parts do not fit") if more else tuple(out)

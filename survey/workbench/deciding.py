@@ -225,7 +225,7 @@ class Deciding(Resident):
         except SurveyError as error:
             if not may_fail or isinstance(error, CancelledError):
                 raise
-            solved, failure = replace(trial, adjustment=None), error
+            solved, failure = replace(trial, judgement=None), error
         signature = self._write(step, rows)
         changes = self._take(replace(self._as_written(solved), signature=signature), failure)
         self.n_unsaved += 1

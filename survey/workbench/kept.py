@@ -13,6 +13,7 @@ from survey.folder.text import NOT_OURS, read_bytes
 from survey.project.project import RESULTS
 from survey.project.tables.files import read_table
 from survey.project.tables.reading import Layout, Table
+from survey.solution.earlier.changes import in_short
 from survey.workbench.rows import PointRows
 from survey.workbench.situation import Situation
 
@@ -41,8 +42,7 @@ def kept_results(situation: Situation) -> Kept | None:
         if found["inputs"]["hashes"] != dict(situation.everything.inputs):
             return None
         said = found["summary"]
-        summary = {k: said[k] for k in ("verdict", "reason", "sigma0", "redundancy", "n_observations", "n_unknowns")}
-        return Kept(summary, [str(w) for w in found["warnings"]], float(said["suspects"]["image_test_limit"]),
+        return Kept(in_short(said), [str(w) for w in found["warnings"]], float(said["suspects"]["image_test_limit"]),
                     float(said["suspects"]["standardized_limit"]), str(found["inputs"]["date"]))  # fmt: skip
     except (SurveyError, *NOT_OURS):
         return None

@@ -18,7 +18,7 @@ from survey.folder.text import read_text
 from survey.project.exclusions import in_force, read_exclusions
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
 from survey.project.reading import leaving_out, read_all
-from survey.solution.earlier.changes import Changes, snapshot, solution_changes
+from survey.solution.earlier.changes import Changes, solution_changes
 from survey.solution.quantities import Scale, scale_of
 from survey.workbench.kept import Kept, kept_results, with_kept
 from survey.workbench.pages.beginning import Folder
@@ -30,6 +30,7 @@ from survey.workbench.situation import (
     Situation,
     identified_in,
     in_complex,
+    judgement_of,
     signature_of,
     spot_places,
 )
@@ -75,7 +76,7 @@ class Resident(Folder):
     @property
     def adjustment(self) -> Adjustment:
         """The solution; raises SurveyError where there is none yet."""
-        return self.situation.solved
+        return self.situation.solved.adjustment
 
     @property
     def scale(self) -> Scale:
@@ -109,8 +110,9 @@ class Resident(Folder):
 
         with self._lock:
             if self._statistics is None or self._statistics[0] != self.version:
-                options = self.situation.project.options
-                self._statistics = self.version, statistics_of(self.adjustment, options.tolerances, self.scale)
+                found, tolerances = self.situation.solved, self.situation.project.options.tolerances
+                made = statistics_of(found.adjustment, tolerances, self.scale, found.tested)
+                self._statistics = self.version, made
             return self._statistics[1]
 
     def spot_name(self, row: int) -> str:
@@ -172,14 +174,14 @@ class Resident(Folder):
         self._cancel.set()
 
     def _take(self, new: Situation, failure: SurveyError | None = None) -> Changes | None:
-        old, before, after = self.situation, self.situation.adjustment, new.adjustment
+        old, before, after = self.situation, self.situation.judgement, new.judgement
         same = new.everything.survey is old.everything.survey and new.identified is old.identified
         self.layout += not same
         self.situation = new
         self.version, self.failure, self.changes = self.version + 1, failure, None
         if after is not None:
-            self._values.keep(after)
-            self.changes = None if before is None else solution_changes(snapshot(before), snapshot(after))
+            self._values.keep(after.adjustment)
+            self.changes = None if before is None else solution_changes(before.snapshot, after.snapshot)
         return self.changes
 
     def _solved(self, situation: Situation, mode: Mode) -> Situation:
@@ -196,8 +198,10 @@ class Resident(Folder):
             identified, known = identified_in(situation.everything, adjustment), spot_places(project.spots)
         else:
             adjustment = found
-        return replace(situation, adjustment=adjustment, identified=identified, known_spots=known, mode=how,
-                       seconds=perf_counter() - begin_s)  # fmt: skip
+        return replace(
+            situation, judgement=judgement_of(adjustment, situation.project), identified=identified,
+            known_spots=known, mode=how, seconds=perf_counter() - begin_s,
+        )  # fmt: skip
 
     def _adjusted(self, situation: Situation, mode: Mode) -> tuple[Adjustment | None, Mode]:
         """From the values of before; None where that does not do."""

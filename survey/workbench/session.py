@@ -15,7 +15,7 @@ from dataclasses import replace
 from survey.jobs.excluding import FILE, author_name
 from survey.project.exclusions import Row
 from survey.project.project import DEFINITION_FILE
-from survey.solution.earlier.changes import Changes, Snapshot, snapshot, solution_changes
+from survey.solution.earlier.changes import Changes, Snapshot, solution_changes
 from survey.solution.earlier.runs import Run, definition_of, find_run, load_run, pin_run
 from survey.workbench.jobs import Jobs
 from survey.workbench.pictures import picture
@@ -69,7 +69,7 @@ class Workbench(Jobs):
         return solution_changes(self._snapshot(a), self._snapshot(b))
 
     def _snapshot(self, number: int | None) -> Snapshot:
-        return snapshot(self.adjustment) if number is None else load_run(self.folder, number)
+        return self.situation.solved.snapshot if number is None else load_run(self.folder, number)
 
     def pin(self, number: int, pinned: bool = True) -> Run:
         """Keep a run for ever, or no more. Raises SurveyError."""

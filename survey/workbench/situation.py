@@ -12,13 +12,16 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
+from survey.folder.plain import plain
 from survey.project import Project
 from survey.project.exclusions import Exclusion, Name
 from survey.project.observed import Hits, Observed, union
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER, SpotBlock
+from survey.solution.earlier.changes import Snapshot, in_short
 
 if TYPE_CHECKING:
     from adjust.graph.assembly import StartValues
+    from adjust.statistics.result import Consistency
 
 Mode = Literal["warm", "cold"]
 
@@ -29,6 +32,30 @@ class ChangedError(SurveyError):
 
 class CancelledError(SurveyError):
     """The adjustment was given up because somebody asked for that."""
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """An adjustment, its summary with the verdict on every part, its warnings, and what was tested for them."""
+
+    adjustment: Adjustment
+    snapshot: Snapshot
+    warnings: tuple[str, ...]
+    tested: "Consistency"
+
+
+def judgement_of(adjustment: Adjustment, project: Project) -> Judgement:
+    """As the results would have it. Raises SurveyError for a tolerance that is about nothing."""
+    from survey.solution.dictionary import summary_dict
+    from survey.solution.quantities import scale_of
+    from survey.solution.statistics import tested_parts
+    from survey.solution.tolerances import verdicts
+    from survey.solution.verdict import warnings_with
+
+    scale, tested = scale_of(adjustment, project.options.sigmas), tested_parts(adjustment)
+    n_unmet = sum(not v.met for v in verdicts(adjustment, project.options.tolerances, scale))
+    summary = plain(in_short(summary_dict(adjustment, project.title, scale, tested, n_unmet)))
+    return Judgement(adjustment, Snapshot(adjustment.estimates, summary), warnings_with(adjustment, tested), tested)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +74,7 @@ class Situation:
     signature: Mapping[str, tuple[int, int]]
     identified: tuple[ImageBlock, ...] = ()
     known_spots: frozenset[tuple[str, str, complex]] = frozenset()
-    adjustment: Adjustment | None = None
+    judgement: Judgement | None = None
     mode: Mode = "cold"
     seconds: float = 0.0
 
@@ -73,11 +100,16 @@ class Situation:
         return union(observed.hits(one.name, one.at) for one in self.exclusions.values())
 
     @property
-    def solved(self) -> Adjustment:
-        """The solution; raises SurveyError where there is none yet."""
-        if self.adjustment is None:
+    def adjustment(self) -> Adjustment | None:
+        """The solution, None where there is none yet."""
+        return None if self.judgement is None else self.judgement.adjustment
+
+    @property
+    def solved(self) -> Judgement:
+        """The solution, judged; raises SurveyError where there is none yet."""
+        if self.judgement is None:
             raise SurveyError(f"{self.project.folder}: is not adjusted yet; adjust it first")
-        return self.adjustment
+        return self.judgement
 
 
 @dataclass(frozen=True, eq=False)

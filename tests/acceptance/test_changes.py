@@ -6,6 +6,7 @@ from shutil import copytree
 
 import pytest
 
+import survey
 from survey.cli import main
 from tests.data import data_folder
 
@@ -34,6 +35,14 @@ def test_a_table_group_that_a_large_survey_dilutes_is_named(tmp_path, capsys):
     assert "group table does not fit" in out
     assert main(["runs", str(tmp_path / "F200ecc12")]) == 0
     assert "  failed  sigma0 " in capsys.readouterr().out  # as the results say, though the whole passes
+    bench = survey.Workbench(tmp_path / "F200ecc12")
+    for _ in range(2):  # as opened, and adjusted again from there
+        bench.adjust()
+        said, found = bench.state(), bench.findings()
+        assert said["solution"]["verdict"] == found["verdict"] == "failed"
+        assert any("group table does not fit" in w for w in said["warnings"])
+        assert any("group table does not fit" in w["text"] for w in found["warnings"])
+    assert bench.changes.after["verdict"] == "failed"
 
 
 def test_a_focal_length_that_changes_half_way_is_named(tmp_path, capsys):

@@ -20,7 +20,7 @@ from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.excluding import exclude_job
 from survey.project import read
 from survey.report.anchors import anchors_in
-from survey.solution.earlier.changes import snapshot, solution_changes
+from survey.solution.earlier.changes import Snapshot, solution_changes
 from survey.solution.earlier.runs import MOST, list_runs, load_run
 from survey.workbench.pictures import picture
 from survey.workbench.rows import BY_PEOPLE, IN_USE, columns, point_rows
@@ -61,7 +61,7 @@ def wrong_point(folder, by_px=6.0):
 
 
 def same(a, b):
-    changes = solution_changes(snapshot(a), snapshot(b))
+    changes = solution_changes(Snapshot(a.estimates, {}), Snapshot(b.estimates, {}))
     assert not changes.new
     assert not changes.gone
     return max((c.sigmas for c in changes.components if np.isfinite(c.sigmas)), default=0.0)
@@ -233,7 +233,7 @@ def test_the_same_again_is_no_new_run_and_old_ones_go(bench, mine):
 
 
 def test_changes_are_in_sigmas_of_before(bench):
-    a = snapshot(bench.adjustment)
+    a = bench.situation.solved.snapshot
     name = next(n for n in a.estimates if n[0] == "lens")
     e = a.estimates[name]
     sigma = np.sqrt(np.diag(e.cov))

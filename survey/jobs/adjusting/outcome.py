@@ -75,7 +75,7 @@ def keep_failure(error: SurveyError, run: RunInfo, target: Path, place: Path, la
 def kept_run(folder: Path, place: Path, project: Project, outcome: AdjustOutcome) -> tuple[str, ...]:
     """Keep what was adjusted among the runs of its project; the files of old runs that are to go."""
     who = author_name(project.options.identification)
-    return record_run(folder, place, outcome.adjustment, outcome.run, outcome.solution, who)
+    return record_run(folder, place, outcome.run, outcome.solution, who)
 
 
 def made(

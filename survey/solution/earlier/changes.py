@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3
 
-from adjust.model.result import Adjustment, Estimate, ParameterName
+from adjust.model.result import Estimate, ParameterName
 from adjust.model.survey import FloatArray
 from survey.folder.plain import plain
 from survey.solution.quantities import sigma_unit_for_people, sigmas_in, unit_for_people
@@ -74,18 +74,16 @@ def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.4f}"
 
 
-def snapshot(adjustment: Adjustment) -> Snapshot:
-    """A solution as it is."""
-    from survey.solution.verdict import suspects, verdict  # here: runs that are only listed do without
+_SHORT = ("verdict", "reason", "sigma0", "redundancy", "n_observations", "n_unknowns", "omega", "iterations")
 
-    found, test = suspects(adjustment), adjustment.global_test
-    level, reason = verdict(adjustment, found)
-    return Snapshot(adjustment.estimates, plain({
-        "verdict": level, "reason": reason, "sigma0": adjustment.sigma0, "redundancy": adjustment.redundancy,
-        "n_observations": adjustment.n_observations, "n_unknowns": adjustment.n_unknowns, "omega": adjustment.omega,
-        "global_test": None if test is None else test.status, "n_suspects": found.n_image + found.n_other,
-        "n_not_used": found.n_not_used, "iterations": adjustment.iterations,
-    }))  # fmt: skip
+
+def in_short(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """Of the ``summary`` in ``solution.json`` what runs and the workbench show. Raises KeyError."""
+    test, suspect = summary["global_test"], summary["suspects"]
+    return {
+        **{key: summary[key] for key in _SHORT}, "global_test": test and test["status"],
+        "n_suspects": suspect["n_image_points"] + suspect["n_other"], "n_not_used": suspect["n_not_used"],
+    }  # fmt: skip
 
 
 def solution_changes(before: Snapshot, after: Snapshot) -> Changes:

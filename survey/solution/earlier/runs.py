@@ -22,14 +22,13 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from adjust.model.errors import SurveyError
-from adjust.model.result import Adjustment
 from survey.folder.plain import plain
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import NOT_OURS, atomic_write, json_text, read_bytes, read_text
 from survey.project.exclusions import Exclusion, Name
 from survey.project.project import DEFINITION_FILE, RESULTS
 from survey.solution.covariances import read_estimates
-from survey.solution.earlier.changes import Snapshot, snapshot
+from survey.solution.earlier.changes import Snapshot, in_short
 
 if TYPE_CHECKING:  # loads what adjusts
     from survey.solution.dictionary import RunInfo
@@ -108,7 +107,7 @@ class Run:
 
 
 def record_run(
-    folder: Path, place: Path, adjustment: Adjustment, run: "RunInfo", solution: Mapping[str, Any], author: str
+    folder: Path, place: Path, run: "RunInfo", solution: Mapping[str, Any], author: str
 ) -> tuple[str, ...]:
     """Keep a run: its files made in ``place`` with its results, while ``folder`` is changed; old files that go then."""
     runs, there = _readable(folder), [int(path.parent.name) for path in _places(folder)]
@@ -117,9 +116,7 @@ def record_run(
     if runs and runs[-1].fingerprint == fingerprint:
         return ()
     number = max(there, default=0) + 1
-    # the verdict is that of the results, on every part of the survey
-    summary = {**snapshot(adjustment).summary, **{key: solution["summary"][key] for key in ("verdict", "reason")}}
-    said = Run(number, run.date, author, run.command, False, summary, dict(run.input_hashes),
+    said = Run(number, run.date, author, run.command, False, in_short(solution["summary"]), dict(run.input_hashes),
                tuple(one.exclusion for one in run.left_out), fingerprint)  # fmt: skip
     into = place / RUNS / f"{number:04d}"
     atomic_write(into / _RUN, json_text(said.as_dict()))

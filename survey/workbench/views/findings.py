@@ -10,7 +10,7 @@ from survey.report.anchors import ANCHORED, anchor, anchors_in
 from survey.report.language import message
 from survey.workbench.jobs import Jobs
 from survey.workbench.rows import BY_THIS_RUN, IN_USE
-from survey.workbench.views.project import in_words, limits, readings, summary_of, warnings_of
+from survey.workbench.views.project import in_words, limits, readings, warnings_of
 
 if TYPE_CHECKING:
     from adjust.diagnosis.hypothesis import Place
@@ -26,12 +26,12 @@ def findings(bench: Jobs) -> dict[str, Any]:
     remedies: what the diagnosis says would mend it; also of a survey that cannot be adjusted, of which nothing else is
     known.
     """
-    solved = bench.situation.adjustment
+    found, kept = bench.situation.judgement, bench.kept
     known: dict[str, Any] = {"verdict": "failed", "reason": message(str(bench.failure or "")), "warnings": [],
                              "causes": [], "n_failing": 0, "findings": []}  # fmt: skip
-    kept = bench.kept
-    if solved is not None or kept is not None:
-        known = _of_solution(bench, in_words(kept.summary) if kept is not None else summary_of(bench.adjustment))
+    summary = found.snapshot.summary if found is not None else kept.summary if kept is not None else None
+    if summary is not None:
+        known = _of_solution(bench, in_words(summary))
     return dict(plain({"version": bench.version, **known, "remedies": remedies(bench)}))
 
 

@@ -8,12 +8,10 @@ from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Reading
-from adjust.model.result import Adjustment
 from survey.folder.plain import attributes, plain
 from survey.folder.text import suggestion
 from survey.project.observed import Observed, name_of_residual
 from survey.report.language import message
-from survey.solution.earlier.changes import snapshot
 from survey.solution.earlier.runs import list_runs
 from survey.solution.frames import AdjustedFrames
 from survey.solution.quantities import (
@@ -47,7 +45,7 @@ def state(bench: Jobs) -> dict[str, Any]:
         "version": bench.version, "folder": str(bench.folder), "title": now.project.title,
         "read_only": bench.read_only, "lock": bench.holder(), "changed_files": bench.changed_files(),
         "unsaved": bench.n_unsaved, "undo": [*map(message, bench.undoable)], "redo": [*map(message, bench.redoable)],
-        "solution": None if solved is None else summary_of(solved) | {
+        "solution": None if solved is None else in_words(now.solved.snapshot.summary) | {
             "mode": now.mode, "seconds": now.seconds, "sigmas": bench.scale.sigmas},
         "kept": None if bench.kept is None else in_words(bench.kept.summary) | {"date": bench.kept.date},
         "warnings": [message(w) for w in warnings_of(bench)],
@@ -64,11 +62,6 @@ def state(bench: Jobs) -> dict[str, Any]:
     }))  # fmt: skip
 
 
-def summary_of(solved: Adjustment) -> dict[str, Any]:
-    """Of a solution, in the language that is spoken."""
-    return in_words(snapshot(solved).summary)
-
-
 def in_words(summary: Mapping[str, Any]) -> dict[str, Any]:
     """A summary with its reason in the language that is spoken."""
     return {**summary, "reason": message(str(summary["reason"]))}
@@ -76,7 +69,7 @@ def in_words(summary: Mapping[str, Any]) -> dict[str, Any]:
 
 def warnings_of(bench: Jobs) -> Sequence[str]:
     """Of the solution, or of the results until there is one."""
-    found = bench.situation.adjustment or bench.kept
+    found = bench.situation.judgement or bench.kept
     return () if found is None else found.warnings
 
 
