@@ -131,8 +131,7 @@ def readings(session: Session) -> None:
         "Ours: variances, redundancy numbers and tests of everything, and the whole covariance matrix up to "
         f"{terrestrial.FULL_UP_TO} unknowns. Dense NumPy: normal equations as one matrix, LAPACK's Cholesky and "
         "inverse; its rows are made in Python, so its own share is “solve” and “precision”. “free”: inner constraints "
-        "over all points. GNU Gama, built from its released source, takes part as a whole process "
-        "(`python -m tests.benchmarks.gama_commands`); results published with it are met in [networks](networks.md)."
+        "over all points. GNU Gama takes part [from file to file](#beside-gnu-gama)."
     )
     ours, dense = terrestrial.OURS, terrestrial.DENSE
     runs = [(100, False), (100, True)] if session.quick else [(300, False), (1000, False), (1000, True), (3000, False),
