@@ -165,10 +165,9 @@ class PairNormals:
 
     def _eliminated(self, linear: PairLinear) -> bool:
         system = self.b, self.a, linear.by_b, linear.by_a, linear.own
-        if not self.by_rows and self.factor.eliminate(*system) >= 0:
-            return False
-        if self.by_rows is None:
-            self.by_rows = not self._exact(linear)
+        refused = not self.by_rows and self.factor.eliminate(*system) >= 0
+        if self.by_rows is None or refused:
+            self.by_rows = refused or not self._exact(linear)
         return not self.by_rows or self.factor.eliminate_rows(*system) < 0
 
     def _exact(self, linear: PairLinear) -> bool:

@@ -29,6 +29,8 @@ from adjust.precision.cliques import Cliques
 
 _COLUMNS = 96
 """Columns that go up the tree at once."""
+_ROOM = 2**30
+"""Bytes of such columns that are kept."""
 _MANY = 20
 """Keys that are looked up one by one, of a joint covariance."""
 
@@ -43,17 +45,21 @@ Half: TypeAlias = tuple[IntArray, FloatArray]
 
 
 def squares(half: Callable[[sparse.csr_array], Half], A: sparse.csr_array) -> FloatArray:
-    """A Q A' (m, m) by halves of some rows at once."""
-    out, done = np.zeros((A.shape[0],) * 2), list[Half]()
-    for i in range(0, A.shape[0], _COLUMNS):
-        rows, U = half(A[i : i + _COLUMNS])
-        for k, (before, V) in enumerate(done):
-            _, here, there = np.intersect1d(rows, before, assume_unique=True, return_indices=True)
-            across = U[here].T @ V[there]
-            out[i : i + _COLUMNS, k * _COLUMNS : (k + 1) * _COLUMNS] = across
-            out[k * _COLUMNS : (k + 1) * _COLUMNS, i : i + _COLUMNS] = across.T
-        done.append((rows, U))
-        out[i : i + _COLUMNS, i : i + _COLUMNS] = U.T @ U
+    """A Q A' (m, m) by halves of some rows at once, anew for as many others as there is room for."""
+    out = np.zeros((A.shape[0],) * 2)
+    parts = [slice(i, i + _COLUMNS) for i in range(0, A.shape[0], _COLUMNS)]
+    while parts:
+        kept = list[tuple[slice, IntArray, FloatArray]]()
+        for i, part in enumerate(parts):
+            rows, U = half(A[part])
+            for other, before, V in kept:
+                _, here, there = np.intersect1d(rows, before, assume_unique=True, return_indices=True)
+                across = U[here].T @ V[there]
+                out[part, other], out[other, part] = across, across.T
+            if i == len(kept) and sum(V.nbytes for _, _, V in kept) < _ROOM:
+                kept.append((part, rows, U))
+                out[part, part] = U.T @ U
+        parts = parts[len(kept) :]
     return out
 
 

@@ -55,6 +55,19 @@ def test_the_clique_after_all_below_it_beside_each_other() -> None:
         waiting = [*waiting[: len(waiting) - len(below)], c]
 
 
+def test_rows_are_eliminated_where_the_normal_matrix_has_no_pivot() -> None:
+    """Two stations tied to each other 1e11 times as firmly as to what is held: Cholesky's last pivot is rounding."""
+    loose, firm = np.diag([1e-3] * 3 + [1e-2] * 3) ** 2, np.diag([1e-14] * 3 + [1e-13] * 3) ** 2
+    b, a = np.array([1, 1, 2, 2]), np.array([0, 0, 1, 1])
+    network = pose_network(("s0", "s1", "s2"), ("p0", "p1", "p2", "p3"), b, a, np.tile(np.eye(3), (4, 1, 1)),
+                           np.zeros((4, 3)), np.array([loose, loose, firm, firm]), held={0: np.eye(4)})  # fmt: skip
+    solved = minimize(network)
+    normals, linear = system(solved.graph)
+    assert normals.factor.eliminate(normals.b, normals.a, linear.by_b, linear.by_a, linear.own) >= 0
+    assert normals.solution(linear) is not None
+    np.testing.assert_allclose(solve_network(network).joint([2]), loose / 2.0, atol=1e-16)
+
+
 @pytest.mark.slow
 def test_the_far_end_of_a_chain_has_the_sigmas_that_its_pairs_add_up_to() -> None:
     """Each pair measured twice: half of the sum of their covariances, carried to the end; Cholesky loses 8e-5 of it."""

@@ -15,6 +15,7 @@ from adjust.model.survey import FloatArray, Point, PointParameter, Survey
 from adjust.start.robust import limit
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.outliers import exchange
+from adjust.statistics.outliers import round as rounds
 from adjust.statistics.outliers.candidates import candidates, without
 from adjust.statistics.outliers.outcome import SearchOptions
 from adjust.statistics.outliers.search import search_outliers
@@ -25,6 +26,7 @@ from adjust.testing.gross_errors import Search
 from survey.simulate import head_on_table, resample
 from tests.adjust import helpers as h
 from tests.adjust import statistics_networks as net
+from tests.adjust.pose_networks import simulate
 
 
 def refit(system: LinearSystem, out: list[int]) -> tuple[FloatArray, FloatArray]:
@@ -174,6 +176,17 @@ def test_false_alarms_at_the_nominal_rate() -> None:
     assert low - 8 <= alarms <= high
     low, high = binom.ppf([0.001, 0.999], 400 * M, 0.001)
     assert low <= single <= high
+
+
+def test_no_group_is_taken_for_too_confident_because_its_tests_agree_with_each_other() -> None:
+    """Corridors of pairs, of whose redundancy there is a third: their tests vary 1.5 times as much as as many coins."""
+    alarms = 0
+    for seed in range(150):
+        now = adjust(simulate(40, 2, seed).network.as_survey)
+        tests = rounds.tests_of_all(now)
+        assert tests.redundancy[0] == pytest.approx(now.redundancy, rel=1e-9)
+        alarms += bool(rounds.typical(tests).max() > 1.0)
+    assert alarms <= binom.ppf(0.999, 150, 0.00135)
 
 
 def test_a_robust_suspect_that_fits_comes_back() -> None:

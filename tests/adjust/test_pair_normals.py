@@ -150,6 +150,8 @@ def test_covariances_among_sparse_rows_are_those_of_the_whole_matrix(monkeypatch
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
     np.testing.assert_array_equal(found, found.T)
     assert tree.among(A[:0]).shape == (0, 0)
+    monkeypatch.setattr(tree_module, "_ROOM", 1)  # bytes: every half is made anew for each of the others
+    np.testing.assert_array_equal(tree.among(A), found)
     ptr = np.array([0, 12, 12, 30, 40])
     for i, j, alone in zip(ptr, ptr[1:], tree.each_among(A, ptr), strict=False):
         np.testing.assert_allclose(alone, found[i:j, i:j], rtol=1e-9, atol=1e-12 * np.abs(expected).max())

@@ -228,14 +228,19 @@ class Round:
 
 
 def typical(tests: Verdicts) -> FloatArray:
-    """Of groups (G,) of many the factor that their typical test shows."""
+    """Of groups (G,) of many the factor that their typical test shows.
+
+    Tests of n observations that share r / n of their redundancy vary like r independent ones at most: the squared
+    correlations of a projection's rows add up to n / r.
+    """
     factor = np.ones(len(tests.omega))
     n = np.bincount(tests.group[tests.used & (tests.freedom > 0)], minlength=len(factor))
     for g in np.flatnonzero(n >= MANY).tolist():
         mine = tests.used & (tests.group == g) & (tests.freedom > 0)
         freedom, of = np.unique(tests.freedom[mine], return_inverse=True)
         ratio = tests.statistic[mine] / chi2.ppf(0.5, freedom)[of]
-        if np.mean(ratio > 1.0) > 0.5 + 1.5 / np.sqrt(n[g]):  # three sigmas of a fair coin
+        independent = min(float(n[g]), float(tests.redundancy[g] / np.mean(tests.freedom[mine])))
+        if np.mean(ratio > 1.0) > 0.5 + 1.5 / np.sqrt(independent):  # three sigmas of a fair coin
             factor[g] = max(1.0, float(np.median(ratio)))
     return factor
 
@@ -255,4 +260,6 @@ def tests_of_all(now: Adjustment) -> Verdicts:
     if graph.pairs is not None:
         freedom[graph.first_pair + graph.pairs.rows] = precision_of(now).pairs.freedom
     none, possible = np.full(len(names) + 1, np.nan), np.ones(len(group), dtype=np.bool_)
-    return Verdicts(np.nan_to_num(others.test), freedom, others.used, possible, group, none, none)
+    own = np.where(others.used[others.observation], others.redundancies, 0.0)
+    redundancy = np.bincount(group[others.observation], own, len(names) + 1).astype(float)
+    return Verdicts(np.nan_to_num(others.test), freedom, others.used, possible, group, none, redundancy)

@@ -19,7 +19,7 @@ from survey.project.declared.toml_text import KeyLines, KeyPath, read_tables
 
 _Word = TypeVar("_Word", bound=str)
 _NO_KEY = Key("", "text", "")
-_LARGEST_TOML = 16 * 2**20  # bytes
+_LARGEST_TOML = 256 * 2**20  # bytes: some millions of stations
 _DEEPEST_KEY = 32  # parts between dots; time and memory grow with their square
 _NUMBERS = {int, float}
 _LONGEST_INTEGER = 1000  # bits: all that a double can hold, and less than what cannot be printed
