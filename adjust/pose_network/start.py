@@ -25,15 +25,14 @@ _EVENED = (1.0, 0.5, 0.25, 0.0)
 """Powers of the weights that are tried in turn, where so uneven ones cost a station its pivot."""
 
 
-def find_network_start(network: PoseNetwork, weights: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+def find_network_start(network: PoseNetwork) -> tuple[FloatArray, FloatArray]:
     """``world_from_station`` of all stations, (N, 3, 3) and (N, 3), from the pairs in use alone.
 
-    weights: (E,) on the information of the pairs, zero leaves a pair out. The held stations, the stations with a prior,
-    or the given poses of a free network (else its first station at the identity) say where it lies. Raises
-    IndeterminateError for pairs that do not tie all stations together.
+    The held stations, the stations with a prior, or the given poses of a free network (else its first station at the
+    identity) say where it lies. Raises IndeterminateError for pairs that do not tie all stations together.
     """
     for power in _EVENED:
-        average = _Average(network, weights, power)
+        average = _Average(network, power)
         if average.lost < 0:
             R = average.rotations()
             return R, np.zeros((network.n_stations, 3)) if network.rotation_only else average.positions(R)
@@ -58,22 +57,22 @@ class _Average:
     Three of the six never meet the other three. lost: a station without a pivot, or -1.
     """
 
-    def __init__(self, network: PoseNetwork, weights: FloatArray | None, power: float) -> None:
+    def __init__(self, network: PoseNetwork, power: float) -> None:
         self.network, self.datum = network, datum_stations(network)
         self.anchor = int(self.datum[0]) if len(self.datum) and network.anchor is None else network.anchor or 0
-        rows = np.flatnonzero(network.used if weights is None else network.used & (weights > 1e-9))
+        rows = np.flatnonzero(network.used)
         ties = self.datum[self.datum != self.anchor] if network.anchor is None else np.zeros(0, dtype=np.int64)
-        self.rows, self.n_ties, shared = rows, len(ties), 1.0 if weights is None else weights[rows]
+        self.rows = rows
         self.a = np.concatenate([network.a_idx[rows], np.full(len(ties), self.anchor)])
         self.b = np.concatenate([network.b_idx[rows], ties])
         given = network.station_rotations
         self.b_from_a = np.concatenate([network.rotations[rows], np.swapaxes(given[ties], 1, 2) @ given[[self.anchor]]])
         variance = np.trace(network.cov[rows][:, :3, :3], axis1=1, axis2=2) / 3.0
         # only ratios matter: a common scale keeps tests of pivots away from rounding
-        turn = np.concatenate([shared * np.median(variance) / variance, np.full(len(ties), _TIGHT)])
+        turn = np.concatenate([np.median(variance) / variance, np.full(len(ties), _TIGHT)])
         known = 1.0 / translation_sigmas(network)[rows]  # zero of rotations
         typical = np.median(known[known > 0.0]) if known.any() else 1.0
-        shift = np.concatenate([shared * (known / typical) ** 2, np.zeros(len(ties))])
+        shift = np.concatenate([(known / typical) ** 2, np.zeros(len(ties))])
         self.turn, self.shift = (np.sqrt(np.where(w > 0.0, w**power, 0.0)) for w in (turn, shift))
         self.fixed = np.zeros(network.n_stations, dtype=np.bool_)
         self.fixed[self.datum if len(self.datum) else self.anchor] = True

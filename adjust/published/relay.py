@@ -2,8 +2,7 @@
 
 Unknowns are the Euler angles (zyx) of every measured pair. Every loop gives the 9 elements of ``I - M``, M the product
 round it, linear in the corrections of the angles: ``C dX = B``; dX is the Moore-Penrose solution, unweighted (eq. 27)
-or with ``P^-1 = D / sigma0^2`` (eqs. 29, 30); the angles move on until all corrections are below 1". Beside it stands
-the reduced form of full rank with the 3 equations a loop really has.
+or with ``P^-1 = D / sigma0^2`` (eqs. 29, 30); the angles move on until all corrections are below 1".
 
 Its limits: C P^-1 C' of the nine equations is singular, so that the inverse of eqs. 27 and 30 has to be a generalised
 one; each step is the least in itself, not the sum of all steps, so that the result differs from the least squares one
@@ -11,7 +10,6 @@ in second order; equal weights mean equal sigmas of Euler angles; near gimbal lo
 """
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import scipy.linalg
@@ -34,13 +32,11 @@ CROSS = np.swapaxes(skew(np.eye(3)), 0, 1)
 class PaperOptions:
     """How the paper's iteration runs.
 
-    equations: per loop, 9 as printed or the 3 independent ones. euler_cov: D (E, 3, 3) rad^2 of the measured Euler
-    angles, None for equal weights. sigma0: rad; it cancels out of the corrections. tolerance: rad.
+    euler_cov: D (E, 3, 3) rad^2 of the measured Euler angles, None for equal weights; sigma0 cancels out of the
+    corrections. tolerance: rad.
     """
 
-    equations: Literal[9, 3] = 9
     euler_cov: FloatArray | None = None
-    sigma0: float = 1.0
     tolerance: float = ARCSECOND
     max_iterations: int = 20
 
@@ -74,7 +70,7 @@ def paper_iteration(network: MeasuredPairs, options: PaperOptions = PaperOptions
     root = _weight_root(options, network.topology.n_pairs)
     corrections: list[float] = []
     while len(corrections) < options.max_iterations:
-        C, B = loop_equations(basis, angles, options.equations)
+        C, B = loop_equations(basis, angles)
         # P^-1/2 (C P^-1/2)^+ B is eq. 30 with the generalised inverse that its singular C P^-1 C' needs
         step = root @ np.linalg.lstsq(C @ root, B, rcond=1e-10)[0]
         angles = angles + step.reshape(-1, 3)
@@ -91,24 +87,19 @@ def paper_iteration(network: MeasuredPairs, options: PaperOptions = PaperOptions
     )
 
 
-def loop_equations(basis: LoopBasis, angles: FloatArray, equations: Literal[9, 3]) -> tuple[FloatArray, FloatArray]:
-    """C and B of all loops: (9 L, 3 E) and (9 L,) of eqs. 4-26, or (3 L, 3 E) and (3 L,) of the misclosure vectors.
+def loop_equations(basis: LoopBasis, angles: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """C (9 L, 3 E) and B (9 L,) of all loops, eqs. 4-26.
 
     A pair's angle q turns M into ``M [u]x``, u the tangent of the angle seen from the loop's first station.
     """
     w, blocks = evaluate_loops(basis, Motions(matrix_from_euler(angles)))
     by_angle = blocks @ euler_jacobian(angles)[basis.pair_idx]
     loop = np.repeat(np.arange(len(basis)), basis.lengths)
-    if equations == 9:
-        M = exp(w).rotation
-        u = right_jacobian(w)[loop] @ by_angle
-        by_angle = np.einsum("kij,jlm,klq->kimq", M[loop], CROSS, u).reshape(-1, 9, 3)
-        B = (np.eye(3) - M).reshape(-1)
-    else:
-        B = -w.reshape(-1)
-    C = np.zeros((len(basis), equations, basis.topology.n_pairs, 3))
-    C[loop, :, basis.pair_idx] = by_angle
-    return C.reshape(len(basis) * equations, -1), B
+    M = exp(w).rotation
+    u = right_jacobian(w)[loop] @ by_angle
+    C = np.zeros((len(basis), 9, basis.topology.n_pairs, 3))
+    C[loop, :, basis.pair_idx] = np.einsum("kij,jlm,klq->kimq", M[loop], CROSS, u).reshape(-1, 9, 3)
+    return C.reshape(9 * len(basis), -1), (np.eye(3) - M).reshape(-1)
 
 
 def adjusted_covariances(found: PaperSolution, options: PaperOptions, cov: FloatArray) -> FloatArray:
@@ -118,7 +109,7 @@ def adjusted_covariances(found: PaperSolution, options: PaperOptions, cov: Float
     corrections are G (B - C dX), G the generalised inverse of eq. 30, so that errors come through I - G C.
     """
     n = found.basis.topology.n_pairs
-    C, _ = loop_equations(found.basis, found.angles, options.equations)
+    C, _ = loop_equations(found.basis, found.angles)
     root = _weight_root(options, n)
     through = np.eye(3 * n) - root @ np.linalg.pinv(C @ root, rcond=1e-10) @ C
     J = euler_jacobian(found.angles)
@@ -138,8 +129,4 @@ def _weight_root(options: PaperOptions, n_pairs: int) -> FloatArray:
     """P^-1/2 (3 E, 3 E), block diagonal; eq. 29."""
     if options.euler_cov is None:
         return np.eye(3 * n_pairs)
-    roots = np.linalg.cholesky(options.euler_cov / options.sigma0**2)
-    out = np.zeros((n_pairs, 3, n_pairs, 3))
-    at = np.arange(n_pairs)
-    out[at, :, at, :] = roots
-    return out.reshape(3 * n_pairs, 3 * n_pairs)
+    return np.asarray(scipy.linalg.block_diag(*np.linalg.cholesky(options.euler_cov)))

@@ -33,7 +33,7 @@ class ComponentOptions:
     """groups: of which the components are estimated (all but ``fixed``, where None).
 
     least_redundancy: a group with less is not estimated. convergence: relative change of all factors by one more
-    solution of the survey. level: of the confidence limits. method: "reml" or "foerstner" (see above).
+    solution of the survey. level: of the confidence limits.
     """
 
     groups: tuple[str, ...] | None = None
@@ -42,7 +42,6 @@ class ComponentOptions:
     convergence: float = 1e-4
     max_iterations: int = 20
     level: float = 0.95
-    method: str = "reml"
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
 
 
@@ -169,7 +168,7 @@ def linear_components(sums: GroupSums, chosen: BoolArray, options: ComponentOpti
     held = np.zeros(k, dtype=np.bool_)
     while not converged and steps < _LINEAR_STEPS:
         steps += 1
-        step = _step(now, k, held, options.method)
+        step = _step(now, k, held)
         theta[:k] = np.maximum(theta[:k] * step, _VANISHED)
         held |= theta[:k] <= _VANISHED
         now = moments(small, theta)
@@ -181,11 +180,8 @@ def linear_components(sums: GroupSums, chosen: BoolArray, options: ComponentOpti
     return LinearComponents(factors, ~fixed, merged, vanished, now.S[:k, :k], final, steps, converged)
 
 
-def _step(now: Moments, k: int, held: BoolArray, method: str) -> FloatArray:
+def _step(now: Moments, k: int, held: BoolArray) -> FloatArray:
     """Relative change (k,) of the factors: Helmert's where it is positive and not far, else of their logarithms."""
-    if method == "foerstner":
-        simple = np.maximum(now.q[:k] / np.maximum(now.r[:k], 1e-9), 1e-3)
-        return np.where(held, 1.0, simple)
     free = np.flatnonzero(~held)
     rest = np.setdiff1d(np.arange(len(now.q)), free)
     right = now.q[free] - now.S[np.ix_(free, rest)].sum(axis=1)
@@ -243,7 +239,7 @@ def _named(
     correlation: FloatArray = np.asarray(cov / np.outer(d, d), dtype=float)
     return VarianceComponents(
         tuple(out), tuple(" + ".join(s) for s in shared), correlation, tuple(s for s in shared if len(s) > 1),
-        found.steps, found.converged, options.method,
+        found.steps, found.converged, "reml",
     )  # fmt: skip
 
 

@@ -78,8 +78,8 @@ def test_squares_redundancies_and_information_against_dense_traces(mixed: bool) 
     assert found.r.sum() == pytest.approx(len(e) - n)
 
 
-@pytest.mark.parametrize(("mixed", "method"), [(False, "reml"), (True, "reml"), (False, "foerstner")])
-def test_the_estimate_is_the_maximum_of_the_restricted_likelihood(mixed: bool, method: str) -> None:
+@pytest.mark.parametrize("mixed", [False, True])
+def test_the_estimate_is_the_maximum_of_the_restricted_likelihood(mixed: bool) -> None:
     blocks, n = random_blocks(5, mixed)
 
     A, e, V_of_ones, group = dense_parts(blocks, np.ones(3))
@@ -94,7 +94,7 @@ def test_the_estimate_is_the_maximum_of_the_restricted_likelihood(mixed: bool, m
 
     best = minimize(minus_log_likelihood, np.zeros(3), method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-12})
     assert best.success
-    options = ComponentOptions(least_redundancy=0.1, convergence=1e-8, method=method)
+    options = ComponentOptions(least_redundancy=0.1, convergence=1e-8)
     found = linear_components(as_sums(blocks, n), ALL, options)
     assert found.converged
     np.testing.assert_allclose(found.theta, np.exp(best.x), rtol=1e-5)

@@ -45,7 +45,6 @@ class OutlierSearch:
     rejected: tuple[Decision, ...]
     log: tuple[Decision, ...]
     suspects: tuple[Decision, ...]
-    rounds: int
     converged: bool
     alternatives: tuple[Alternative, ...] = ()
     cautious: tuple[str, ...] = ()

@@ -213,7 +213,7 @@ class Round:
         mine = {names[g] for g in np.unique(now.group[now.candidates]).tolist()}
         return OutlierSearch(
             adjustment, tuple(sorted(rejected, key=lambda d: -d.statistic / d.limit)), tuple(log),
-            tuple(self._decision("rejected", i, now, "test") for i in suspects), self.number, converged,
+            tuple(self._decision("rejected", i, now, "test") for i in suspects), converged,
             tuple(self._alternative(x) for x in equal_sets(now, self._limits())),
             tuple(n for n, timid in zip(names, self.cautious, strict=False) if timid),
             tuple((n, float(f)) for n, f in zip(names, self.factor, strict=False) if f > 1.0 and n in mine),
