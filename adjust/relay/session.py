@@ -27,27 +27,16 @@ from adjust.pose_network.network import PoseNetwork
 from adjust.pose_network.start import carried
 from adjust.relay.growth import Batch, Growth, Tree, moved_over
 
-_SHARE = 0.3
-_WINDOW = 20
+_RELINEARIZE = 1e-3
+"""Change (rad, m) from which a station is linearised anew."""
+_WILDFIRE = 1e-5
+"""Change below which steps do not spread."""
+_MOVED_RAD, _MOVED_M = 1e-6, 1e-5
+_SECTION = 1000
+"""Latest stations that are always kept moving; older ones may rest until :meth:`NetworkSession.finish`."""
+_SHARE, _WINDOW = 0.3, 20
+"""Of the network, that additions may touch, on average over so many, before batch iterations take over."""
 _LEAST = 50  # stations; below it nothing is worth a thought
-
-
-@dataclass(frozen=True)
-class SessionOptions:
-    """How additions are solved.
-
-    relinearize: change (rad, m) from which a station is linearised anew. wildfire: change below which steps do not
-    spread. moved_rad, moved_m: what counts as moved. batch_share: share of the network that additions may touch on
-    average before batch iterations take over; 1 never. section: latest stations that are always kept moving; older
-    ones may rest until :meth:`NetworkSession.finish`.
-    """
-
-    relinearize: float = 1e-3
-    wildfire: float = 1e-5
-    moved_rad: float = 1e-6
-    moved_m: float = 1e-5
-    batch_share: float = _SHARE
-    section: int = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +56,7 @@ class Addition:
 class NetworkSession:
     """An adjusted network that takes additions; not a value, but the state of one piece of work."""
 
-    def __init__(self, network: Survey | Adjustment, options: SessionOptions = SessionOptions()) -> None:
+    def __init__(self, network: Survey | Adjustment) -> None:
         """network: fixed stations and pairs of poses between them, adjusted here where it is not.
 
         Raises SurveyError for a survey of anything else, and for rotations alone.
@@ -80,7 +69,7 @@ class NetworkSession:
             raise SurveyError("sessions take networks of poses; solve a network of rotations as a whole")
         if survey.datum.kind == "inner":
             raise SurveyError("sessions need a station that is held or has a prior; solve a free network as a whole")
-        self.options, self._survey = options, survey
+        self._survey = survey
         self._ids = list(base.station_ids)
         self._index = dict(base.index_of)
         self._added: list[Pair] = []
@@ -95,7 +84,7 @@ class NetworkSession:
         self._shares: list[float] = []
         self._switched_at = 0
         self._factor_of: dict[str, int] = {}
-        self._growth: Growth = Tree(options.relinearize, options.wildfire, options.section)
+        self._growth: Growth = Tree(_RELINEARIZE, _WILDFIRE, _SECTION)
         self._begin(base)
 
     def _begin(self, network: PoseNetwork) -> None:
@@ -191,7 +180,7 @@ class NetworkSession:
             now = self._estimate(i)
             step = Pose3.Logmap(self._last[i].between(now))
             turn, shift = float(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:]))
-            far = turn > self.options.moved_rad or shift > self.options.moved_m
+            far = turn > _MOVED_RAD or shift > _MOVED_M
             if far:
                 self._last[i] = now
                 if i not in new:
@@ -229,11 +218,11 @@ class NetworkSession:
         """Batch iterations where additions touch so much that these are cheaper; judged again at twice the size."""
         n = len(self._ids)
         self._shares = [*self._shares[1 - _WINDOW :], touched / max(1, n)]
-        often = len(self._shares) == _WINDOW and float(np.mean(self._shares)) > self.options.batch_share
+        often = len(self._shares) == _WINDOW and float(np.mean(self._shares)) > _SHARE
         if isinstance(self._growth, Tree) and often and n >= _LEAST:
-            self._switch(Batch(self.options.wildfire))
+            self._switch(Batch(_WILDFIRE))
         elif isinstance(self._growth, Batch) and n >= 2 * self._switched_at:
-            self._switch(Tree(self.options.relinearize, self.options.wildfire, self.options.section))
+            self._switch(Tree(_RELINEARIZE, _WILDFIRE, _SECTION))
 
     def _switch(self, growth: Growth) -> None:
         table = moved_over(self._growth, growth)

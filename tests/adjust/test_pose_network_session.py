@@ -6,13 +6,14 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, Pair
 from adjust.pose_network.from_survey import network_from_survey
 from adjust.pose_network.start import carried
-from adjust.relay.session import NetworkSession, SessionOptions
+from adjust.relay import session as session_module
+from adjust.relay.session import NetworkSession
 from tests.adjust.pose_networks import Simulated, simulate, solve_network
 from tests.benchmarks.networks import additions, adjusted, difference, first_stations
 
 
-def grown(sim: Simulated, group: int = 1, **options) -> NetworkSession:
-    session = NetworkSession(first_stations(sim.network), SessionOptions(**options))
+def grown(sim: Simulated, group: int = 1) -> NetworkSession:
+    session = NetworkSession(first_stations(sim.network))
     steps = additions(sim.network)
     for k in range(0, len(steps), group):
         session.add([pair for step in steps[k : k + group] for pair in step])
@@ -36,9 +37,10 @@ def test_a_grown_network_equals_its_batch_solution(nx: int, ny: int, group: int)
 
 
 @pytest.mark.slow
-def test_settled_stations_wake_when_they_are_needed() -> None:
+def test_settled_stations_wake_when_they_are_needed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session_module, "_SECTION", 30)
     sim = simulate(100, 2, seed=9)
-    session = grown(sim, section=30)
+    session = grown(sim)
     batch = solve_network(sim.network)
     assert difference(session.poses(), batch)[1] < 0.5
     # a loop from the far end to a settled station moves everything, also what had settled
@@ -54,7 +56,7 @@ def test_settled_stations_wake_when_they_are_needed() -> None:
     assert difference(present, again)[1] < 0.2
     assert finished.omega == pytest.approx(again.omega, rel=1e-9)
     # the same where a pair between settled stations is taken out
-    session = grown(sim, section=30)
+    session = grown(sim)
     session.remove(["p3"])
     assert session.finish().redundancy == batch.redundancy - 6
 
@@ -88,9 +90,10 @@ def test_additions_say_what_is_new_and_what_moved() -> None:
     assert adjusted(finished)["s40"].translation() == pytest.approx(before.translation(), abs=1e-2)
 
 
-def test_a_pair_may_start_at_a_held_station() -> None:
+def test_a_pair_may_start_at_a_held_station(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session_module, "_RELINEARIZE", 1e-6)
     sim = simulate(4, 3)
-    session = grown(sim, relinearize=1e-6)
+    session = grown(sim)
     R, t = sim.rotations, sim.translations
     cov = np.diag([1e-4, 1e-2, 1.0, 1e-3, 0.1, 1.0]) ** 2  # strong in some directions of a only
     measured = Pose3(Rot3(R[10].T @ R[0]), R[10].T @ (t[0] - t[10]) + 0.02)

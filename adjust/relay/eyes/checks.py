@@ -10,6 +10,9 @@ from adjust.relay.eyes.setup import EyeSetup
 from adjust.spatial.rigid import rotation_log
 from adjust.start.closed_forms.hand_eye import degenerate_direction
 
+_WEAKEST_TURN = 10.0
+"""Sigmas of a turn that the turns about the second axis must have, all epochs together."""
+
 
 @dataclass(frozen=True)
 class OutlierEpoch:
@@ -29,7 +32,7 @@ class OutlierEpoch:
         )
 
 
-def refuse_undetermined(setup: EyeSetup, weakest_turn_sigmas: float) -> EyeSetup:
+def refuse_undetermined(setup: EyeSetup) -> EyeSetup:
     """The setup as it is. Raises SurveyError naming the direction that no turn determines, pair of eyes by pair."""
     c = setup.problem.conditions
     for a, b in sorted({(int(x), int(y)) for x, y in zip(c.eye_k, c.eye_l, strict=True)}):
@@ -43,7 +46,7 @@ def refuse_undetermined(setup: EyeSetup, weakest_turn_sigmas: float) -> EyeSetup
         except SurveyError as error:
             raise SurveyError(f"{names}: {error}") from None
         _, s, vt = np.linalg.svd(turns, full_matrices=False)
-        weak = axis is None and s[1] < weakest_turn_sigmas * sigma
+        weak = axis is None and s[1] < _WEAKEST_TURN * sigma
         if axis is not None or weak:
             text = ", ".join(f"{x:+.3f}" for x in vt[0])
             second = float(s[1]) if len(s) > 1 else 0.0

@@ -24,20 +24,18 @@ from adjust.relay.eyes.setup import EyeSetup, eye_setup
 from adjust.relay.eyes.solver import EyeSolution
 from adjust.spatial.rigid_motions import Motions
 
+_UNCERTAIN = 0.1
+"""Sigma (rad) of the rotation of an eye from which it is undetermined."""
+
 
 @dataclass(frozen=True)
 class EyeOptions:
-    """reject: epochs that contradict the others are left out and listed. alpha: of that test, for all epochs together.
+    """reject: epochs that contradict the others are left out and listed.
 
-    weakest_turn_sigmas: the turns about the second axis must be so many sigmas of a turn, all epochs together.
-    largest_sigma_rad: an eye whose rotation stays more uncertain than this is undetermined.
     free_scales: of motions, whether each eye but the first has a scale of its own, as visual trackers do.
     """
 
     reject: bool = True
-    alpha: float = 0.001
-    weakest_turn_sigmas: float = 10.0
-    largest_sigma_rad: float = 0.1
     free_scales: bool = False
 
 
@@ -116,14 +114,14 @@ def adjust_eyes(
     by their ids. Worlds of the same name are the same; of ``known`` ones the relation is an observation. Raises
     SurveyError naming the undetermined direction where the turns do not suffice.
     """
-    setup = refuse_undetermined(eye_setup(sequences, known, options.free_scales), options.weakest_turn_sigmas)
-    solution, outliers = solve_screened(setup, options.reject, options.alpha)
+    setup = refuse_undetermined(eye_setup(sequences, known, options.free_scales))
+    solution, outliers = solve_screened(setup, options.reject)
     k = len(setup.eyes)
     place = np.concatenate([solution.rows(i) for i in range(k)])
     target = np.concatenate([6 * i + np.arange(6) for i in range(k) if len(solution.rows(i))])
     cov = np.zeros((6 * k, 6 * k))
     cov[np.ix_(target, target)] = solution.cov[np.ix_(place, place)]
-    _refuse_weak(setup, cov, options.largest_sigma_rad)
+    _refuse_weak(setup, cov)
     first = solution.cov.shape[0] - len(solution.scales)
     spread = np.sqrt(np.diag(solution.cov)[first:])
     factors = np.exp(solution.scales)
@@ -137,11 +135,11 @@ def adjust_eyes(
     )  # fmt: skip
 
 
-def _refuse_weak(setup: EyeSetup, cov: FloatArray, largest: float) -> None:
+def _refuse_weak(setup: EyeSetup, cov: FloatArray) -> None:
     """The last word: a rotation that stays uncertain is no result."""
     for i, eye in enumerate(setup.eyes):
         s, V = np.linalg.eigh(cov[6 * i : 6 * i + 3, 6 * i : 6 * i + 3])
-        if s[-1] > largest**2:
+        if s[-1] > _UNCERTAIN**2:
             text = ", ".join(f"{x:+.3f}" for x in V[:, -1])
             raise SurveyError(
                 f"eye {eye.frame_id}: its rotation about ({text}) of its own frame is uncertain by "

@@ -11,8 +11,11 @@ from adjust.relay.eyes.setup import EyeSetup
 from adjust.relay.eyes.solver import EyeProblem, EyeSolution, linearise, own_blocks, solve_eyes
 from adjust.testing.gross_errors import Search, State, Verdicts, one_group
 
+_FAMILY = 0.001
+"""Error probability of the tests of all epochs together."""
 
-def solve_screened(setup: EyeSetup, reject: bool, alpha: float) -> tuple[EyeSolution, tuple[OutlierEpoch, ...]]:
+
+def solve_screened(setup: EyeSetup, reject: bool) -> tuple[EyeSolution, tuple[OutlierEpoch, ...]]:
     """Least squares of the epochs that agree, and the others, worst first.
 
     The limit follows the scatter of most epochs where that is larger than the a priori sigmas say; where all are
@@ -34,7 +37,7 @@ def solve_screened(setup: EyeSetup, reject: bool, alpha: float) -> tuple[EyeSolu
         solution = solve_eyes(problem)
         return solution, one_group(_all_tests(setup.problem, solution, used), np.full(m, 6), used)
 
-    search = Search(solve, alpha, many=1)
+    search = Search(solve, _FAMILY, many=1)
     first = search.judged(*solve(np.ones(m, dtype=np.bool_), None))
     if not reject or first.tests.cautious[0]:
         return first.solution, ()
