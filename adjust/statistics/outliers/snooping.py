@@ -36,8 +36,10 @@ class Snooping:
 
     Those before it are all kept, and may stand condensed; n_kept: their components. candidates: (M,) may be left out.
     out: what is, in order; columns: of each U (m, k), what its error shows elsewhere, and its share (k,). left:
-    redundancy; omega: v'Pv of all that is in use.
+    redundancy; omega: v'Pv of all that is in use. rounds: of a robust solution, at most.
     """
+
+    rounds = 100
 
     def __init__(self, system: LinearSystem, candidates: BoolArray, first: int = 0, n_kept: int = 0) -> None:
         s, at = system, int(system.ptr[first])
@@ -230,31 +232,36 @@ class Snooping:
             found[o] = float(bias[k] @ np.linalg.solve(cov[k, k], bias[k])), float(np.linalg.norm(bias[k]))
         return found
 
-    def robust_squares(self, freedom: IntArray, factors: FloatArray, rounds: int = 100) -> FloatArray:
+    def robust_squares(self, freedom: IntArray, factors: FloatArray) -> FloatArray:
         """Weighted squares (M,), over the factors (G,) of the groups, where Cauchy weights settle.
 
-        What is kept keeps its weight.
+        What is not followed keeps its weight.
         """
-        s, q, at = self.system, np.maximum(freedom, 1), self.system.A.shape[0] - len(self.row_of)
-        used, weights = s.used[s.row_of].astype(float), np.ones(len(self.used))
-
-        def of(e: FloatArray) -> FloatArray:
-            return np.bincount(self.row_of, weights=e[at:] ** 2, minlength=len(q)) / factors[self.group]
-
-        squares = of(s.e)
-        for _ in range(rounds):
+        q, weights, factor = np.maximum(freedom, 1), np.ones(len(self.used)), factors[self.group]
+        e, squares = self._linearised(), np.zeros(len(q))
+        for _ in range(self.rounds):
+            squares = np.bincount(self.row_of, weights=e**2, minlength=len(q)) / factor
             new = cauchy_weights(squares / q)
             for rows, _ in self.joint:  # one weight for what is whitened together
                 mine = self.row_of[rows]
                 new[mine] = new[mine].min()
-            if np.abs(new - weights).max() < 1e-2:
+            if np.abs(new - weights).max(initial=0.0) < 1e-2:
                 break
             weights = new
-            of_rows = used.copy()
-            of_rows[at:] *= (weights / factors[self.group])[self.row_of]
-            step = s.normal_of(of_rows).solve(np.asarray(s.A.T @ (of_rows * s.e)))
-            squares = of(s.e - s.A @ step)
+            e = self._reweighted(weights, factor)
         return squares
+
+    def _linearised(self) -> FloatArray:
+        """Residuals (m,) that the robust solution begins with."""
+        return self.system.e[len(self.system.e) - len(self.row_of) :]
+
+    def _reweighted(self, weights: FloatArray, factor: FloatArray) -> FloatArray:
+        """Residuals (m,) with weights (M,) over the factors (M,) of the variances."""
+        s, kept = self.system, len(self.system.e) - len(self.row_of)
+        of_rows = s.used[s.row_of].astype(float)
+        of_rows[kept:] *= (weights / factor)[self.row_of]
+        step = s.normal_of(of_rows).solve(np.asarray(s.A.T @ (of_rows * s.e)))
+        return np.asarray(s.e[kept:] - s.A[kept:] @ step)
 
 
 def _influences(precision: Precision) -> tuple[list[FloatArray], BoolArray]:

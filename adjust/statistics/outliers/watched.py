@@ -15,7 +15,6 @@ from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.precision.precision import ObservationRows, Precision, precision_of
 from adjust.statistics.outliers.snooping import Snooping
 from adjust.statistics.rows import Entries, groups_of_others
-from adjust.testing.criteria import cauchy_weights
 
 FOLLOWED = 120
 """Observations that fail, or that are out, of which so many are watched at once."""
@@ -52,6 +51,8 @@ class WatchedSnooping(Snooping):
     given: (M,) those that the survey uses, of which the solution may have left out some.
     """
 
+    rounds = 20
+
     def __init__(self, now: Adjustment, index: IntArray, given: BoolArray) -> None:
         precision = precision_of(now)
         others = [precision.graph.other(o) for o in index.tolist()]
@@ -82,19 +83,13 @@ class WatchedSnooping(Snooping):
         own = np.arange(len(self._M))
         return np.asarray((own[rows][:, None] == own[columns]) - self._M[rows][:, columns])
 
-    def robust_squares(self, freedom: IntArray, factors: FloatArray, rounds: int = 20) -> FloatArray:
-        """As of all observations, with those that are not watched as they are: e(w) = inv(I - M (1 - w)) e."""
-        q, weights, own = np.maximum(freedom, 1), np.ones(len(self.used)), np.eye(len(self.g))
-        squares = np.zeros(len(q))
-        for _ in range(rounds):
-            less = 1.0 - np.where(self.used, weights, 0.0)[self.row_of]
-            e = np.linalg.solve(own - self._M * np.where(self.used[self.row_of], less, 0.0), self.g)
-            squares = np.bincount(self.row_of, weights=e**2, minlength=len(q)) / factors[self.group]
-            new = cauchy_weights(squares / q)
-            if np.abs(new - weights).max(initial=0.0) < 1e-2:
-                break
-            weights = new
-        return squares
+    def _linearised(self) -> FloatArray:
+        return self.g
+
+    def _reweighted(self, weights: FloatArray, factor: FloatArray) -> FloatArray:
+        """With what is not watched as it is: e(w) = inv(I - M (1 - w)) e."""
+        less = np.where(self.used, 1.0 - weights, 0.0)[self.row_of]
+        return np.asarray(np.linalg.solve(np.eye(len(self.g)) - self._M * less, self.g))
 
 
 def _influences(precision: Precision, rows: Sequence[ObservationRows]) -> FloatArray:
