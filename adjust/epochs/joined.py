@@ -17,6 +17,7 @@ from scipy import sparse
 from adjust.epochs.change import Change, Displaced, between
 from adjust.epochs.states import EpochNormals, gauge_rows
 from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.precision.s_transformation import moved
 from adjust.statistics.normal import Normal
 
 _CANDIDATES = 12
@@ -239,7 +240,6 @@ class JoinedChange(Change):
             inside = self.place[rows] - first[names, None]
             own = np.array([self._own[i] for i in names.tolist()])
             own = own[np.arange(len(names))[:, None, None], inside[:, :, None], inside[:, None]]
-            across, back = G[rows] @ np.swapaxes(W[rows], 1, 2), np.swapaxes(G[rows], 1, 2)
-            return d[rows], own - across - np.swapaxes(across, 1, 2) + G[rows] @ C @ back
+            return d[rows], moved(own, G[rows], W[rows], C)
 
         return of

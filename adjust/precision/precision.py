@@ -35,7 +35,7 @@ from adjust.model.survey import FloatArray, IntArray
 from adjust.native.point_tests import AdjustedPoints, residual_tests, sums_of_blocks
 from adjust.observations.factors import ObservationFactor
 from adjust.observations.images.bundle_hidden import BundleHidden
-from adjust.precision.s_transformation import STransformation, s_transformation
+from adjust.precision.s_transformation import STransformation, moved, s_transformation
 from adjust.precision.stacked import Stacked
 from adjust.precision.tree import TreeCovariance
 from adjust.testing.distributions import chi2
@@ -233,8 +233,7 @@ class Precision(Covariances):
         if t is not None and keys.size:
             every = keys.ravel().tolist()
             G, W = (np.array([of[k] for k in every]).reshape(*shape, -1) for of in (t.motions, t.spread))
-            across = G @ np.swapaxes(W, 1, 2)
-            Q = Q + (G @ t.core @ np.swapaxes(G, 1, 2) - across - np.swapaxes(across, 1, 2))
+            Q = moved(Q, G, W, t.core)
         free = np.ones((keys.size, dim), dtype=np.bool_)
         for i in np.flatnonzero(np.isin(keys, list(self.unknowns.held))).tolist():
             free[i, list(self.unknowns.held[int(keys.flat[i])])] = False

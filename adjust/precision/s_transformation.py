@@ -26,8 +26,14 @@ class STransformation:
         """The joint covariance of ``keys`` in the datum, from Q (n, n) in that of the solution."""
         G = np.concatenate([self.motions[k] for k in keys])
         W = np.concatenate([self.spread[k] for k in keys])
-        across = G @ W.T
-        return np.asarray(Q - across - across.T + G @ self.core @ G.T)
+        return moved(Q, G, W, self.core)
+
+
+def moved(Q: FloatArray, G: FloatArray, W: FloatArray, core: FloatArray) -> FloatArray:
+    """Blocks (.., n, n) of a covariance, of unknowns with G, W (.., n, k), in the datum of this core (k, k)."""
+    back = np.swapaxes(G, -1, -2)
+    across = G @ np.swapaxes(W, -1, -2)
+    return np.asarray(Q + (G @ core @ back - across - np.swapaxes(across, -1, -2)))
 
 
 def s_transformation(
