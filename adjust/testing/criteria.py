@@ -30,16 +30,20 @@ _CAUCHY = 2.385**2
 class LevelOptions:
     """How observations are tested.
 
-    method: "b" (Baarda's B-method: ``alpha0`` is the level of a test of one component; tests of several components get
-    the level at which they find the same non-centrality with the same power) or "sidak" (``family_alpha`` is the error
-    probability of all tests together, each of them has the same level). power: probability 1 - beta with which a
-    minimal detectable bias is found.
+    family_alpha: error probability of all tests together, each of which has the same level (Sidak). alpha0: instead of
+    that the level of a test of one component; tests of several components get the level at which they find the same
+    non-centrality with the same power (Baarda's B-method). power: probability 1 - beta with which a minimal detectable
+    bias is found.
     """
 
-    method: Method = "sidak"
     family_alpha: float = 0.05
-    alpha0: float = 0.001
+    alpha0: float | None = None
     power: float = 0.80
+
+    @property
+    def method(self) -> Method:
+        """By whose levels."""
+        return "sidak" if self.alpha0 is None else "b"
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +184,7 @@ def _crossing(beyond_low: Callable[[float], bool], high: float) -> float:
 def criteria(options: LevelOptions, n_tests: int, most_components: int = 6) -> Criteria:
     """Of tests with 1 ... ``most_components`` (6 at least) components."""
     freedom = np.arange(1, max(6, most_components) + 1)
-    if options.method == "sidak":
+    if options.alpha0 is None:
         alpha = np.full(len(freedom), sidak(options.family_alpha, n_tests))
         lambda0 = np.array([noncentrality(float(alpha[0]), options.power, int(q)) for q in freedom])
         return Criteria(options, n_tests, alpha, np.asarray(chi2.isf(alpha, freedom)), lambda0)

@@ -65,7 +65,7 @@ class Solution:
     @cached_property
     def precision(self) -> Statistics:
         """The fourth step: tests, reliability, weak directions, relative precision, budget, tolerances."""
-        return statistics_of(self.adjustment, self.project.options.tolerances, self.scale)
+        return statistics_of(self.adjustment, self.project.options, self.scale)
 
     @cached_property
     def as_dict(self) -> Mapping[str, Any]:

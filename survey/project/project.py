@@ -120,7 +120,9 @@ class Tolerance:
 class AdjustmentOptions:
     """How the project is adjusted and reported: the tables [adjustment], [tolerances.NAME] and [identification].
 
-    alpha: error probability of the tests. reject_blocks: leave mis-detected images out of the start, then test them.
+    alpha: error probability of each family of tests; alpha0: of one test of one component instead, where observations
+    are tested for their reliability (Baarda's B-method). power: with which a minimal detectable bias is found.
+    reject_blocks: leave mis-detected images out of the start, then test them.
     reject_points: leave gross errors among the image points out, and list them. reject_pairs: the same for measured
     pairs and single observations of all other kinds. variance_components: estimate the variance of every group.
     sigmas: of all that is estimated, as the observations' own sigmas say (a_priori) or times sigma0 (a_posteriori);
@@ -140,6 +142,8 @@ class AdjustmentOptions:
     closures: tuple[Closure, ...] = ()
     tolerances: tuple[Tolerance, ...] = ()
     identification: tuple[tuple[str, str], ...] = ()
+    alpha0: float | None = None
+    power: float = 0.80
 
 
 @dataclass(frozen=True)

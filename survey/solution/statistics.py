@@ -26,7 +26,8 @@ from adjust.statistics.result import (
 )
 from adjust.statistics.system import LinearSystem
 from adjust.statistics.weakness import compared_columns, correlations, weak_directions
-from survey.project.project import Tolerance
+from adjust.testing.criteria import LevelOptions
+from survey.project.project import AdjustmentOptions
 from survey.solution.quantities import PROBABILITY, Scale, correlations_in, estimated, in_joint
 from survey.solution.tolerances import Verdict, verdicts
 
@@ -78,17 +79,18 @@ def tested_parts(adjustment: Adjustment) -> Consistency:
 
 
 def statistics_of(
-    adjustment: Adjustment, tolerances: tuple[Tolerance, ...], scale: Scale, tested: Consistency | None = None
+    adjustment: Adjustment, options: AdjustmentOptions, scale: Scale, tested: Consistency | None = None
 ) -> Statistics:
     """All of them, at every size. Raises SurveyError for a tolerance that is about nothing.
 
     tested: what :func:`tested_parts` found, where that is known.
     """
-    judged, alpha = verdicts(adjustment, tolerances, scale), _alpha(adjustment)
+    judged, alpha = verdicts(adjustment, options.tolerances, scale), _alpha(adjustment)
+    levels = LevelOptions(options.alpha, options.alpha0, options.power)
     drawn, near = correlation_matrix(adjustment), neighbours(adjustment, scale)
     if _is_large_network(adjustment):
         tested = tested or consistency(adjustment, None, alpha)
-        return Statistics(reliability(adjustment), adjustment.variance_components, (), (), near, (), drawn,
+        return Statistics(reliability(adjustment, levels), adjustment.variance_components, (), (), near, (), drawn,
                           adjustment.decisions, judged, tested, (*tested.left_out, _LARGE_NETWORK))  # fmt: skip
     condensed = condensed_system(precision_of(adjustment))
     system, components = condensed.system, adjustment.variance_components
@@ -96,7 +98,7 @@ def statistics_of(
     _ = system.structured, system.sigmas  # all of these ask for them
     with Beside() as made:
         consistent = made.of(lambda: tested or consistency(adjustment, condensed, alpha))
-        reliable = made.of(lambda: reliability(adjustment, system=condensed))
+        reliable = made.of(lambda: reliability(adjustment, levels, system=condensed))
         weak = made.of(lambda: weak_directions(adjustment, system=system))
         correlated = made.of(lambda: correlations(adjustment, system=system))
         budget = made.of(lambda: _budget(adjustment, names[:MOST_BUDGETS], system, scale.factor))

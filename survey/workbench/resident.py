@@ -110,8 +110,8 @@ class Resident(Folder):
 
         with self._lock:
             if self._statistics is None or self._statistics[0] != self.version:
-                found, tolerances = self.situation.solved, self.situation.project.options.tolerances
-                made = statistics_of(found.adjustment, tolerances, self.scale, found.tested)
+                found, options = self.situation.solved, self.situation.project.options
+                made = statistics_of(found.adjustment, options, self.scale, found.tested)
                 self._statistics = self.version, made
             return self._statistics[1]
 

@@ -40,8 +40,7 @@ LANGUAGES = ("en", "de")
 
 
 def pages(adjustment: Adjustment, run: RunInfo, project: Project | None = None) -> dict[str, str]:
-    tolerances = project.options.tolerances if project is not None else ()
-    found = statistics_of(adjustment, tolerances, scale_of(adjustment, run.sigmas)) if project is not None else None
+    found = project and statistics_of(adjustment, project.options, scale_of(adjustment, run.sigmas))
     return {language: report_html(adjustment, run, None, found, language) for language in LANGUAGES}
 
 

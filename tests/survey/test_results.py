@@ -17,6 +17,7 @@ from adjust.adjustment import adjust
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment, Estimate, GlobalTest
 from adjust.native.text import NUMBERS, TEXT, WORD, Words, number_rows, record_rows
+from survey.project import AdjustmentOptions
 from survey.report.language import ReportOptions
 from survey.report.results import write_results
 from survey.simulate import head_on_table
@@ -530,7 +531,7 @@ def test_files_are_the_same_for_any_number_of_threads(tmp_path: Path, monkeypatc
     files = {}
     for threads in "13":
         monkeypatch.setenv("LABSURVEY_THREADS", threads)
-        found = statistics_of(adjusted, (), scale_of(adjusted, "a_posteriori"))
+        found = statistics_of(adjusted, AdjustmentOptions(), scale_of(adjusted, "a_posteriori"))
         paths = write_results(tmp_path / threads, adjusted, RUN, found, ReportOptions(parquet=True))
         files[threads] = {name: path.read_bytes() for name, path in paths.items()}
     assert len(files["1"]) == 6

@@ -48,6 +48,30 @@ def test_the_key_is_kept_and_a_wrong_word_is_named(tmp_path, capsys):
     assert "did you mean 'a_priori'" in said
 
 
+def test_levels_of_the_tests_are_those_of_the_project(tmp_path, capsys):
+    """Sidak's by alpha, or Baarda's with alpha0 and power; lambda0 17.075 is that of his nomogram (1968)."""
+    told, pairs = {}, measured(chain(), np.random.default_rng(4))
+    given = {"usual": {}, "strict": {"alpha": 0.01}, "baarda": {"alpha0": 0.001}, "sure": {"power": 0.95}}
+    for name, levels in given.items():
+        options = AdjustmentOptions(**levels)
+        write_project(tmp_path / name, pairs, options=options)
+        assert read(tmp_path / name).options == options
+        told[name] = _solution(tmp_path / name)["reliability"]
+    n = len(json.loads((tmp_path / "usual" / "results" / "solution.json").read_text(encoding="utf-8"))["pairs"])
+    levels = {name: told[name]["level_of_one_test"] for name in told}
+    assert levels["usual"] == pytest.approx(1.0 - 0.95 ** (1.0 / n))
+    assert levels["strict"] == pytest.approx(1.0 - 0.99 ** (1.0 / n))
+    assert (told["baarda"]["method"], levels["baarda"]) == ("b", pytest.approx(0.001))
+    assert told["baarda"]["noncentrality"] == pytest.approx(17.075, abs=1e-3)
+    assert (told["sure"]["power"], levels["sure"]) == (0.95, levels["usual"])
+    assert told["sure"]["noncentrality"] > told["usual"]["noncentrality"]
+    assert "Baarda" in (tmp_path / "baarda" / "results" / "report.html").read_text(encoding="utf-8")
+    path = tmp_path / "baarda" / "survey.toml"
+    path.write_text(path.read_text(encoding="utf-8").replace("alpha0 = 0.001", "alpha0 = 1.5"), encoding="utf-8")
+    assert main(["adjust", str(path.parent), "--quiet"]) == 1
+    assert "alpha0: found 1.5; it is a probability" in capsys.readouterr().err.replace("'", "")
+
+
 def test_results_and_report_obey(tmp_path):
     found, covs, pages = {}, {}, {}
     for sigmas in KINDS:

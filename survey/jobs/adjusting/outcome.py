@@ -96,7 +96,7 @@ def made(
         with clock.step("report"):
             begun = begun_results(place, adjustment, run, report, writing, beside)
         with clock.step("statistics"):
-            found = statistics_of(adjustment, project.options.tolerances, scale_of(adjustment, run.sigmas))
+            found = statistics_of(adjustment, project.options, scale_of(adjustment, run.sigmas))
         with clock.step("report"):
             solution, paths = finished_results(begun, adjustment, run, found, report)
     return AdjustOutcome(adjustment, run, solution, paths, found)

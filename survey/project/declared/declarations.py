@@ -99,6 +99,9 @@ DECLARATIONS: tuple[Declared, ...] = (
     declare(
         "adjustment", "adjustment", "Tests and what a run may leave out.",
         Key("alpha", "number", "probability of a false alarm, of each family of tests", 0.05, positive=True),
+        Key("alpha0", "number", "level of one test of one component instead (Baarda's B-method), for minimal "
+            "detectable biases and external reliability", positive=True),
+        Key("power", "number", "probability with which a minimal detectable bias is found", 0.8, positive=True),
         Key("reject_blocks", "flag", "leave out a target in one image that fits nowhere", True),
         Key("reject_points", "flag", "leave out single image points", True),
         Key("reject_pairs", "flag", "leave out pairs and single observations of all other kinds", True),

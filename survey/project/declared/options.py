@@ -32,16 +32,22 @@ _SAID = {POSITION: ("mm",), ROTATION: ("arcsec", "deg")}
 def read_options(root: Node) -> AdjustmentOptions:
     """The tables [adjustment], [closures], [tolerances] and [identification]. Raises SurveyError."""
     node, said = root.table("adjustment"), root.table("identification")
-    alpha = node.number("alpha")
-    if alpha >= 1:
-        raise node.error(f"found {alpha:g}; it is a probability, between 0 and 1", "alpha")
     flags = {n: node.flag(n) for n in ("reject_blocks", "reject_points", "reject_pairs", "variance_components")}
     form, closures = _closures(root)
     return AdjustmentOptions(
-        alpha, **flags, sigmas=node.choice("sigmas", SIGMA_KINDS) if node.has("sigmas") else None, pairs=form,
-        closures=closures, tolerances=tuple(_tolerance(name, node) for name, node in root.tables("tolerances")),
+        _probability(node, "alpha"), **flags, pairs=form, closures=closures,
+        sigmas=node.choice("sigmas", SIGMA_KINDS) if node.has("sigmas") else None,
+        tolerances=tuple(_tolerance(name, node) for name, node in root.tables("tolerances")),
         identification=tuple((key, said.text(key)) for key in said.values),
+        alpha0=_probability(node, "alpha0") if node.has("alpha0") else None, power=_probability(node, "power"),
     )  # fmt: skip
+
+
+def _probability(node: Node, key: str) -> float:
+    value = node.number(key)
+    if value >= 1:
+        raise node.error(f"found {value:g}; it is a probability, between 0 and 1", key)
+    return value
 
 
 def _tolerance(name: str, node: Node) -> Tolerance:

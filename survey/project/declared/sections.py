@@ -69,7 +69,8 @@ def option_sections(options: AdjustmentOptions, request: SpotsRequest | None, si
         cameras=request.cameras, diameter_px=request.diameter_px, gate_px=request.gate_px, epochs=request.epochs
     )  # fmt: skip
     adjustment = in_units(
-        alpha=x.alpha, reject_blocks=x.reject_blocks, reject_points=x.reject_points, reject_pairs=x.reject_pairs,
+        alpha=x.alpha, alpha0=x.alpha0, power=None if x.power == AdjustmentOptions.power else x.power,
+        reject_blocks=x.reject_blocks, reject_points=x.reject_points, reject_pairs=x.reject_pairs,
         variance_components=x.variance_components or None, sigmas=x.sigmas,
         pairs=None if x.pairs == "poses" else x.pairs,
     )  # fmt: skip
