@@ -17,10 +17,11 @@ from adjust.graph.building import GraphBuilder
 from adjust.model.errors import SurveyError
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.observations.terrestrial import equations as k
-from adjust.observations.terrestrial.batch import TerrestrialBatch, circular_median, circular_medians
+from adjust.observations.terrestrial.batch import TerrestrialBatch
 from adjust.observations.terrestrial.building import reading_refs
 from adjust.observations.terrestrial.layout import ReadingArrays
 from adjust.precision.precision import adjusted_motion, residual_of
+from adjust.spatial.averaging import circular_median, circular_medians
 from adjust.start import find_start
 from adjust.start.positions import given_points
 

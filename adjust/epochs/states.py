@@ -14,7 +14,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.precision.precision import Precision, precision_of, rotations_only
-from adjust.spatial.motions import point_motions, poses_motions
+from adjust.spatial.motions import moved_value, value_motions
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.system import LinearSystem
 
@@ -259,14 +259,6 @@ def gauge_rows(state: Epoch) -> FloatArray:
     return np.concatenate([value_motions(v) for v in state.values])
 
 
-def value_motions(value: Pose3 | FloatArray) -> FloatArray:
-    """How the components (3 or 6, 7) of a point or pose move with the whole."""
-    if not isinstance(value, Pose3):
-        return point_motions(value)
-    R, t = value.rotation().matrix(), np.nan_to_num(value.translation())
-    return np.asarray(poses_motions(R[None], t[None], np.ones(1, dtype=np.bool_))[0])
-
-
 def differences(before: Sequence[Pose3 | FloatArray], after: Sequence[Pose3 | FloatArray]) -> FloatArray:
     """After minus before (n,), of poses in the tangent of the first; nan where only rotations are known."""
     return np.concatenate([differences_of(a, b) for a, b in zip(before, after, strict=True)])
@@ -280,13 +272,6 @@ def differences_of(a: Pose3 | FloatArray, b: Pose3 | FloatArray) -> FloatArray:
         return np.asarray(Pose3.Logmap(a.inverse() * b))
     turn = Rot3.Logmap(a.rotation().inverse() * b.rotation())
     return np.concatenate([turn, np.full(3, np.nan)])
-
-
-def moved_value(value: Pose3 | FloatArray, motion: FloatArray) -> Pose3 | FloatArray:
-    """A point or pose moved by ``motion`` (7,) about the origin: translation, rotation vector, ln(scale)."""
-    R, s = Rot3.Expmap(motion[3:6]).matrix(), float(np.exp(motion[6]))
-    x = s * R @ origin(value) + motion[:3]
-    return Pose3(Rot3(R @ value.rotation().matrix()), x) if isinstance(value, Pose3) else x
 
 
 def moved(state: SomeEpoch, motion: FloatArray) -> SomeEpoch:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from gtsam import Pose3, Rot3
+from gtsam import Rot3
 from scipy.linalg import block_diag
 
 from adjust.frames.unknowns import Unknowns
@@ -22,6 +22,7 @@ from adjust.model.rewriting import Rewriting
 from adjust.model.survey import Datum, FloatArray, PointParameter, PoseParameter, Survey
 from adjust.precision.precision import Covariances, Precision, precision_of, rotations_only
 from adjust.precision.s_transformation import STransformation, s_transformation
+from adjust.spatial.motions import moved_value
 
 _ROUNDS, _SETTLED = 20, 1e-13
 
@@ -145,15 +146,13 @@ def _move(
     graph: AdjustmentGraph, values: gtsam.Values, c: FloatArray, steps: Mapping[int, FloatArray]
 ) -> gtsam.Values:
     """Values after the finite motion c (7,): translation, rotation vector, logarithm of the scale; vectors by steps."""
-    scale, world = float(np.exp(c[6])), Pose3(Rot3.Expmap(c[3:6]), c[:3])
-    out = gtsam.Values(values)
+    only_larger, out = np.concatenate([np.zeros(6), c[6:]]), gtsam.Values(values)
     for name, unknown in graph.unknowns.by_name.items():
         if unknown.kind == "point":
-            out.update(unknown.key, np.asarray(world.transformFrom(scale * np.asarray(values.atPoint3(unknown.key)))))
+            out.update(unknown.key, moved_value(np.asarray(values.atPoint3(unknown.key)), c))
         elif unknown.kind == "pose":
-            pose = values.atPose3(unknown.key)
-            scaled = Pose3(pose.rotation(), scale * pose.translation())
-            out.update(unknown.key, world.compose(scaled) if in_world(graph.survey, name) else scaled)
+            motion = c if in_world(graph.survey, name) else only_larger
+            out.update(unknown.key, moved_value(values.atPose3(unknown.key), motion))
         else:
             out.update(unknown.key, np.asarray(values.atVector(unknown.key) + steps[unknown.key]))
     return out

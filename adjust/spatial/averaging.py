@@ -1,4 +1,4 @@
-"""Robust means of rotations and of rigid motions."""
+"""Robust means of angles, of rotations and of rigid motions."""
 
 import numpy as np
 
@@ -9,6 +9,19 @@ _MEDOID_LIMIT = 40  # more candidates than this are thinned out for the quadrati
 _AT_ONCE = 1000  # means whose medoids are found together
 _STEPS = 20
 _SETTLED = 1e-4  # of the scale: a further step tells nothing that the motions do
+
+
+def circular_median(angles: FloatArray) -> float:
+    """The angle nearest to all others (least sum of absolute differences), of those given; zero of none."""
+    return float(circular_medians(angles[None])[0]) if len(angles) else 0.0
+
+
+def circular_medians(angles: FloatArray) -> FloatArray:
+    """The same (m,) of each row of angles (m, n), n > 0."""
+    some = angles[:, :: max(1, angles.shape[1] // 64)]
+    turns = (angles[:, None, :] - some[:, :, None] + np.pi) % (2.0 * np.pi) - np.pi
+    rows, best = np.arange(len(angles)), np.abs(turns).sum(axis=2).argmin(axis=1)
+    return np.asarray(some[rows, best] + np.median(turns[rows, best], axis=1))
 
 
 def pose_distance(a: FloatArray, b: FloatArray, lever: float) -> FloatArray:

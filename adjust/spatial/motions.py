@@ -4,15 +4,15 @@ from collections.abc import Sequence
 
 import gtsam
 import numpy as np
+from gtsam import Pose3, Rot3
 
 from adjust.frames.unknowns import Unknown
 from adjust.model.survey import BoolArray, FloatArray
-from adjust.spatial.rigid import skew
 
 
 def point_motions(x: FloatArray) -> FloatArray:
     """How a point (3,) m of the world moves, (3, 7)."""
-    return np.column_stack([np.eye(3), -skew(x), x])
+    return np.asarray(points_motions(x[None])[0])
 
 
 def points_motions(x: FloatArray) -> FloatArray:
@@ -32,6 +32,22 @@ def poses_motions(R: FloatArray, t: FloatArray, in_world: BoolArray) -> FloatArr
     out[in_world, 3:, :3] = out[in_world, :3, 3:6] = turned
     out[in_world, 3:, 3:6] = turned @ points_motions(t[in_world])[:, :, 3:6]
     return out
+
+
+def value_motions(value: Pose3 | FloatArray) -> FloatArray:
+    """How the components (3 or 6, 7) of a point or pose of the world move."""
+    if not isinstance(value, Pose3):
+        return point_motions(value)
+    R, t = value.rotation().matrix(), np.nan_to_num(value.translation())
+    return np.asarray(poses_motions(R[None], t[None], np.ones(1, dtype=np.bool_))[0])
+
+
+def moved_value(value: Pose3 | FloatArray, motion: FloatArray) -> Pose3 | FloatArray:
+    """A point or pose moved by ``motion`` (7,) about the origin: translation, rotation vector, ln(scale)."""
+    R, s = Rot3.Expmap(motion[3:6]), float(np.exp(motion[6]))
+    if isinstance(value, Pose3):
+        return Pose3(R * value.rotation(), s * R.matrix() @ value.translation() + motion[:3])
+    return np.asarray(s * R.matrix() @ value + motion[:3])
 
 
 def poses_at(values: gtsam.Values, keys: Sequence[int]) -> tuple[FloatArray, FloatArray]:

@@ -20,9 +20,10 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.epochs.states import differences_of, laid_onto, origin, value_motions
+from adjust.epochs.states import differences_of, laid_onto, origin
 from adjust.model.errors import listed
 from adjust.model.survey import FloatArray
+from adjust.spatial.motions import value_motions
 from adjust.spatial.rotation_forms import quaternion_wxyz
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2

@@ -16,6 +16,7 @@ from adjust.observations.factors import Jacobians
 from adjust.observations.terrestrial import equations as k
 from adjust.observations.terrestrial.layout import Chunk, Layout, ReadingArrays
 from adjust.observations.terrestrial.parameters import TerrestrialParameters
+from adjust.spatial.averaging import circular_median
 from adjust.spatial.vertical import Horizon
 
 
@@ -285,19 +286,6 @@ def sigmas(a: ReadingArrays, axes: FloatArray, A: FloatArray) -> FloatArray:
         by_target = np.einsum("nij,nj->ni", horizontal, A[rows, column : column + 3])
         variance[rows] += a.target_centring[rows] ** 2 * (by_target**2).sum(axis=1)
     return np.sqrt(variance)
-
-
-def circular_median(angles: FloatArray) -> float:
-    """The angle nearest to all others (least sum of absolute differences), of those given; zero of none."""
-    return float(circular_medians(angles[None])[0]) if len(angles) else 0.0
-
-
-def circular_medians(angles: FloatArray) -> FloatArray:
-    """The same (m,) of each row of angles (m, n), n > 0."""
-    some = angles[:, :: max(1, angles.shape[1] // 64)]
-    turns = (angles[:, None, :] - some[:, :, None] + np.pi) % (2.0 * np.pi) - np.pi
-    rows, best = np.arange(len(angles)), np.abs(turns).sum(axis=2).argmin(axis=1)
-    return np.asarray(some[rows, best] + np.median(turns[rows, best], axis=1))
 
 
 def _blocks(chunk: Chunk, J: FloatArray) -> list[FloatArray]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from adjust.model.names import grouped
-from adjust.observations.terrestrial.batch import circular_median
+from adjust.spatial.averaging import circular_median
 from adjust.start.readings.places import positions
 from adjust.start.readings.sights import Node, Sights, best_of_places
 

@@ -12,7 +12,7 @@ import numpy as np
 from adjust.model.names import grouped
 from adjust.model.observations import PositionRef, Reading, position_text
 from adjust.model.survey import FloatArray, Survey
-from adjust.observations.terrestrial.batch import circular_median
+from adjust.spatial.averaging import circular_median
 from adjust.spatial.vertical import plumb
 
 Node = str

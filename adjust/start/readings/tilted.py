@@ -13,7 +13,7 @@ from adjust.model.boards import deformed
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, PositionRef
 from adjust.model.survey import FloatArray, Survey
-from adjust.observations.terrestrial.batch import circular_median
+from adjust.spatial.averaging import circular_median
 from adjust.spatial.rigid import align, inverse, rotation_exp
 from adjust.start.chains import ChainObservation
 from adjust.start.closed_forms.absolute_pose import best_of, pose_solutions
