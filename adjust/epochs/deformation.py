@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from gtsam import Pose3, Rot3
+from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Estimate, ParameterName
@@ -66,18 +66,12 @@ class Deformation:
         return np.asarray(np.sqrt(np.diag(self.cov)))
 
 
-def relative_pose(adjustment: Adjustment, a: str, b: str) -> tuple[Pose3, FloatArray]:
-    """``b_from_a`` of two fixed stations and its a priori covariance (6, 6) rad, m, in the tangent on the right, in a.
+def relative_poses(adjustment: Adjustment, pairs: Sequence[tuple[str, str]]) -> tuple[Motions, FloatArray]:
+    """``b_from_a`` (p,) of two fixed stations each and the a priori covariances (p, 6, 6) rad, m, in the tangents in a.
 
     Neither depends on the datum. Held stations have no error. In networks of rotations the translation and its rows of
     the covariance are nan. Raises SurveyError for stations that were not adjusted as fixed ones.
     """
-    b_from_a, cov = _relative_poses(adjustment, [(a, b)])
-    return Pose3(Rot3(b_from_a.rotation[0]), b_from_a.shifts[0]), cov[0]
-
-
-def _relative_poses(adjustment: Adjustment, pairs: Sequence[tuple[str, str]]) -> tuple[Motions, FloatArray]:
-    """The same of many pairs, and their covariances (p, 6, 6)."""
     same = next((a for a, b in pairs if a == b), None)
     if same is not None:
         raise SurveyError(f"a relative pose of station {same!r} to itself was asked for; name two stations")
@@ -107,7 +101,7 @@ def station_deformations(
     """
     chosen = _consecutive(first, second) if pairs is None else tuple(pairs)
     factors = [_factor(x, s) for x, s in zip((first, second), scale, strict=True)]
-    return _deformations(chosen, _relative_poses(first, chosen), _relative_poses(second, chosen), factors, alpha)
+    return _deformations(chosen, relative_poses(first, chosen), relative_poses(second, chosen), factors, alpha)
 
 
 def _station(adjustment: Adjustment, station_id: str) -> Estimate:

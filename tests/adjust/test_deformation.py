@@ -9,7 +9,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from adjust.epochs.deformation import relative_pose, station_deformations
+from adjust.epochs.deformation import relative_poses, station_deformations
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Coordinates, FrameRef, Pair, PositionRef
 from adjust.model.survey import Datum, Point, PoseParameter, Station, Survey
@@ -46,6 +46,11 @@ def measured(poses, rng, sigmas=SIGMAS, held=0, rotations=False):
     if held is not None:
         stations[held] = Station(f"S{held}", world_from_station=PoseParameter(Pose3(poses[held]), "held"))
     return Survey(stations=tuple(stations), pairs=tuple(pairs), datum=Datum("inner" if held is None else "given"))
+
+
+def relative_pose(adjustment, a, b):
+    b_from_a, cov = relative_poses(adjustment, [(a, b)])
+    return Pose3(b_from_a.matrices()[0]), cov[0]
 
 
 def adjusted(survey):
