@@ -7,10 +7,15 @@ import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.navigation.fit import PoseFit, Prior, fit_pose, fit_without_outliers, local, log_evidence
-from adjust.navigation.model import NavigateOptions
 from adjust.navigation.system import Sightings, System, evaluate, visible
 from adjust.testing.distributions import chi2
 
+DETECTION = 0.9
+"""Probability that a beacon in the field of view gives a spot."""
+_FALSE_SPOTS = 0.3
+"""Expected number of false spots an image."""
+_ROOM_M = 3.0
+"""Edge of the cube in which the head is, where no prior says more."""
 KEPT = 400
 _ADJUSTED = 60
 _HOPELESS = 40.0  # difference in -2 ln evidence beyond which a candidate is of no interest
@@ -40,7 +45,7 @@ def allowed_namings(seen: Sightings) -> BoolArray:
     return np.asarray((label < 0) | (label == np.arange(len(seen.system.beacons.beacon_ids))))
 
 
-def gate_distances(seen: Sightings, prior: Prior, options: NavigateOptions) -> tuple[FloatArray, FloatArray]:
+def gate_distances(seen: Sightings, prior: Prior) -> tuple[FloatArray, FloatArray]:
     """Squared distance (n, m) of every spot from where the prior expects every beacon, in sigmas.
 
     Infinite for a beacon far outside the field of view, where the distortion may fold it back into the image.
@@ -50,8 +55,8 @@ def gate_distances(seen: Sightings, prior: Prior, options: NavigateOptions) -> t
     """
     margin = _MARGIN + 4.0 * float(np.sqrt(np.diag(prior.total)[:3].max()))
     distance, log_det = _gates(seen, prior, visible(seen.system, prior.pose, margin))
-    vague = distance + log_det - 2.0 * np.log(options.detection / (1.0 - options.detection))
-    by_chance = 2.0 * np.log(image_areas(seen.system)[seen.camera] / options.false_spots)
+    vague = distance + log_det - 2.0 * np.log(DETECTION / (1.0 - DETECTION))
+    by_chance = 2.0 * np.log(image_areas(seen.system)[seen.camera] / _FALSE_SPOTS)
     return distance, np.where((seen.label >= 0)[:, None], np.inf, by_chance[:, None] - vague)
 
 
@@ -89,14 +94,14 @@ Trial = tuple[FloatArray, IntArray]
 
 
 def judged(
-    seen: Sightings, trials: Sequence[Trial], prior: Prior | None, options: NavigateOptions
+    seen: Sightings, trials: Sequence[Trial], prior: Prior | None, alpha: float
 ) -> tuple[Candidate, ...]:
-    """Adjust the trials, compare their evidence, and give each its probability."""
+    """Adjust the trials, compare their evidence, and give each its probability. alpha: of the outlier test."""
     by_naming: dict[tuple[bytes, bytes], list[Candidate]] = {}
     # three spots fit many namings exactly, and all of them are to be named
     most = 2 * MOST_NAMINGS if prior is not None else (_ADJUSTED if len(seen.uv) > 3 else KEPT)
     for pose, match in trials[:most]:
-        candidate = _adjusted(seen, (pose, match), prior, options)
+        candidate = _adjusted(seen, (pose, match), prior, alpha)
         if candidate is not None:
             alike = by_naming.setdefault((candidate.fit.used.tobytes(), candidate.fit.beacon.tobytes()), [])
             if not any(np.linalg.norm(local(candidate.fit.pose, other.fit.pose)) < _SAME for other in alike):
@@ -111,25 +116,25 @@ def judged(
                  if c.score < found[0].score + _HOPELESS)  # fmt: skip
 
 
-def _adjusted(seen: Sightings, trial: Trial, prior: Prior | None, options: NavigateOptions) -> Candidate | None:
+def _adjusted(seen: Sightings, trial: Trial, prior: Prior | None, alpha: float) -> Candidate | None:
     pose, match = trial
     used = np.flatnonzero(match >= 0)
     if prior is None and len(used) < 3:
         return None
-    fit, rejected = fit_without_outliers(seen, used, match[used], pose, prior, options.alpha)
+    fit, rejected = fit_without_outliers(seen, used, match[used], pose, prior, alpha)
     if fit is None or not fit.in_front:
         return None
     if prior is None:
-        fit = _grown(seen, fit, rejected, options)
+        fit = _grown(seen, fit, rejected)
     if fit.redundancy > 0 and fit.chi_square > chi2.isf(1e-6, fit.redundancy):
         return None
-    return Candidate(fit, rejected, score_of(seen, fit, prior, options))
+    return Candidate(fit, rejected, score_of(seen, fit, prior))
 
 
-def _grown(seen: Sightings, fit: PoseFit, rejected: tuple[int, ...], options: NavigateOptions) -> PoseFit:
+def _grown(seen: Sightings, fit: PoseFit, rejected: tuple[int, ...]) -> PoseFit:
     """Name the spots that the pose explains and the coarse consensus left out."""
     for _ in range(len(seen.uv) - len(fit.used) - len(rejected)):
-        distance, support = gate_distances(seen, fit.posterior, options)
+        distance, support = gate_distances(seen, fit.posterior)
         distance[~(allowed_namings(seen) & (support > 0.0))] = np.inf
         distance[fit.used] = np.inf
         distance[list(rejected)] = np.inf
@@ -146,7 +151,7 @@ def _grown(seen: Sightings, fit: PoseFit, rejected: tuple[int, ...], options: Na
     return fit
 
 
-def score_of(seen: Sightings, fit: PoseFit, prior: Prior | None, options: NavigateOptions) -> float:
+def score_of(seen: Sightings, fit: PoseFit, prior: Prior | None) -> float:
     """-2 ln of the evidence of an explanation: fit, spots it calls false, beacons it should have seen and did not.
 
     A false spot may be anywhere in its image; what no prior knows of the pose is uniform over all rotations (8 pi^2)
@@ -157,11 +162,11 @@ def score_of(seen: Sightings, fit: PoseFit, prior: Prior | None, options: Naviga
     score = log_evidence(fit)
     known = set() if prior is None else set(prior.rows.tolist())
     score += 2.0 * np.log(8.0 * np.pi**2) * len({0, 1, 2} - known) / 3.0
-    score += 2.0 * np.log(options.room_m) * len({3, 4, 5} - known)
-    score -= 2.0 * float(np.log(options.false_spots / image_areas(seen.system)[seen.camera[false]]).sum())
-    score -= 2.0 * len(fit.used) * np.log(options.detection)
+    score += 2.0 * np.log(_ROOM_M) * len({3, 4, 5} - known)
+    score -= 2.0 * float(np.log(_FALSE_SPOTS / image_areas(seen.system)[seen.camera[false]]).sum())
+    score -= 2.0 * len(fit.used) * np.log(DETECTION)
     # only cameras that took part: the others may not have been triggered
     view = visible(seen.system, fit.pose) & seen.present[:, None]
     view[seen.camera[fit.used], fit.beacon] = False
     missing = int(view.sum())
-    return float(score - 2.0 * missing * np.log(1.0 - options.detection))
+    return float(score - 2.0 * missing * np.log(1.0 - DETECTION))

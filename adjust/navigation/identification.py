@@ -15,6 +15,7 @@ from adjust.lenses.models import MODELS, focal_length_px
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.navigation import FoundArrays, SkyArrays, search
 from adjust.navigation.evidence import (
+    DETECTION,
     GATE,
     KEPT,
     MOST_NAMINGS,
@@ -27,10 +28,17 @@ from adjust.navigation.evidence import (
     score_of,
 )
 from adjust.navigation.fit import Prior, fit_pose
-from adjust.navigation.model import NavigateOptions
 from adjust.navigation.system import Sightings, System, station_rays
 from adjust.spatial.rigid import rigid
 
+PROBABILITY = 0.999
+"""What a solution needs to be taken for the only one."""
+_GATE = float(np.radians(0.8))
+"""How far a beacon may be from a spot in a hypothesis of three."""
+_NEAREST_M, _FARTHEST = 0.05, 10.0
+"""Distances of beacons: the least, and the largest in extents of them all."""
+_MOST_HYPOTHESES = 40_000
+"""Three-point problems solved for one epoch at most."""
 _COARSE = 25.0  # difference in the coarse score, about ln of the evidence, beyond which nobody looks
 _DOUBTED = 6
 _BEYOND_DOUBT = 20.0  # 2 ln of a likelihood ratio
@@ -38,31 +46,27 @@ _CROWDED = 3.0  # beacons near a spot beyond which naming in turn is hopeless
 _MOST_TRIPLES = 400
 
 
-def without_prior(seen: Sightings, options: NavigateOptions) -> tuple[Candidate, ...]:
+def without_prior(seen: Sightings, alpha: float) -> tuple[Candidate, ...]:
     """All explanations of an epoch that are worth naming, best first; empty where fewer than three spots are there."""
     if len(seen.uv) < 3:
         return ()
-    return judged(seen, _hypotheses(seen, allowed_namings(seen), options), None, options)
+    return judged(seen, _hypotheses(seen, allowed_namings(seen)), None, alpha)
 
 
-def _hypotheses(seen: Sightings, allowed: BoolArray, options: NavigateOptions) -> list[Trial]:
+def _hypotheses(seen: Sightings, allowed: BoolArray) -> list[Trial]:
     """Poses (4, 4) and namings (n,) by the coarse consensus, best first."""
     n, system = len(seen.uv), seen.system.arrays
-    farthest = options.farthest_m
-    if farthest is None:
-        farthest = 10.0 * float(np.linalg.norm(np.ptp(system.x_in_world, axis=0)))
+    farthest = _FARTHEST * float(np.linalg.norm(np.ptp(system.x_in_world, axis=0)))
     R, t = np.empty((KEPT, 3, 3)), np.empty((KEPT, 3))
     score, match = np.full(KEPT, -np.inf), np.empty((KEPT, n), dtype=np.int64)
-    missed = np.where(seen.present, -np.log(1.0 - options.detection), 0.0)
-    named = np.log(_sky(seen.system) / np.radians(options.gate_deg) ** 2)[seen.camera]
+    missed = np.where(seen.present, -np.log(1.0 - DETECTION), 0.0)
+    named = np.log(_sky(seen.system) / _GATE**2)[seen.camera]
     origin, ray = station_rays(seen)
     sky = SkyArrays(
         origin, np.ascontiguousarray(ray), seen.camera, allowed, system.x_in_world, system.camera_R, system.camera_t,
-        seen.system.field, float(np.radians(options.gate_deg)), named, missed,
+        seen.system.field, _GATE, named, missed,
     )  # fmt: skip
-    kept = search(
-        sky, _triples(ray), options.nearest_m, farthest, options.max_hypotheses, FoundArrays(R, t, score, match)
-    )
+    kept = search(sky, _triples(ray), _NEAREST_M, farthest, _MOST_HYPOTHESES, FoundArrays(R, t, score, match))
     order = np.argsort(-score[:kept], kind="stable")
     order = order[score[order] > score[order[:1]] - _COARSE]
     return list(zip(rigid(R[order], t[order]), match[order], strict=True))
@@ -85,19 +89,19 @@ def _triples(ray: FloatArray) -> IntArray:
     return np.ascontiguousarray(every[rank][:_MOST_TRIPLES])
 
 
-def with_prior(seen: Sightings, prior: Prior, options: NavigateOptions) -> tuple[Candidate, ...]:
+def with_prior(seen: Sightings, prior: Prior, alpha: float) -> tuple[Candidate, ...]:
     """Explanations near a prior, best first. One that leaves components open needs names, or three spots."""
     if len(prior.rows) < 6:
-        return _with_partial_prior(seen, prior, options)
-    distance, support = gate_distances(seen, prior, options)
+        return _with_partial_prior(seen, prior, alpha)
+    distance, support = gate_distances(seen, prior)
     near = (distance < GATE) & allowed_namings(seen) & (support > 0.0)
     if len(seen.uv) >= 3 and near.sum() > _CROWDED * near.any(axis=1).sum():
-        trials = _doubted(_hypotheses(seen, near, options), support)
-        found = judged(seen, trials, prior, options)
+        trials = _doubted(_hypotheses(seen, near), support)
+        found = judged(seen, trials, prior, alpha)
         if found:
-            return _agreed(seen, prior, found, options)
-    trials = _doubted(_in_turn(seen, prior, near, distance, options), support)
-    return _agreed(seen, prior, judged(seen, trials, prior, options), options)
+            return _agreed(seen, prior, found)
+    trials = _doubted(_in_turn(seen, prior, near, distance), support)
+    return _agreed(seen, prior, judged(seen, trials, prior, alpha))
 
 
 def _doubted(trials: list[Trial], support: FloatArray) -> list[Trial]:
@@ -114,35 +118,33 @@ def _doubted(trials: list[Trial], support: FloatArray) -> list[Trial]:
     return out
 
 
-def _agreed(
-    seen: Sightings, prior: Prior, candidates: tuple[Candidate, ...], options: NavigateOptions
-) -> tuple[Candidate, ...]:
+def _agreed(seen: Sightings, prior: Prior, candidates: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
     """Where no candidate is certain: what all agree on that together are. Spots in doubt are not used at all.
 
     The prior and the spots that are beyond doubt give a pose, less precise, whose covariance holds whichever is true.
     """
-    if not candidates or candidates[0].probability >= options.probability:
+    if not candidates or candidates[0].probability >= PROBABILITY:
         return candidates
     total, likely = 0.0, []
     for c in candidates:
         likely.append(set(zip(c.fit.used.tolist(), c.fit.beacon.tolist(), strict=True)))
         total += c.probability
-        if total >= options.probability:
+        if total >= PROBABILITY:
             break
     pairs = np.array(sorted(set.intersection(*likely)), dtype=np.int64).reshape(-1, 2)
     used, beacon = np.ascontiguousarray(pairs[:, 0]), np.ascontiguousarray(pairs[:, 1])
     fit = fit_pose(seen, used, beacon, prior.pose, prior)
     if fit is None or not fit.in_front:
         return candidates
-    return (Candidate(fit, (), score_of(seen, fit, prior, options), total),)
+    return (Candidate(fit, (), score_of(seen, fit, prior), total),)
 
 
-def _with_partial_prior(seen: Sightings, prior: Prior, options: NavigateOptions) -> tuple[Candidate, ...]:
+def _with_partial_prior(seen: Sightings, prior: Prior, alpha: float) -> tuple[Candidate, ...]:
     if len(seen.uv) >= 3:
-        return judged(seen, _hypotheses(seen, allowed_namings(seen), options), prior, options)
+        return judged(seen, _hypotheses(seen, allowed_namings(seen)), prior, alpha)
     if np.any(seen.label < 0):
         return ()
-    return judged(seen, [(prior.pose, seen.label)], prior, options)
+    return judged(seen, [(prior.pose, seen.label)], prior, alpha)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,9 +156,7 @@ class _Partial:
     prior: Prior
 
 
-def _in_turn(
-    seen: Sightings, prior: Prior, near: BoolArray, distance: FloatArray, options: NavigateOptions
-) -> list[Trial]:
+def _in_turn(seen: Sightings, prior: Prior, near: BoolArray, distance: FloatArray) -> list[Trial]:
     """Poses (4, 4) and namings (n,): first what has no rival, each naming narrowing the choice of the next.
 
     Where only rivals are left the spot with the fewest is tried with each of them, and with none.
@@ -174,7 +174,7 @@ def _in_turn(
             posterior = _posterior(seen, match, prior) if np.any(match != partial.match) else partial.prior
             if posterior is None:
                 continue
-            new, support = gate_distances(seen, posterior, options)
+            new, support = gate_distances(seen, posterior)
             free = (new < GATE) & allowed & (support > 0.0) & ~decided[:, None]
             for i in np.flatnonzero(match >= 0):
                 free[seen.camera == seen.camera[i], match[i]] = False

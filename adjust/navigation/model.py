@@ -119,26 +119,12 @@ class NavigateOptions:
 
     motion: bridges and identifies by constant velocity; None: every epoch stands alone. use_table: whether table
     angles identify and bridge.
-    detection: probability that a beacon in the field of view gives a spot. false_spots: expected number of false spots
-    an image. Both weigh hypotheses against each other.
-    probability: what a solution needs to be taken for the only one. alpha: level of the outlier test of an epoch.
-    gate_deg: how far a beacon may be from a spot in a hypothesis of three. nearest_m, farthest_m: distances of beacons;
-    farthest None: ten times their extent. room_m: edge of the cube in which the head is, where no prior says more.
-    max_hypotheses: three-point problems solved for one epoch at most. max_alternatives: solutions listed at most.
+    alpha: level of the outlier test of an epoch.
     """
 
     motion: Motion | None = field(default_factory=Motion)
     use_table: bool = True
-    detection: float = 0.9
-    false_spots: float = 0.3
-    probability: float = 0.999
     alpha: float = 1e-3
-    gate_deg: float = 0.8
-    nearest_m: float = 0.05
-    farthest_m: float | None = None
-    room_m: float = 3.0
-    max_hypotheses: int = 40_000
-    max_alternatives: int = 400
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ import numpy as np
 from adjust.model.survey import FloatArray, IntArray
 from adjust.navigation.evidence import Candidate
 from adjust.navigation.fit import PoseFit, Prior, fit_pose, local
-from adjust.navigation.identification import with_prior, without_prior
+from adjust.navigation.identification import PROBABILITY, with_prior, without_prior
 from adjust.navigation.model import (
     Beacons,
     Bridge,
@@ -29,6 +29,7 @@ from adjust.spatial.rigid import as_pose3
 from adjust.testing.distributions import chi2
 
 _AGREES = 1e-6
+_MOST_LISTED = 400  # solutions of one epoch
 _WEAKEST_RAD = 0.2  # a covariance from first derivatives means nothing beyond
 _NOTHING = np.diag(np.full(6, np.inf))
 
@@ -88,19 +89,19 @@ class _Epoch:
 
     def solved(self, state: MotionState | None) -> _Step:
         """The pose, by the spots and what is known of it beforehand: state, of the motion at another epoch."""
-        seen, motion, options = self.seen, self.options.motion, self.options
+        seen, motion, alpha = self.seen, self.options.motion, self.options.alpha
         now = predicted(state, self.time_s, motion) if state is not None and motion is not None else None
         prior, bridge = self._prior(now)
         candidates: tuple[Candidate, ...] = ()
         if prior is not None and len(seen.uv):
-            candidates = with_prior(seen, prior, options)
+            candidates = with_prior(seen, prior, alpha)
             if not _plausible(seen, prior, candidates):
-                afresh = without_prior(seen, options)
+                afresh = without_prior(seen, alpha)
                 if self._certain(afresh):
                     return self._from_candidates(afresh, None, "", None)
                 candidates = candidates if bridge == "motion" else ()
         elif len(seen.uv):
-            candidates = without_prior(seen, options)
+            candidates = without_prior(seen, alpha)
         if candidates:
             return self._from_candidates(candidates, prior, bridge, now)
         return _Step(self._from_little(prior, bridge), now)
@@ -118,7 +119,7 @@ class _Epoch:
 
     def _certain(self, candidates: Sequence[Candidate]) -> bool:
         """Whether the first candidate is the only one; three spots without names never say so by themselves."""
-        if not candidates or candidates[0].probability < self.options.probability:
+        if not candidates or candidates[0].probability < PROBABILITY:
             return False
         fit = candidates[0].fit
         return fit.redundancy >= 2 or bool(np.all(self.seen.label[fit.used] >= 0))
@@ -127,7 +128,7 @@ class _Epoch:
         self, candidates: Sequence[Candidate], prior: Prior | None, bridge: Bridge, now: MotionState | None
     ) -> _Step:
         best = candidates[0]
-        certain = self._certain(candidates) if prior is None else best.probability >= self.options.probability
+        certain = self._certain(candidates) if prior is None else best.probability >= PROBABILITY
         own = best.fit if prior is None else self._own(best.fit)
         fit, used = (best.fit, bridge) if own is None else (own, "")
         if not certain:
@@ -168,7 +169,7 @@ class _Epoch:
         several: tuple[Solution, ...] = ()
         notes: tuple[str, ...] = ()
         if status == "ambiguous":
-            several = tuple(map(self._solution, candidates[: self.options.max_alternatives]))
+            several = tuple(map(self._solution, candidates[:_MOST_LISTED]))
             if best.more or len(several) < len(candidates):
                 notes = (f"more solutions fit than the {len(several)} likeliest, which are listed",)
         rejected = tuple((self.given.spots[seen.block[i]].camera_id, int(seen.row[i])) for i in best.rejected)
