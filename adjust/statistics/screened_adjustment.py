@@ -15,7 +15,7 @@ from adjust.statistics.group_sums import scaled_survey
 from adjust.statistics.outliers.outcome import OutlierSearch, SearchOptions
 from adjust.statistics.outliers.search import disagreeing_pairs, search_outliers
 from adjust.statistics.outliers.watched import watchable
-from adjust.statistics.variance_components import ComponentOptions, Scaled, estimate_variance_components
+from adjust.statistics.variance_components import Scaled, estimate_variance_components
 from adjust.testing.criteria import limits
 
 _LARGEST, _ROOM = 6000, 1e8
@@ -94,8 +94,7 @@ def _cleaned(
         if not options.variance_components or found == rejected:
             break
         rejected = found
-        how = ComponentOptions(adjust=options.adjust)
-        scaled = estimate_variance_components(now.survey, options=how, progress=progress, first=now)
+        scaled = estimate_variance_components(now.survey, None, options.adjust, progress, now)
         now = scaled.adjustment
         factors = {c.group: factors.get(c.group, 1.0) * c.factor for c in scaled.components.components}
     return _told(now, first, search, scaled, factors, _unsearched(now, options))

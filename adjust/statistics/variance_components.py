@@ -6,13 +6,12 @@ would leave the positive factors or go far, the scoring of their logarithms. In 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.graph.assembly import StartValues, values_of
-from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Component, VarianceComponents
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.precision.precision import precision_of
@@ -26,26 +25,15 @@ _SINGULAR = 1e-6
 _LONGEST = 1.5
 _MANY_POINTS = 300_000
 _LINEAR_STEPS = 100
-
-
-@dataclass(frozen=True)
-class ComponentOptions:
-    """groups: of which the components are estimated (all but ``fixed``, where None).
-
-    least_redundancy: a group with less is not estimated. convergence: relative change of all factors by one more
-    solution of the survey. level: of the confidence limits.
-    """
-
-    groups: tuple[str, ...] | None = None
-    fixed: tuple[str, ...] = ("prior",)
-    least_redundancy: float = 1.0
-    convergence: float = 1e-4
-    max_iterations: int = 20
-    level: float = 0.95
-    adjust: AdjustOptions = field(default_factory=AdjustOptions)
-
-
-DEFAULT_COMPONENTS = ComponentOptions()
+_FIXED = "prior"
+"""A group that keeps its variance."""
+_LEAST = 1.0
+"""Redundancy below which a group is not estimated."""
+_CONVERGENCE, _ROUNDS = 1e-4, 20
+"""Relative change of all factors by one more solution of the survey, and solutions at most."""
+_USUAL = AdjustOptions()
+_LEVEL = 0.95
+"""Of the confidence limits."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,88 +62,76 @@ class LinearComponents:
 
 
 def estimate_variance_components(
-    survey: Survey, start: StartValues | None = None, options: ComponentOptions = DEFAULT_COMPONENTS,
+    survey: Survey, start: StartValues | None = None, options: AdjustOptions = _USUAL,
     progress: Callable[[int, float], None] | None = None, first: Adjustment | None = None,
 ) -> Scaled:  # fmt: skip
     """Estimate the variance components of a survey's groups, and adjust it with them.
 
-    first: an adjustment of this survey, where there is one. Raises SurveyError where a group is not in the survey or
-    has no observation in use, and as :func:`adjust.adjustment.adjust`.
+    first: an adjustment of this survey, where there is one. Raises as :func:`adjust.adjustment.adjust`.
     """
-    now = first or adjust(survey, start, options.adjust, progress)
+    now = first or adjust(survey, start, options, progress)
     survey = now.survey
     total: dict[str, float] = {}
-    for iteration in range(1, options.max_iterations + 1):
-        found = _of_adjustment(now, options)
+    for iteration in range(1, _ROUNDS + 1):
+        found = _of_adjustment(now)
         change = max((abs(np.log(c.factor)) for c in found.components if c.status in _CHANGED), default=0.0)
-        if change < options.convergence:
-            return Scaled(now, _totals(found, total, iteration, True, options))
+        if change < _CONVERGENCE:
+            return Scaled(now, _totals(found, total, iteration, True))
         total = {c.group: total.get(c.group, 1.0) * c.factor for c in found.components}
-        now = adjust(scaled_survey(survey, total), values_of(now), options.adjust, progress)
-    return Scaled(now, _totals(_of_adjustment(now, options), total, options.max_iterations, False, options))
+        now = adjust(scaled_survey(survey, total), values_of(now), options, progress)
+    return Scaled(now, _totals(_of_adjustment(now), total, _ROUNDS, False))
 
 
 _CHANGED = ("estimated", "unseparable", "vanished")
 
 
-def _totals(
-    found: VarianceComponents, total: dict[str, float], iterations: int, converged: bool, options: ComponentOptions
-) -> VarianceComponents:
+def _totals(found: VarianceComponents, total: dict[str, float], iterations: int, converged: bool) -> VarianceComponents:
     """The last step's components with factors over the a priori variances."""
     components = []
     for c in found.components:
         factor = total.get(c.group, 1.0)
         status = "vanished" if c.status == "estimated" and factor < 10.0 * _VANISHED else c.status
-        components.append(_tested(replace(c, factor=factor, sigma=c.sigma / c.factor * factor, status=status), options))
+        components.append(_tested(replace(c, factor=factor, sigma=c.sigma / c.factor * factor, status=status)))
     return replace(found, components=tuple(components), iterations=iterations, converged=converged)
 
 
-def _of_adjustment(adjustment: Adjustment, options: ComponentOptions) -> VarianceComponents:
-    groups = {g.group: g for g in adjustment.groups}
-    wanted = options.groups if options.groups is not None else tuple(g for g in groups if g not in options.fixed)
-    unknown = [g for g in wanted if g not in groups]
-    if unknown:
-        raise SurveyError(
-            f"no observation in use belongs to group {unknown[0]!r}; groups with observations: {', '.join(groups)}"
-        )
+def _of_adjustment(adjustment: Adjustment) -> VarianceComponents:
+    wanted = tuple(g.group for g in adjustment.groups if g.group != _FIXED)
     large = precision_of(adjustment).graph.unknowns.n_unknowns > DENSE
     if large or len(adjustment.image_residuals.test) > _MANY_POINTS:
-        return _simplified(adjustment, wanted, options)
-    return components_of(linear_system(adjustment), wanted, options)
+        return _simplified(adjustment, wanted)
+    return components_of(linear_system(adjustment), wanted)
 
 
-def _simplified(adjustment: Adjustment, wanted: Sequence[str], options: ComponentOptions) -> VarianceComponents:
+def _simplified(adjustment: Adjustment, wanted: Sequence[str]) -> VarianceComponents:
     """Foerstner's step from the sums of the adjustment; sigmas without the coupling of the groups."""
     out = []
     for g in adjustment.groups:
-        enough = g.group in wanted and g.redundancy >= options.least_redundancy
+        enough = g.group in wanted and g.redundancy >= _LEAST
         status = "estimated" if enough else "no redundancy" if g.group in wanted else "fixed"
         factor = max(g.factor, _VANISHED) if enough else 1.0
         sigma = factor * np.sqrt(2.0 / g.redundancy) if enough else np.nan
         component = Component(g.group, factor, float(sigma), g.n_observations, g.redundancy, g.omega, status)
-        out.append(_tested(component, options))
+        out.append(_tested(component))
     names = tuple(c.group for c in out if c.status == "estimated")
     return VarianceComponents(tuple(out), names, np.eye(len(names)), (), 1, True, "foerstner")
 
 
-def components_of(
-    system: LinearSystem, wanted: Sequence[str], options: ComponentOptions = DEFAULT_COMPONENTS
-) -> VarianceComponents:
+def components_of(system: LinearSystem, wanted: Sequence[str]) -> VarianceComponents:
     """Variance components of a linear system: no new linearisation."""
     names = system.group_names
     mixed = [(rows, np.array([names.index(g) for g in of], dtype=np.int64), back)
              for rows, of, back in mixed_blocks(system)]  # fmt: skip
     sums = group_sums(system, mixed)
     chosen = np.array([g in wanted for g in names], dtype=np.bool_)
-    found = linear_components(sums, chosen, options)
-    return _named(names, sums, chosen, found, options)
+    return _named(names, sums, chosen, linear_components(sums, chosen))
 
 
-def linear_components(sums: GroupSums, chosen: BoolArray, options: ComponentOptions) -> LinearComponents:
+def linear_components(sums: GroupSums, chosen: BoolArray) -> LinearComponents:
     """Factors of the ``chosen`` groups (G,); the others keep 1. Groups that cannot be told apart share one factor."""
     G = len(chosen)
     first = moments(sums, np.ones(G))
-    chosen = chosen & (first.r >= options.least_redundancy)
+    chosen = chosen & (first.r >= _LEAST)
     sets = _sets(first.S, chosen)
     to = np.where(sets >= 0, sets, 0)
     k = int(sets.max(initial=-1)) + 1
@@ -172,7 +148,7 @@ def linear_components(sums: GroupSums, chosen: BoolArray, options: ComponentOpti
         theta[:k] = np.maximum(theta[:k] * step, _VANISHED)
         held |= theta[:k] <= _VANISHED
         now = moments(small, theta)
-        converged = bool(np.all(np.abs(np.log(step))[~held] < 1e-2 * options.convergence))
+        converged = bool(np.all(np.abs(np.log(step))[~held] < 1e-2 * _CONVERGENCE))
     factors = np.where(fixed, 1.0, theta[to])
     merged = np.where(fixed, -1, to)
     vanished = ~fixed & (factors <= _VANISHED)
@@ -214,9 +190,7 @@ def _sets(S: FloatArray, chosen: BoolArray) -> IntArray:
     return sets
 
 
-def _named(
-    names: Sequence[str], sums: GroupSums, chosen: BoolArray, found: LinearComponents, options: ComponentOptions
-) -> VarianceComponents:
+def _named(names: Sequence[str], sums: GroupSums, chosen: BoolArray, found: LinearComponents) -> VarianceComponents:
     k = len(found.S)
     cov = 2.0 * np.linalg.pinv(found.S, hermitian=True) if k else np.zeros((0, 0))
     counts = sums.n.copy()
@@ -234,7 +208,7 @@ def _named(
             status = "unseparable" if len(shared[at]) > 1 else "vanished" if found.vanished[g] else "estimated"
         component = Component(name, float(found.theta[g]), float(sigma), int(counts[g]), float(found.moments.r[g]),
                               float(found.moments.q[g]), status)  # fmt: skip
-        out.append(_tested(component, options))
+        out.append(_tested(component))
     d = np.sqrt(np.diag(cov))
     correlation: FloatArray = np.asarray(cov / np.outer(d, d), dtype=float)
     return VarianceComponents(
@@ -243,13 +217,13 @@ def _named(
     )  # fmt: skip
 
 
-def _tested(given: Component, options: ComponentOptions) -> Component:
+def _tested(given: Component) -> Component:
     """With limits and test from chi-square with the equivalent degrees of freedom (Satterthwaite 1946)."""
     factor, sigma = given.factor, given.sigma
     if given.status == "vanished" or not (np.isfinite(sigma) and sigma > 0.0 and factor > 0.0):
         return replace(given, freedom=np.nan, p=np.nan, lower=np.nan, upper=np.nan)
     freedom = 2.0 * factor**2 / sigma**2
-    low, high = chi2.ppf([0.5 - 0.5 * options.level, 0.5 + 0.5 * options.level], freedom)
+    low, high = chi2.ppf([0.5 - 0.5 * _LEVEL, 0.5 + 0.5 * _LEVEL], freedom)
     p = 2.0 * min(float(chi2.cdf(factor * freedom, freedom)), float(chi2.sf(factor * freedom, freedom)))
     return replace(given, freedom=freedom, p=min(1.0, p), lower=float(factor * freedom / high),
                    upper=float(factor * freedom / low))  # fmt: skip
