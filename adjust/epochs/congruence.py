@@ -6,7 +6,7 @@ contributes most is taken out of the datum, until what is left is congruent.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from gtsam import Pose3
@@ -28,7 +28,7 @@ from adjust.epochs.states import (
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray
-from adjust.testing.criteria import LevelOptions, sidak
+from adjust.testing.criteria import sidak
 from adjust.testing.distributions import fisher
 from adjust.testing.quadratic_forms import squares_in_sigmas
 
@@ -41,7 +41,7 @@ class CongruenceOptions:
     """alpha: of the global test, and of all single tests together.
 
     scaled: sigma0 is pooled from both epochs, else the a priori sigmas hold. reference: names to begin with as stable
-    (all common ones, where None). search: whether unstable ones are looked for among them. levels: only the power of
+    (all common ones, where None). search: whether unstable ones are looked for among them. power: of
     ``Motion.smallest``. names: of the epochs.
     """
 
@@ -49,7 +49,7 @@ class CongruenceOptions:
     scaled: bool = True
     reference: tuple[ParameterName, ...] | None = None
     search: bool = True
-    levels: LevelOptions = field(default_factory=LevelOptions)
+    power: float = 0.80
     names: tuple[str, str] = ("first", "second")
 
 
@@ -113,7 +113,7 @@ def compare(both: Common, options: CongruenceOptions, cross: FloatArray | None =
     first_test = tests.of_all(begin)
     steps, stable, last = tests.search(begin, first_test)
     level = sidak(options.alpha, len(np.unique(change.owner)))
-    judging = Judging(change, both.before, frozenset(stable), pooled, level, options.alpha, options.levels.power)
+    judging = Judging(change, both.before, frozenset(stable), pooled, level, options.alpha, options.power)
     motions = judging.of(change.displaced(stable))
     moved = tuple(m.name for m in motions if m.significant)
     return Congruence(

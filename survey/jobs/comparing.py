@@ -88,7 +88,8 @@ def compare_job(folder_a: Path, folder_b: Path, *, progress: bool = True) -> Com
     projects = read(folders[0]), read(folders[1])
     sigmas = _sigmas(projects)
     first, second = (_adjusted(project, progress) for project in projects)
-    options = CongruenceOptions(ALPHA, sigmas != "a_priori", names=(folders[0].name, folders[1].name))
+    power, names = max(p.options.power for p in projects), (folders[0].name, folders[1].name)
+    options = CongruenceOptions(ALPHA, sigmas != "a_priori", power=power, names=names)
     try:
         found, why = congruence(first, second, options), ""
     except SurveyError as error:
