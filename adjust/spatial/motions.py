@@ -8,6 +8,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.frames.unknowns import Unknown
 from adjust.model.survey import BoolArray, FloatArray
+from adjust.spatial.rigid import skew
 
 
 def point_motions(x: FloatArray) -> FloatArray:
@@ -17,11 +18,7 @@ def point_motions(x: FloatArray) -> FloatArray:
 
 def points_motions(x: FloatArray) -> FloatArray:
     """How points (n, 3) m of the world move, (n, 3, 7)."""
-    B = np.zeros((len(x), 3, 7))
-    B[:, :, :3], B[:, :, 6] = np.eye(3), x
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # w x x, by w
-        B[:, i, 3 + j], B[:, j, 3 + i] = x[:, k], -x[:, k]
-    return B
+    return np.concatenate([np.tile(np.eye(3), (len(x), 1, 1)), -skew(x), x[:, :, None]], axis=2)
 
 
 def poses_motions(R: FloatArray, t: FloatArray, in_world: BoolArray) -> FloatArray:
