@@ -11,7 +11,7 @@ from typing import Any
 from tqdm import tqdm
 
 from capture.session.quality_thread import quality_text
-from capture.session.run_session import Taken
+from capture.session.taking import Taken
 from survey.folder.text import atomic_write
 from survey.project.captured import status_path
 
@@ -63,4 +63,3 @@ class Progress:
     def close(self) -> None:
         """End the line."""
         self._bar.close()
-
