@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NoReturn
 from adjust.model.errors import SurveyError
 from survey.commands.common import DONE, is_set, print_json, run_as_program, run_command, say
 from survey.commands.completion import declare_completion
-from survey.commands.parser import Commands, port, program_parser, project_folder
+from survey.commands.parser import Commands, Parser, port, program_parser, project_folder
 
 if TYPE_CHECKING:
     from capture.devices.camera import CameraInfo
@@ -43,7 +43,7 @@ def program() -> NoReturn:
     run_as_program(main)
 
 
-def build_parser() -> argparse.ArgumentParser:
+def build_parser() -> Parser:
     """All commands and flags."""
     flags = {
         "--json": "print the summary as one JSON object", "--quiet": "no progress and no messages on stderr",
