@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
@@ -28,6 +28,9 @@ from survey.workbench.bodies import (
 )
 from survey.workbench.guard import LONGEST_BODY, TooLongError
 from survey.workbench.work import Work
+
+if TYPE_CHECKING:
+    from survey.detection import ImageReport
 
 _MOST_ROWS = 200_000  # of image points at once, where not all are asked for
 _NEW_PROJECT = ("init", "show")  # jobs after which the page shows another project
@@ -181,7 +184,7 @@ def _job(name: str) -> _Handler:
         body = Body(await json_of(request))
         bench = work.shown if name in _NEW_PROJECT else work.bench
 
-        def found(report: Any) -> None:
+        def found(report: "ImageReport") -> None:
             work.live.post({"type": "detected"} | found_in(report))
 
         told = await work.run(name, lambda: JOBS[name].run(bench, body, found))

@@ -224,6 +224,6 @@ def _component(o: ObservationResidual, k: int, limit: float) -> dict[str, Any]:
     return {"component": o.components[k], "unit": unit, "sigma_unit": sigma_unit, "kind": o.kind, **plain(values)}
 
 
-def _joins(item: Any) -> list[str]:
+def _joins(item: object) -> list[str]:
     """What a reading joins, as tables write it."""
     return [frame_text(one) if isinstance(one, FrameRef) else position_text(one) for one in refs_of(item)]

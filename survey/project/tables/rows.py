@@ -2,7 +2,7 @@
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -24,11 +24,11 @@ class RowTable:
 
     layout: Layout
     header: tuple[str, ...]
-    rows: tuple[Sequence[Any], ...] = ()
+    rows: tuple[Sequence[object], ...] = ()
 
-    def _column(self, name: str) -> list[Any]:
+    def _column(self, name: str) -> list[str]:
         i = self.header.index(name) if name in self.header else -1
-        return [row[i] for row in self.rows] if i >= 0 else [""] * len(self.rows)
+        return [str(row[i]) for row in self.rows] if i >= 0 else [""] * len(self.rows)
 
     @cached_property
     def _keys(self) -> list[tuple[ImageKey, str]]:
@@ -96,14 +96,14 @@ class RowTable:
     def marked_unused(self) -> list[tuple[str, ...]]:
         """Points of the rows that are marked ``used = false``."""
         marks = self._column("used")
-        return [key for key, used in zip(self.points(), marks, strict=True) if str(used).strip().lower() in _FALSE]
+        return [key for key, used in zip(self.points(), marks, strict=True) if used.strip().lower() in _FALSE]
 
     def text(self) -> str:
         """The table as CSV."""
         return csv_text([self.header, *self.rows])
 
 
-def _in_order(table: RowTable, header: Sequence[str]) -> list[Sequence[Any]]:
+def _in_order(table: RowTable, header: Sequence[str]) -> list[Sequence[object]]:
     if tuple(header) == table.header:
         return list(table.rows)
     at = {name: i for i, name in enumerate(table.header)}
@@ -111,7 +111,7 @@ def _in_order(table: RowTable, header: Sequence[str]) -> list[Sequence[Any]]:
     return [["" if i is None else row[i] for i in order] for row in table.rows]
 
 
-def _canonical(cell: Any, number: bool) -> str:
+def _canonical(cell: object, number: bool) -> str:
     """A cell in one form, however a program writes its numbers."""
     text = "" if cell is None else str(cell).strip()
     if not number or not text:
@@ -138,7 +138,7 @@ def row_table(folder: Path | None, layout: Layout, columns: Columns | None = Non
     return RowTable(layout, layout.columns)
 
 
-def _columns(table: Table) -> Mapping[str, Any]:
+def _columns(table: Table) -> Columns:
     return {
         name: table.text(name).values() if table.layout.is_text(name) else table.numbers(name)
         for name in table.layout.columns
@@ -146,7 +146,7 @@ def _columns(table: Table) -> Mapping[str, Any]:
     }
 
 
-def _rows(columns: Mapping[str, Any]) -> tuple[Sequence[Any], ...]:
-    cells: Iterable[Sequence[Any]] = (cells_of(np.asarray(c) if isinstance(c, np.ndarray) else c)
+def _rows(columns: Columns) -> tuple[Sequence[Any], ...]:
+    cells: Iterable[Sequence[object]] = (cells_of(np.asarray(c) if isinstance(c, np.ndarray) else c)
                                       for c in columns.values())  # fmt: skip
     return tuple(zip(*cells, strict=True))
