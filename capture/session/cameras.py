@@ -83,9 +83,9 @@ class PlannedCameras:
             raise SurveyError("the cameras are not open; open them first")
         return self._set.take(timeout_s)
 
-    def values(self, camera_id: str, names: Sequence[str]) -> Mapping[str, Any]:
+    def values(self, camera_id: str, names: Sequence[str]) -> Mapping[str, object]:
         """Features as they are now; those that a camera does not know or tell are left out."""
-        found: dict[str, Any] = {}
+        found: dict[str, object] = {}
         for name in names:
             with suppress(CameraError):
                 found[name] = self._cameras[camera_id].get(name)
@@ -99,7 +99,7 @@ class PlannedCameras:
         else:
             self._set.arm()
 
-    def describe(self) -> Mapping[str, Mapping[str, Any]]:
+    def describe(self) -> Mapping[str, Mapping[str, object]]:
         """Address, serial number and main features of every camera."""
         return {
             name: {"address": camera.address, "serial": camera.serial, **self.values(name, _DESCRIBED)}

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import Any
 
 import numpy as np
 
@@ -29,7 +28,7 @@ class Placing:
             self._table = table, plan.table
         self._pose_id: str | None = None
 
-    def description(self) -> Mapping[str, Any] | None:
+    def description(self) -> Mapping[str, object] | None:
         """For the journal."""
         if self._table is None:
             return None

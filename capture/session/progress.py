@@ -23,7 +23,7 @@ class Progress:
         self._folder, self._begin = folder, time.monotonic()
         self._first: int | None = None
         self._bar = tqdm(total=total, desc="capturing", unit="epoch", disable=not shown, file=sys.stderr)
-        self._last: dict[str, Any] = {}
+        self._last: dict[str, object] = {}
 
     def taken(self, taken: Taken, quality: Mapping[str, Mapping[str, Any]]) -> None:
         """One more epoch; quality: of its images, by camera."""
@@ -43,7 +43,7 @@ class Progress:
         }
         self.state("running")
 
-    def quality(self, quality: Mapping[str, Mapping[str, Any]]) -> None:
+    def quality(self, quality: Mapping[str, Mapping[str, object]]) -> None:
         """What was found out later."""
         self._last |= {"quality": {name: dict(values) for name, values in quality.items()}}
         self._bar.set_postfix_str(quality_text(quality))

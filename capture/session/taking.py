@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -66,7 +65,7 @@ class Outcome:
     retries: Mapping[str, int] = field(default_factory=dict)
     seconds: float = 0.0
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """As plain values."""
         return {
             "folder": str(self.folder), "epochs_planned": self.planned, "epochs_before": self.before,
@@ -134,7 +133,7 @@ class Session:
             self._note(f"{len(valid)} epochs are there and whole, {len(missing)} to go")
         return missing, len(wanted & set(valid))
 
-    def _session_record(self) -> dict[str, Any]:
+    def _session_record(self) -> dict[str, object]:
         plan = self._plan
         return {
             "format": JOURNAL_FORMAT,
@@ -210,7 +209,7 @@ class Session:
                     f"{wanted[1]}; set Width and Height (and OffsetX, OffsetY) in the plan, or correct image_size_px"
                 )
 
-    def _write(self, camera_id: str, shot: Shot, frame: Frame) -> dict[str, Any]:
+    def _write(self, camera_id: str, shot: Shot, frame: Frame) -> dict[str, object]:
         values = self._cameras.values(camera_id, ("ExposureTime", "Gain", "PixelFormat"))
         return {
             **write_image(self._plan.project, camera_id, shot.epoch_id, frame.image),

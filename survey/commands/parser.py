@@ -66,7 +66,7 @@ class Parser(argparse.ArgumentParser):
 class Commands:
     """The commands of a program."""
 
-    def __init__(self, parser: Parser, shaped: dict[str, Any]) -> None:
+    def __init__(self, parser: Parser, shaped: dict[str, object]) -> None:
         self._program, self._shaped = parser, shaped
         self._known = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
 

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from markupsafe import Markup
 
@@ -39,7 +38,7 @@ class AlignOutcome:
         """For the terminal."""
         return f"{sheet_text(self.sheets)}\nWorking sheet: {self.page}"
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """For ``--json``."""
         tasks = {
             sheet.task.task_id: {

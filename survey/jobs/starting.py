@@ -41,7 +41,7 @@ class StartOutcome:
     n_with_board: int
     n_with_markers: int
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """As plain values."""
         return {
             "folder": str(self.folder), "board": None if self.board is None else list(self.board),

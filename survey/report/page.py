@@ -115,7 +115,7 @@ def finished_page(begun: BegunPage, solution: dict[str, Any], found: Statistics 
         return document(title, shown, scripts)
 
 
-def _words() -> dict[str, Any]:
+def _words() -> dict[str, object]:
     """What the script says."""
     of_modules = json.loads((WEB / f"{language()}.json").read_text(encoding="utf-8"))
     return {

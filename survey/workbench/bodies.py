@@ -187,7 +187,7 @@ DECISIONS: Mapping[str, Asked] = {
 """By their addresses; what they answer is the state after them."""
 
 
-def told_changes(changes: "Changes | None", most: int | None) -> dict[str, Any] | None:
+def told_changes(changes: "Changes | None", most: int | None) -> dict[str, object] | None:
     """What an adjustment changed, its summaries in the language that is spoken."""
     from survey.workbench.views.project import in_words
 
