@@ -191,7 +191,9 @@ def scene_values(adjustment: Adjustment, scale: Scale, drawn: Scene | None = Non
     return drawn_values(drawn, scale.ellipsoid, {"/".join(k): pose for k, pose in poses.items() if pose is not None})
 
 
-def drawn_values(drawn: Scene, ellipsoid: float, images: Mapping[str, Pose3] = MappingProxyType({})) -> dict[str, object]:
+def drawn_values(
+    drawn: Scene, ellipsoid: float, images: Mapping[str, Pose3] = MappingProxyType({})
+) -> dict[str, object]:
     """The same of any scene; images: ``world_from_camera`` by image."""
     return dict(plain({
         "ellipsoid": ellipsoid,
