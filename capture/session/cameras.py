@@ -1,6 +1,6 @@
 """The cameras of a plan, opened, set and armed as one trigger set."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any, Self
 
@@ -19,15 +19,8 @@ class PlannedCameras:
     trigger: software, hardware (pulses come from outside) or free (no trigger).
     """
 
-    def __init__(
-        self,
-        plans: Sequence[CameraPlan],
-        trigger: str = "software",
-        opener: Callable[..., Camera] = open_camera,
-        fire: Callable[[], None] | None = None,
-    ) -> None:
-        self._plans, self._trigger, self._opener = tuple(plans), trigger, opener
-        self._fire = fire if fire is not None else (_wait_for_pulse if trigger == "hardware" else None)
+    def __init__(self, plans: Sequence[CameraPlan], trigger: str = "software") -> None:
+        self._plans, self._trigger = tuple(plans), trigger
         self._cameras: dict[str, Camera] = {}
         self._set: TriggerSet | None = None
 
@@ -42,10 +35,10 @@ class PlannedCameras:
         """Open and set all cameras, and arm them. Raises CameraError."""
         try:
             for plan in self._plans:
-                camera = self._opener(plan.address, **plan.options)
+                camera = open_camera(plan.address, **plan.options)
                 self._cameras[plan.camera_id] = camera
                 self._apply(plan, camera)
-            self._set = TriggerSet(self._cameras, self._fire)
+            self._set = TriggerSet(self._cameras, _wait_for_pulse if self._trigger == "hardware" else None)
             self._set.arm()
         except BaseException:
             self.close()
