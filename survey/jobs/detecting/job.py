@@ -81,6 +81,11 @@ class _State:
         entry = self.known.get(key)
         return entry is not None and entry.rows != "" and entry.rows != self.rows_digest(key)
 
+    def file(self, key: ImageKey) -> DetectedImage:
+        """The file of an image as it is now."""
+        path = self.definition.images[key]
+        return file_of(path, path.relative_to(self.definition.folder).as_posix())
+
     def rows_digest(self, key: ImageKey) -> str:
         """A hash of the rows of an image that belong to detection."""
         return self.points.digest(key) + self.spots.digest(key)
@@ -111,7 +116,7 @@ def detect_in(
                       None if one.spots_px is None else SpotOptions(diameter_px=one.spots_px))
         for key in wanted for one in [state.sought[key]]
     ]  # fmt: skip
-    files = {key: file_of(state.definition.images[key], _file_name(key, state)) for key in wanted}
+    files = {key: state.file(key) for key in wanted}
     dropped = _without_image(state, files, everything)
     reports = detect_images(tasks, jobs, progress, place / PICTURES if pictures else None, told)
     blocks, spots = _blocks(state.definition, reports)
@@ -134,10 +139,6 @@ def detect_in(
     same = len([key for key in state.definition.images if key not in files])
     paths, said = tuple(folder / n for n in names), defect_warnings(bad)
     return DetectOutcome(folder, tuple(reports), paths, same, tuple(state.notes), wrong, said)
-
-
-def _file_name(key: ImageKey, state: _State) -> str:
-    return state.definition.images[key].relative_to(state.definition.folder).as_posix()
 
 
 def _require_something(folder: Path, state: _State) -> None:
@@ -258,10 +259,9 @@ def _known_now(
 def _given(state: _State, known: Mapping[ImageKey, DetectedImage]) -> dict[ImageKey, DetectedImage]:
     """Images that have not been looked at, with the points that they have."""
     return {
-        key: replace(file_of(path, _file_name(key, state)), status="given",
-                     n_image_points=state.points.images.get(key, 0), n_spots=state.spots.images.get(key, 0))
-        for key, path in state.definition.images.items()
-        if key not in known
+        key: replace(state.file(key), status="given", n_image_points=state.points.images[key],
+                     n_spots=state.spots.images[key])
+        for key in state.definition.images if key not in known
     }  # fmt: skip
 
 
