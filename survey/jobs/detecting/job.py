@@ -35,7 +35,7 @@ from survey.project.exclusions import EXCLUSIONS_FILE, Exclusion, Name, Row, app
 from survey.project.images import Sought, sought_in
 from survey.project.project import IMAGES_FOLDER, OBSERVATIONS_FOLDER
 from survey.project.tables.image_points import IMAGE_POINTS, SPOTS, image_point_columns, spot_columns
-from survey.project.tables.rows import RowTable, row_table
+from survey.project.tables.rows import RowTable, read_rows, rows_of
 
 if TYPE_CHECKING:  # brings in OpenCV, which a folder that is detected already does without
     from survey.detection import ImageReport
@@ -94,7 +94,7 @@ class _State:
 def _state(folder: Path) -> _State:
     definition = read_definition(folder)
     place = folder / OBSERVATIONS_FOLDER
-    points, spots = row_table(place, IMAGE_POINTS), row_table(place, SPOTS)
+    points, spots = read_rows(place, IMAGE_POINTS), read_rows(place, SPOTS)
     known, sought = read_detected(place), sought_in(definition)
     news = image_news(definition.images, known, {*points.images, *spots.images},
                       {key: one.digest() for key, one in sought.items()})  # fmt: skip
@@ -203,13 +203,13 @@ def _write(
     targets = {key: set(state.sought[key].targets) for key in wanted}
     gone = state.points.taken(lambda key, target: key in dropped or target in targets.get(key, ()))
     _keep_decisions(folder, place, state, gone)
-    found = row_table(None, IMAGE_POINTS, image_point_columns(blocks, state.definition.survey))
+    found = rows_of(IMAGE_POINTS, image_point_columns(blocks, state.definition.survey))
     state.points = state.points.without(gone).with_rows(found.with_cells_of(gone, "group"))
     files = {Path(OBSERVATIONS_FOLDER, "image_points.csv"): state.points.text()}
     if state.definition.spots_request is not None:
         keys = {*wanted, *dropped}
         old = state.spots.taken(lambda key, _: key in keys)
-        state.spots = state.spots.without(old).with_rows(row_table(None, SPOTS, spot_columns(spots)))
+        state.spots = state.spots.without(old).with_rows(rows_of(SPOTS, spot_columns(spots)))
         files[Path(OBSERVATIONS_FOLDER, "spots.csv")] = state.spots.text()
     # an empty table is written too: one of an earlier run must not stay behind
     for name, text in files.items():

@@ -2,18 +2,15 @@
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from survey.folder.text import csv_rows, csv_text, read_text
 from survey.project.detected import ImageKey
 from survey.project.tables.files import cells_of, read_table
-from survey.project.tables.reading import Columns, Layout, Table
+from survey.project.tables.reading import Columns, Layout
 
 _FALSE = ("false", "0")
 
@@ -122,31 +119,20 @@ def _canonical(cell: object, number: bool) -> str:
         return text
 
 
-def row_table(folder: Path | None, layout: Layout, columns: Columns | None = None) -> RowTable:
-    """The rows of a table in a folder, none where it is not there, or of ready columns. Raises SurveyError."""
-    if columns is not None:
-        return RowTable(layout, tuple(columns), _rows(columns))
-    csv_path, parquet = ((folder or Path()) / f"{layout.name}.{ending}" for ending in ("csv", "parquet"))
+def read_rows(folder: Path, layout: Layout) -> RowTable:
+    """The rows of a table in a folder, none where it is not there. Raises SurveyError."""
+    csv_path, parquet = (folder / f"{layout.name}.{ending}" for ending in ("csv", "parquet"))
     if csv_path.is_file():
         read_table(csv_path, layout)  # its faults, with their lines
         header, *rows = (cells for _, cells in csv_rows(csv_path, read_text(csv_path)))
         return RowTable(layout, tuple(header), tuple(rows))
     if parquet.is_file():
         table = read_table(parquet, layout)
-        found = _columns(table)
-        return RowTable(layout, tuple(found), _rows(found))
+        columns: Columns = {**table.text_columns, **table.number_columns}
+        return rows_of(layout, {name: columns[name] for name in layout.columns if name in columns})
     return RowTable(layout, layout.columns)
 
 
-def _columns(table: Table) -> Columns:
-    return {
-        name: table.text(name).values() if table.layout.is_text(name) else table.numbers(name)
-        for name in table.layout.columns
-        if table.has(name)
-    }
-
-
-def _rows(columns: Columns) -> tuple[Sequence[Any], ...]:
-    cells: Iterable[Sequence[object]] = (cells_of(np.asarray(c) if isinstance(c, np.ndarray) else c)
-                                      for c in columns.values())  # fmt: skip
-    return tuple(zip(*cells, strict=True))
+def rows_of(layout: Layout, columns: Columns) -> RowTable:
+    """The rows of ready columns."""
+    return RowTable(layout, tuple(columns), tuple(zip(*map(cells_of, columns.values()), strict=True)))
