@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from adjust.model.errors import SurveyError
-from survey.commands.common import DONE, is_set, print_json, run_as_program, run_command, say
+from survey.commands.common import DONE, is_set, print_json, run_as_program, run_command, say, tell
 from survey.commands.completion import declare_completion
-from survey.commands.parser import Commands, port, program_parser, project_folder
+from survey.commands.parser import Parser, command, flag, port, program_parser, project_folder
 
 if TYPE_CHECKING:
     from capture.devices.camera import CameraInfo
@@ -43,121 +43,60 @@ def program() -> NoReturn:
     run_as_program(main)
 
 
-def build_parser() -> argparse.ArgumentParser:
+def build_parser() -> Parser:
     """All commands and flags."""
     flags = {
         "--json": "print the summary as one JSON object", "--quiet": "no progress and no messages on stderr",
     }  # fmt: skip
-    declared = (_add_run, _add_cameras, _add_table, _add_view, _add_export,
-                partial(declare_completion, "labcapture", build_parser))  # fmt: skip
+    completion = partial(declare_completion, "labcapture", build_parser)
+    declared = (run, cameras, table, view, export, completion)
     return program_parser("labcapture", _OPENING, _DESCRIPTION, _EPILOG, flags, declared)
 
 
-def _add_run(commands: Commands) -> None:
-    parser = commands.add(
-        "run",
-        _run,
-        help="take the images of a plan (the main job)",
-        usage=f"{_OPENING}   (labcapture run PLAN [--dry-run])",
-        description="Turns the table to every pose of the plan, takes one image with every camera, writes them to the\n"
-        "project folder with a journal. Epochs that are recorded already are not taken again.\n"
-        "While it runs: p pauses and goes on (or: kill -USR1 PID), Ctrl-C stops table and session at once.",
-        epilog="Next: labsurvey adjust FOLDER   (the folder that the plan names)",
-    )
-    parser.add_argument("plan", type=Path, metavar="PLAN", help="capture plan, a TOML file")
-    parser.add_argument("--dry-run", action="store_true", help="print poses and time, check limits; move nothing")
-
-
-def _add_cameras(commands: Commands) -> None:
-    parser = commands.add(
-        "cameras",
-        _cameras,
-        help="list the cameras that can be reached",
-        usage="labcapture cameras   (labcapture cameras [DRIVER])",
-        description="Asks every driver whose software is installed; the first column is the address for a plan.",
-        epilog="Next: labcapture run plan.toml --dry-run",
-    )
-    parser.add_argument("driver", nargs="?", default="all", metavar="DRIVER", help="ask this driver only")
-
-
-def _add_table(commands: Commands) -> None:
-    parser = commands.add(
-        "table",
-        _table,
-        help="list drivers; show, turn, home or stop the table of a plan",
-        usage="labcapture table plan.toml   (labcapture table [PLAN] [--jog AXIS=DEG ...] [--home] [--stop])",
-        description="Without a plan: the drivers and dialects. With one: where its table is.\n"
-        "The plan's limits hold for --jog as for a session.",
-        epilog="Next: labcapture run plan.toml --dry-run",
-    )
-    parser.add_argument("plan", nargs="?", type=Path, metavar="PLAN", help="capture plan whose table is meant")
-    parser.add_argument(
-        "--jog", nargs="+", metavar="AXIS=DEG", help="turn to an angle (axis1=12.5) or by one (axis1=+0.5, axis1=-0.5r)"
-    )
-    parser.add_argument("--home", action="store_true", help="look for the references")
-    parser.add_argument("--stop", action="store_true", help="stop all axes")
-
-
-def _add_view(commands: Commands) -> None:
-    parser = commands.add(
-        "view",
-        _view,
-        help="watch a session on a local web page",
-        usage="labcapture view plan.toml   (labcapture view PLAN [--port N] [--live] [--allow-move])",
-        description="Serves a page on this machine only: the last images with the targets found in them, what of each\n"
-        "camera's image is covered, progress. --live shows what the cameras see now, while no session runs.",
-        epilog="Next: open the address that it prints",
-    )
-    parser.add_argument("plan", type=Path, metavar="PLAN", help="capture plan")
-    parser.add_argument("--port", type=port, default=8780, metavar="N", help="on loopback; 0 takes a free one")
-    parser.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help="a loopback address; others are refused")
-    parser.add_argument("--live", action="store_true", help="open the cameras and show what they see")
-    parser.add_argument(
-        "--allow-move", action="store_true", help="let the page turn and stop the table, with the token that is printed"
-    )
-
-
-def _add_export(commands: Commands) -> None:
-    parser = commands.add(
-        "export",
-        _export,
-        help="write a recorded run as NeXus/HDF5",
-        usage="labcapture export lab lab.nxs   (labcapture export FOLDER FILE.nxs)",
-        description="Images, setpoints, readbacks and times of all recorded epochs in one NXentry.",
-        epilog="Next: labsurvey adjust FOLDER",
-    )
-    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder that was captured")
-    parser.add_argument("file", type=Path, metavar="FILE.nxs", help="new file")
-
-
-def _run(arguments: argparse.Namespace) -> int:
+@command(
+    "run",
+    flag("plan", type=Path, metavar="PLAN", help="capture plan, a TOML file"),
+    flag("--dry-run", action="store_true", help="print poses and time, check limits; move nothing"),
+    help="take the images of a plan (the main job)",
+    usage=f"{_OPENING}   (labcapture run PLAN [--dry-run])",
+    description="Turns the table to every pose of the plan, takes one image with every camera, writes them to the\n"
+    "project folder with a journal. Epochs that are recorded already are not taken again.\n"
+    "While it runs: p pauses and goes on (or: kill -USR1 PID), Ctrl-C stops table and session at once.",
+    epilog="Next: labsurvey adjust FOLDER   (the folder that the plan names)",
+)
+def run(arguments: argparse.Namespace) -> int:
+    """The command ``run``."""
     from capture.plan.plan import read_plan
 
     plan = read_plan(arguments.plan)
     if arguments.dry_run:
         from capture.plan.report import plan_summary, plan_text
 
-        if is_set(arguments, "json"):
-            print_json(plan_summary(plan))
-        else:
-            print(f"{plan_text(plan)}\nNext: labcapture run {arguments.plan}")
+        tell(arguments, plan_summary(plan), f"{plan_text(plan)}\nNext: labcapture run {arguments.plan}")
         return DONE
     from capture.session.run import run_plan
 
     outcome = run_plan(plan, shown=not is_set(arguments, "quiet"))
-    if is_set(arguments, "json"):
-        print_json(outcome.summary())
-        return DONE
     now = f"{outcome.taken} of {outcome.planned} epochs taken"
     now += f", {outcome.before} were there" if outcome.before else ""
     retries = ", ".join(f"{n} x {kind}" for kind, n in sorted(outcome.retries.items()))
     again = " --redetect" if outcome.taken and (plan.project / "observations" / "image_points.csv").exists() else ""
-    print(f"{plan.project}: {now} in {outcome.seconds:.1f} s" + (f"; retried: {retries}" if retries else ""))
-    print(f"Next: labsurvey adjust {plan.project}{again}")
+    tell(arguments, outcome.summary(),
+         f"{plan.project}: {now} in {outcome.seconds:.1f} s{f'; retried: {retries}' if retries else ''}\n"
+         f"Next: labsurvey adjust {plan.project}{again}")  # fmt: skip
     return DONE
 
 
-def _cameras(arguments: argparse.Namespace) -> int:
+@command(
+    "cameras",
+    flag("driver", nargs="?", default="all", metavar="DRIVER", help="ask this driver only"),
+    help="list the cameras that can be reached",
+    usage="labcapture cameras   (labcapture cameras [DRIVER])",
+    description="Asks every driver whose software is installed; the first column is the address for a plan.",
+    epilog="Next: labcapture run plan.toml --dry-run",
+)
+def cameras(arguments: argparse.Namespace) -> int:
+    """The command ``cameras``."""
     from dataclasses import asdict
 
     from capture.devices.cameras import DRIVERS, describe_driver, discover
@@ -186,7 +125,21 @@ def _cameras(arguments: argparse.Namespace) -> int:
     return DONE
 
 
-def _table(arguments: argparse.Namespace) -> int:
+@command(
+    "table",
+    flag("plan", nargs="?", type=Path, metavar="PLAN", help="capture plan whose table is meant"),
+    flag("--jog", nargs="+", metavar="AXIS=DEG",
+         help="turn to an angle (axis1=12.5) or by one (axis1=+0.5, axis1=-0.5r)"),
+    flag("--home", action="store_true", help="look for the references"),
+    flag("--stop", action="store_true", help="stop all axes"),
+    help="list drivers; show, turn, home or stop the table of a plan",
+    usage="labcapture table plan.toml   (labcapture table [PLAN] [--jog AXIS=DEG ...] [--home] [--stop])",
+    description="Without a plan: the drivers and dialects. With one: where its table is.\n"
+    "The plan's limits hold for --jog as for a session.",
+    epilog="Next: labcapture run plan.toml --dry-run",
+)
+def table(arguments: argparse.Namespace) -> int:
+    """The command ``table``."""
     from capture.session.table_jobs import driver_list, table_job
 
     if arguments.plan is None:
@@ -208,7 +161,22 @@ def _table(arguments: argparse.Namespace) -> int:
     return DONE
 
 
-def _view(arguments: argparse.Namespace) -> int:
+@command(
+    "view",
+    flag("plan", type=Path, metavar="PLAN", help="capture plan"),
+    flag("--port", type=port, default=8780, metavar="N", help="on loopback; 0 takes a free one"),
+    flag("--host", default="127.0.0.1", metavar="ADDRESS", help="a loopback address; others are refused"),
+    flag("--live", action="store_true", help="open the cameras and show what they see"),
+    flag("--allow-move", action="store_true",
+         help="let the page turn and stop the table, with the token that is printed"),
+    help="watch a session on a local web page",
+    usage="labcapture view plan.toml   (labcapture view PLAN [--port N] [--live] [--allow-move])",
+    description="Serves a page on this machine only: the last images with the targets found in them, what of each\n"
+    "camera's image is covered, progress. --live shows what the cameras see now, while no session runs.",
+    epilog="Next: open the address that it prints",
+)
+def view(arguments: argparse.Namespace) -> int:
+    """The command ``view``."""
     from capture.web.serve import serve
 
     return serve(
@@ -221,14 +189,21 @@ def _view(arguments: argparse.Namespace) -> int:
     )
 
 
-def _export(arguments: argparse.Namespace) -> int:
+@command(
+    "export",
+    flag("folder", type=project_folder, metavar="FOLDER", help="project folder that was captured"),
+    flag("file", type=Path, metavar="FILE.nxs", help="new file"),
+    help="write a recorded run as NeXus/HDF5",
+    usage="labcapture export lab lab.nxs   (labcapture export FOLDER FILE.nxs)",
+    description="Images, setpoints, readbacks and times of all recorded epochs in one NXentry.",
+    epilog="Next: labsurvey adjust FOLDER",
+)
+def export(arguments: argparse.Namespace) -> int:
+    """The command ``export``."""
     from capture.session.nexus import export
 
     summary = export(arguments.folder, arguments.file)
-    if is_set(arguments, "json"):
-        print_json(summary)
-    else:
-        print(f"{arguments.file}: {summary['epochs']} epochs, {summary['images']} images")
+    tell(arguments, summary, f"{arguments.file}: {summary['epochs']} epochs, {summary['images']} images")
     return DONE
 
 

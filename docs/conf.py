@@ -48,7 +48,7 @@ MODULES = {
         "capture.devices.camera",
         "capture.devices.turntable",
         "capture.plan.plan",
-        "capture.session.run_session",
+        "capture.session.taking",
     ),
 }
 

@@ -5,7 +5,6 @@ than the sigmas say), 130 interrupted.
 Results go to stdout, progress and messages to stderr. Heavy imports happen inside the commands.
 """
 
-import argparse
 from collections.abc import Sequence
 from functools import partial
 from typing import NoReturn
@@ -19,7 +18,7 @@ from survey.commands.excluding import exclude, include
 from survey.commands.navigating import align, navigate
 from survey.commands.networks import add, pairs, remove, trackers
 from survey.commands.opening import open_project, runs
-from survey.commands.parser import program_parser
+from survey.commands.parser import Parser, program_parser
 from survey.commands.planning import check, plan
 from survey.commands.starting import detect, example, init, schema
 
@@ -72,7 +71,7 @@ def program() -> NoReturn:
     run_as_program(main)
 
 
-def build_parser() -> argparse.ArgumentParser:
+def build_parser() -> Parser:
     """All commands and flags."""
     flags = {
         "--json": "print the summary as one JSON object", "-v --verbose": "say more on stderr",

@@ -1,15 +1,15 @@
 """What the completion scripts of both programs have to do, whichever shell reads them."""
 
-import argparse
 import re
 import shutil
 import subprocess
 from pathlib import Path
 
 from survey.commands.completion import commands_of, completion_script
+from survey.commands.parser import Parser
 
 
-def bash_completes(parser: argparse.ArgumentParser, folder: Path, words: list[str], expected: list[str]) -> None:
+def bash_completes(parser: Parser, folder: Path, words: list[str], expected: list[str]) -> None:
     """What bash offers for the last of ``words``, of which the first is the program."""
     script = folder / "completion"
     script.write_text(completion_script(parser, "bash"))
@@ -20,7 +20,7 @@ def bash_completes(parser: argparse.ArgumentParser, folder: Path, words: list[st
     assert done.stdout.split() == expected
 
 
-def names_every_command_and_parses(parser: argparse.ArgumentParser, shell: str, script: str, folder: Path) -> None:
+def names_every_command_and_parses(parser: Parser, shell: str, script: str, folder: Path) -> None:
     """Every command and flag is in it; the shell takes it, where there is that shell."""
     for command in commands_of(parser):
         assert re.search(rf"\b{command.name}\b", script)

@@ -26,7 +26,7 @@ from adjust.model.survey import (
     VectorParameter,
 )
 from adjust.native.images import square_root_information
-from survey.solution.quantities import Scale, pose_dict, pose_entry, sigmas_of
+from survey.solution.quantities import Scale, pose_columns, pose_dict, sigmas_of
 from tests.adjust import helpers as h
 
 RNG = np.random.default_rng(3)
@@ -188,7 +188,7 @@ def test_translation_sigmas_are_along_the_axes_of_the_left_frame() -> None:
     turned = Pose3(Rot3.Rz(np.pi / 2), np.zeros(3))
     names = ("rx", "ry", "rz", "tx", "ty", "tz")
     estimate = Estimate(("world_from_station", "s"), turned, names, ("rad",) * 3 + ("m",) * 3, cov, ("free",) * 6)
-    entry = pose_entry(estimate, Scale("a_priori", 1.0, 1.0))
+    entry = pose_columns([estimate], Scale("a_priori", 1.0, 1.0)).entry(estimate.name)
     np.testing.assert_allclose(entry["sigma_translation_mm"], [0.2, 0.1, 0.3], atol=1e-12)
     np.testing.assert_allclose(np.radians(np.array(entry["sigma_rotation_arcsec"]) / 3600), [1e-3, 2e-3, 3e-3])
 

@@ -4,7 +4,6 @@
 its adjusted folder, as ``.ci/run`` does: rendering and detecting its images takes too long for every run of the tests.
 """
 
-import argparse
 import ast
 import contextlib
 import fnmatch
@@ -19,7 +18,6 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -299,12 +297,6 @@ def test_every_page_is_in_the_index() -> None:
     assert missing == []
 
 
-def _commands_of(parser: argparse.ArgumentParser) -> Iterator[str]:
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            yield from action.choices
-
-
 def test_numbers_of_readme_stand_in_the_pages_it_links() -> None:
     lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
     checked = 0
@@ -321,7 +313,7 @@ def test_numbers_of_readme_stand_in_the_pages_it_links() -> None:
 def test_readme_names_every_command(name: str) -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     rows = set(re.findall(rf"^\| `{name} ([\w-]+)", readme, re.M))
-    assert rows == set(_commands_of(COMMANDS[name][1]()))
+    assert rows == set(COMMANDS[name][1]().commands)
 
 
 def test_anchors_are_made_as_github_makes_them() -> None:

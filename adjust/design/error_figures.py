@@ -68,11 +68,9 @@ class ErrorFigure:
         return np.asarray(self.rms / self.same_draws - 1.0)
 
 
-def error_figure(
-    kind: ErrorKind, field: BeaconField, sigmas: FloatArray | None = None, n_trials: int = 10_000, seed: int = 0
-) -> ErrorFigure:
+def error_figure(kind: ErrorKind, field: BeaconField, n_trials: int = 10_000, seed: int = 0) -> ErrorFigure:
     """Simulate one figure: ``n_trials`` new beacons and normal errors for every point."""
-    sizes = SIZES[kind] if sigmas is None else sigmas
+    sizes = SIZES[kind]
     rng = np.random.default_rng([seed, ERROR_KINDS.index(kind)])
     k, finite = len(sizes), bool(np.isfinite(expected_slope(kind, field)))
     exact, linear, carried = np.empty((k, n_trials)), np.empty((k, n_trials)), np.empty((k, n_trials))
@@ -101,7 +99,7 @@ def error_figures(
     fields: Sequence[BeaconField], n_trials: int = 10_000, seed: int = 0
 ) -> tuple[tuple[ErrorFigure, ...], ...]:
     """All three figures for each of the fields."""
-    return tuple(tuple(error_figure(k, f, n_trials=n_trials, seed=seed) for k in ERROR_KINDS) for f in fields)
+    return tuple(tuple(error_figure(k, f, n_trials, seed) for k in ERROR_KINDS) for f in fields)
 
 
 def _root(mean_square: FloatArray, spread: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:

@@ -56,18 +56,16 @@ class Placement:
 
 
 def place_beacons(
-    head: Head, poses: Sequence[Pose3], x_in_world: FloatArray, sigma: float, n: int,
-    options: PlacementOptions, fixed: FloatArray | None = None,
-) -> Placement:  # fmt: skip
+    head: Head, poses: Sequence[Pose3], x_in_world: FloatArray, sigma: float, n: int, options: PlacementOptions
+) -> Placement:
     """Choose ``n`` of the candidate places (m, 3) m, each to be surveyed with ``sigma`` (m) per component.
 
-    fixed: (f, 3) beacons that are there already, with the same sigma. Raises SurveyError where some pose cannot see
-    ``at_least`` beacons even with all candidates lit, or ``n`` are too few for that.
+    Raises SurveyError where some pose cannot see ``at_least`` beacons even with all candidates lit, or ``n`` are too
+    few for that.
     """
-    there = np.zeros((0, 3)) if fixed is None else np.asarray(fixed, dtype=float)
-    board = _Board(head, poses, np.concatenate([there, np.asarray(x_in_world, dtype=float)]), sigma, options)
-    state = _State(board, list(range(len(there))))
-    board.check(n + len(there))
+    board = _Board(head, poses, x_in_world, sigma, options)
+    state = _State(board)
+    board.check(n)
     measure = []
     for _ in range(min(n, len(x_in_world))):
         best = state.best_addition()
@@ -75,16 +73,15 @@ def place_beacons(
             break
         state.add(best)
         measure.append(state.value())
-    exchanged = state.exchange(len(there), options.exchanges)
+    exchanged = state.exchange(options.exchanges)
     short = [k for k, s in enumerate(state.counts) if s < options.at_least]
     if short:
         raise SurveyError(
             f"{len(state.chosen)} beacons are too few: {len(short)} of {len(poses)} poses see fewer than "
             f"{options.at_least} (pose {short[0] + 1} sees {state.counts[short[0]]}); allow more beacons or fewer poses"
         )
-    chosen = tuple(i - len(there) for i in state.chosen[len(there) :])
-    per_pose = state.per_pose()
-    return Placement(chosen, np.array(measure), exchanged, state.value(), per_pose, tuple(int(c) for c in state.counts))
+    seen = tuple(state.counts.tolist())
+    return Placement(tuple(state.chosen), np.array(measure), exchanged, state.value(), state.per_pose(), seen)
 
 
 class _Board:
@@ -138,9 +135,9 @@ class _Board:
 class _State:
     """The poses' covariances with what has been chosen."""
 
-    def __init__(self, board: _Board, chosen: list[int]) -> None:
+    def __init__(self, board: _Board) -> None:
         self.board = board
-        self.set(chosen)
+        self.set([])
 
     def set(self, chosen: Sequence[int]) -> None:
         """Light these beacons alone; the covariances are built anew, which loses no digits."""
@@ -213,12 +210,12 @@ class _State:
             return None
         return int(np.argmin(np.where(free, self.scores(), np.inf)))
 
-    def exchange(self, first: int, sweeps: int) -> int:
+    def exchange(self, sweeps: int) -> int:
         """Replace chosen beacons one by one where that is better (Fedorov 1972); how many were."""
         done = 0
         for _ in range(sweeps):
             before = done
-            for i in self.chosen[first:]:
+            for i in list(self.chosen):
                 old = self.score()
                 order = list(self.chosen)
                 self.set([c for c in order if c != i])

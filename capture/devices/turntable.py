@@ -7,7 +7,7 @@ Angles are radians, one per axis, outermost first; they count whole turns, becau
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -169,7 +169,7 @@ def degrees_text(axes: Sequence[Axis], angles: Sequence[float] | FloatArray) -> 
     return ", ".join(f"{axis.name} {math.degrees(angle):.4f} deg" for axis, angle in pairs)
 
 
-def location_dict(location: Location) -> Mapping[str, Any]:
+def location_dict(location: Location) -> Mapping[str, object]:
     """For journals: degrees, and both clocks."""
     setpoint = [None if math.isnan(a) else a for a in np.degrees(location.setpoint).tolist()]
     return {

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, TypeVar, get_args
+from typing import TYPE_CHECKING, TypeVar, get_args
 
 from survey.folder.units import from_si, unit_in
 from survey.project.declared.node import Node
@@ -24,7 +24,7 @@ def with_given(
     """
     keys = {f.name: f"{f.name}_deg" if f.type is float and unit_in(f.name) == "1" else f.name for f in fields(default)}
     node.allow(*keys.values(), *also)
-    found: dict[str, Any] = {}
+    found: dict[str, object] = {}
     for f in fields(default):
         key, usual, lowest = keys[f.name], getattr(default, f.name), least.get(f.name)
         if f.type is bool:

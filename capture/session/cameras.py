@@ -1,6 +1,6 @@
 """The cameras of a plan, opened, set and armed as one trigger set."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any, Self
 
@@ -19,15 +19,8 @@ class PlannedCameras:
     trigger: software, hardware (pulses come from outside) or free (no trigger).
     """
 
-    def __init__(
-        self,
-        plans: Sequence[CameraPlan],
-        trigger: str = "software",
-        opener: Callable[..., Camera] = open_camera,
-        fire: Callable[[], None] | None = None,
-    ) -> None:
-        self._plans, self._trigger, self._opener = tuple(plans), trigger, opener
-        self._fire = fire if fire is not None else (_wait_for_pulse if trigger == "hardware" else None)
+    def __init__(self, plans: Sequence[CameraPlan], trigger: str = "software") -> None:
+        self._plans, self._trigger = tuple(plans), trigger
         self._cameras: dict[str, Camera] = {}
         self._set: TriggerSet | None = None
 
@@ -42,10 +35,10 @@ class PlannedCameras:
         """Open and set all cameras, and arm them. Raises CameraError."""
         try:
             for plan in self._plans:
-                camera = self._opener(plan.address, **plan.options)
+                camera = open_camera(plan.address, **plan.options)
                 self._cameras[plan.camera_id] = camera
                 self._apply(plan, camera)
-            self._set = TriggerSet(self._cameras, self._fire)
+            self._set = TriggerSet(self._cameras, _wait_for_pulse if self._trigger == "hardware" else None)
             self._set.arm()
         except BaseException:
             self.close()
@@ -83,9 +76,9 @@ class PlannedCameras:
             raise SurveyError("the cameras are not open; open them first")
         return self._set.take(timeout_s)
 
-    def values(self, camera_id: str, names: Sequence[str]) -> Mapping[str, Any]:
+    def values(self, camera_id: str, names: Sequence[str]) -> Mapping[str, object]:
         """Features as they are now; those that a camera does not know or tell are left out."""
-        found: dict[str, Any] = {}
+        found: dict[str, object] = {}
         for name in names:
             with suppress(CameraError):
                 found[name] = self._cameras[camera_id].get(name)
@@ -99,7 +92,7 @@ class PlannedCameras:
         else:
             self._set.arm()
 
-    def describe(self) -> Mapping[str, Mapping[str, Any]]:
+    def describe(self) -> Mapping[str, Mapping[str, object]]:
         """Address, serial number and main features of every camera."""
         return {
             name: {"address": camera.address, "serial": camera.serial, **self.values(name, _DESCRIBED)}

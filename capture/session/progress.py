@@ -11,7 +11,7 @@ from typing import Any
 from tqdm import tqdm
 
 from capture.session.quality_thread import quality_text
-from capture.session.run_session import Taken
+from capture.session.taking import Taken
 from survey.folder.text import atomic_write
 from survey.project.captured import status_path
 
@@ -23,7 +23,7 @@ class Progress:
         self._folder, self._begin = folder, time.monotonic()
         self._first: int | None = None
         self._bar = tqdm(total=total, desc="capturing", unit="epoch", disable=not shown, file=sys.stderr)
-        self._last: dict[str, Any] = {}
+        self._last: dict[str, object] = {}
 
     def taken(self, taken: Taken, quality: Mapping[str, Mapping[str, Any]]) -> None:
         """One more epoch; quality: of its images, by camera."""
@@ -43,7 +43,7 @@ class Progress:
         }
         self.state("running")
 
-    def quality(self, quality: Mapping[str, Mapping[str, Any]]) -> None:
+    def quality(self, quality: Mapping[str, Mapping[str, object]]) -> None:
         """What was found out later."""
         self._last |= {"quality": {name: dict(values) for name, values in quality.items()}}
         self._bar.set_postfix_str(quality_text(quality))
@@ -63,4 +63,3 @@ class Progress:
     def close(self) -> None:
         """End the line."""
         self._bar.close()
-

@@ -20,8 +20,8 @@ from capture.session.control import Control
 from capture.session.folder import session_lock
 from capture.session.progress import Progress
 from capture.session.quality_thread import QualityWatch
-from capture.session.run_session import Outcome, Session, Taken
 from capture.session.table_jobs import opened_table
+from capture.session.taking import Outcome, Session, Taken
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 _LOOK_S = 0.05

@@ -48,7 +48,7 @@ class SimulatedTable:
         if self._log is not None:
             self._log.write(f"{time.monotonic_ns()} {line}\n")
 
-    def truth(self) -> dict[str, Any]:
+    def truth(self) -> dict[str, object]:
         """True angles now, by the names that ``capture.simulated.angles`` reads."""
         with self.lock:
             now = time.monotonic()

@@ -215,7 +215,7 @@ def _free(status: Status, components: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(name for name, word in status.items() if word == "free")
 
 
-def _components(path: str, entry: Mapping[str, Any]) -> Iterator[Number]:
+def _components(path: str, entry: Mapping[str, object]) -> Iterator[Number]:
     """Number and sigma of every free component of a lens, table, warp or clock, whose keys end with their units."""
     for c in components_of(entry):
         if c.status == "free" and c.value is not None and c.sigma is not None:

@@ -11,10 +11,10 @@ from survey.commands.common import (
     is_set,
     not_negative,
     positive,
-    print_json,
     require_project,
     say,
     show,
+    tell,
     tested,
 )
 from survey.commands.parser import command, flag, group, project_folder
@@ -121,13 +121,9 @@ def _adjust_batch(arguments: argparse.Namespace) -> int:
         from survey.batch.page import write_overview
 
         paths = write_overview(arguments.report, records, trends, arguments.language)
-    if is_set(arguments, "json"):
-        overview = {name: str(path) for name, path in paths.items()}
-        print_json({"folders": [row_of(r) for r in records], "written": overview})
-    else:
-        print(summary_table(records))
-        print(*([""] + trend_lines(trends, records) if trends.charts else []), sep="\n")
-        say(arguments, *(f"written: {path}" for path in paths.values()))
+    overview = {"folders": [row_of(r) for r in records], "written": {n: str(p) for n, p in paths.items()}}
+    charts = ["", *trend_lines(trends, records)] if trends.charts else [""]
+    tell(arguments, overview, "\n".join([summary_table(records), *charts]), paths.values())
     return exit_code(records)
 
 

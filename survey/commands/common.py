@@ -172,11 +172,8 @@ def tell(arguments: argparse.Namespace, found: Mapping[str, object], text: str, 
 
 def show(arguments: argparse.Namespace, outcome: Outcome, written: Iterable[Path] = (), then: str = "") -> None:
     """The outcome as JSON where that is asked for, else in words, ``then`` behind them, and what was written."""
-    if is_set(arguments, "json"):
-        print_json(outcome.summary())
-    else:
-        print(outcome.text() + then)
-        say(arguments, *(f"written: {path}" for path in written))
+    is_json = is_set(arguments, "json")
+    tell(arguments, outcome.summary() if is_json else {}, "" if is_json else outcome.text() + then, written)
 
 
 def tested(summary: Mapping[str, object]) -> int:

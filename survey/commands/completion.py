@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from survey.commands.common import DONE
-from survey.commands.parser import Commands
+from survey.commands.parser import Commands, Parser
 
 SHELLS = ("bash", "zsh", "fish")
 _EPILOG = """\
@@ -38,20 +38,18 @@ class Command:
     words: tuple[str, ...]
 
 
-def commands_of(parser: argparse.ArgumentParser) -> tuple[Command, ...]:
+def commands_of(parser: Parser) -> tuple[Command, ...]:
     """The commands of a parser in their order."""
-    sub = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
-    helps = {choice.dest: choice.help or "" for choice in sub._choices_actions}
-    return tuple(_command(name, helps.get(name, ""), found) for name, found in sub.choices.items())
+    return tuple(_command(name, help, found) for name, (help, found) in parser.commands.items())
 
 
-def _command(name: str, help: str, parser: argparse.ArgumentParser) -> Command:
+def _command(name: str, help: str, parser: Parser) -> Command:
     flags: list[Flag] = []
     words: list[str] = []
-    for action in parser._actions:
-        choices = tuple(str(c) for c in action.choices or ())
-        if action.option_strings:
-            flags.append(Flag(tuple(action.option_strings), _plain(action.help), choices, action.nargs != 0))
+    for argument in parser.arguments:
+        choices = tuple(str(c) for c in argument.choices or ())
+        if argument.option_strings:
+            flags.append(Flag(tuple(argument.option_strings), _plain(argument.help), choices, argument.nargs != 0))
         else:
             words += choices
     return Command(name, _plain(help), tuple(flags), tuple(words))
@@ -62,7 +60,7 @@ def _plain(text: str | None) -> str:
     return re.sub(r"[^\w ,.;/()=+-]", "", (text or "").replace("\n", " "))
 
 
-def completion_script(parser: argparse.ArgumentParser, shell: str) -> str:
+def completion_script(parser: Parser, shell: str) -> str:
     """The script that teaches ``shell`` the commands of ``parser``. Raises ValueError for another shell."""
     makers = {"bash": _bash, "zsh": _zsh, "fish": _fish}
     if shell not in makers:
@@ -133,7 +131,7 @@ def _fish(program: str, commands: tuple[Command, ...]) -> Iterator[str]:
             yield f"complete -c {program} {seen} -a '{' '.join(c.words)}'"
 
 
-def declare_completion(program: str, build_parser: Callable[[], argparse.ArgumentParser], commands: Commands) -> None:
+def declare_completion(program: str, build_parser: Callable[[], Parser], commands: Commands) -> None:
     """Add ``completion`` to the commands of a program whose parser ``build_parser`` makes."""
     parser = commands.add(
         "completion",
@@ -146,6 +144,6 @@ def declare_completion(program: str, build_parser: Callable[[], argparse.Argumen
     parser.add_argument("shell", choices=SHELLS, metavar="SHELL", help="bash, zsh or fish")
 
 
-def _completion(build_parser: Callable[[], argparse.ArgumentParser], arguments: argparse.Namespace) -> int:
+def _completion(build_parser: Callable[[], Parser], arguments: argparse.Namespace) -> int:
     print(completion_script(build_parser(), arguments.shell), end="")
     return DONE

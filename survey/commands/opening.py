@@ -61,13 +61,13 @@ def open_project(arguments: argparse.Namespace) -> int:
             if not arguments.no_browser:
                 webbrowser.open(address)
             waiting = threading.get_ident()
-            server.opened.add_done_callback(
+            server.work.opened.add_done_callback(
                 lambda found: signal.pthread_kill(waiting, signal.SIGTERM) if found.exception() else None
             )
             signal.sigwait(endings)
-            if server.opened.done() and server.opened.exception():
-                server.told.wait(0.0 if arguments.no_browser else _PATIENCE_S)  # the page says it too
-                server.opened.result()
+            if server.work.opened.done() and server.work.opened.exception():
+                server.work.told.wait(0.0 if arguments.no_browser else _PATIENCE_S)  # the page says it too
+                server.work.opened.result()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
     return DONE

@@ -5,7 +5,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Protocol
 
 from survey.commands.common import Version
 
@@ -16,8 +16,34 @@ _NUMBER = re.compile(r"argument (?P<what>.+?): invalid (?:int|float) value: '(?P
 _FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 
 
+class Takes(Protocol):
+    """What arguments can be added to: a parser, or a group in it."""
+
+    def add_argument(self, *names: str, **how: Any) -> argparse.Action:
+        """As argparse's."""
+
+
 class Parser(argparse.ArgumentParser):
-    """As argparse's, with other words where the usage is wrong; commands are of this class too."""
+    """As argparse's, with other words where the usage is wrong; commands are of this class too.
+
+    arguments: all that it takes, in their order; commands: those of a program, by name, with a line of help each.
+    """
+
+    def __init__(self, prog: str | None = None, parents: "Sequence[Parser]" = (), **options: Any) -> None:
+        self.arguments: list[argparse.Action] = []
+        self.commands: dict[str, tuple[str, Parser]] = {}
+        super().__init__(prog, parents=parents, **options)
+        self.arguments += [argument for parent in parents for argument in parent.arguments]
+
+    def add_argument(self, *names: str, **how: Any) -> argparse.Action:
+        """As argparse's, and it is remembered."""
+        self.arguments.append(super().add_argument(*names, **how))
+        return self.arguments[-1]
+
+    def add_group(self, title: str, arguments: "Iterable[Argument]") -> None:
+        """Arguments that stand together in the help."""
+        place = self.add_argument_group(title)
+        self.arguments += [argument(place) for argument in arguments]
 
     def add_subparsers(self, **options: Any) -> Any:
         """Commands are called by the program's name; argparse would put the whole usage in front of them."""
@@ -40,27 +66,30 @@ class Parser(argparse.ArgumentParser):
 class Commands:
     """The commands of a program."""
 
-    def __init__(self, parser: argparse.ArgumentParser, shaped: dict[str, Any]) -> None:
-        self._known, self._shaped = parser.add_subparsers(title="commands", metavar="COMMAND", required=True), shaped
+    def __init__(self, parser: Parser, shaped: dict[str, object]) -> None:
+        self._program, self._shaped = parser, shaped
+        self._known = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
-    def add(self, name: str, run: "Run", **words: str) -> argparse.ArgumentParser:
+    def add(self, name: str, run: "Run", **words: str) -> Parser:
         """A command that ``run`` carries out. words: help, usage, description and epilog, as argparse has them."""
-        parser: argparse.ArgumentParser = self._known.add_parser(name, **{**self._shaped, **words})
+        parser: Parser = self._known.add_parser(name, **{**self._shaped, **words})
+        self._program.commands[name] = words.get("help", ""), parser
         parser.set_defaults(run=run, parser=parser)  # every command's arguments know the parser that they came through
         return parser
 
 
 Run = Callable[[argparse.Namespace], int]
-Argument = Callable[[argparse.ArgumentParser], object]
+Argument = Callable[[Takes], argparse.Action]
+Addition = Callable[[Parser], object]
 
 
-def command(name: str, *arguments: Argument, **words: str) -> Callable[[Run], Callable[[Commands], None]]:
+def command(name: str, *additions: Addition, **words: str) -> Callable[[Run], Callable[[Commands], None]]:
     """What makes a command of the function that carries it out; words: as of :meth:`Commands.add`."""
 
     def declared(run: Run) -> Callable[[Commands], None]:
         def declare(commands: Commands) -> None:
             parser = commands.add(name, run, **words)
-            for add_to in arguments:
+            for add_to in additions:
                 add_to(parser)
 
         return declare
@@ -70,18 +99,12 @@ def command(name: str, *arguments: Argument, **words: str) -> Callable[[Run], Ca
 
 def flag(*names: str, **how: Any) -> Argument:
     """An argument as :meth:`argparse.ArgumentParser.add_argument` takes it."""
-    return lambda parser: parser.add_argument(*names, **how)
+    return lambda place: place.add_argument(*names, **how)
 
 
-def group(title: str, *arguments: Argument) -> Argument:
+def group(title: str, *arguments: Argument) -> Addition:
     """Arguments that stand together in the help."""
-
-    def add_to(parser: argparse.ArgumentParser) -> None:
-        place: Any = parser.add_argument_group(title)
-        for argument in arguments:
-            argument(place)
-
-    return add_to
+    return lambda parser: parser.add_group(title, arguments)
 
 
 def program_parser(
@@ -89,7 +112,7 @@ def program_parser(
     declared: Iterable[Callable[[Commands], None]],
 ) -> Parser:  # fmt: skip
     """A program's parser with all its commands. flags: that stand before or after any of them, with their help."""
-    shared = argparse.ArgumentParser(add_help=False)
+    shared = Parser(add_help=False)
     for names, help in flags.items():  # SUPPRESS: a flag before the command is not reset by the command's own default
         shared.add_argument(*names.split(), action="store_true", default=argparse.SUPPRESS, help=help)
     shaped: Any = {"formatter_class": argparse.RawDescriptionHelpFormatter, "parents": [shared]}

@@ -54,29 +54,24 @@ def write_images(draft: Draft, folder: Path, seed: int, jobs: int | None, progre
             bar.update()
 
 
-def picture(draft: Draft, scene: Scene, shot: Shot, seed: int, clutter: bool = False) -> GrayImage:
+def picture(draft: Draft, scene: Scene, shot: Shot, seed: int) -> GrayImage:
     """One image (height, width), 8 bit: targets by day, beacons by night.
 
-    clutter: also what stands in the room without being meant, such as wall plates behind a board held by hand, which
-    hides parts of them. The examples' plates are hung for the epochs that are meant to show them.
+    Plates on the walls are hung for the epochs that are meant to show them.
     """
     camera = scene_camera(scene, shot.camera_id)
     camera_from_world = np.linalg.inv(scene.world_from_camera(shot.camera_id, shot.epoch_id)).astype(np.float64)
     if shot.beacons:
         beacons = Beacons(transform(camera_from_world, scene.world_points()), BEACON_DIAMETER_M, 230.0)
         return render(camera, beacons=beacons, imaging=NIGHT, seed=seed)
-    return render(camera, _placed(draft, scene, shot, camera_from_world, clutter), imaging=DAY, seed=seed)
+    return render(camera, _placed(draft, scene, shot, camera_from_world), imaging=DAY, seed=seed)
 
 
-def _placed(
-    draft: Draft, scene: Scene, shot: Shot, camera_from_world: FloatArray, clutter: bool
-) -> Sequence[PlacedTarget]:
+def _placed(draft: Draft, scene: Scene, shot: Shot, camera_from_world: FloatArray) -> Sequence[PlacedTarget]:
     placed = []
     for target in scene.survey.targets:
         kind = draft.kinds[target.target_id]
-        if target.target_id not in shot.target_ids and (target.motion == "epoch" or not clutter):
-            continue
-        if isinstance(kind, PointList):
+        if target.target_id not in shot.target_ids or isinstance(kind, PointList):
             continue
         pose = Pose3(camera_from_world @ scene.world_from_target(target.target_id, shot.epoch_id))
         if may_be_seen(scene_camera(scene, shot.camera_id), pose, target.x_in_target):

@@ -49,7 +49,7 @@ class FileLock:
 
     def acquire(self) -> None:
         """Take the lock; raises BusyError naming who has it, SurveyError where there can be none, OSError."""
-        while fcntl is not None and self._handle is None:
+        while _has_locks() and self._handle is None:
             handle = self._opened()
             try:
                 self._lock(handle)
@@ -196,9 +196,13 @@ def _wait_for(handle: int, shared: bool) -> None:
         pass
 
 
+def _has_locks() -> bool:
+    return hasattr(fcntl, "flock")
+
+
 def _flocked(handle: int, shared: bool) -> bool:
     """Try to lock; False where another has it. Raises OSError where the file system has no locks."""
-    if fcntl is None:
+    if not _has_locks():
         return True
     try:
         fcntl.flock(handle, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)

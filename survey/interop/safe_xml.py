@@ -7,7 +7,6 @@ entities and default attributes can blow a short file up without end.
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 from xml.parsers import expat
 
 from adjust.model.errors import SurveyError
@@ -74,7 +73,7 @@ class Element:
 class _Builder:
     """Handlers of expat that make a tree of elements."""
 
-    def __init__(self, path: Path, parser: Any) -> None:
+    def __init__(self, path: Path, parser: expat.XMLParserType) -> None:
         self.path, self.parser = path, parser
         self.open: list[Element] = []
         self.root: Element | None = None
@@ -96,7 +95,7 @@ class _Builder:
         if self.open:
             self.open[-1].text += data
 
-    def refuse(self, *_arguments: Any) -> int:
+    def refuse(self, *_arguments: object) -> int:
         where = Where(self.path, self.parser.CurrentLineNumber)
         raise where.error("the document type declares entities or the like, which network files do not need; remove it")
 

@@ -1,18 +1,15 @@
 """The job of the command ``align``: adjust the readings, write the working sheet, keep the rounds."""
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from markupsafe import Markup
 
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from survey.folder.replacing import changing, replace_parts
-from survey.folder.text import csv_text, read_text, time_text
+from survey.folder.text import csv_rows, csv_text, read_text, time_text
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.working_sheet import ARCSEC, STATES, Sheet, angle_text, sheet_text, steps, working_sheets
 from survey.project import atomic_write, read
@@ -41,7 +38,7 @@ class AlignOutcome:
         """For the terminal."""
         return f"{sheet_text(self.sheets)}\nWorking sheet: {self.page}"
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """For ``--json``."""
         tasks = {
             sheet.task.task_id: {
@@ -91,13 +88,11 @@ def _made(folder: Path, target: Path, place: Path, progress: bool) -> tuple[Adju
 def _rounds(path: Path) -> list[list[str]]:
     if not path.is_file():
         return []
-    try:
-        rows = list(csv.reader(io.StringIO(read_text(path), newline=""), strict=True))
-    except csv.Error as error:
-        raise SurveyError(f"{path}: this is no list of rounds ({error}); remove the file") from error
-    if not rows or tuple(rows[0]) != ROUND_COLUMNS or any(len(row) != len(ROUND_COLUMNS) for row in rows):
-        raise SurveyError(f"{path}:1: this is no list of rounds; remove the file")
-    return rows[1:]
+    rows = list(csv_rows(path, read_text(path)))
+    bad = [line for line, cells in rows if len(cells) != len(ROUND_COLUMNS)]
+    if bad or not rows or tuple(rows[0][1]) != ROUND_COLUMNS:
+        raise SurveyError(f"{path}:{bad[0] if bad else 1}: this is no list of rounds; remove the file")
+    return [cells for _, cells in rows[1:]]
 
 
 def _with_round(rounds: list[list[str]], sheets: tuple[Sheet, ...], date: str) -> list[list[str]]:

@@ -3,7 +3,6 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -47,7 +46,7 @@ class CompareOutcome:
         causes = (f"probable cause: {c.cause}; {c.change} (then p {c.p:.2g})" for c in self.causes)
         return (*causes, *(f"{folder}: {warning}" for folder, adjustment in pairs for warning in adjustment.warnings))
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """As plain values; None where something was not measured or cannot be tested."""
         return {
             "folders": [str(f) for f in self.folders],
@@ -126,7 +125,7 @@ def _adjusted(project: Project, progress: bool) -> Adjustment:
         raise error if str(folder) in str(error) else SurveyError(f"{folder}: {error}") from error
 
 
-def _entry(d: Deformation) -> dict[str, Any]:
+def _entry(d: Deformation) -> dict[str, object]:
     sigmas = d.sigmas
     tests = {"test_rotation": d.rotation_test, "test_displacement": d.displacement_test, "test": d.test}
     return dict(plain({
@@ -148,7 +147,7 @@ def _row(d: Deformation, width: int) -> str:
     return f"  {f'{d.a} - {d.b}':<{width}}  {turn}  {shift}{p}{' *' if d.significant else ''}"
 
 
-def _congruence_dict(found: Congruence) -> dict[str, Any]:
+def _congruence_dict(found: Congruence) -> dict[str, object]:
     """As plain values; None where something was not measured or cannot be tested."""
     return {
         "alpha": found.alpha,
@@ -207,12 +206,12 @@ def _name(name: tuple[str, ...]) -> str:
     return "/".join(name)
 
 
-def _f_test(test: CongruenceTest) -> dict[str, Any]:
+def _f_test(test: CongruenceTest) -> dict[str, object]:
     return dict(plain({"f": test.statistic, **attributes(test, "freedom", "freedom_sigma0", "p", "passed")}))
 
 
-def _motion(m: Motion) -> dict[str, Any]:
-    out: dict[str, Any] = {
+def _motion(m: Motion) -> dict[str, object]:
+    out: dict[str, object] = {
         "name": _name(m.name),
         "displacement_mm": plain(1e3 * m.displacement),
         "sigma_displacement_mm": plain(1e3 * sigmas_in(m.cov)),

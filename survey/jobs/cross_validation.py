@@ -8,7 +8,6 @@ that name in its tour).
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from gtsam import Rot3
@@ -65,7 +64,7 @@ class LensHalves:
         """Length of the motion that was fitted; 0 for points at infinity."""
         return 1e3 * float(np.linalg.norm(self.difference.second_from_first.translation()))
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """Plain values."""
         worst = int(np.argmax(np.abs(self.in_sigmas)))
         return {
@@ -76,7 +75,7 @@ class LensHalves:
             "dof": len(self.components), "p_value": self.p_value,
         }  # fmt: skip
 
-    def pixels(self) -> dict[str, Any]:
+    def pixels(self) -> dict[str, object]:
         """Over the image: pixels, shifts and sigmas (px), and which have observations near."""
         return {"uv": self.difference.uv, "shift": self.difference.shift, "sigma": self.sigma,
                 "covered": self.difference.fitted}  # fmt: skip
@@ -93,7 +92,7 @@ class CrossValidation:
     cameras: tuple[LensHalves, ...]
     notes: tuple[str, ...] = ()
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """Plain values, cameras with the largest ratio first; nothing pixel by pixel."""
         return {
             "folder": str(self.folder), "distance_m": None if np.isinf(self.distance) else self.distance,

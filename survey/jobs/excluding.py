@@ -11,7 +11,6 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from adjust.model.errors import SurveyError
 from survey.folder.replacing import changing, replace_parts
@@ -37,7 +36,7 @@ class ExcludeOutcome:
     path: Path
     n_in_force: int
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """As plain values."""
         names = [o.exclusion.as_dict() | o.counts() for o in self.done]
         return {"folder": str(self.folder), "excluded" if self.excluded else "included": names,

@@ -135,7 +135,7 @@ def star(found: RelayPairs) -> tuple[Pair, ...]:
     return tuple(found.joint.pair(first.frame_id, other.frame_id) for other in others)
 
 
-def triangles(eyes: EyePairs) -> tuple[dict[str, Any], ...]:
+def triangles(eyes: EyePairs) -> tuple[dict[str, object], ...]:
     """Misclosures of all triangles whose three pairs were found, from the pairs alone: lengths, and whether by chance.
 
     The test is w' inv(C) w, chi-square with 6 degrees of freedom, C with what pairs of one eye share.
@@ -175,7 +175,7 @@ def write_pair_project(folder: Path, pairs: Sequence[Pair], title: str) -> Path:
     return folder / DEFINITION_FILE
 
 
-def _entry(b_from_a: Any, cov: FloatArray) -> dict[str, Any]:
+def _entry(b_from_a: Any, cov: FloatArray) -> dict[str, object]:
     pose = b_from_a if isinstance(b_from_a, Pose3) else Pose3(b_from_a, np.zeros(3))
     sigmas = first_row(pair_sigmas(pose.rotation().matrix()[None], cov[None]))
     return pose_dict(pose) | sigmas | {"cov": cov.tolist()}

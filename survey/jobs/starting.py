@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +15,9 @@ from survey.folder.replacing import filling
 from survey.folder.text import atomic_write, id_problem
 from survey.project.images import IMAGE_ENDINGS
 from survey.project.project import DEFINITION_FILE, IMAGES_FOLDER
+
+if TYPE_CHECKING:  # detection brings in OpenCV
+    from survey.detection.gray import AnyImage
 
 _LOOKED_AT = 6  # images of each camera in which a board is looked for
 _LONGEST_PX = 1600  # of the image in which it is looked for
@@ -38,7 +41,7 @@ class StartOutcome:
     n_with_board: int
     n_with_markers: int
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """As plain values."""
         return {
             "folder": str(self.folder), "board": None if self.board is None else list(self.board),
@@ -130,7 +133,7 @@ def _images(folder: Path) -> list[Path]:
     return sorted(found, key=lambda p: natural_key(p.name))
 
 
-def _shown(image: Any) -> tuple[tuple[int, int] | None, bool]:
+def _shown(image: "AnyImage") -> tuple[tuple[int, int] | None, bool]:
     """Columns and rows of the inner corners of a checkerboard in an image, and whether there are markers.
 
     OpenCV's finder is asked for the smallest board and for whatever is larger; one with markers is no checkerboard.

@@ -1,19 +1,29 @@
 """A plan as one HTML page that needs nothing but itself."""
 
+from functools import partial
+
 import numpy as np
 from gtsam import Pose3
 from markupsafe import Markup
 
 from adjust.design import group_redundancy
 from survey.planning.navigation import NavigationOutcome
-from survey.planning.summary import PlanResult, expected_sigmas, meets, pose_sigmas, tolerance_values
+from survey.planning.summary import (
+    PlanResult,
+    expected_sigmas,
+    factor_text,
+    gained,
+    meets,
+    pose_sigmas,
+    tolerance_values,
+)
 from survey.report import drawing as d
 from survey.report import markup as m
 from survey.report.charts import Series, bars, chart, seen_map
 from survey.report.language import esc, speaking
 from survey.report.picture import draw, perspective, pictures
 from survey.report.scene import Scene, Spot, scene_of
-from survey.solution.quantities import scale_of, sigma_unit_for_people
+from survey.solution.quantities import scale_of
 
 _MOST_CANDIDATES = 30
 _COLOURS = {"epoch": d.BLUE, "beacon": d.RED, "distance": d.GREEN, "pair": d.ORANGE, "coordinates": d.PURPLE}
@@ -116,11 +126,11 @@ def _selection(o: PlanResult) -> Markup:
     ]  # fmt: skip
     columns = ("", "<Kind", "<Measure next", "Gain ln det", "Of all unknowns", "Mean variance falls by")
     body = m.figures([drawn]) + m.table(columns, steps)
-    rows = []
-    for c, a, b in zip(s.wanted, s.sigmas.tolist(), s.after.tolist(), strict=True):
-        unit, factor = sigma_unit_for_people(c.unit)
-        drop = m.fixed(100 * (1 - b / a), 1) + " %" if a > 0 else ""
-        rows.append((c.text, m.sigma_text(factor * a), m.sigma_text(factor * b), unit, drop))
+    rows = [
+        (g.component.text, *(m.sigma_text(g.factor * sigma) for sigma in (g.before, g.after)), g.unit,
+         m.fixed(100 * (1 - g.share), 1) + " %" if g.before > 0 else "")
+        for g in gained(s)
+    ]  # fmt: skip
     wanted = m.table(("<Component", "Before", "After all", "<Unit", "Smaller by"), rows)
     body += m.part("details", "Sigmas of everything wanted, before and after", wanted, False)
     said = (
@@ -140,7 +150,8 @@ def _tolerances(o: PlanResult) -> Markup:
         sigmas = m.sigma_text(x.factor * x.required), m.sigma_text(x.factor * x.planned)
         rows.append((x.component.text, *sigmas, x.unit, word, *(m.fixed(100 * v, 0) + " %" for v in shares)))
     body = m.table(("<Component", "Required", "Planned", "<Unit", "<", *map(esc, o.budget.groups)), rows)
-    lines = [(t.group, _factor(t.alone), _factor(t.together), t.limiting) for t in o.tolerances]
+    three = partial(m.general, digits=3)
+    lines = [(t.group, factor_text(t.alone, three), factor_text(t.together, three), t.limiting) for t in o.tolerances]
     body += m.table(
         ("<Group", "Alone", "Together", "<Limited by"), lines, "Sigmas may be so many times the planned ones"
     )
@@ -149,12 +160,6 @@ def _tolerances(o: PlanResult) -> Markup:
         "the others stay; together: every group takes an equal share of what is allowed."
     )
     return m.section("tolerances", "Required precision and tolerances", body, said)
-
-
-def _factor(value: float) -> str:
-    if np.isnan(value):
-        return "never"
-    return "any" if value > 1e6 else m.general(value, 3)
 
 
 def _trials(o: PlanResult) -> Markup:

@@ -1,6 +1,6 @@
 """All that is known of a plan, as plain values."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,22 @@ class Met:
         return self.planned <= self.required * (1 + 1e-9)
 
 
+@dataclass(frozen=True)
+class Gained:
+    """A component with its sigma before and after what is to be added (SI), and what people read."""
+
+    component: Component
+    before: float
+    after: float
+    unit: str
+    factor: float
+
+    @property
+    def share(self) -> float:
+        """What stays of the sigma; all of one that is zero."""
+        return self.after / self.before if self.before > 0.0 else 1.0
+
+
 @dataclass(frozen=True, eq=False)
 class PlanResult:
     """All that is known of a plan."""
@@ -70,6 +86,17 @@ class PlanResult:
         planned = () if self.budget is None else self.budget.sigmas.tolist()
         return tuple(Met(c, r, s, *sigma_unit_for_people(c.unit))
                      for (c, r), s in zip(self.required.items(), planned, strict=self.budget is not None))  # fmt: skip
+
+
+def gained(s: Selection) -> list[Gained]:
+    """What a selection does for everything that is wanted."""
+    return [Gained(c, a, b, *sigma_unit_for_people(c.unit))
+            for c, a, b in zip(s.wanted, s.sigmas.tolist(), s.after.tolist(), strict=True)]  # fmt: skip
+
+
+def factor_text(value: float, shown: Callable[[float], str] = "{:.3g}".format) -> str:
+    """How many times the planned sigmas may be, for people."""
+    return "never" if np.isnan(value) else "any" if value > 1e6 else shown(value)
 
 
 def expected_sigmas(o: PlanResult) -> Iterator[tuple[ParameterName, list[tuple[str, float, str]]]]:
@@ -129,11 +156,9 @@ def plan_summary(o: PlanResult) -> dict[str, object]:
 
 def _selection(s: Selection) -> dict[str, object]:
     gain = ("name", "kind", "ln_det", "ln_det_all", "mean_variance")
-    wanted = {}
-    for c, before, after in zip(s.wanted, s.sigmas.tolist(), s.after.tolist(), strict=True):
-        unit, factor = sigma_unit_for_people(c.unit)
-        wanted[c.text] = {f"sigma_{when}_{unit}".rstrip("_"): factor * sigma
-                          for when, sigma in (("before", before), ("after", after))}  # fmt: skip
+    wanted = {g.component.text: {f"sigma_{when}_{g.unit}".rstrip("_"): g.factor * sigma
+                                 for when, sigma in (("before", g.before), ("after", g.after))}
+              for g in gained(s)}  # fmt: skip
     return {
         "criterion": s.criterion,
         "chosen": [attributes(g, *gain) for g in s.steps],

@@ -2,9 +2,18 @@
 
 import numpy as np
 
-from adjust.design import Component, group_redundancy
-from survey.planning.summary import PlanResult, expected_sigmas, meets, pose_sigmas, tolerance_values
-from survey.solution.quantities import sigma_unit_for_people
+from adjust.design import group_redundancy
+from survey.planning.summary import (
+    Gained,
+    Met,
+    PlanResult,
+    expected_sigmas,
+    factor_text,
+    gained,
+    meets,
+    pose_sigmas,
+    tolerance_values,
+)
 
 _MOST = 8
 
@@ -29,10 +38,9 @@ def plan_text(o: PlanResult) -> str:
     return "\n".join(lines)
 
 
-def _sigma_of(component: Component, sigma: float) -> str:
+def _people(sigma: float, of: Gained | Met) -> str:
     """``0.12 mm``."""
-    unit, factor = sigma_unit_for_people(component.unit)
-    return f"{factor * sigma:.3g} {unit}".strip()
+    return f"{of.factor * sigma:.3g} {of.unit}".strip()
 
 
 def _sigma_lines(o: PlanResult) -> list[str]:
@@ -58,8 +66,8 @@ def _selection_lines(o: PlanResult) -> list[str]:
     for g in s.steps:
         less = f"-{100 * g.mean_variance:.1f} %"
         out.append(f"    {g.kind + ' ' + g.name:<34}{g.ln_det:>9.3f}{g.ln_det_all:>9.3f}{less:>10}")
-    gained = sorted(zip(s.wanted, s.sigmas, s.after, strict=True), key=lambda x: x[2] / x[1] if x[1] > 0 else 1.0)
-    out += [f"    {c.text:<34}{_sigma_of(c, a)} -> {_sigma_of(c, b)}" for c, a, b in gained[:_MOST]]
+    out += [f"    {g.component.text:<34}{_people(g.before, g)} -> {_people(g.after, g)}"
+            for g in sorted(gained(s), key=lambda g: g.share)[:_MOST]]  # fmt: skip
     return out
 
 
@@ -68,19 +76,13 @@ def _tolerance_lines(o: PlanResult) -> list[str]:
         return []
     out = ["", "  required precision"]
     for x in o.requirements:
-        required, planned = (_sigma_of(x.component, sigma) for sigma in (x.required, x.planned))
+        required, planned = _people(x.required, x), _people(x.planned, x)
         word = "met" if x.met else "NOT MET"
         out.append(f"    {x.component.text:<34}{required:>14} required{planned:>14} planned   {word}")
     out.append(f"    {'sigmas may be, times the planned':<34}{'alone':>9}{'together':>10}   limited by")
     for t in o.tolerances:
-        out.append(f"    {t.group:<34}{_factor(t.alone):>9}{_factor(t.together):>10}   {t.limiting}")
+        out.append(f"    {t.group:<34}{factor_text(t.alone):>9}{factor_text(t.together):>10}   {t.limiting}")
     return out
-
-
-def _factor(value: float) -> str:
-    if np.isnan(value):
-        return "never"
-    return "any" if value > 1e6 else f"{value:.3g}"
 
 
 def _trial_lines(o: PlanResult) -> list[str]:

@@ -2,7 +2,6 @@
 
 import difflib
 from functools import lru_cache
-from typing import Any
 
 import cv2
 import numpy as np
@@ -18,7 +17,7 @@ def dictionary_names() -> dict[str, int]:
     return {n[5:].upper(): int(getattr(cv2.aruco, n)) for n in dir(cv2.aruco) if n.startswith("DICT_")}
 
 
-def marker_dictionary(name: str) -> Any:
+def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
     """The dictionary called ``4X4_50``, ``DICT_4X4_50``, ``APRILTAG_36h11`` ...; case does not matter."""
     names = dictionary_names()
     key = name.upper().removeprefix("DICT_")
@@ -38,7 +37,7 @@ def marker_cells(name: str, marker: int) -> npt.NDArray[np.float64]:
     return np.asarray(cv2.aruco.generateImageMarker(dictionary, marker, side) / 255.0, float)
 
 
-def charuco_board(target: Charuco) -> Any:
+def charuco_board(target: Charuco) -> cv2.aruco.CharucoBoard:
     """OpenCV's board for the target, in metres; its origin is the outer corner of the first square."""
     if not 0.0 < target.marker_m < target.square_m:
         raise SurveyError(

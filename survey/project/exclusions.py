@@ -23,7 +23,6 @@ spot         ``camera/epoch/spot``; u_px and v_px tell which one it was when it 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from adjust.model.errors import SurveyError
 from survey.folder.plain import attributes
@@ -71,7 +70,7 @@ class Exclusion:
     line: int = 0
     at: tuple[float, float] | None = None
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """Who left what out, and why."""
         return {"name": str(self.name), "what": self.name.what, "id": self.name.id,
                 **attributes(self, "reason", "author", "time")}  # fmt: skip

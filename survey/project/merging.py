@@ -133,7 +133,7 @@ def _new_sections(
     return out, lines
 
 
-def _take_point_list(merged: Merged, entry: Mapping[str, Any]) -> None:
+def _take_point_list(merged: Merged, entry: Mapping[str, object]) -> None:
     """The file that a target of points names."""
     name = entry.get("file")
     if not isinstance(name, str) or not (merged.new / name).is_file():

@@ -132,7 +132,7 @@ _NO_ID = '[/\\\\:@,;"|<>*?]'
 _NUMBER = {"type": "number"}
 
 
-def survey_schema() -> dict[str, Any]:
+def survey_schema() -> dict[str, object]:
     """JSON schema (draft 2020-12) of a whole ``survey.toml``."""
     definitions = {d.name: _object(d) for d in DECLARATIONS}
     for name in ("target", "surface"):
@@ -193,7 +193,7 @@ def _typed(key: Key, table: Declared) -> dict[str, Any]:
             one = {"anyOf": [_NUMBER | {"exclusiveMinimum": 0}, {"const": "inf"}]}
             return {"anyOf": [one, _list(one, 1, key.size[0])]}
         case "names":
-            item: dict[str, Any] = {"enum": list(key.choices)} if key.choices else {"type": "string"}
+            item: dict[str, object] = {"enum": list(key.choices)} if key.choices else {"type": "string"}
             if (table.name, key.name) == ("lens", "free"):
                 item = {"enum": list(_lens_parameters())}
             return _names(item)
@@ -201,7 +201,7 @@ def _typed(key: Key, table: Declared) -> dict[str, Any]:
             return _below(key, table)
 
 
-def _names(item: dict[str, Any]) -> dict[str, Any]:
+def _names(item: dict[str, object]) -> dict[str, object]:
     return {"type": "array", "items": item, "uniqueItems": True}
 
 
@@ -218,7 +218,7 @@ def _matrix(size: tuple[int, ...]) -> dict[str, Any]:
     return _list(row, size[0], size[0])
 
 
-def _below(key: Key, table: Declared) -> dict[str, Any]:
+def _below(key: Key, table: Declared) -> dict[str, object]:
     """The table under a key: one, or one for each id."""
     if table.name == "lens" and key.name in ("values", "prior", "tie"):
         entry = _NUMBER if key.name == "values" else _ref(key.table)

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -58,7 +57,7 @@ def write_project(
     _make_room(folder, overwrite)
     kinds = _complete_kinds(survey, target_kinds or {})
     sigmas = sigmas or Sigmas()
-    seen_by: dict[tuple[str, ...], dict[str, Any]] = {
+    seen_by: dict[tuple[str, ...], dict[str, object]] = {
         ("targets", target_id): {"cameras": ids} for target_id, ids in (target_cameras or {}).items()
     }
     sections = [(path, {**values, **seen_by.get(path, {})}) for path, values in survey_sections(survey, kinds, sigmas)]

@@ -18,7 +18,7 @@ from survey.solution.statistics import Statistics
 class Listed:
     """The rows of the table of all observations, of ``total``, without what statistics say of them.
 
-    values: (12, n), as :mod:`survey.report.sections.observations` has them. columns: each as JSON, by its heading.
+    values: (12, n), as :mod:`survey.report.sections.every_observation` has them. columns: each as JSON, by its heading.
     rest: JSON of what the table has beside its columns.
     """
 

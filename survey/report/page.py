@@ -17,7 +17,16 @@ from survey.report.context import Context
 from survey.report.language import language, localised, speaking, t
 from survey.report.markup import document, element, joined, json_of, json_script, part
 from survey.report.modules import WEB, bundled
-from survey.report.sections import diagnosis, loops, observations, overview, published, statistics, unknowns
+from survey.report.sections import (
+    diagnosis,
+    every_observation,
+    loops,
+    observations,
+    overview,
+    published,
+    statistics,
+    unknowns,
+)
 from survey.solution.dictionary import RunInfo, solution_dict
 from survey.solution.quantities import scale_of
 from survey.solution.residual_tables import ImageRows, image_rows
@@ -45,7 +54,7 @@ _SECTIONS = (
     ("Excluded by people", "excluded", observations.excluded),
     ("Observations", "observations", observations.others),
     ("Image points", "image-points", observations.image_points),
-    ("All observations", "all-observations", observations.every_observation),
+    ("All observations", "all-observations", every_observation.every_observation),
     ("Distribution", "normality", statistics.normality),
     ("Reliability", "reliability", statistics.reliability),
     ("Relative precision", "relative", statistics.relative),
@@ -97,7 +106,7 @@ def begun_page(
         images.used & (images.test > limit),
     )  # fmt: skip
     with speaking(in_language):
-        c = replace(c, listed=observations.listed(c))
+        c = replace(c, listed=every_observation.listed(c))
         made = {anchor: make(c) for _, anchor, make in _SECTIONS if anchor not in _OF_STATISTICS}
     return BegunPage(c, in_language, made)
 
@@ -115,7 +124,7 @@ def finished_page(begun: BegunPage, solution: dict[str, Any], found: Statistics 
         return document(title, shown, scripts)
 
 
-def _words() -> dict[str, Any]:
+def _words() -> dict[str, object]:
     """What the script says."""
     of_modules = json.loads((WEB / f"{language()}.json").read_text(encoding="utf-8"))
     return {

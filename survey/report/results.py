@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 from adjust.model.result import Adjustment
 from adjust.native.parallel import Beside
@@ -95,7 +94,7 @@ class BegunResults:
 
 def begun_results(
     place: Path, adjustment: Adjustment, run: RunInfo, options: ReportOptions, writing: Beside,
-    more: Mapping[str, Any] = MappingProxyType({}),
+    more: Mapping[str, object] = MappingProxyType({}),
 ) -> BegunResults:  # fmt: skip
     """Begin with what needs no statistics: tables of residuals and covariances, the solution, most of the report.
 
@@ -120,7 +119,7 @@ def begun_results(
 
 def finished_results(
     begun: BegunResults, adjustment: Adjustment, run: RunInfo, statistics: Statistics | None, options: ReportOptions
-) -> tuple[dict[str, Any], dict[str, Path]]:
+) -> tuple[dict[str, object], dict[str, Path]]:
     """What ``solution.json`` holds, and the paths of all files by name. Raises as :func:`write_results`."""
     page = begun.page()
     solution = page.context.solution

@@ -6,7 +6,7 @@ Also the view in space, to be turned around on the screen: lines, points and ell
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from gtsam import Pose3
@@ -177,7 +177,7 @@ def enlargement(scene: Scene, ellipsoid: float, extent: float) -> float:
     return d.round_below(extent * min(0.035 / float(np.median(semi_axes)), 0.2 / float(semi_axes.max())))
 
 
-def scene_values(adjustment: Adjustment, scale: Scale, drawn: Scene | None = None) -> dict[str, Any]:
+def scene_values(adjustment: Adjustment, scale: Scale, drawn: Scene | None = None) -> dict[str, object]:
     """The scene as a page draws it, in the world (m), covariances (m^2) as sigmas are given.
 
     images: ``world_from_camera`` by image, three rows of four; of all images, or, where ``drawn`` is given already, of
@@ -191,7 +191,9 @@ def scene_values(adjustment: Adjustment, scale: Scale, drawn: Scene | None = Non
     return drawn_values(drawn, scale.ellipsoid, {"/".join(k): pose for k, pose in poses.items() if pose is not None})
 
 
-def drawn_values(drawn: Scene, ellipsoid: float, images: Mapping[str, Pose3] = MappingProxyType({})) -> dict[str, Any]:
+def drawn_values(
+    drawn: Scene, ellipsoid: float, images: Mapping[str, Pose3] = MappingProxyType({})
+) -> dict[str, object]:
     """The same of any scene; images: ``world_from_camera`` by image."""
     return dict(plain({
         "ellipsoid": ellipsoid,

@@ -80,7 +80,7 @@ def single_camera(seed: int, *, n_images: int = 12, sigma_px: float = 0.1) -> tu
     return observed(draft, seed, sigma_px), draft.truth
 
 
-def stereo_draft(seed: int, n_pairs: int, baseline_m: float = 0.2) -> Draft:
+def stereo_draft(seed: int, n_pairs: int) -> Draft:
     """Two cameras on a bar, slightly converging, and a board held by hand that both see whole."""
     draft = Draft(np.random.default_rng(seed))
     draft.stations.append(Station("bar", world_from_station=HELD))
@@ -88,7 +88,7 @@ def stereo_draft(seed: int, n_pairs: int, baseline_m: float = 0.2) -> Draft:
     draft.add_camera("left", "bar", parts.wide_lens(draft.rng, 1400.0), np.eye(4), held=True)
     turned = rotation_about("y", np.radians(-12.0))
     turned[:3, :3] = turned[:3, :3] @ rotation_vector(draft.rng.normal(0.0, 0.7, 3))
-    draft.add_camera("right", "bar", parts.wide_lens(draft.rng, 1400.0), shift_along("x", baseline_m) @ turned)
+    draft.add_camera("right", "bar", parts.wide_lens(draft.rng, 1400.0), shift_along("x", 0.2) @ turned)
     draft.add_target("board", SMALL_BOARD, None)
     number = 0
     while sum(shot.camera_id == "right" for shot in draft.shots) < n_pairs:
@@ -131,13 +131,12 @@ def head_on_table(
     n_table_epochs: int = 11,
     n_free_epochs: int = 10,
     sigma_px: float = CORNER_SIGMA_PX,
-    table_sigma_arcsec: float = TABLE_SIGMA_ARCSEC,
     non_orthogonality_arcsec: float = 60.0,
     axis_offset_mm: float = 0.35,
 ) -> tuple[Survey, Truth]:
     """The head on the two-axis table before the fixed board (world), with table and by-hand epochs for each camera."""
     draft = _head_draft(seed, n_cameras, n_table_epochs, n_free_epochs, non_orthogonality_arcsec, axis_offset_mm)
-    return observed(draft, seed, sigma_px, table_sigma_arcsec), draft.truth
+    return observed(draft, seed, sigma_px), draft.truth
 
 
 def beacons(
@@ -147,13 +146,12 @@ def beacons(
     n_table_epochs: int = 11,
     n_free_epochs: int = 10,
     sigma_px: float = CORNER_SIGMA_PX,
-    table_sigma_arcsec: float = TABLE_SIGMA_ARCSEC,
 ) -> tuple[Survey, Truth]:
     """``head_on_table`` and ten beacons on walls and ceiling, most with surveyed coordinates, and five distances."""
     draft = _head_draft(seed, 3, n_table_epochs, n_free_epochs, 60.0, 0.35)
     parts.add_beacons(draft)
     _shoot_night(draft, n_night_epochs, ("X", "Y", "Z"))
-    return observed(draft, seed, sigma_px, table_sigma_arcsec), draft.truth
+    return observed(draft, seed, sigma_px), draft.truth
 
 
 def _shoot_night(draft: Draft, n_epochs: int, camera_ids: tuple[str, ...]) -> None:

@@ -244,11 +244,6 @@ def _variances(cov: FloatArray) -> FloatArray:
     return np.clip(np.diagonal(cov, axis1=1, axis2=2), 0.0, None)
 
 
-def pose_entry(estimate: Estimate, scale: Scale) -> dict[str, Any]:
-    """The same of one; raises KeyError where it is no pose."""
-    return pose_columns([estimate], scale).entry(estimate.name)
-
-
 def pair_sigmas(rotations: FloatArray, covs: FloatArray, factor: float = 1.0) -> dict[str, FloatArray]:
     """Sigmas (n, 3) of n ``b_from_a`` times factor: rotation about the axes of a, translation along the axes of b.
 

@@ -54,7 +54,7 @@ class BodyError(Exception):
     """What is asked is not understood."""
 
 
-async def json_of(request: Request) -> Any:
+async def json_of(request: Request) -> object:
     """The body of a request; raises BodyError."""
     body = await request.body()
     try:
@@ -66,7 +66,7 @@ async def json_of(request: Request) -> Any:
 class Body:
     """An object by its keys; every method raises BodyError for what is not of the kind it gives."""
 
-    def __init__(self, values: Any) -> None:
+    def __init__(self, values: object) -> None:
         if not isinstance(values, dict):
             raise BodyError("expected an object")
         self._values = values
@@ -118,7 +118,7 @@ class Body:
         return names
 
 
-def _plan(bench: "Workbench", body: Body, _: Any) -> "Told":
+def _plan(bench: "Workbench", body: Body, _: object) -> "Told":
     from survey.planning.job import PlanRequest
 
     wanted = tuple(body.text("wanted").split())
@@ -155,7 +155,7 @@ JOBS: Mapping[str, Asked] = {
 """The jobs of a page by their names, with what it asks of them."""
 
 
-def _definition(bench: "Workbench", body: Body, _: Request) -> Any:
+def _definition(bench: "Workbench", body: Body, _: Request) -> "Changes | None":
     """One of: {group, factor}, {parameter, treatment}, {datum: kind, points, stations}."""
     base = body.base()
     if body.text("group"):
@@ -165,7 +165,7 @@ def _definition(bench: "Workbench", body: Body, _: Request) -> Any:
     return bench.set_datum(body.text("datum"), body.names("points"), body.names("stations"), base)
 
 
-def _exclusions(bench: "Workbench", body: Body, _: Request) -> Any:
+def _exclusions(bench: "Workbench", body: Body, _: Request) -> "Changes | None":
     excluded, included = body.changes()
     return bench.decide(exclude=excluded, include=included, reason=body.text("reason"), author=body.text("author"),
                         base=body.base())  # fmt: skip
@@ -187,7 +187,7 @@ DECISIONS: Mapping[str, Asked] = {
 """By their addresses; what they answer is the state after them."""
 
 
-def told_changes(changes: "Changes | None", most: int | None) -> dict[str, Any] | None:
+def told_changes(changes: "Changes | None", most: int | None) -> dict[str, object] | None:
     """What an adjustment changed, its summaries in the language that is spoken."""
     from survey.workbench.views.project import in_words
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from adjust.model.errors import SurveyError
 from survey.folder.replacing import changing, replace_parts
@@ -60,7 +60,7 @@ class Deciding(Resident):
             self._done, self._undone = [], []
             return changes
 
-    def preview(self, *names: str, excluded: bool = True) -> dict[str, Any]:
+    def preview(self, *names: str, excluded: bool = True) -> dict[str, object]:
         """What leaving ``names`` out (or taking them back) means, before it is done. Raises SurveyError."""
         now = self.situation
         observed = Observed(now.everything.survey, now.everything.spots)

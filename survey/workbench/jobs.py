@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from gtsam import Pose3
@@ -150,7 +150,7 @@ def _positions(adjustment: Adjustment) -> dict[str, FloatArray]:
     return {"/".join(n): np.asarray(v.translation() if isinstance(v, Pose3) else v) for n, v in found.items()}
 
 
-def _beacons(known: "Beacons") -> dict[str, Any]:
+def _beacons(known: "Beacons") -> dict[str, object]:
     """What a path is drawn beside where there is no solution."""
     from survey.report.scene import Scene, Spot, drawn_values
 

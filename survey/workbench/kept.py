@@ -3,7 +3,6 @@
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -28,7 +27,7 @@ _LAYOUT = Layout(
 class Kept:
     """A solution as it was written: summary, warnings, limits of the chi-square test of image points and of |w|."""
 
-    summary: Mapping[str, Any]
+    summary: Mapping[str, object]
     warnings: Sequence[str]
     image_limit: float
     w_limit: float

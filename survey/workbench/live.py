@@ -5,7 +5,7 @@ import json
 import socket
 import threading
 from contextlib import suppress
-from typing import Any, Protocol
+from typing import Protocol
 
 from starlette.types import ASGIApp
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -22,21 +22,21 @@ class Live:
     STANDING = ("state", "folder")
 
     def __init__(self) -> None:
-        self._queues: set[asyncio.Queue[dict[str, Any] | None]] = set()
+        self._queues: set[asyncio.Queue[dict[str, object] | None]] = set()
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._standing: dict[str, dict[str, Any]] = {}
+        self._standing: dict[str, dict[str, object]] = {}
         self.joined = asyncio.Event()
 
     def begin(self) -> None:
         """Belong to the loop that runs."""
         self._loop = asyncio.get_running_loop()
 
-    def post(self, message: dict[str, Any] | None) -> None:
+    def post(self, message: dict[str, object] | None) -> None:
         """Send to all; None ends them."""
         if self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._put, message)
 
-    def _put(self, message: dict[str, Any] | None) -> None:
+    def _put(self, message: dict[str, object] | None) -> None:
         if message is not None and message["type"] in self.STANDING:
             self._standing[message["type"]] = message
         for queue in self._queues:
@@ -45,7 +45,7 @@ class Live:
     async def serve(self, page: WebSocket) -> None:
         """Until the page or the server goes."""
         await page.accept()
-        queue: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
+        queue: asyncio.Queue[dict[str, object] | None] = asyncio.Queue()
         for message in self._standing.values():
             queue.put_nowait(message)
         self._queues.add(queue)

@@ -70,7 +70,7 @@ def etag(known: DetectedImage | None, path: Path, size: int | None) -> str:
     return f'"{hashlib.sha256(f"{text} {size}".encode()).hexdigest()[:32]}"'
 
 
-def found_in(report: "ImageReport") -> dict[str, Any]:
+def found_in(report: "ImageReport") -> dict[str, object]:
     """What detection found in an image, for a page that shows its picture: size, up to ``_MOST_SHOWN`` places (px)."""
     found = [d.uv for d in report.detections.values()] + ([report.spots.uv] if report.spots is not None else [])
     uv = np.concatenate([*found, np.zeros((0, 2))])

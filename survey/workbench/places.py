@@ -11,7 +11,7 @@ from adjust.model.survey import FloatArray, Point
 from survey.solution.frames import AdjustedFrames
 
 
-def refs_of(item: Any) -> list[FrameRef | PositionRef]:
+def refs_of(item: object) -> list[FrameRef | PositionRef]:
     """The frames and positions that a reading is about."""
     values = (getattr(item, name, None) for name in ("positions", "at", "to", "a", "b", "second", "position", "frame"))
     return [one for value in values for one in (value if isinstance(value, tuple) else (value,)) if one is not None]

@@ -144,7 +144,7 @@ def columns(
             "du": rows.residuals[:, 0], "dv": rows.residuals[:, 1], "w": np.sqrt(rows.test),
             "redundancy": rows.redundancy.mean(axis=1), "used": rows.used.astype(np.uint8), "why": rows.why,
         }  # fmt: skip
-    header: dict[str, Any] = {"version": version, "limit": limit, "layout": layout, "whole": whole}
+    header: dict[str, object] = {"version": version, "limit": limit, "layout": layout, "whole": whole}
     if whole:
         said, seen = _seen(rows)
         header, arrays = header | said, seen | arrays
@@ -169,7 +169,7 @@ def _small(values: IntArray) -> npt.NDArray[np.unsignedinteger[Any]]:
     return values.astype("u1" if most < 1 << 8 else "<u2" if most < 1 << 16 else "<u4")
 
 
-def _seen(rows: PointRows) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
+def _seen(rows: PointRows) -> tuple[dict[str, object], dict[str, npt.NDArray[Any]]]:
     """What was observed, whatever the solution: names, and the columns of places and sigmas (these of so many rows)."""
     blocks, sizes = rows.survey.image_blocks, np.diff(rows.ptr)
     uv = np.concatenate([*(b.uv for b in blocks), np.zeros((0, 2))])
@@ -189,13 +189,13 @@ def _seen(rows: PointRows) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]
     }, arrays  # fmt: skip
 
 
-def reading_rows(survey: Survey, left: Hits, adjustment: Adjustment | None, limit: float) -> list[dict[str, Any]]:
+def reading_rows(survey: Survey, left: Hits, adjustment: Adjustment | None, limit: float) -> list[dict[str, object]]:
     """Every observation that is no image point, one entry per component, also those that take no part.
 
     survey: with all of them. left: what people left out of it. limit: of |w|. Values in the units shown.
     """
     found = {} if adjustment is None else {name_of_residual(o): o for o in adjustment.other_residuals}
-    out: list[dict[str, Any]] = []
+    out: list[dict[str, object]] = []
     observed = Observed(survey, ())
     gone = set(observed.names(left))
     for name, places in observed.readings.items():
@@ -214,7 +214,7 @@ def reading_rows(survey: Survey, left: Hits, adjustment: Adjustment | None, limi
     return out
 
 
-def _component(o: ObservationResidual, k: int, limit: float) -> dict[str, Any]:
+def _component(o: ObservationResidual, k: int, limit: float) -> dict[str, object]:
     unit, factor = unit_for_people(o.components[k], o.units[k])
     sigma_unit, sigma_factor = sigma_unit_for_people(o.units[k])
     values = {"observed": o.observed[k] * factor, "adjusted": o.adjusted[k] * factor,
@@ -224,6 +224,6 @@ def _component(o: ObservationResidual, k: int, limit: float) -> dict[str, Any]:
     return {"component": o.components[k], "unit": unit, "sigma_unit": sigma_unit, "kind": o.kind, **plain(values)}
 
 
-def _joins(item: Any) -> list[str]:
+def _joins(item: object) -> list[str]:
     """What a reading joins, as tables write it."""
     return [frame_text(one) if isinstance(one, FrameRef) else position_text(one) for one in refs_of(item)]

@@ -19,7 +19,7 @@ from capture.session.folder import session_lock
 from capture.session.journal import read_journal
 from capture.session.progress import Progress
 from capture.session.run import run_plan
-from capture.session.run_session import SessionStoppedError
+from capture.session.taking import SessionStoppedError
 from survey.folder.locking import SESSION_LOCK, holder_of
 from tests.capture.session_runs import processes, require_complete, run_to_end, write_plan
 from tests.capture.table_server import table_server

@@ -318,6 +318,15 @@ def _rounds(path: Path) -> object:
     return read(path)
 
 
+def _rows(path: Path) -> object:
+    """As detection keeps them: every image's hash, who is marked, and the text again."""
+    from survey.project.tables.image_points import IMAGE_POINTS
+    from survey.project.tables.rows import read_rows
+
+    found = read_rows(path.parent, IMAGE_POINTS)
+    return [found.digest(key) for key in found.images], found.marked_unused(), found.text()
+
+
 READERS: dict[str, Reader] = {
     "definition": Reader(
         lambda: [_projects()[0]["survey.toml"], _projects()[0]["survey.toml"] + _ALIGN, _projects()[1]["survey.toml"]],
@@ -326,6 +335,7 @@ READERS: dict[str, Reader] = {
     "points-file": Reader(lambda: [_projects()[0]["sheet_points.csv"]], _points),
     **_tables(),
     "table-by-arrow": Reader(lambda: [_projects()[0]["observations/image_points.csv"]], _by_arrow),
+    "table-rows": Reader(lambda: [_projects()[0]["observations/image_points.csv"]], in_file("image_points.csv", _rows)),
     "table-in-pieces": Reader(lambda: [_quoted()], _in_pieces, dictionary=[b'"', b'""', b'"\n']),
     "image": Reader(_images, _image, is_text=False),
     "solution": Reader(lambda: [adjusted()["results/solution.json"]], _results("solution.json")),

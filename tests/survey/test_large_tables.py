@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from adjust.model.errors import SurveyError
 from survey.project.tables import arrow as arrow_columns
 from survey.project.tables import files as table_reading
-from survey.project.tables.arrow import csv_columns, csv_rows
+from survey.project.tables.arrow import csv_bytes, csv_columns
 from survey.project.tables.files import read_table, write_table
 from survey.project.tables.image_points import _distinct, one_code
 from survey.project.tables.reading import Layout, Table, TextColumn
@@ -126,14 +126,14 @@ def test_arrow_writes_what_the_csv_module_writes(numbers: list[float], words: li
     out = io.StringIO(newline="")
     cells = [repr(x) if math.isfinite(x) else "" for x in numbers]
     csv.writer(out, lineterminator="\n").writerows(zip(texts, cells, texts, strict=True))
-    assert csv_rows({"a": texts, "x": finite, "b": coded}).decode() == out.getvalue()
+    assert csv_bytes({"a": texts, "x": finite, "b": coded}).decode() == out.getvalue()
 
 
 def test_arrow_writes_numbers_of_every_size_as_python_does() -> None:
     rng = np.random.default_rng(5)
     powers = np.array([float(f"1e{k}") for k in range(-320, 308)])
     values = np.concatenate([powers, np.nextafter(powers, 0), powers * rng.uniform(1, 10, powers.size), -powers])
-    assert csv_rows({"x": values, "y": values}).decode().splitlines() == [f"{v!r},{v!r}" for v in values.tolist()]
+    assert csv_bytes({"x": values, "y": values}).decode().splitlines() == [f"{v!r},{v!r}" for v in values.tolist()]
 
 
 @pytest.mark.slow

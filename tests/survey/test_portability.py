@@ -2,6 +2,7 @@
 
 import ctypes
 import errno
+import fcntl
 import os
 import signal
 import time
@@ -47,12 +48,15 @@ def lab(tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("has_locks", [True, False])
+@pytest.mark.parametrize("lacking", ["nothing", "module", "call"])
 def test_a_project_is_adjusted_twice(
-    lab: Path, elsewhere: None, has_locks: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    lab: Path, elsewhere: None, lacking: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    if not has_locks:
+    """With locks, where the module for them is missing, and where it is there without the call that locks."""
+    if lacking == "module":
         monkeypatch.setattr(locking, "fcntl", None)
+    elif lacking == "call":
+        monkeypatch.delattr(fcntl, "flock")
     assert main(["adjust", str(lab), "--quiet"]) == 0
     before = (lab / "results" / "residuals_other.csv").read_bytes()
     (lab / "results" / "mine.txt").write_text("the only copy")

@@ -20,7 +20,7 @@ from survey.report.language import esc
 from survey.report.page import report_html
 from survey.report.picture import HEIGHT, WIDTH, perspective, pictures, plan
 from survey.report.scene import Scene, Spot, enlargement, scene_of
-from survey.report.sections import observations, unknowns
+from survey.report.sections import every_observation, unknowns
 from survey.report.terminal import summary_text
 from survey.solution.dictionary import RunInfo, solution_dict
 from survey.solution.quantities import scale_of
@@ -396,7 +396,7 @@ def test_all_observations_are_in_the_page_with_what_was_observed(page: str, adju
     assert data["rows"] == n
     columns = [c["values"] if "values" in c else [c["names"][k] for k in c["codes"]] for c in data["columns"]]
     assert {len(c) for c in columns} == {n}
-    by_name = dict(zip(observations.COLUMNS, columns, strict=True))
+    by_name = dict(zip(every_observation.COLUMNS, columns, strict=True))
     kind, where, point, component = (by_name[name] for name in ("Kind", "Where", "Point", "Component"))
     observed, sigma, adjusted, residual = (by_name[name] for name in ("Observed", "σ", "Adjusted", "Residual"))
     block = adjustment.survey.image_blocks[5]
@@ -440,7 +440,7 @@ def test_the_largest_are_those_of_a_whole_sorting() -> None:
 @pytest.mark.slow
 def test_the_page_grows_no_further_with_the_observations() -> None:
     small, large = (lab_adjustment(Lab(n_epochs=n, n_beacons=60)) for n in (150, 600))
-    assert 2 * len(small.image_residuals.test) > observations.MOST
+    assert 2 * len(small.image_residuals.test) > every_observation.MOST
     pages = [report_html(made, RUN) for made in (small, large)]
     assert len(pages[1]) < 1.1 * len(pages[0]) < 3e6
     n = markup.count(2 * len(large.image_residuals.test) + sum(len(o.components) for o in large.other_residuals))
@@ -451,7 +451,7 @@ def test_rows_shown_are_the_same_with_and_without_the_others(adjustment: Adjustm
     """The worst rows of a page that is cut are the first of the one that is not."""
     whole = json.loads(re.search(r'id="all-data">(.*?)</script>', page, re.S)[1])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(observations, "MOST", 40)
+        patch.setattr(every_observation, "MOST", 40)
         cut = report_html(adjustment, RUN)
     part = json.loads(re.search(r'id="all-data">(.*?)</script>', cut, re.S)[1])
     assert part["rows"] == 40

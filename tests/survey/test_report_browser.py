@@ -16,7 +16,7 @@ from survey.report import page as printing
 from survey.report.anchors import anchor
 from survey.report.drawing import DARK
 from survey.report.page import report_html
-from survey.report.sections import observations
+from survey.report.sections import every_observation
 from survey.solution.dictionary import RunInfo
 from tests.browsing import CONTRAST, INKED, Page, asked, need_browser
 from tests.survey.accessible import FAULTS
@@ -24,7 +24,7 @@ from tests.survey.adjustments import Lab, lab_adjustment
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 RUN = RunInfo("lab", "Full lab", {"survey.toml": "12ab"}, {"alpha": 0.05}, {"labsurvey": "0.1.0"}, "2026-01-02")
-SHOWN = (*observations.COLUMNS[:3], "state", *observations.COLUMNS[3:])
+SHOWN = (*every_observation.COLUMNS[:3], "state", *every_observation.COLUMNS[3:])
 COMPONENT, W, OBSERVED = (SHOWN.index(name) for name in ("Component", "w", "Observed"))
 PHONE = 390
 

@@ -24,7 +24,7 @@ from survey.simulate import head_on_table
 from survey.solution.covariances import covariance_npz, read_estimates
 from survey.solution.dictionary import RunInfo, solution_dict
 from survey.solution.frames import AdjustedFrames, table_from_mount
-from survey.solution.quantities import ellipsoid, key_of, pose_entry, scale_of, vector_entry
+from survey.solution.quantities import ellipsoid, key_of, pose_columns, scale_of, vector_entry
 from survey.solution.records import Form, Records, solution_json
 from survey.solution.residual_tables import image_residuals_csv, image_residuals_parquet, other_residuals_csv
 from survey.solution.statistics import statistics_of
@@ -59,7 +59,7 @@ def test_sigmas_of_a_translation_are_turned_into_the_left_frame(adjustment: Adju
     estimate = pose_estimate(
         Pose3(Rot3.Rz(np.pi / 2), (1, 2, 3)), [1 * ARCSEC, 2 * ARCSEC, 3 * ARCSEC, 1e-3, 2e-3, 3e-3]
     )
-    entry = pose_entry(estimate, scale_of(adjustment, "a_priori"))
+    entry = pose_columns([estimate], scale_of(adjustment, "a_priori")).entry(estimate.name)
     # x of the station points along y of the world: its 1 mm becomes the sigma of y
     np.testing.assert_allclose(entry["sigma_translation_mm"], (2, 1, 3), rtol=1e-12)
     np.testing.assert_allclose(entry["sigma_rotation_arcsec"], (1, 2, 3), rtol=1e-12)
@@ -73,7 +73,7 @@ def test_quaternion_and_euler_angles_agree_with_scipy(adjustment: Adjustment, xy
     # z, y, x intrinsic: R = Rz Ry Rx
     expected = Rotation.from_euler("ZYX", xyz_deg[::-1], degrees=True)
     estimate = pose_estimate(Pose3(Rot3(expected.as_matrix()), np.zeros(3)), [1.0] * 6)
-    entry = pose_entry(estimate, scale_of(adjustment, "a_priori"))
+    entry = pose_columns([estimate], scale_of(adjustment, "a_priori")).entry(estimate.name)
     np.testing.assert_allclose(entry["rotation_euler_xyz_deg"], xyz_deg, atol=1e-9)
     xyzw = expected.as_quat(canonical=True)
     np.testing.assert_allclose(entry["rotation_quaternion_wxyz"], xyzw[[3, 0, 1, 2]], atol=1e-12)

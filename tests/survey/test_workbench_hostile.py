@@ -13,11 +13,12 @@ import pytest
 from survey.cli import main
 from survey.examples import write_example
 from survey.folder.locking import LOCK, FileLock
+from survey.workbench.addresses import WAYS
 from survey.workbench.session import Workbench
 from tests.browsing import opened
 from tests.survey.test_workbench import exclusions
 from tests.survey.test_workbench_browser import VIEWS
-from tests.survey.test_workbench_server import HERE, TOKEN, exclude, image_of, page, post, ways
+from tests.survey.test_workbench_server import HERE, TOKEN, exclude, image_of, page, post
 
 ODD = '"><img src=x onerror=window.ran=1><script>window.ran=1</script>'
 MANY = "9" * 5000  # more digits than Python makes a number of
@@ -62,14 +63,14 @@ def test_no_address_answers_another_site(served, headers):
     """Rebound names, foreign and no origins, requests that a form of another page can send; and no token."""
     mine, client = served
     with nothing_written(mine):
-        for way in ways(mine):
+        for way in WAYS:
             client.cookies.clear()
             answer = client.request(way.method, address_of(way), headers=headers, json={} if way.changes else None)
             is_picture = way.path.startswith("/api/image/") and "Cookie" in headers
             assert answer.status_code == (404 if is_picture else 403), way.path
             assert "access-control-allow-origin" not in answer.headers
         form = {"Content-Type": "application/x-www-form-urlencoded"}
-        for way in (w for w in ways(mine) if w.method == "POST"):
+        for way in (w for w in WAYS if w.method == "POST"):
             assert client.post(address_of(way), content="base=1", headers=HERE | form).status_code == 415, way.path
             assert client.options(address_of(way), headers=headers).status_code in (403, 405)
 
@@ -92,7 +93,7 @@ BODIES = (
 def test_whatever_a_body_says_is_answered_in_a_line(mine, body):
     """Nothing but what asks for nothing may pass; no server error, and no file changes."""
     with page(mine) as client, nothing_written(mine.parent):
-        for way in (w for w in ways(mine) if w.method == "POST" and "save" not in w.calls and "batch" not in w.calls):
+        for way in (w for w in WAYS if w.method == "POST" and "save" not in w.calls and "batch" not in w.calls):
             answer = client.post(address_of(way), content=body.encode(), headers=HERE | KIND)
             allowed = (400, 404, 409) if way.changes else (200, 400, 409)
             assert answer.status_code in allowed, f"{way.path} {answer.status_code} {answer.text[:300]}"
@@ -109,7 +110,7 @@ def test_whatever_an_address_asks_is_answered_in_a_line(served, query):
     mine, client = served
     client.cookies.clear()
     with nothing_written(mine):
-        for way in (w for w in ways(mine) if w.method == "GET"):
+        for way in (w for w in WAYS if w.method == "GET"):
             answer = client.get(f"{address_of(way)}?{query}", headers=HERE)
             assert answer.status_code in (200, 404, 409), way.path
         for path in (f"/api/runs/{MANY}/restore", f"/api/runs/{MANY}/pin"):

@@ -21,6 +21,7 @@ from websockets.sync.client import connect
 from adjust.model.errors import SurveyError
 from survey.cli import main
 from survey.report.language import message, speaking
+from survey.workbench.addresses import WAYS
 from survey.workbench.live import Listening
 from survey.workbench.pages.beginning import Beginning
 from survey.workbench.server import WEB, Server
@@ -128,10 +129,6 @@ def test_bodies_that_are_too_long_or_no_sense(mine):
         assert not exclusions(mine)
 
 
-def ways(folder):
-    return Server(Workbench(folder), TOKEN).ways()
-
-
 @pytest.mark.slow
 def test_reading_only_allows_what_changes_no_file_and_nothing_else(mine, tmp_path):
     """Every address is asked; those that say that they change nothing with what makes them work."""
@@ -141,7 +138,7 @@ def test_reading_only_allows_what_changes_no_file_and_nothing_else(mine, tmp_pat
               "/api/adjust": {"mode": "cold"}}  # fmt: skip
     files = {p: p.read_bytes() for at in (mine, other) for p in at.rglob("*") if p.is_file()}
     with page(mine, read_only=True) as client:
-        for way in ways(mine):
+        for way in WAYS:
             path = way.path.replace("{number:int}", "1").replace("{camera}/{epoch}", image_of(mine))
             path = path.replace("{camera}", "left").replace("{part}", "weak").replace("{name}", "none")
             if way.method == "GET":
@@ -156,15 +153,14 @@ def test_reading_only_allows_what_changes_no_file_and_nothing_else(mine, tmp_pat
 
 def test_every_address_is_a_function_of_the_python_interface(mine):
     """And what the scripts of the page ask for is an address."""
-    found = ways(mine)
-    for way in found:
+    for way in WAYS:
         for name in way.calls:
             assert name in vars(Workbench(mine)) or inspect.getdoc(getattr(Workbench, name)), name
-    assert {"state", "exclude", "undo", "save", "plan", "detect"} <= {name for way in found for name in way.calls}
+    assert {"state", "exclude", "undo", "save", "plan", "detect"} <= {name for way in WAYS for name in way.calls}
     table = re.findall(r"(?m)^\| .+ \| `(\w+ /api/\S+)` \| (.+) \|$", PYTHON.read_text(encoding="utf-8"))
     assert {address: tuple(re.findall(r"`(\w+)`", names)) for address, names in table} == {
-        f"{way.method} {way.path}": way.calls for way in found if way.calls}  # fmt: skip
-    known = {re.sub(r"\{.*", "", way.path.removeprefix("/api/")).split("/")[0] for way in found}
+        f"{way.method} {way.path}": way.calls for way in WAYS if way.calls}  # fmt: skip
+    known = {re.sub(r"\{.*", "", way.path.removeprefix("/api/")).split("/")[0] for way in WAYS}
     asked = {name for p in WEB.glob("*.js") for name in re.findall(r'\b(?:get|post)\([`"]([a-z_]+)', p.read_text())}
     assert len(asked) > 10
     assert asked <= known
@@ -326,7 +322,7 @@ def test_what_there_is_is_shown_while_the_first_solution_is_waited_for(mine, kep
             stream.write("\n")  # other inputs than those of the results
     bench, seen = Workbench(mine), threading.Event()
     server = Server(bench, TOKEN)
-    server.patience_s = 0.0  # no page joins here
+    server.work.patience_s = 0.0  # no page joins here
     bench.watch = lambda _step, _omega: seen.wait(SECONDS)
     with TestClient(server.app(), base_url=BASE) as client:
         state = client.get("/api/state", headers=HERE).json()
@@ -423,10 +419,10 @@ def test_the_page_comes_before_the_project_is_read(mine):
     with TestClient(server.app(), base_url=BASE) as client, ThreadPoolExecutor(1) as other:
         state = other.submit(client.get, "/api/state", headers=HERE)
         assert all(client.get(f"/{name}").status_code == 200 for name in ("", "app.js", "en.json"))
-        assert not any((server.opened.done(), state.done()))
+        assert not any((server.work.opened.done(), state.done()))
         go_on.set()
         assert state.result(20.0).json()["tree"]["cameras"]
-    assert server.bench.folder == mine
+    assert server.work.bench.folder == mine
 
 
 def test_a_page_that_is_there_already_says_why_a_project_cannot_be_opened(tmp_path):
@@ -435,9 +431,9 @@ def test_a_page_that_is_there_already_says_why_a_project_cannot_be_opened(tmp_pa
     with TestClient(server.app(), base_url=BASE) as client:
         answer = client.get("/api/state", headers=HERE)
         assert (answer.status_code, "survey.toml:1: not valid TOML" in answer.json()["error"]) == (409, True)
-        assert server.told.wait(5.0)
+        assert server.work.told.wait(5.0)
     with pytest.raises(SurveyError, match="not valid TOML"):
-        server.opened.result()
+        server.work.opened.result()
 
 
 def test_messages_are_in_the_language_that_is_asked_for(mine):
@@ -494,7 +490,7 @@ def test_whatever_is_asked_in_german_nothing_is_said_in_english(mine):
     shutil.copy(mine / "survey.toml", mine.parent / "new")
     german, answers = HERE | {"X-Language": "de"}, []
     with page(mine) as client:
-        for way in ways(mine):
+        for way in WAYS:
             if way.method == "GET":
                 path = way.path.replace("{camera}/{epoch}", image_of(mine)).replace("{camera}", "left")
                 for part in PARTS if "{part}" in path else ("",):

@@ -18,6 +18,7 @@ from adjust.spatial.rigid_motions import Motions
 
 _STEP_S = 0.02  # of the comparison of clocks
 _HALF_S = 0.1  # turning speed over twice this time
+_PARTS = 8  # of the time in common, each with an offset of its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +64,7 @@ class TimeOffset:
     drift_sigma_per_s: float
 
 
-def time_offset(a: Trajectory, b: Trajectory, n_parts: int = 8) -> TimeOffset:
+def time_offset(a: Trajectory, b: Trajectory) -> TimeOffset:
     """Offset of b's clock against a's by the turning speeds of both, over all shifts with half the time in common.
 
     Raises SurveyError where the turning speeds do not agree at any shift.
@@ -81,11 +82,11 @@ def time_offset(a: Trajectory, b: Trajectory, n_parts: int = 8) -> TimeOffset:
             f"eyes {a.eye.frame_id} and {b.eye.frame_id}: their turning speeds agree at no time offset (correlation "
             f"{correlation:.2f}); they are not on one rigid body, or it hardly turned"
         )
-    parts = np.array([_refined(a, b, part, best) for part in np.array_split(times, n_parts)])
-    centre = np.array([part.mean() for part in np.array_split(times, n_parts)])
+    parts = np.array([_refined(a, b, part, best) for part in np.array_split(times, _PARTS)])
+    centre = np.array([part.mean() for part in np.array_split(times, _PARTS)])
     line, cov = np.polyfit(centre - centre.mean(), parts, 1, cov=True)
     return TimeOffset(
-        best, float(parts.std(ddof=1) / np.sqrt(n_parts)), correlation, float(line[0]), float(np.sqrt(cov[0, 0]))
+        best, float(parts.std(ddof=1) / np.sqrt(_PARTS)), correlation, float(line[0]), float(np.sqrt(cov[0, 0]))
     )
 
 

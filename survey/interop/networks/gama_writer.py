@@ -11,7 +11,7 @@ from adjust.model.observations import Reading
 from adjust.model.survey import FloatArray, Point, Survey
 from survey.interop.networks.draft import AXES
 from survey.interop.networks.foreign import CC, GON, MM
-from survey.interop.networks.gama import KINDS
+from survey.interop.networks.gama_readings import KINDS
 from survey.interop.networks.values import NetworkValues, readings_of, triples_of
 from survey.project.tables.terrestrial import ANGLES
 

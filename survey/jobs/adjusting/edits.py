@@ -1,7 +1,7 @@
 """The edits of a hypothesis as texts of the project's files: everything that is not concerned stays to the letter."""
 
-import csv
-from collections.abc import Iterator, Mapping, Sequence
+import io
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -21,7 +21,7 @@ from adjust.diagnosis.hypothesis import (
 )
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
-from survey.folder.text import csv_text, read_text
+from survey.folder.text import csv_rows, csv_text, read_text
 from survey.folder.units import from_si, to_si
 from survey.project.declared.editing import with_product, with_value
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
@@ -107,31 +107,29 @@ def _edited(path: Path, text: str, edit: Edit, chosen: Hypothesis) -> str:
             raise SurveyError(f"{path}: {error}") from error
     if isinstance(edit, LeaveOut):
         raise TypeError("exclusions are rows of their own table")
-    return "".join(_table(path, text, edit, chosen))
+    return _table(path, text, edit, chosen)
 
 
-def _table(path: Path, text: str, edit: TableEdit, chosen: Hypothesis) -> Iterator[str]:
-    """The lines of a table with its rows changed; those that are not concerned as they are."""
-    lines = text.splitlines(keepends=True)
-    names = [name.strip() for name in next(csv.reader(lines[:1]), [])]
+def _table(path: Path, text: str, edit: TableEdit, chosen: Hypothesis) -> str:
+    """A table with its rows changed; the lines of those that are not concerned as they are."""
+    lines, rows = io.StringIO(text, newline="").readlines(), csv_rows(path, text)
+    names = [name.strip() for name in next(rows, (1, []))[1]]
     wanted, where = _columns(edit)
     if missing := [name for name in (*wanted, *where) if name not in (*names, _NUMBERED)]:
         raise SurveyError(f"{path}:1: the column {missing[0]!r} is missing; {chosen.change}")
-    yield lines[0]
-    number = 0
-    for at, line in enumerate(lines[1:], 2):
-        row = dict(zip(names, next(csv.reader([line]), []), strict=False))
-        number += bool(row)
-        if row and _NUMBERED in where:
+    for number, (line, cells) in enumerate(rows, 1):
+        row = dict(zip(names, cells, strict=False))
+        if _NUMBERED in where:
             row[_NUMBERED] = row.get(_NUMBERED) or f"r{number}"
-        if not row or any(row[column] not in values for column, values in where.items()):
-            yield line
+        if any(row[column] not in values for column, values in where.items()):
             continue
         try:
             new = row | _changed(row, edit)
         except ValueError as error:
-            raise SurveyError(f"{path}:{at}: {', '.join(wanted)}: a number is missing; {chosen.change}") from error
-        yield _row([new.get(name, "") for name in names], line) if new != row else line
+            raise SurveyError(f"{path}:{line}: {', '.join(wanted)}: a number is missing; {chosen.change}") from error
+        if new != row:
+            lines[line - 1] = _row([new.get(name, "") for name in names], lines[line - 1])
+    return "".join(lines)
 
 
 def _columns(edit: TableEdit) -> tuple[tuple[str, ...], Mapping[str, frozenset[str]]]:

@@ -23,13 +23,13 @@ from survey.solution.quantities import ARCSEC_PER_RAD, Scale, sigmas_in
 MOST_PAIRS = 400  # its equations are dense: 3 corrections a pair, 9 equations a loop
 
 
-def published_dict(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
+def published_dict(adjustment: Adjustment, scale: Scale) -> dict[str, object]:
     """``head`` and ``pairs`` of what was run, ``not_run`` with the reason for the others; plain values.
 
     Sigmas are scaled as those of the joint adjustment. Raises SurveyError naming what is missing where neither method
     can be run.
     """
-    out: dict[str, Any] = {}
+    out: dict[str, object] = {}
     reasons: dict[str, str] = {}
     for name, run in (("head", _head), ("pairs", _pairs)):
         try:
@@ -42,11 +42,11 @@ def published_dict(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
             f"Steps for a head on a table: {reasons['head']}\nIteration on measured pairs: {reasons['pairs']}\n"
             "Adjust without --method published, or add what is missing"
         )
-    found: dict[str, Any] = plain(out | {"not_run": reasons})
+    found: dict[str, object] = plain(out | {"not_run": reasons})
     return found
 
 
-def _head(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
+def _head(adjustment: Adjustment, scale: Scale) -> dict[str, object]:
     found = compare_head(adjustment)
     entries = {"/".join(pose.name): _components(pose, scale.factor) for pose in found.poses}
     return {"main_camera": found.main_camera, "notes": list(found.notes), "poses": entries}
@@ -74,7 +74,7 @@ def _components(pose: ComparedPose, factor: float) -> dict[str, Any]:
     return out
 
 
-def _pairs(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
+def _pairs(adjustment: Adjustment, scale: Scale) -> dict[str, object]:
     used = [p for p in adjustment.survey.pairs if p.used]
     if not used:
         raise SurveyError("they need measured pairs in use: observations/pairs.csv")

@@ -35,7 +35,7 @@ from survey.project.exclusions import EXCLUSIONS_FILE, Exclusion, Name, Row, app
 from survey.project.images import Sought, sought_in
 from survey.project.project import IMAGES_FOLDER, OBSERVATIONS_FOLDER
 from survey.project.tables.image_points import IMAGE_POINTS, SPOTS, image_point_columns, spot_columns
-from survey.project.tables.rows import RowTable, row_table
+from survey.project.tables.rows import RowTable, read_rows, rows_of
 
 if TYPE_CHECKING:  # brings in OpenCV, which a folder that is detected already does without
     from survey.detection import ImageReport
@@ -81,6 +81,11 @@ class _State:
         entry = self.known.get(key)
         return entry is not None and entry.rows != "" and entry.rows != self.rows_digest(key)
 
+    def file(self, key: ImageKey) -> DetectedImage:
+        """The file of an image as it is now."""
+        path = self.definition.images[key]
+        return file_of(path, path.relative_to(self.definition.folder).as_posix())
+
     def rows_digest(self, key: ImageKey) -> str:
         """A hash of the rows of an image that belong to detection."""
         return self.points.digest(key) + self.spots.digest(key)
@@ -89,7 +94,7 @@ class _State:
 def _state(folder: Path) -> _State:
     definition = read_definition(folder)
     place = folder / OBSERVATIONS_FOLDER
-    points, spots = row_table(place, IMAGE_POINTS), row_table(place, SPOTS)
+    points, spots = read_rows(place, IMAGE_POINTS), read_rows(place, SPOTS)
     known, sought = read_detected(place), sought_in(definition)
     news = image_news(definition.images, known, {*points.images, *spots.images},
                       {key: one.digest() for key, one in sought.items()})  # fmt: skip
@@ -111,7 +116,7 @@ def detect_in(
                       None if one.spots_px is None else SpotOptions(diameter_px=one.spots_px))
         for key in wanted for one in [state.sought[key]]
     ]  # fmt: skip
-    files = {key: file_of(state.definition.images[key], _file_name(key, state)) for key in wanted}
+    files = {key: state.file(key) for key in wanted}
     dropped = _without_image(state, files, everything)
     reports = detect_images(tasks, jobs, progress, place / PICTURES if pictures else None, told)
     blocks, spots = _blocks(state.definition, reports)
@@ -134,10 +139,6 @@ def detect_in(
     same = len([key for key in state.definition.images if key not in files])
     paths, said = tuple(folder / n for n in names), defect_warnings(bad)
     return DetectOutcome(folder, tuple(reports), paths, same, tuple(state.notes), wrong, said)
-
-
-def _file_name(key: ImageKey, state: _State) -> str:
-    return state.definition.images[key].relative_to(state.definition.folder).as_posix()
 
 
 def _require_something(folder: Path, state: _State) -> None:
@@ -202,13 +203,13 @@ def _write(
     targets = {key: set(state.sought[key].targets) for key in wanted}
     gone = state.points.taken(lambda key, target: key in dropped or target in targets.get(key, ()))
     _keep_decisions(folder, place, state, gone)
-    found = row_table(None, IMAGE_POINTS, image_point_columns(blocks, state.definition.survey))
+    found = rows_of(IMAGE_POINTS, image_point_columns(blocks, state.definition.survey))
     state.points = state.points.without(gone).with_rows(found.with_cells_of(gone, "group"))
     files = {Path(OBSERVATIONS_FOLDER, "image_points.csv"): state.points.text()}
     if state.definition.spots_request is not None:
         keys = {*wanted, *dropped}
         old = state.spots.taken(lambda key, _: key in keys)
-        state.spots = state.spots.without(old).with_rows(row_table(None, SPOTS, spot_columns(spots)))
+        state.spots = state.spots.without(old).with_rows(rows_of(SPOTS, spot_columns(spots)))
         files[Path(OBSERVATIONS_FOLDER, "spots.csv")] = state.spots.text()
     # an empty table is written too: one of an earlier run must not stay behind
     for name, text in files.items():
@@ -258,10 +259,9 @@ def _known_now(
 def _given(state: _State, known: Mapping[ImageKey, DetectedImage]) -> dict[ImageKey, DetectedImage]:
     """Images that have not been looked at, with the points that they have."""
     return {
-        key: replace(file_of(path, _file_name(key, state)), status="given",
-                     n_image_points=state.points.images.get(key, 0), n_spots=state.spots.images.get(key, 0))
-        for key, path in state.definition.images.items()
-        if key not in known
+        key: replace(state.file(key), status="given", n_image_points=state.points.images[key],
+                     n_spots=state.spots.images[key])
+        for key in state.definition.images if key not in known
     }  # fmt: skip
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # brings in OpenCV, which a folder that is detected already does without
     from survey.detection import ImageReport
@@ -40,7 +40,7 @@ class DetectOutcome:
         lacking = missed(report)
         return report.status == "failed" or not lacking or not lacking <= self.wrong_sizes.keys()
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """Counts as plain values."""
         return {
             "folder": str(self.folder),

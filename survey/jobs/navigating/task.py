@@ -1,6 +1,5 @@
 """What of a project is navigated, and what it is calibrated from: station, epochs, their times, spots and readings."""
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import repeat
@@ -15,7 +14,7 @@ from adjust.model.subsets import in_use, points_read, with_points
 from adjust.model.survey import Survey
 from adjust.navigation import NavigationEpoch, Spots, head_of
 from adjust.statistics.outliers.supported import supported
-from survey.folder.text import read_text
+from survey.folder.text import csv_rows, read_text
 from survey.jobs.navigating.lenses import with_images_left
 from survey.project import Project
 
@@ -95,19 +94,7 @@ def chosen_times(epochs: Sequence[str], request: NavigateRequest) -> list[float]
         return None if step is None else [i * step for i in range(len(epochs))]
     if request.interval_s is not None:
         raise SurveyError("give either the interval between epochs or a table of their times, not both")
-    rows = list(csv.DictReader(read_text(request.times).splitlines()))
-    if not rows or not {"epoch_id", "time_s"} <= set(rows[0]):
-        raise SurveyError(f"{request.times}:1: the columns epoch_id and time_s are needed")
-    found: dict[str, float] = {}
-    for line, row in enumerate(rows, 2):
-        try:
-            value = float(row["time_s"])
-        except (TypeError, ValueError):
-            value = float("nan")
-        if not np.isfinite(value) or row["epoch_id"] in found:
-            problem = "is there twice" if row["epoch_id"] in found else f"has the time {row['time_s']!r}, give seconds"
-            raise SurveyError(f"{request.times}:{line}: epoch {row['epoch_id']!r} {problem}")
-        found[row["epoch_id"]] = value
+    found = _times(request.times)
     missing = [e for e in epochs if e not in found]
     if missing:
         raise SurveyError(f"{request.times}: no time for epoch {', '.join(missing[:5])}; add it, or leave it out")
@@ -115,6 +102,26 @@ def chosen_times(epochs: Sequence[str], request: NavigateRequest) -> list[float]
     if len(set(times)) < len(times):
         raise SurveyError(f"{request.times}: two of the epochs to navigate have the same time; times must differ")
     return times
+
+
+def _times(path: Path) -> dict[str, float]:
+    """Time (s) by epoch, from a table that has both among its columns. Raises SurveyError."""
+    (_, header), *rows = [*csv_rows(path, read_text(path))] or [(1, [""])]
+    if not rows or not {"epoch_id", "time_s"} <= set(header):
+        raise SurveyError(f"{path}:1: the columns epoch_id and time_s are needed")
+    found: dict[str, float] = {}
+    for line, cells in rows:
+        row = dict.fromkeys(header, "") | dict(zip(header, cells, strict=False))
+        epoch_id, text = row["epoch_id"], row["time_s"]
+        try:
+            seconds = float(text)
+        except ValueError:
+            seconds = float("nan")
+        if not np.isfinite(seconds) or epoch_id in found:
+            problem = "is there twice" if epoch_id in found else f"has the time {text!r}, give seconds"
+            raise SurveyError(f"{path}:{line}: epoch {epoch_id!r} {problem}")
+        found[epoch_id] = seconds
+    return found
 
 
 def require_one_time(survey: Survey, station_id: str) -> tuple[str, ...]:

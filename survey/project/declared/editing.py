@@ -13,7 +13,7 @@ from gtsam import Pose3
 
 from adjust.lenses.models import MODELS
 from adjust.model.errors import SurveyError
-from adjust.model.result import Estimate
+from adjust.model.result import Estimate, ParameterName
 from adjust.model.survey import Survey
 from survey.folder.units import from_si
 from survey.project.declared.owners import geometry_units
@@ -107,7 +107,9 @@ def _with_keys(text: str, path: Sequence[str], keys: Mapping[str, object]) -> st
     return tomlkit.dumps(document)
 
 
-def with_treatment(text: str, survey: Survey, estimates: Mapping[Any, Estimate], name: str, treatment: str) -> str:
+def with_treatment(
+    text: str, survey: Survey, estimates: Mapping[ParameterName, Estimate], name: str, treatment: str
+) -> str:
     """With a parameter ``free``, or ``held`` at its adjusted value.
 
     name: as in results, such as ``lens/X/k1``, ``lens/X``, ``point/B07``, ``station_from_camera/X``. Raises SurveyError

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -166,7 +166,7 @@ def body_sections(beams: tuple[Beam, ...], surfaces: tuple[Surface, ...]) -> lis
     sections: list[Section] = []
     for beam in beams:
         path = ("beams", beam.beam_id)
-        values: dict[str, Any] = {beam.carrier_kind: beam.carrier_id, "axis": beam.axis}
+        values: dict[str, object] = {beam.carrier_kind: beam.carrier_id, "axis": beam.axis}
         sections.append((path, values | vector_to_toml(beam.parameters, BEAM_UNITS, ".".join(path))))
     for surface in surfaces:
         path, key = ("surfaces", surface.surface_id), _REFERENCE.get(surface.kind)

@@ -1,6 +1,5 @@
 """The lens of a camera in ``survey.toml``."""
 
-from typing import Any
 
 import numpy as np
 
@@ -142,10 +141,10 @@ def _ties(node: Node, names: tuple[str, ...], free: tuple[str, ...]) -> tuple[Ti
     return tuple(ties)
 
 
-def lens_to_toml(lens: LensParameter) -> dict[str, Any]:
+def lens_to_toml(lens: LensParameter) -> dict[str, object]:
     """The table that ``read_lens`` reads."""
     names, prior = MODELS[lens.model].names, lens.prior
-    table: dict[str, Any] = {"model": lens.model, "free": list(lens.free)}
+    table: dict[str, object] = {"model": lens.model, "free": list(lens.free)}
     if lens.values is not None:
         table["values"] = dict(zip(names, lens.values.tolist(), strict=True))
     if prior is not None:
@@ -167,8 +166,8 @@ def lens_to_toml(lens: LensParameter) -> dict[str, Any]:
     )  # fmt: skip
 
 
-def _drift_to_toml(drift: LensDrift) -> dict[str, Any]:
-    out: dict[str, Any] = {"parameters": list(drift.parameters)}
+def _drift_to_toml(drift: LensDrift) -> dict[str, object]:
+    out: dict[str, object] = {"parameters": list(drift.parameters)}
     if drift.reference_temperature is not None:
         return out | {"with_temperature": True, "reference_degC": drift.reference_temperature}
     steps = () if drift.step_sigmas is None else zip(drift.parameters, drift.step_sigmas.tolist(), strict=True)

@@ -69,7 +69,7 @@ def _line_at(text: str, at: int) -> int:
     return text.count("\n", 0, at) + 1
 
 
-def _check_integers(root: "Node", value: Any, keys: KeyPath) -> None:
+def _check_integers(root: "Node", value: object, keys: KeyPath) -> None:
     """Refuse integers beyond every number that can be meant; some could not even be shown in a message."""
     if isinstance(value, dict | list):
         for key, item in value.items() if isinstance(value, dict) else enumerate(value):
@@ -260,14 +260,14 @@ class Node:
             raise self.error(f"expected {words}, found {_kind(value)}", key)
         return value
 
-    def _number(self, value: Any, *keys: str | int) -> float:
+    def _number(self, value: object, *keys: str | int) -> float:
         if value == "inf":
             return math.inf
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise self.error(f"expected a number, found {_kind(value)}", *keys)
         return float(value)
 
-    def _fill(self, array: FloatArray, value: Any, keys: tuple[str | int, ...]) -> None:
+    def _fill(self, array: FloatArray, value: object, keys: tuple[str | int, ...]) -> None:
         if array.ndim == 0:
             array[()] = self._number(value, *keys)
             return
@@ -281,7 +281,7 @@ class Node:
             self._fill(array[i : i + 1].reshape(array.shape[1:]), item, (*keys, i))
 
 
-def _kind(value: Any) -> str:
+def _kind(value: object) -> str:
     if isinstance(value, dict):
         return "a table"
     if isinstance(value, list):

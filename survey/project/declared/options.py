@@ -1,7 +1,7 @@
 """How a project is adjusted and what it demands: [adjustment], [closures], [identification], [tolerances], [align]."""
 
 from collections.abc import Iterable
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from gtsam import Rot3
@@ -90,7 +90,7 @@ def tolerance_sections(tolerances: tuple[Tolerance, ...]) -> list[Section]:
     """The inverse of :func:`read_options`; components are written in the unit that their name has in results."""
     sections: list[Section] = []
     for x in tolerances:
-        values: dict[str, Any] = in_units(of=x.of, ids=x.ids)
+        values: dict[str, object] = in_units(of=x.of, ids=x.ids)
         if x.quantity in _SAID:
             values |= in_units(**{f"expanded_{_SAID[x.quantity][0]}": x.expanded})
         else:

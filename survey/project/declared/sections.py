@@ -81,7 +81,7 @@ def option_sections(options: AdjustmentOptions, request: SpotsRequest | None, si
     return found + tolerance_sections(x.tolerances)
 
 
-def pose_to_toml(pose: PoseParameter, where: str) -> dict[str, Any]:
+def pose_to_toml(pose: PoseParameter, where: str) -> dict[str, object]:
     """The table that ``read_pose`` reads; empty for a free pose without start."""
     x = pose.value
     result = in_units(
@@ -138,7 +138,7 @@ def _station(station: Station, timed: bool) -> list[Section]:
     return [(path, values), *_epochs(path, station.epochs)]
 
 
-def _table(table: Table, sigma: FloatArray | None, timed: bool) -> dict[str, Any]:
+def _table(table: Table, sigma: FloatArray | None, timed: bool) -> dict[str, object]:
     where = f"tables.{table.table_id}"
     geometry = vector_to_toml(table.geometry, geometry_units(table.geometry.names), f"{where}.geometry")
     values = in_units(axes=table.axes, sigma_arcsec=sigma, geometry_sigma=geometry.pop("sigma", None))
@@ -164,7 +164,7 @@ def points_file(target_id: str) -> str:
     return f"{target_id}_points.csv"
 
 
-def _kind(target_id: str, kind: TargetKind) -> dict[str, Any]:
+def _kind(target_id: str, kind: TargetKind) -> dict[str, object]:
     if isinstance(kind, PointList):
         return {"kind": "points", "file": points_file(target_id)}
     if isinstance(kind, MarkerBlock):
@@ -174,7 +174,7 @@ def _kind(target_id: str, kind: TargetKind) -> dict[str, Any]:
     return {"kind": name} | in_units(**{board_key(f.name): getattr(kind, f.name) for f in fields(kind)})
 
 
-def _point(point: PointParameter) -> dict[str, Any]:
+def _point(point: PointParameter) -> dict[str, object]:
     cov = None if point.prior_cov is None or point.treatment != "prior" else _without_vague_rows(point.prior_cov)
     correlated = cov is not None and np.count_nonzero(cov) > 3
     return in_units(

@@ -6,13 +6,13 @@ import tomllib
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
 from survey.folder.units import from_si, unit_in
 
-Section = tuple[tuple[str, ...], Mapping[str, Any]]
+Section = tuple[tuple[str, ...], Mapping[str, object]]
 
 
 def toml_text(sections: Iterable[Section]) -> str:
@@ -33,7 +33,7 @@ def _string(text: str) -> str:
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")  # JSON leaves DEL as it is, TOML does not
 
 
-def _value(value: Any) -> str:
+def _value(value: object) -> str:
     if isinstance(value, str):
         return _string(value)
     if isinstance(value, bool):
@@ -50,7 +50,7 @@ def _value(value: Any) -> str:
     raise TypeError(f"no TOML for {type(value)}")
 
 
-def in_units(**values: Any) -> dict[str, Any]:
+def in_units(**values: Any) -> dict[str, object]:
     """Keys with what they hold: numbers in SI as the unit at the end of the key wants them; without what is empty."""
     found = {key: from_si(x, unit_in(key)).tolist() if isinstance(x, float | np.ndarray) else x
              for key, x in values.items()}  # fmt: skip
@@ -62,7 +62,7 @@ _INLINE_KEY = re.compile(r"([A-Za-z0-9_-]+) = ")
 _TEXTS = re.compile(r'("[^"]*")')
 
 
-def read_tables(text: str) -> dict[str, Any]:
+def read_tables(text: str) -> dict[str, object]:
     """A valid document as plain values; raises as :func:`tomllib.loads`.
 
     What looks as :func:`toml_text` writes it is read line by line, its values as those of JSON: several times as fast
@@ -75,10 +75,10 @@ def read_tables(text: str) -> dict[str, Any]:
 _NOT_PLAIN = ("\\", "\r", "\x7f", "null", "'''", '"""')  # what JSON and TOML read differently, or in several lines
 
 
-def _plain_tables(text: str) -> dict[str, Any] | None:
+def _plain_tables(text: str) -> dict[str, object] | None:
     """The same; None for a line that is anything but a header, a key with its value, or blank."""
-    root: dict[str, Any] = {}
-    below: dict[tuple[str, ...], dict[str, Any]] = {(): root}
+    root: dict[str, object] = {}
+    below: dict[tuple[str, ...], dict[str, object]] = {(): root}
     headers, table = {()}, root
     for line in text.split("\n"):
         key, equals, value = line.partition(" = ")
@@ -117,14 +117,14 @@ def _plain_value(text: str) -> Any:
     return value
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
     found = dict(pairs)
     if len(found) < len(pairs):
         raise ValueError("a key comes twice")
     return found
 
 
-def _no_constant(name: str) -> Any:
+def _no_constant(name: str) -> NoReturn:
     raise ValueError(name)
 
 

@@ -4,7 +4,6 @@ Used for instruments, the vertical, beams and surfaces.
 """
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -55,10 +54,10 @@ def read_vector(
     return VectorParameter(names, values, chosen, VectorPrior(tuple(known), mean, np.diag(sigmas**2)))
 
 
-def vector_to_toml(vector: VectorParameter, units: Units, where: str) -> dict[str, Any]:
+def vector_to_toml(vector: VectorParameter, units: Units, where: str) -> dict[str, object]:
     """The keys that ``read_vector`` reads."""
     _check(vector, where)
-    result: dict[str, Any] = {"free": vector.free}
+    result: dict[str, object] = {"free": vector.free}
     for name, value in zip(vector.names, vector.values, strict=True):
         if not np.isnan(value):
             result[key_of(name, units)] = float(from_si(value, units[name]))

@@ -104,7 +104,7 @@ def _has_blank(column: TextColumn | FloatArray) -> bool:
     return "" in column.names if isinstance(column, TextColumn) else bool(np.isnan(column).any())
 
 
-def csv_rows(columns: Columns) -> bytes:
+def csv_bytes(columns: Columns) -> bytes:
     """Rows of CSV without their header, as the csv module writes them; nan is blank."""
     import pyarrow.compute as pc
 

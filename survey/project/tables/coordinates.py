@@ -1,7 +1,7 @@
 """Tables of coordinates and of coordinate differences (baselines), with covariances within sets of rows."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -29,21 +29,12 @@ DIFFERENCES_COVARIANCE = Layout(
 )
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class _Set:
     """Rows that are one observation, in the natural order of their names. of_set: its name, blank for a single row.
 
-    entries: the covariances between them (m^2) by (row and axis, row and axis).
+    values (n, 3) m, cov (3n, 3n) m^2.
     """
-
-    of_set: str
-    rows: list[int] = field(default_factory=list)
-    entries: dict[tuple[int, int], float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
-class _Joint:
-    """A set as an observation: rows (n,), values (n, 3) m, cov (3n, 3n) m^2."""
 
     of_set: str
     rows: list[int]
@@ -57,10 +48,10 @@ def read_coordinates(table: Table, names: Names, sigmas: Sigmas) -> tuple[Coordi
     """Coordinates sorted by set and position; a row without set_id is an observation of its own."""
     texts = table.text("point_id").values()
     positions = [timed_position(text, names, table.fail(row, "point_id")) for row, text in enumerate(texts)]
-    found = _joined(table, texts, _XYZ, "coordinates", "point", sigmas)
-    found.sort(key=lambda j: (bool(j.of_set), natural_key(j.of_set)))
+    found = _sets(table, texts, _XYZ, "coordinates", "point", sigmas)
+    found.sort(key=lambda s: (bool(s.of_set), natural_key(s.of_set)))
     return tuple(
-        Coordinates(tuple(positions[row] for row in j.rows), j.values, j.cov, j.group, j.used, j.of_set) for j in found
+        Coordinates(tuple(positions[row] for row in s.rows), s.values, s.cov, s.group, s.used, s.of_set) for s in found
     )
 
 
@@ -71,83 +62,86 @@ def read_differences(table: Table, names: Names, sigmas: Sigmas) -> tuple[Coordi
         zip(table.text("from_id").values(), table.text("to_id").values(), strict=True))]  # fmt: skip
     return tuple(
         CoordinateDifferences(
-            tuple(ends[row][0] for row in j.rows), tuple(ends[row][1] for row in j.rows), j.values, j.cov,
-            j.group, j.used, j.of_set or ids[j.rows[0]],
+            tuple(ends[row][0] for row in s.rows), tuple(ends[row][1] for row in s.rows), s.values, s.cov,
+            s.group, s.used, s.of_set or ids[s.rows[0]],
         )
-        for j in _joined(table, ids, _DIFFERENCE, "coordinate_difference", "difference", sigmas)
+        for s in _sets(table, ids, _DIFFERENCE, "coordinate_difference", "difference", sigmas)
     )  # fmt: skip
 
 
-def _sets(table: Table, ids: Sequence[str], what: str) -> list[_Set]:
-    """The sets in the natural order of their first rows, with what stands in the table of covariances beside them."""
-    sets: dict[tuple[str, str], _Set] = {}
-    members: dict[tuple[str, str], tuple[_Set, int]] = {}
-    named = table.beside is None or "set_id" in table.beside.layout.ids
+def _sets(
+    table: Table, ids: Sequence[str], columns: tuple[str, ...], kind: str, what: str, sigmas: Sigmas
+) -> list[_Set]:
+    """The sets in the natural order of their first rows, with what the table of covariances beside them says.
+
+    columns: of values, sigmas and correlations; what: the rows are, for messages. Raises SurveyError for a set of
+    different groups, or whose joint covariance is none.
+    """
+    members = _members(table, ids)
+    values, own = read_triples(table, columns)
+    groups, used, scale = marks(table, kind, sigmas.scale)
+    sets = []
+    for (of_set, _), rows in members.items():
+        first = rows[0]
+        for row in rows:
+            if (groups[row], used[row]) != (groups[first], used[first]):
+                raise table.error(row, f"set {of_set!r} has different 'group' or 'used'; make them the same")
+        sets.append(_Set(of_set, rows, values[rows], _block_diagonal(own[rows]), groups[first], used[first]))
+    for one in () if table.beside is None else _with_covariances(table.beside, sets, ids, what):
+        if problem := joint_problem(one.cov):
+            correct = f"correct {table.layout.name}_covariance"
+            raise table.error(one.rows[0], f"set {one.of_set!r}: {problem}; {correct}")
+    for one in sets:
+        one.cov[:] *= scale[one.rows[0]] ** 2
+    return sets
+
+
+def _members(table: Table, ids: Sequence[str]) -> dict[tuple[str, str], list[int]]:
+    """The rows of every set, by its name, or by that of its one row. Raises SurveyError for a name that is twice."""
+    first: dict[tuple[str, str], int] = {}
+    members: dict[tuple[str, str], list[int]] = {}
     set_ids = table.text("set_id").values()
     for row in sorted(range(len(ids)), key=lambda row: natural_key(ids[row])):
         of_set, name = set_ids[row], ids[row]
-        one = sets.setdefault((of_set, "" if of_set else name), _Set(of_set))
-        first = members.setdefault((of_set if named else "", name), (one, row))[1]
-        if first != row:
-            line = table.lines[first]
+        if first.setdefault((of_set, name), row) != row:
+            line = table.lines[first[of_set, name]]
             raise table.error(row, f"point_id: {name!r} stands already in line {line}; remove one, or give set_ids")
-        one.rows.append(row)
-    if table.beside is not None:
-        _add_entries(table.beside, members, what, named)
-    return list(sets.values())
+        members.setdefault((of_set, "" if of_set else name), []).append(row)
+    return members
 
 
-def _add_entries(
-    extra: Table, members: Mapping[tuple[str, str], tuple[_Set, int]], what: str, named: bool
-) -> None:
-    """Put the covariances between different rows into their sets. named: whether the table says of which set."""
-    columns = [extra.text(name).values() for name in ("set_id", "a_id", "a_axis", "b_id", "b_axis")]
+def _block_diagonal(blocks: FloatArray) -> FloatArray:
+    """Of blocks (n, 3, 3) one matrix (3n, 3n)."""
+    n, numbers = len(blocks), np.arange(len(blocks))
+    out = np.zeros((n, 3, n, 3))
+    out[numbers, :, numbers] = blocks
+    return out.reshape(3 * n, 3 * n)
+
+
+def _with_covariances(extra: Table, sets: Sequence[_Set], ids: Sequence[str], what: str) -> list[_Set]:
+    """Put the covariances between different rows into their sets; the sets that have any."""
+    named = "set_id" in extra.layout.ids
+    places = {(one.of_set if named else "", ids[row]): (number, i)
+              for number, one in enumerate(sets) for i, row in enumerate(one.rows)}  # fmt: skip
+    names = [extra.text(name).values() for name in ("set_id", "a_id", "a_axis", "b_id", "b_axis")]
     values = to_si(extra.numbers("covariance_mm2"), "mm2").tolist()
-    for row, (of_set, a, a_axis, b, b_axis) in enumerate(zip(*columns, strict=True)):
+    given: dict[tuple[int, int, int], float] = {}
+    for row, (of_set, a, a_axis, b, b_axis) in enumerate(zip(*names, strict=True)):
         if named:
-            extra.require(row, "set_id", "set", of_set, dict.fromkeys(known for known, _ in members if known))
+            extra.require(row, "set_id", "set", of_set, dict.fromkeys(known for known, _ in places if known))
         for column, name in (("a_id", a), ("b_id", b)):
-            if (of_set, name) not in members:
-                extra.require(row, column, what, name, [known for where, known in members if where == of_set])
-        (one, i), (other, j) = members[of_set, a], members[of_set, b]
-        if one is not other:
+            if (of_set, name) not in places:
+                extra.require(row, column, what, name, [known for where, known in places if where == of_set])
+        (number, i), (other, j) = places[of_set, a], places[of_set, b]
+        if number != other:
             raise extra.error(row, f"{a!r} and {b!r} are not in one set; give them the same set_id")
         if a == b or a_axis not in tuple("xyz") or b_axis not in tuple("xyz"):
             raise extra.error(row, f"expected two different {what}s with axes x, y or z; correct a_id to b_axis")
-        key = 3 * i + "xyz".index(a_axis), 3 * j + "xyz".index(b_axis)
-        if key in one.entries or one.entries.get(key[::-1], values[row]) != values[row]:
+        p, q = 3 * i + "xyz".index(a_axis), 3 * j + "xyz".index(b_axis)
+        if (number, p, q) in given or given.get((number, q, p), values[row]) != values[row]:
             raise extra.error(row, f"the covariance of {a} {a_axis} and {b} {b_axis} is given twice; keep one")
-        one.entries[key] = values[row]
-
-
-def _joined(
-    table: Table, ids: Sequence[str], columns: tuple[str, ...], kind: str, what: str, sigmas: Sigmas
-) -> list[_Joint]:
-    """The sets as observations. columns: of values, sigmas and correlations; what: the rows are, for messages.
-
-    Raises SurveyError for a set of different groups, or whose joint covariance is none.
-    """
-    sets, (values, own) = _sets(table, ids, what), read_triples(table, columns)
-    groups, used, scale = marks(table, kind, sigmas.scale)
-    out = []
-    for one in sets:
-        first, rows = one.rows[0], one.rows
-        for row in rows:
-            if (groups[row], used[row]) != (groups[first], used[first]):
-                raise table.error(row, f"set {one.of_set!r} has different 'group' or 'used'; make them the same")
-        n, numbers = len(rows), np.arange(len(rows))
-        blocks = np.zeros((n, 3, n, 3))
-        blocks[numbers, :, numbers] = own[rows]
-        cov = blocks.reshape(3 * n, 3 * n)
-        at = {3 * row + axis: 3 * i + axis for i, row in enumerate(rows) for axis in range(3)}
-        for (a, b), value in one.entries.items():
-            cov[at[a], at[b]] = cov[at[b], at[a]] = value
-        problem = joint_problem(cov) if one.entries else None
-        if problem:
-            raise table.error(first, f"set {one.of_set!r}: {problem}; correct {table.layout.name}_covariance")
-        cov[np.isfinite(cov)] *= scale[first] ** 2
-        out.append(_Joint(one.of_set, rows, values[rows], cov, groups[first], used[first]))
-    return out
+        given[number, p, q] = sets[number].cov[p, q] = sets[number].cov[q, p] = values[row]
+    return [sets[number] for number in sorted({number for number, *_ in given})]
 
 
 def coordinate_columns(coordinates: Sequence[Coordinates]) -> tuple[Columns, Columns]:

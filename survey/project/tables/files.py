@@ -1,10 +1,10 @@
 """Tables out of CSV or Parquet files, with file and line of whatever is wrong in them, and columns as such files."""
 
-import contextlib
 import csv
 import io
 import itertools
 import re
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,13 +19,14 @@ from survey.folder.text import (
     LARGEST_NUMBER,
     atomic_write,
     content,
+    csv_rows,
     csv_text,
     decode,
     formula_problem,
     utf8,
     with_digest,
 )
-from survey.project.tables.arrow import LARGE, csv_columns, csv_rows, parquet_bytes, parquet_columns
+from survey.project.tables.arrow import LARGE, csv_bytes, csv_columns, parquet_bytes, parquet_columns
 from survey.project.tables.reading import Columns, Layout, Table, TextColumn, check_header, check_rows, first_row
 
 CHUNK = 65536
@@ -156,17 +157,14 @@ class _NumberBuilder:
 def csv_chunks(path: Path, text: str) -> tuple[list[str], Iterator[Chunk]]:
     """The header, and the rows after it: the line of each row, and the columns. Raises SurveyError for broken rows."""
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    try:
-        header = next(reader)
-    except csv.Error as error:
-        raise SurveyError(f"{path}:1: not a CSV line ({error}); correct the quotes") from error
+    header = _next_rows(path, text, reader, 1)[0]
     return header, _columns(path, text, reader, len(header))
 
 
 def _columns(path: Path, text: str, reader: Any, n: int) -> Iterator[Chunk]:
     """Chunk by chunk through the csv module; raises where a row has a wrong length."""
     line = reader.line_num + 1
-    while rows := _next_rows(path, text, reader):
+    while rows := _next_rows(path, text, reader, CHUNK):
         lines = np.arange(line, line + len(rows))
         _check_lengths(path, rows, lines, n, reader.line_num)
         line += len(rows)
@@ -175,11 +173,12 @@ def _columns(path: Path, text: str, reader: Any, n: int) -> Iterator[Chunk]:
             yield lines[filled], list(zip(*filter(None, rows), strict=True))
 
 
-def _next_rows(path: Path, text: str, reader: Any) -> list[list[str]]:
+def _next_rows(path: Path, text: str, reader: Iterator[list[str]], n: int) -> list[list[str]]:
     try:
-        return list(itertools.islice(reader, CHUNK))
-    except csv.Error as error:
-        raise SurveyError(f"{path}:{_last_start(text)}: not a CSV line ({error}); correct the quotes") from error
+        return list(itertools.islice(reader, n))
+    except csv.Error:
+        deque(csv_rows(path, text), maxlen=0)  # raises it with the line
+        raise
 
 
 def _check_lengths(path: Path, rows: list[list[str]], lines: IntArray, n: int, last_line: int) -> None:
@@ -190,16 +189,6 @@ def _check_lengths(path: Path, rows: list[list[str]], lines: IntArray, n: int, l
     if last_line != lines[-1]:
         i = next(i for i, row in enumerate(rows) if any("\n" in field or "\r" in field for field in row))
         raise SurveyError(f"{path}:{lines[i]}: a quoted field runs over the end of the line; close its quotes")
-
-
-def _last_start(text: str) -> int:
-    """The line on which the row begins that the csv module cannot read."""
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    line = 1
-    with contextlib.suppress(csv.Error):
-        for _ in reader:
-            line = reader.line_num + 1
-    return line
 
 
 def write_table(folder: Path, name: str, columns: Columns, parquet: bool = False) -> Path:
@@ -231,7 +220,7 @@ def _csv(columns: Columns) -> bytes:
     header = csv_text([columns])
     doubles = all(c.dtype == np.float64 for c in columns.values() if isinstance(c, np.ndarray))
     if doubles and 10 * len(columns) * max(map(len, columns.values()), default=0) > LARGE:
-        return utf8(header) + csv_rows(columns)
+        return utf8(header) + csv_bytes(columns)
     return utf8(header + csv_text(zip(*(cells_of(column) for column in columns.values()), strict=True)))
 
 

@@ -2,18 +2,15 @@
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from survey.folder.text import csv_rows, csv_text, read_text
 from survey.project.detected import ImageKey
 from survey.project.tables.files import cells_of, read_table
-from survey.project.tables.reading import Columns, Layout, Table
+from survey.project.tables.reading import Columns, Layout
 
 _FALSE = ("false", "0")
 
@@ -24,11 +21,11 @@ class RowTable:
 
     layout: Layout
     header: tuple[str, ...]
-    rows: tuple[Sequence[Any], ...] = ()
+    rows: tuple[Sequence[object], ...] = ()
 
-    def _column(self, name: str) -> list[Any]:
+    def _column(self, name: str) -> list[str]:
         i = self.header.index(name) if name in self.header else -1
-        return [row[i] for row in self.rows] if i >= 0 else [""] * len(self.rows)
+        return [str(row[i]) for row in self.rows] if i >= 0 else [""] * len(self.rows)
 
     @cached_property
     def _keys(self) -> list[tuple[ImageKey, str]]:
@@ -96,14 +93,14 @@ class RowTable:
     def marked_unused(self) -> list[tuple[str, ...]]:
         """Points of the rows that are marked ``used = false``."""
         marks = self._column("used")
-        return [key for key, used in zip(self.points(), marks, strict=True) if str(used).strip().lower() in _FALSE]
+        return [key for key, used in zip(self.points(), marks, strict=True) if used.strip().lower() in _FALSE]
 
     def text(self) -> str:
         """The table as CSV."""
         return csv_text([self.header, *self.rows])
 
 
-def _in_order(table: RowTable, header: Sequence[str]) -> list[Sequence[Any]]:
+def _in_order(table: RowTable, header: Sequence[str]) -> list[Sequence[object]]:
     if tuple(header) == table.header:
         return list(table.rows)
     at = {name: i for i, name in enumerate(table.header)}
@@ -111,7 +108,7 @@ def _in_order(table: RowTable, header: Sequence[str]) -> list[Sequence[Any]]:
     return [["" if i is None else row[i] for i in order] for row in table.rows]
 
 
-def _canonical(cell: Any, number: bool) -> str:
+def _canonical(cell: object, number: bool) -> str:
     """A cell in one form, however a program writes its numbers."""
     text = "" if cell is None else str(cell).strip()
     if not number or not text:
@@ -122,31 +119,20 @@ def _canonical(cell: Any, number: bool) -> str:
         return text
 
 
-def row_table(folder: Path | None, layout: Layout, columns: Columns | None = None) -> RowTable:
-    """The rows of a table in a folder, none where it is not there, or of ready columns. Raises SurveyError."""
-    if columns is not None:
-        return RowTable(layout, tuple(columns), _rows(columns))
-    csv_path, parquet = ((folder or Path()) / f"{layout.name}.{ending}" for ending in ("csv", "parquet"))
+def read_rows(folder: Path, layout: Layout) -> RowTable:
+    """The rows of a table in a folder, none where it is not there. Raises SurveyError."""
+    csv_path, parquet = (folder / f"{layout.name}.{ending}" for ending in ("csv", "parquet"))
     if csv_path.is_file():
         read_table(csv_path, layout)  # its faults, with their lines
         header, *rows = (cells for _, cells in csv_rows(csv_path, read_text(csv_path)))
         return RowTable(layout, tuple(header), tuple(rows))
     if parquet.is_file():
         table = read_table(parquet, layout)
-        found = _columns(table)
-        return RowTable(layout, tuple(found), _rows(found))
+        columns: Columns = {**table.text_columns, **table.number_columns}
+        return rows_of(layout, {name: columns[name] for name in layout.columns if name in columns})
     return RowTable(layout, layout.columns)
 
 
-def _columns(table: Table) -> Mapping[str, Any]:
-    return {
-        name: table.text(name).values() if table.layout.is_text(name) else table.numbers(name)
-        for name in table.layout.columns
-        if table.has(name)
-    }
-
-
-def _rows(columns: Mapping[str, Any]) -> tuple[Sequence[Any], ...]:
-    cells: Iterable[Sequence[Any]] = (cells_of(np.asarray(c) if isinstance(c, np.ndarray) else c)
-                                      for c in columns.values())  # fmt: skip
-    return tuple(zip(*cells, strict=True))
+def rows_of(layout: Layout, columns: Columns) -> RowTable:
+    """The rows of ready columns."""
+    return RowTable(layout, tuple(columns), tuple(zip(*map(cells_of, columns.values()), strict=True)))

@@ -202,7 +202,7 @@ def _pair_row(pair_id: str, e: dict[str, Any], poses: bool) -> list[str]:
     return cells
 
 
-def _pair_flag(e: dict[str, Any]) -> str:
+def _pair_flag(e: dict[str, object]) -> str:
     if not e["used"]:
         return m.pill("soft", t("not used"))
     return "" if e.get("controlled", True) else m.pill("warn", t("uncontrolled"))

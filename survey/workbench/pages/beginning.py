@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from gtsam import Pose3
 
@@ -27,9 +26,9 @@ class Drawn:
     points: Sequence[tuple[str, FloatArray, FloatArray]] = ()
     lines: Sequence[tuple[str, Sequence[FloatArray]]] = ()
     path: Sequence[tuple[str, FloatArray, FloatArray, str]] = ()
-    scene: Mapping[str, Any] | None = None
+    scene: Mapping[str, object] | None = None
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """As plain values."""
         return dict(plain({
             "cameras": {name: pose.matrix()[:3].ravel() for name, pose in self.cameras.items()},
@@ -45,10 +44,10 @@ class Told:
     """What a job said: for people, as plain values, and in the scene."""
 
     text: str
-    summary: Mapping[str, Any]
+    summary: Mapping[str, object]
     drawn: Drawn = Drawn()
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """As plain values; the text in the language that is spoken."""
         return {"text": text_said(self.text), "summary": self.summary, "drawn": self.drawn.as_dict()}
 
@@ -60,7 +59,7 @@ class Folder:
         self.folder, self.read_only = Path(folder), read_only
         self._session = FolderView(self.folder)
 
-    def capture_status(self) -> dict[str, Any]:
+    def capture_status(self) -> dict[str, object]:
         """How far a capture session in the folder is, its last images and what they cover, as plain values."""
         return self._session.status()
 
@@ -116,7 +115,7 @@ class Beginning(Folder):
         self._new = here if in_place else here.with_name(f"{here.name}-project")
         self._cameras = cameras_in(self._images)
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> dict[str, object]:
         """What there is: number of images by camera, and where the project would be."""
         return {
             "version": 0, "folder": str(self.folder), "read_only": self.read_only,

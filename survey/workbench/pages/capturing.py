@@ -81,13 +81,13 @@ class FolderView:
             raise SurveyError(f"camera {camera_id}: no image yet")
         return picture({(camera_id, str(epoch_id)): path}, (camera_id, str(epoch_id)), size)
 
-    def _path(self, camera_id: str, epoch_id: Any) -> Path | None:
+    def _path(self, camera_id: str, epoch_id: object) -> Path | None:
         known = not self._cameras or camera_id in self._cameras
         if epoch_id is None or not known or not is_id(camera_id):
             return None
         return self._folder / IMAGES_FOLDER / camera_id / f"{epoch_id}.png"
 
-    def _shown(self, camera_id: str, epoch_id: Any) -> Shown | None:
+    def _shown(self, camera_id: str, epoch_id: object) -> Shown | None:
         """An image is read once; what is seen in it may be known later."""
         from survey.detection.gray import read_image
 

@@ -8,11 +8,10 @@ import errno
 import platform
 import socket
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -20,11 +19,9 @@ from adjust.model.errors import SurveyError
 from capture.devices.camera import CameraError, DisconnectedError, Frame
 from capture.devices.turntable import (
     LimitError,
-    Location,
     StoppedError,
     TableDisconnectedError,
     TurntableError,
-    degrees_text,
     location_dict,
 )
 from capture.devices.turntables.moving import MovingTable
@@ -33,6 +30,7 @@ from capture.session.cameras import PlannedCameras
 from capture.session.control import AbortedError, Control
 from capture.session.folder import journal_path, prepare, remove_unrecorded, write_image, write_table_angles
 from capture.session.journal import Journal, Record, clocks
+from capture.session.placing import DriftError, Placing
 from capture.session.resume import verified_sets
 
 JOURNAL_FORMAT = 1
@@ -44,10 +42,6 @@ class SessionStoppedError(SurveyError):
     def __init__(self, message: str, interrupted: bool = False) -> None:
         super().__init__(message)
         self.interrupted = interrupted
-
-
-class DriftError(SurveyError):
-    """The table moved while the images were taken."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +65,7 @@ class Outcome:
     retries: Mapping[str, int] = field(default_factory=dict)
     seconds: float = 0.0
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """As plain values."""
         return {
             "folder": str(self.folder), "epochs_planned": self.planned, "epochs_before": self.before,
@@ -93,12 +87,11 @@ class Session:
         listener: Callable[[Taken], None] = lambda taken: None,
         note: Callable[[str], None] = lambda line: None,
     ) -> None:
-        self._plan, self._table, self._cameras = plan, table, cameras
         self.control = control or Control()
-        self.control.on_stop = self._stop_table
+        self._plan, self._placing, self._cameras = plan, Placing(plan, table, self.control), cameras
+        self.control.on_stop = self._placing.stop_at_once
         self._listener, self._note = listener, note
         self._retries: dict[str, int] = {}
-        self._at: Shot | None = None
 
     def run(self) -> Outcome:
         """Take all epochs that are missing. Raises SessionStoppedError; the table is stopped before."""
@@ -108,7 +101,8 @@ class Session:
         self._journal = Journal(journal_path(folder))
         try:
             missing, n_before = self._resume()
-            self._home(missing)
+            if missing:
+                self._placing.home(self._note)
             for shot in missing:
                 self._pause(shot)
                 self._take_with_retries(shot)
@@ -122,9 +116,7 @@ class Session:
             with suppress(OSError):  # a full disk: the next start writes it from the journal
                 self._write_angles()
             self._journal.close()
-        return Outcome(
-            folder, len(plan.shots), n_before, len(missing), dict(self._retries), time.monotonic() - begin
-        )
+        return Outcome(folder, len(plan.shots), n_before, len(missing), dict(self._retries), time.monotonic() - begin)
 
     def _resume(self) -> tuple[list[Shot], int]:
         plan, journal = self._plan, self._journal
@@ -141,25 +133,15 @@ class Session:
             self._note(f"{len(valid)} epochs are there and whole, {len(missing)} to go")
         return missing, len(wanted & set(valid))
 
-    def _home(self, missing: Sequence[Shot]) -> None:
-        """Look for the references, where the plan wants it and anything is to be taken."""
-        if missing and self._table is not None and self._plan.table is not None and self._plan.table.home:
-            self._note(f"{self._table.name}: looking for its references")
-            self._table.home().result()
-
-    def _session_record(self) -> dict[str, Any]:
+    def _session_record(self) -> dict[str, object]:
         plan = self._plan
-        table = None
-        if plan.table is not None and self._table is not None:
-            axes = [axis.axis.name for axis in plan.table.axes]
-            table = {"table_id": plan.table.table_id, "driver": plan.table.driver, "axes": axes}
         return {
             "format": JOURNAL_FORMAT,
             "plan": plan.file.name,
             "plan_sha256": plan.digest,
             "host": socket.gethostname(),
             "python": platform.python_version(),
-            "table": table,
+            "table": self._placing.description(),
             "cameras": {name: dict(values) for name, values in self._cameras.describe().items()},
             **clocks(),
         }
@@ -173,45 +155,38 @@ class Session:
         self.control.checkpoint()
 
     def _take_with_retries(self, shot: Shot) -> None:
-        options = self._plan.options
-        for attempt in range(options.retries + 1):
+        for attempt in range(self._plan.options.retries + 1):
             self.control.checkpoint()
             try:
                 return self._take(shot, attempt)
             except (AbortedError, LimitError, StoppedError):
                 raise
             except (CameraError, TurntableError, DriftError) as error:
-                self._stop_after_fault()
-                self._at = None  # whatever happened, the pose is approached anew
-                if attempt == options.retries:
+                self._placing.give_up_pose()
+                if attempt == self._plan.options.retries:
                     raise
-                kind = type(error).__name__.removesuffix("Error")
-                self._retries[kind] = self._retries.get(kind, 0) + 1
-                self._event("retry", f"{shot.epoch_id}: {error}")
-                self._note(f"{shot.epoch_id}: {error}\n  trying again ({attempt + 1} of {options.retries})")
-                self.control.sleep(options.retry_pause_s)
-                self._recover(error)
+                self._before_retry(shot, attempt + 1, error)
         return None
 
-    def _stop_after_fault(self) -> None:
-        if self._table is not None:
-            with suppress(TurntableError):  # a cut connection: the next try connects anew, or says so
-                self._table.stop()
-
-    def _recover(self, error: SurveyError) -> None:
-        """Bring back what was lost; where that fails the next try says so."""
+    def _before_retry(self, shot: Shot, number: int, error: SurveyError) -> None:
+        """Write the fault down, wait, and bring back what was lost; where that fails the next try says so."""
+        options, kind = self._plan.options, type(error).__name__.removesuffix("Error")
+        self._retries[kind] = self._retries.get(kind, 0) + 1
+        self._event("retry", f"{shot.epoch_id}: {error}")
+        self._note(f"{shot.epoch_id}: {error}\n  trying again ({number} of {options.retries})")
+        self.control.sleep(options.retry_pause_s)
         with suppress(CameraError, TurntableError):
-            if isinstance(error, TableDisconnectedError) and self._table is not None:
-                self._table.reopen()
+            if isinstance(error, TableDisconnectedError):
+                self._placing.reopen()
             self._cameras.recover(reopen=isinstance(error, DisconnectedError))
 
     def _take(self, shot: Shot, attempt: int) -> None:
         plan = self._plan
-        self._move(shot)
-        before = self._locate()
+        self._placing.go_to(shot)
+        before = self._placing.locate()
         frames = self._cameras.take(plan.options.fetch_timeout_s)
-        after = self._locate()
-        self._require_rest(before, after)
+        after = self._placing.locate()
+        self._placing.require_rest(before, after)
         self._require_sizes(frames)
         self.control.checkpoint()
         images = {camera_id: self._write(camera_id, shot, frame) for camera_id, frame in frames.items()}
@@ -222,27 +197,6 @@ class Session:
         )  # fmt: skip
         done = len(set(self._journal.taken()) & {s.epoch_id for s in plan.shots})
         self._listener(Taken(record, frames, done, len(plan.shots)))
-
-    def _move(self, shot: Shot) -> None:
-        if self._table is None or self._plan.table is None:
-            return
-        if self._at is None or self._at.pose_id != shot.pose_id:
-            self._table.set(shot.angles).result()
-            self.control.sleep(self._plan.options.wait_s)
-        self._at = shot
-
-    def _locate(self) -> Location:
-        none = np.zeros(0)
-        return Location(none, none, **clocks()) if self._table is None else self._table.locate()
-
-    def _require_rest(self, before: Location, after: Location) -> None:
-        moved = np.abs(after.readback - before.readback)
-        if self._table is not None and (moved > self._plan.options.drift).any():
-            raise DriftError(
-                f"{self._table.name}: it moved while the images were taken, from "
-                f"{degrees_text(self._table.axes, before.readback)} to "
-                f"{degrees_text(self._table.axes, after.readback)}; brake it, or give drift_deg a larger value"
-            )
 
     def _require_sizes(self, frames: Mapping[str, Frame]) -> None:
         """An image that the survey cannot use is no image: better to hear of it at the first than after the last."""
@@ -255,7 +209,7 @@ class Session:
                     f"{wanted[1]}; set Width and Height (and OffsetX, OffsetY) in the plan, or correct image_size_px"
                 )
 
-    def _write(self, camera_id: str, shot: Shot, frame: Frame) -> dict[str, Any]:
+    def _write(self, camera_id: str, shot: Shot, frame: Frame) -> dict[str, object]:
         values = self._cameras.values(camera_id, ("ExposureTime", "Gain", "PixelFormat"))
         return {
             **write_image(self._plan.project, camera_id, shot.epoch_id, frame.image),
@@ -283,21 +237,9 @@ class Session:
         if table is not None and sets:
             write_table_angles(self._plan.project, table.table_id, sets, table.sigma)
 
-    def _stop_table(self) -> None:
-        """At once, in the thread that asks for it; whatever moves ends with StoppedError."""
-        if self._table is not None:
-            with suppress(TurntableError):
-                self._table.emergency_stop()
-
     def _made_safe(self, error: BaseException) -> BaseException:
         """Stop the table, write down why, and say what to do next."""
-        safe = ""
-        if self._table is not None:
-            try:
-                self._table.stop()
-                safe = "the table is stopped, "
-            except TurntableError as second:
-                safe = f"THE TABLE COULD NOT BE STOPPED ({second}), "
+        safe = self._placing.stopped_text()
         with suppress(OSError):
             self._event("stopped", str(error))
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
