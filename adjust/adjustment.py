@@ -21,7 +21,7 @@ from adjust.model.survey import BoolArray, Survey
 from adjust.native.parallel import Beside
 from adjust.native.point_tests import farthest_points
 from adjust.observations.terrestrial.statistics import joined_residuals, reading_residuals
-from adjust.precision.precision import Precision, global_test, group_summaries, other_residuals
+from adjust.precision.precision import Precision, global_test, group_summaries, other_residuals, precision_of
 from adjust.start import Start, find_start
 from adjust.start.choice import Begun, adjusted_from_own_start
 from adjust.start.given import GivenStarts, given_starts, moved_onto
@@ -275,6 +275,11 @@ def warnings(graph: AdjustmentGraph, result: Adjustment, given: Survey | None = 
     test = result.global_test
     if test is not None and not test.passed:
         out.append(test.warning(result.sigma0))
+    if graph.pairs is not None and (far := precision_of(result).pairs.too_far).any():
+        out.append(
+            f"{far.sum()} of {len(far)} pairs are not tested: so many pairs from what holds the datum, rounding hides "
+            "what the others say of them; hold or observe stations nearer to them, or divide the network"
+        )
     out += _image_warnings(graph, result, given) + _lens_warnings(graph, result)
     return tuple(out)
 

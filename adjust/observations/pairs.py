@@ -30,6 +30,8 @@ from adjust.testing.distributions import chi2
 
 UNCONTROLLED = 1e-4
 """Share of a pair's direction that others must control for it to be tested; weak covariances lose digits."""
+MOST_ROUNDING = 0.02
+"""Of a whitened covariance of a residual: a pair is not tested where rounding may be more."""
 _HELD = -1
 
 
@@ -73,7 +75,7 @@ class PairStatistics:
     whitened: (E, dim). redundancy: (E, dim) numbers of the whitened components, zero for pairs out of use. test,
     freedom, p_value: of the whole pair; freedom 0 and nan where nothing controls it. A pair out of use is tested
     against its prediction from the others. adjusted_cov: (E, dim, dim) of the adjusted ``b_from_a``. residual_cov:
-    (E, dim, dim).
+    (E, dim, dim), zero where it is not known. too_far: (E,) from the datum to be tested: rounding is all that is left.
     """
 
     residual: FloatArray
@@ -84,6 +86,7 @@ class PairStatistics:
     p_value: FloatArray
     adjusted_cov: FloatArray
     residual_cov: FloatArray
+    too_far: BoolArray
 
 
 @dataclass(eq=False)
@@ -205,8 +208,14 @@ class PairBatch:
         Qvv = sign * (W @ scatter @ np.swapaxes(W, 1, 2)) + np.any(W, axis=2)[..., None] * np.eye(6)
         white = np.einsum("nij,nj->ni", W, residual)
         redundancy = np.where(used[:, None], np.diagonal(Qvv, axis1=1, axis2=2), 0.0)
-        tests = pair_tests(Qvv, white, UNCONTROLLED)
-        return PairStatistics(residual, white, redundancy, *tests, own, arrays.cov + sign * scatter)
+        test, freedom, p = pair_tests(Qvv, white, UNCONTROLLED)
+        residual_cov = arrays.cov + sign * scatter
+        # the covariance of a pair is the difference of those of its far ends, which share nearly all of their errors
+        apart = by_a @ (turn @ Q[:, :6, :6] @ np.swapaxes(turn, 1, 2) + Q[:, 6:, 6:]) @ np.swapaxes(by_a, 1, 2)
+        rounding = 4.0 * np.finfo(float).eps * np.einsum("nij,njk,nik->ni", W, apart, W).max(axis=1, initial=0.0)
+        far = rounding > MOST_ROUNDING
+        test[far], freedom[far], p[far], residual_cov[far] = np.nan, 0, np.nan, 0.0
+        return PairStatistics(residual, white, redundancy, test, freedom, p, own, residual_cov, far)
 
     def residuals(self, stats: PairStatistics, pairs: Sequence[Pair]) -> Residuals:
         """As reports take them; ``pairs`` are those of the survey."""

@@ -66,7 +66,7 @@ class Solved:
     def pairs(self) -> PairStatistics:
         p, k = self.precision.pairs, self.network.dim
         return PairStatistics(p.residual[:, :k], p.whitened[:, :k], p.redundancy[:, :k], p.test, p.freedom, p.p_value,
-                              p.adjusted_cov[:, :k, :k], p.residual_cov[:, :k, :k])  # fmt: skip
+                              p.adjusted_cov[:, :k, :k], p.residual_cov[:, :k, :k], p.too_far)  # fmt: skip
 
     @property
     def world_from_station(self) -> Motions:

@@ -1,14 +1,20 @@
 """Corridors of thousands of stations, where the normal matrix has no digits left for the far end."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
 
+from adjust.adjustment import adjust
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.pair_normals import PairLinear, PairNormals
+from adjust.model.survey import PoseParameter, Survey
 from adjust.native.pairs import compose_poses
+from adjust.observations import pairs as pairs_module
 from adjust.pose_network import pose_network
 from adjust.pose_network.solve import minimize
+from adjust.precision.precision import precision_of
 from adjust.spatial.rigid_motions import Motions, exp
 from tests.adjust import pose_networks
 from tests.adjust.pose_networks import solve_network
@@ -121,6 +127,34 @@ def test_rotations_stay_so_along_thousands_of_pairs() -> None:
     first, second, third = each.rotation[:3]
     np.testing.assert_allclose(R[2], first @ second @ third, atol=1e-14)
     np.testing.assert_allclose(t[2], 1.0 + first @ (1.0 + second @ np.ones(3)), atol=1e-14)
+
+
+def ends_held(nx: int, held: int) -> Survey:
+    survey = pose_networks.simulate(nx, 2).network.as_survey
+    place = replace(survey.stations[0].world_from_station, treatment="held")
+    stations = [replace(s, world_from_station=PoseParameter()) for s in survey.stations]
+    stations[held] = replace(stations[held], world_from_station=place)
+    return replace(survey, stations=tuple(stations))
+
+
+def test_pairs_too_far_from_the_datum_are_not_tested_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pairs_module, "MOST_ROUNDING", 1e-10)
+    result = adjust(ends_held(300, 0))
+    far, residuals = precision_of(result).pairs.too_far, result.other_residuals
+    assert far[-200:].all()
+    assert not far[:200].any()
+    assert [bool(np.isnan(o.test)) for o in residuals] == far.tolist()
+    assert np.isnan(residuals[-1].standardized).all()
+    assert any(w.startswith(f"{far.sum()} of {len(far)} pairs are not tested") for w in result.warnings)
+
+
+@pytest.mark.slow
+def test_tests_of_pairs_are_as_good_as_their_rounding_says() -> None:
+    """They do not depend on the datum: held at the near end, and at the far one, where the same digits are there."""
+    near, far = (precision_of(adjust(ends_held(8000, end))).pairs for end in (0, -1))
+    assert not near.too_far.any()
+    np.testing.assert_allclose(near.redundancy, far.redundancy, rtol=0.0, atol=0.1 * pairs_module.MOST_ROUNDING)
+    np.testing.assert_allclose(near.test, far.test, rtol=2e-3)
 
 
 @pytest.mark.slow
