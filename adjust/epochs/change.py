@@ -86,7 +86,7 @@ def between(before: Epoch, after: Epoch, directions: FloatArray, determined: Boo
     known = np.isfinite(d) & determined
     component = np.concatenate([before.components(n) for n in before.names])
     nowhere = frozenset(before.names[int(i)] for i in before.owner[~np.isfinite(d)])
-    G = gauge_rows(before) @ directions
+    G = gauge_rows(before.values) @ directions
     return (before.names, d[known], G[known], before.owner[known], component[known], nowhere), known
 
 

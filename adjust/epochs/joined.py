@@ -151,7 +151,7 @@ class JoinedChange(Change):
         _, s, V = np.linalg.svd(scale * np.hstack([ours, -theirs]))
         apart = int((s > _APART * s.max(initial=0.0)).sum())
         motions = ours @ V[apart:, : ours.shape[1]].T
-        G = gauge_rows(self.before)[self.place[rows]] @ motions
+        G = gauge_rows(self.before.values)[self.place[rows]] @ motions
         if not G.size:
             return np.zeros(0, dtype=np.int64)
         return np.asarray(scipy.linalg.qr(G.T, mode="r", pivoting=True)[1][: G.shape[1]], dtype=np.int64)

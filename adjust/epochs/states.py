@@ -14,7 +14,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.precision.precision import Precision, precision_of, rotations_only
-from adjust.spatial.motions import point_motions, poses_motions
+from adjust.spatial.motions import points_motions, poses_motions
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.system import LinearSystem
 
@@ -254,17 +254,22 @@ def open_directions(adjustment: Adjustment) -> FloatArray:
     return np.zeros((7, 0))
 
 
-def gauge_rows(state: Epoch) -> FloatArray:
-    """How all components (n, 7) move with the whole."""
-    return np.concatenate([value_motions(v) for v in state.values])
+def gauge_rows(values: Sequence[Pose3 | FloatArray]) -> FloatArray:
+    """How all components (n, 7) of points and poses move with the whole."""
+    is_pose = np.array([isinstance(v, Pose3) for v in values], dtype=np.bool_)
+    poses = np.array([v.matrix() for v in values if isinstance(v, Pose3)]).reshape(-1, 4, 4)
+    points = np.array([v for v in values if not isinstance(v, Pose3)]).reshape(-1, 3)
+    of_pose = np.repeat(is_pose, np.where(is_pose, 6, 3))
+    out = np.empty((len(of_pose), 7))
+    out[~of_pose] = points_motions(points).reshape(-1, 7)
+    R, t, in_world = poses[:, :3, :3], np.nan_to_num(poses[:, :3, 3]), np.ones(len(poses), dtype=np.bool_)
+    out[of_pose] = poses_motions(R, t, in_world).reshape(-1, 7)
+    return out
 
 
 def value_motions(value: Pose3 | FloatArray) -> FloatArray:
-    """How the components (3 or 6, 7) of a point or pose move with the whole."""
-    if not isinstance(value, Pose3):
-        return point_motions(value)
-    R, t = value.rotation().matrix(), np.nan_to_num(value.translation())
-    return np.asarray(poses_motions(R[None], t[None], np.ones(1, dtype=np.bool_))[0])
+    """How the components (3 or 6, 7) of one point or pose move with the whole."""
+    return gauge_rows((value,))
 
 
 def differences(before: Sequence[Pose3 | FloatArray], after: Sequence[Pose3 | FloatArray]) -> FloatArray:
@@ -311,7 +316,7 @@ def laid_onto(
     target: Sequence[Pose3 | FloatArray], values: Values, directions: FloatArray, kept: BoolArray
 ) -> tuple[Values, FloatArray, float]:
     """Values moved as a whole until the kept components (n,) lie on the target; L and scale took them there."""
-    along = np.concatenate([value_motions(v) for v in target]) @ directions
+    along = gauge_rows(target) @ directions
     L, scale = np.eye(3), 1.0
     for _ in range(20):
         d = differences(target, values)
