@@ -21,6 +21,7 @@ from survey.folder.plain import PlainRecords
 Column = np.ndarray[Any, Any] | Sequence[str]
 """Of n records: floats, whole numbers or truths (n,), lists of floats (n, k), or n words."""
 Tree = Mapping[str, "Column | Tree"]
+_FLOATS = {float}
 _JSON = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
 
 
@@ -193,13 +194,9 @@ def _lines(value: Any, depth: int) -> str:
         return str(value.lines(depth))
     if kind is not list:
         return _one(value)
-    try:
-        text = ", ".join(map(float.__repr__, value))
-    except TypeError:
-        text = "n"
-    if "n" not in text:  # not even of nan or inf
-        return f"[{text}]"
     kinds = set(map(type, value))
+    if kinds == _FLOATS and "n" not in (text := ", ".join(map(float.__repr__, value))):  # not even of nan or inf
+        return f"[{text}]"
     if dict in kinds or str in kinds:
         inner = ",\n".join([" " * (depth + 1) + _lines(v, depth + 1) for v in value])
         return f"[\n{inner}\n{' ' * depth}]"
