@@ -406,6 +406,13 @@ def test_plain_documents_are_read_as_by_tomllib() -> None:
     assert n_valid > 1000
 
 
+def test_plain_documents_are_read_line_by_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Comments of a line do not stand in the way: `add` writes one into every definition that it makes."""
+    expected = tomllib.loads(_PLAIN)
+    monkeypatch.setattr(tomllib, "loads", pytest.fail)
+    assert read_tables(_PLAIN) == expected
+
+
 def _read_or_refused(read: Callable[[str], dict], document: str) -> str:
     try:
         return repr(read(document))
