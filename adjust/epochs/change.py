@@ -7,11 +7,12 @@ from functools import cached_property
 
 import numpy as np
 
-from adjust.epochs.states import Epoch, EpochState, differences, gauge_rows
+from adjust.epochs.states import Epoch, EpochState, differences
 from adjust.model.errors import SurveyError
 from adjust.model.result import ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.precision.s_transformation import transformed
+from adjust.spatial.motions import values_motions
 from adjust.testing.quadratic_forms import pseudo_precision, pseudo_square, pseudo_square_beside
 
 Displaced = Callable[[IntArray], tuple[FloatArray, FloatArray]]
@@ -86,7 +87,7 @@ def between(before: Epoch, after: Epoch, directions: FloatArray, determined: Boo
     known = np.isfinite(d) & determined
     component = np.concatenate([before.components(n) for n in before.names])
     nowhere = frozenset(before.names[int(i)] for i in before.owner[~np.isfinite(d)])
-    G = gauge_rows(before) @ directions
+    G = values_motions(before.values) @ directions
     return (before.names, d[known], G[known], before.owner[known], component[known], nowhere), known
 
 

@@ -64,7 +64,7 @@ def congruence(
     Raises SurveyError where nothing is common, or the reference is too small.
     """
     both = common(first, second, options)
-    after = aligned(both.before, both.after, both.directions, _numbers(both.names, options.reference))
+    after = aligned(both.before, both.after, both.directions, _numbers(both.before, options.reference))
     return compare(replace(both, after=after), options)
 
 
@@ -107,7 +107,8 @@ def compare(both: Common, options: CongruenceOptions, cross: FloatArray | None =
     names, pooled = both.names, both.pooled
     change = _change(both.before, both.after, both.directions, cross)
     tests = _Tests(change, pooled, options)
-    begin = [i for i in _numbers(names, options.reference) if (change.owner == i).any()]
+    numbers = np.array(_numbers(both.before, options.reference), dtype=np.int64)
+    begin = numbers[np.isin(numbers, change.owner)].tolist()
     if not begin:
         raise SurveyError("no point of the reference is free in either epoch; there is nothing to test")
     first_test = tests.of_all(begin)
@@ -122,13 +123,13 @@ def compare(both: Common, options: CongruenceOptions, cross: FloatArray | None =
     )  # fmt: skip
 
 
-def _numbers(names: Sequence[ParameterName], reference: Sequence[ParameterName] | None) -> list[int]:
+def _numbers(epoch: Epoch, reference: Sequence[ParameterName] | None) -> list[int]:
     if reference is None:
-        return list(range(len(names)))
-    lost = [n for n in reference if n not in names]
+        return list(range(len(epoch.names)))
+    lost = [n for n in reference if n not in epoch.index]
     if lost:
         raise SurveyError(f"{' '.join(lost[0])} of the reference is not common to both epochs")
-    return [names.index(n) for n in reference]
+    return [epoch.index[n] for n in reference]
 
 
 def _pooled(first: Adjustment, second: Adjustment, scaled: bool) -> Pooled:
@@ -204,8 +205,8 @@ class _Tests:
                 break
             stable, test = rest, now
             steps.append(CongruenceStep(self.change.names[worst], shares[worst], test))
-        level = sidak(self.options.alpha, len(begin))
-        for i in [i for i in begin if i not in stable] if test.passed else []:
+        level, kept = sidak(self.options.alpha, len(begin)), frozenset(stable)
+        for i in [i for i in begin if i not in kept] if test.passed else []:
             more = sorted([*stable, i])
             square = squares_in_sigmas(*self.change.displaced(stable)(self.change.rows([i])[None]))
             alone = tests_of(*square, self.pooled, level)[0]

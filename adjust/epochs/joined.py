@@ -15,9 +15,10 @@ import scipy
 from scipy import sparse
 
 from adjust.epochs.change import Change, Displaced, between
-from adjust.epochs.states import EpochNormals, gauge_rows
+from adjust.epochs.states import EpochNormals
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.precision.s_transformation import moved
+from adjust.spatial.motions import values_motions
 from adjust.statistics.normal import Normal
 
 _CANDIDATES = 12
@@ -152,7 +153,7 @@ class JoinedChange(Change):
         _, s, V = np.linalg.svd(scale * np.hstack([ours, -theirs]))
         apart = int((s > _APART * s.max(initial=0.0)).sum())
         motions = ours @ V[apart:, : ours.shape[1]].T
-        G = gauge_rows(self.before)[self.place[rows]] @ motions
+        G = values_motions(self.before.values)[self.place[rows]] @ motions
         if not G.size:
             return np.zeros(0, dtype=np.int64)
         return np.asarray(scipy.linalg.qr(G.T, mode="r", pivoting=True)[1][: G.shape[1]], dtype=np.int64)

@@ -14,7 +14,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.precision.precision import Precision, precision_of, rotations_only
-from adjust.spatial.motions import moved_value, value_motions
+from adjust.spatial.motions import moved_value, values_motions
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.system import LinearSystem
 
@@ -254,11 +254,6 @@ def open_directions(adjustment: Adjustment) -> FloatArray:
     return np.zeros((7, 0))
 
 
-def gauge_rows(state: Epoch) -> FloatArray:
-    """How all components (n, 7) move with the whole."""
-    return np.concatenate([value_motions(v) for v in state.values])
-
-
 def differences(before: Sequence[Pose3 | FloatArray], after: Sequence[Pose3 | FloatArray]) -> FloatArray:
     """After minus before (n,), of poses in the tangent of the first; nan where only rotations are known."""
     return np.concatenate([differences_of(a, b) for a, b in zip(before, after, strict=True)])
@@ -296,7 +291,7 @@ def laid_onto(
     target: Sequence[Pose3 | FloatArray], values: Values, directions: FloatArray, kept: BoolArray
 ) -> tuple[Values, FloatArray, float]:
     """Values moved as a whole until the kept components (n,) lie on the target; L and scale took them there."""
-    along = np.concatenate([value_motions(v) for v in target]) @ directions
+    along = values_motions(target) @ directions
     L, scale = np.eye(3), 1.0
     for _ in range(20):
         d = differences(target, values)

@@ -31,12 +31,17 @@ def poses_motions(R: FloatArray, t: FloatArray, in_world: BoolArray) -> FloatArr
     return out
 
 
-def value_motions(value: Pose3 | FloatArray) -> FloatArray:
-    """How the components (3 or 6, 7) of a point or pose of the world move."""
-    if not isinstance(value, Pose3):
-        return point_motions(value)
-    R, t = value.rotation().matrix(), np.nan_to_num(value.translation())
-    return np.asarray(poses_motions(R[None], t[None], np.ones(1, dtype=np.bool_))[0])
+def values_motions(values: Sequence[Pose3 | FloatArray]) -> FloatArray:
+    """How all components (n, 7) of points and poses of the world move."""
+    is_pose = np.array([isinstance(v, Pose3) for v in values], dtype=np.bool_)
+    poses = np.array([v.matrix() for v in values if isinstance(v, Pose3)]).reshape(-1, 4, 4)
+    points = np.array([v for v in values if not isinstance(v, Pose3)]).reshape(-1, 3)
+    of_pose = np.repeat(is_pose, np.where(is_pose, 6, 3))
+    out = np.empty((len(of_pose), 7))
+    out[~of_pose] = points_motions(points).reshape(-1, 7)
+    R, t, in_world = poses[:, :3, :3], np.nan_to_num(poses[:, :3, 3]), np.ones(len(poses), dtype=np.bool_)
+    out[of_pose] = poses_motions(R, t, in_world).reshape(-1, 7)
+    return out
 
 
 def moved_value(value: Pose3 | FloatArray, motion: FloatArray) -> Pose3 | FloatArray:

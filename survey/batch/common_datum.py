@@ -23,7 +23,7 @@ from gtsam import Pose3, Rot3
 from adjust.epochs.states import differences_of, laid_onto, origin
 from adjust.model.errors import listed
 from adjust.model.survey import FloatArray
-from adjust.spatial.motions import value_motions
+from adjust.spatial.motions import values_motions
 from adjust.spatial.rotation_forms import quaternion_wxyz
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
@@ -168,7 +168,7 @@ class _Epoch:
         self.values, self.L, self.scale = dict(zip(names, values, strict=True)), L @ self.L, scale * self.scale
 
     def _motions(self, target: Mapping[str, Pose3 | FloatArray], names: Sequence[str]) -> FloatArray:
-        return np.concatenate([value_motions(target[n]) for n in names]) @ self.directions
+        return values_motions([target[n] for n in names]) @ self.directions
 
     def moved(
         self, target: Mapping[str, Pose3 | FloatArray], carriers: Sequence[str], level: float, spread: float
@@ -208,7 +208,7 @@ class _Epoch:
         self, target: Mapping[str, Pose3 | FloatArray], stable: Sequence[str], out: Sequence[str], name: str
     ) -> FloatArray:
         """Sigmas (3 or 6,) of what the motion of the whole gained, in the tangent of a pose."""
-        own = value_motions(self.values[name]) @ self.directions
+        own = values_motions((self.values[name],)) @ self.directions
         total = np.zeros(len(own))
         if out:
             G = self._motions(target, stable)

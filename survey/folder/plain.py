@@ -26,8 +26,10 @@ def plain(value: Any) -> Any:
         return value
     if kind is float:
         return value if math.isfinite(value) else None
-    if kind is list and set(map(type, value)) == _FLOATS and all(map(math.isfinite, value)):
-        return value
+    if kind is list:
+        kinds = set(map(type, value))
+        if kinds <= _AS_IT_IS or (kinds == _FLOATS and all(map(math.isfinite, value))):
+            return value
     if isinstance(value, Mapping):
         return {str(k): v if type(v) in _AS_IT_IS else plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple | np.ndarray):

@@ -2,7 +2,6 @@
 
 import re
 import shutil
-import tomllib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,7 +13,7 @@ from adjust.model.errors import SurveyError
 from survey.folder.text import atomic_write, csv_rows, csv_text, read_text, suggestion
 from survey.folder.whole import copy_folder
 from survey.project.declared.node import read_toml
-from survey.project.declared.toml_text import KeyPath, key_lines, toml_text
+from survey.project.declared.toml_text import KeyLines, KeyPath, read_tables, toml_text
 from survey.project.detected import ImageKey, file_of
 from survey.project.exclusions import EXCLUSIONS_FILE, appended, read_exclusions
 from survey.project.project import DEFINITION_FILE, FORMAT, IMAGES_FOLDER, OBSERVATIONS_FOLDER, Project
@@ -88,15 +87,16 @@ def check_new(folder: Path, new: Path) -> None:
 def _merge_definition(merged: Merged) -> None:
     old_path, new_path = merged.folder / DEFINITION_FILE, merged.new / DEFINITION_FILE
     text = read_text(old_path)
+    old = read_tables(text)
     text += "" if text.endswith("\n") else "\n"
     origins: list[Origin] = [(old_path, i + 1) for i in range(text.count("\n"))]
     if new_path.is_file():
-        added, lines = _new_sections(merged, new_path, key_lines(text), tomllib.loads(text))
+        added, lines = _new_sections(merged, new_path, KeyLines(text), old)
         text, origins = text + added, origins + lines
         merged.entries.append(DEFINITION_FILE)
         try:
-            tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
+            read_tables(text)
+        except ValueError as error:  # of tomllib
             raise SurveyError(
                 f"{old_path}: nothing can be added below its tables ({error}); write them as [stations.ID], not as one "
                 "line in braces"
@@ -189,9 +189,9 @@ def read_copy(place: Path, project: Project, folder: Path) -> Project:
 
 def point_files(folder: Path) -> list[str]:
     """Point lists that the old survey.toml names; the merged project is read with them."""
-    definition = tomllib.loads(read_text(folder / DEFINITION_FILE))
-    targets = definition.get("targets", {})
-    return [t["file"] for t in targets.values() if isinstance(t, dict) and isinstance(t.get("file"), str)]
+    targets = read_tables(read_text(folder / DEFINITION_FILE)).get("targets")
+    tables = [t for t in targets.values() if isinstance(t, dict)] if isinstance(targets, dict) else []
+    return [file for t in tables if isinstance(file := t.get("file"), str)]
 
 
 def _link_into(path: Path, merged: Merged) -> None:

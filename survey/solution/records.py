@@ -4,6 +4,7 @@ Such entries are dictionaries where they are asked for.
 """
 
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -20,6 +21,7 @@ from survey.folder.plain import PlainRecords
 Column = np.ndarray[Any, Any] | Sequence[str]
 """Of n records: floats, whole numbers or truths (n,), lists of floats (n, k), or n words."""
 Tree = Mapping[str, "Column | Tree"]
+_FLOATS = {float}
 _JSON = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
 
 
@@ -168,6 +170,18 @@ def solution_json(solution: Mapping[str, Any]) -> str:
     return _lines(solution, 0) + "\n"
 
 
+def sections(document: bytes, *names: str) -> dict[str, Any]:
+    """Some of the topmost entries of what :func:`solution_json` wrote, the others unread; all of what looks otherwise.
+
+    Raises ValueError for what is no JSON.
+    """
+    entry = rb'\n %b: (.+?)(?:,\n "|\n}\s*\Z)'
+    found = [re.findall(entry % re.escape(_key(name).encode()), document, re.DOTALL) for name in names]
+    if not document.startswith(b"{\n ") or any(len(texts) != 1 for texts in found):
+        return dict(json.loads(document))
+    return {name: json.loads(texts[0]) for name, texts in zip(names, found, strict=True)}
+
+
 def _lines(value: Any, depth: int) -> str:
     kind = type(value)
     if kind is float:
@@ -180,13 +194,9 @@ def _lines(value: Any, depth: int) -> str:
         return str(value.lines(depth))
     if kind is not list:
         return _one(value)
-    try:
-        text = ", ".join(map(float.__repr__, value))
-    except TypeError:
-        text = "n"
-    if "n" not in text:  # not even of nan or inf
-        return f"[{text}]"
     kinds = set(map(type, value))
+    if kinds == _FLOATS and "n" not in (text := ", ".join(map(float.__repr__, value))):  # not even of nan or inf
+        return f"[{text}]"
     if dict in kinds or str in kinds:
         inner = ",\n".join([" " * (depth + 1) + _lines(v, depth + 1) for v in value])
         return f"[\n{inner}\n{' ' * depth}]"

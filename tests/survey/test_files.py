@@ -383,6 +383,8 @@ title = "a b = c: [d]"
 motion = "fixed"
 world_from_station = { treatment = "held", translation_mm = [0.0, -1e-5, 3], rotation_quaternion_wxyz = [1.0, 0, 0, 0] }
 
+# added from = [new]
+
 [stations.head]
 flag = true
 """
@@ -391,7 +393,7 @@ flag = true
 @pytest.mark.slow
 def test_plain_documents_are_read_as_by_tomllib() -> None:
     """Line by line or not, right or wrong: the same values and the same complaints."""
-    rng, signs = np.random.default_rng(0), list("[]{}=\"',.:# \n\\+-01eE_aln\t")
+    rng, signs = np.random.default_rng(0), list("[]{}=\"',.:# \n\\+-01eE_aln\t\x01\u2028")
     n_valid = 0
     for _ in range(6000):
         text = list(_PLAIN)
@@ -402,6 +404,13 @@ def test_plain_documents_are_read_as_by_tomllib() -> None:
         assert found == expected, document
         n_valid += expected.startswith("{")
     assert n_valid > 1000
+
+
+def test_plain_documents_are_read_line_by_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Comments of a line do not stand in the way: `add` writes one into every definition that it makes."""
+    expected = tomllib.loads(_PLAIN)
+    monkeypatch.setattr(tomllib, "loads", pytest.fail)
+    assert read_tables(_PLAIN) == expected
 
 
 def _read_or_refused(read: Callable[[str], dict], document: str) -> str:

@@ -25,7 +25,7 @@ from survey.solution.covariances import covariance_npz, read_estimates
 from survey.solution.dictionary import RunInfo, solution_dict
 from survey.solution.frames import AdjustedFrames, table_from_mount
 from survey.solution.quantities import ellipsoid, key_of, pose_columns, scale_of, vector_entry
-from survey.solution.records import Form, Records, solution_json
+from survey.solution.records import Form, Records, sections, solution_json
 from survey.solution.residual_tables import image_residuals_csv, image_residuals_parquet, other_residuals_csv
 from survey.solution.statistics import statistics_of
 from survey.solution.unknowns import correlated
@@ -386,6 +386,21 @@ def test_entries_by_columns_are_those_one_by_one() -> None:
     assert solution_json({"all": records, "none": Records([], [])}) == solution_json({"all": dict(records), "none": {}})
     with pytest.raises(KeyError):
         records["t"]
+
+
+def test_sections_of_a_solution_are_those_of_the_whole() -> None:
+    """Of what another program has laid out anew too; what stands deeper under the same name is not meant."""
+    whole = {"summary": {"title": 'a\n "inputs": 1'}, "empty": {}, "stations": {"summary": {"inputs": [1.5, 2.0]}},
+             "list": ["inputs", {"summary": 3}], "inputs": {"hashes": {"a": "b"}}}  # fmt: skip
+    wanted = {"summary": whole["summary"], "inputs": whole["inputs"]}
+    text = solution_json(whole)
+    assert sections(text.encode(), "summary", "inputs") == wanted
+    for indent in (None, 0, 1, 4):
+        found = sections(json.dumps(whole, indent=indent).encode(), "summary", "inputs")
+        assert {name: found[name] for name in wanted} == wanted
+    assert "inputs" not in sections(text.replace('"inputs": {', '"other": {').encode(), "summary", "inputs")
+    with pytest.raises(ValueError, match=r"delimiter|value|property name"):
+        sections(text[: len(text) // 2].encode(), "summary", "inputs")
 
 
 @pytest.mark.parametrize("decimals", [0, 2, 6])

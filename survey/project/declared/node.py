@@ -140,9 +140,11 @@ class Node:
         value = self.values.get(key, {})
         if not isinstance(value, dict):
             raise self.error(f"expected a table, found {_kind(value)}; write {{ ... }}", key)
-        found = Node(self.file, self.lines, (*self.path, key), value)
-        what = self.declared and below(self.declared, key)
-        return found.declared_as(what) if what else found
+        what = below(self.declared, key) if self.declared else None
+        found = Node(self.file, self.lines, (*self.path, key), value, what)
+        if value and what and what.free_keys is None:
+            found.allow(*what.by_name)
+        return found
 
     def tables(self, key: str) -> list[tuple[str, "Node"]]:
         """The tables under the ids below a key, in the order of the file."""

@@ -76,20 +76,20 @@ _NOT_PLAIN = ("\\", "\r", "\x7f", "null", "'''", '"""')  # what JSON and TOML re
 
 
 def _plain_tables(text: str) -> dict[str, object] | None:
-    """The same; None for a line that is anything but a header, a key with its value, or blank."""
+    """The same; None for a line that is anything but a header, a key with its value, a comment, or blank."""
     root: dict[str, object] = {}
     below: dict[tuple[str, ...], dict[str, object]] = {(): root}
     headers, table = {()}, root
     for line in text.split("\n"):
         key, equals, value = line.partition(" = ")
-        if equals:
+        if equals and key[:1] != "#":
             if key in table or not _BARE.fullmatch(key):
                 return None
             try:
                 table[key] = _plain_value(value)
             except ValueError:
                 return None
-        elif line:
+        elif line and not (line[0] == "#" and line.isprintable()):
             header = _HEADER.fullmatch(line)
             path = tuple(header[1].split(".")) if header else ()
             if path in headers:

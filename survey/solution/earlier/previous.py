@@ -1,6 +1,5 @@
 """What an earlier adjustment of a project left in its results: values to start from, and sigmas to compare with."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +19,7 @@ from survey.project.project import RESULTS
 from survey.solution.covariances import read_estimates
 from survey.solution.earlier.changes import Snapshot
 from survey.solution.quantities import ARCSEC_PER_RAD, SigmaKind, sigmas_in
+from survey.solution.records import sections
 
 _MOST_MOVES, _MOST_SHOWN = 200, 8
 _SUMMARY = {"redundancy": WHOLE, "sigma0": Either((POSITIVE, None)), "sigma_factor": POSITIVE}
@@ -84,7 +84,7 @@ def _read_previous(project: Project) -> Snapshot:
         if not file.is_file():
             raise SurveyError(f"{file}: is not there, the project is not adjusted yet; {again}")
     try:
-        found = json.loads(read_bytes(path)[0])
+        found = sections(read_bytes(path)[0], "summary", "inputs")
         if (problem := misfit(found["summary"], _SUMMARY)) is not None:
             raise ValueError(problem)
         previous = Snapshot(read_estimates(archive), found["summary"])
