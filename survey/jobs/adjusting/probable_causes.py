@@ -21,6 +21,8 @@ _LARGE = 1.15
 """sigma0 from which a mistake is looked for by trial; below, sigmas that are a little small explain as much."""
 
 
+_SEVERAL = 3
+"""Observations that were left out from which on they may have one cause."""
 NOT_LOOKED_FOR = ("two mistakes at once", "bodies that bend or never rest", "refraction")
 """Told where nothing is named; the documentation says more."""
 
@@ -71,13 +73,26 @@ def with_probable_causes(survey: Survey, result: Adjustment, project: Project) -
             warnings = diagnosis.lines if diagnosis is not None else ()
         warnings += tuple(c for c in causes if c not in warnings)
     if diagnosis is None and not warnings:
-        diagnosis, _ = _named(_misread(survey, result), project)
+        diagnosis, _ = _named(_left_out(survey, result), project)
         warnings = diagnosis.lines if diagnosis is not None else ()
     lines = tuple(f"probable cause: {c}" for c in warnings)
     if diagnosis is None and not warnings:
         diagnosis, _ = _named(_too_cautious(survey, result), project)
         lines = tuple(f"too good: {c}" for c in diagnosis.lines) if diagnosis is not None else ()
+    if diagnosis is None or diagnosis.candidates[0].hypothesis.place.key not in ("sigma", "instrument_height"):
+        lines += doubts(survey)
     return replace(result, warnings=(*lines, *result.warnings, *note), diagnosis=diagnosis)
+
+
+def doubts(survey: Survey) -> tuple[str, ...]:
+    """What cannot be right by its value alone, whatever the residuals say; a target may be as thin as a millimetre."""
+    if not (survey.readings or survey.distances or survey.pairs):
+        return ()
+    from adjust.diagnosis.units.heights import doubtful_heights  # here: as above
+    from adjust.diagnosis.weights.impossible import doubtful_sigmas
+
+    found = (*doubtful_heights(survey), *doubtful_sigmas(survey))
+    return tuple(f"{h.cause}; {h.change}" for h in found if h.place.kind != "point")
 
 
 def _diagnosis(
@@ -107,15 +122,25 @@ def _too_cautious(survey: Survey, result: Adjustment) -> "Diagnosis | None":
     return diagnose(Case(survey, result), [wrong_factors])
 
 
-def _misread(survey: Survey, result: Adjustment) -> "Diagnosis | None":
-    """What was left out by the search for gross errors, and fits as it was meant; None where nothing does."""
-    left_out = survey.n_others_used - result.survey.n_others_used
-    if left_out <= 0 and result.other_arrays.used.all():
+def _left_out(survey: Survey, result: Adjustment) -> "Diagnosis | None":
+    """What was left out by the search for gross errors, and fits as it was meant; None where nothing does.
+
+    Of several first what they may have in common.
+    """
+    left_out = survey.n_others_used - result.survey.n_others_used + int((~result.other_arrays.used).sum())
+    if left_out <= 0:
         return None
-    from adjust.diagnosis.diagnosis import Diagnosis  # here: as above
+    from adjust.diagnosis.diagnosis import Diagnosis, diagnose  # here: as above
     from adjust.diagnosis.trial import misfit_of
     from adjust.diagnosis.units.singles import misread_singles
 
+    if left_out >= _SEVERAL:
+        from adjust.diagnosis.case import Case
+        from adjust.diagnosis.families import IN_COMMON
+
+        common = diagnose(Case(survey, result), IN_COMMON)
+        if common.candidates:
+            return replace(common, spoils=True)
     found = misread_singles(survey, result)
     names = tuple(dict.fromkeys(c.hypothesis.name for c in found))
     return Diagnosis(found, names, misfit_of(result, survey)) if found else None
