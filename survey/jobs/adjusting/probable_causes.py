@@ -60,11 +60,13 @@ def with_probable_causes(survey: Survey, result: Adjustment, project: Project) -
     """The adjustment of the ``survey`` of a project; its first warnings are the probable causes of what contradicts."""
     warnings: tuple[str, ...] = ()
     note: tuple[str, ...] = ()
+    alone: tuple[str, ...] = ()
     diagnosis: Diagnosis | None = None
     if survey.tables:
-        from adjust.diagnosis.table import sign_warnings  # here: a survey without a table starts without it
+        from adjust.diagnosis.table import sign_warnings, unseen_readings  # here: most surveys start without a table
 
         warnings = sign_warnings(survey, result)
+        alone = tuple(f"{f.found}; {f.remedy}" for f in unseen_readings(survey))
     if _contradicted(survey, result):
         # what does not fit may have spoilt the lenses too: then those that the images alone give
         causes = _probable_causes(survey, result) or _probable_causes(survey)
@@ -80,12 +82,12 @@ def with_probable_causes(survey: Survey, result: Adjustment, project: Project) -
         diagnosis, _ = _named(_too_cautious(survey, result), project)
         lines = tuple(f"too good: {c}" for c in diagnosis.lines) if diagnosis is not None else ()
     if diagnosis is None or diagnosis.candidates[0].hypothesis.place.key not in ("sigma", "instrument_height"):
-        lines += doubts(survey)
-    return replace(result, warnings=(*lines, *result.warnings, *note), diagnosis=diagnosis)
+        lines += doubtful_values(survey)
+    return replace(result, warnings=(*lines, *alone, *result.warnings, *note), diagnosis=diagnosis)
 
 
-def doubts(survey: Survey) -> tuple[str, ...]:
-    """What cannot be right by its value alone, whatever the residuals say; a target may be as thin as a millimetre."""
+def doubtful_values(survey: Survey) -> tuple[str, ...]:
+    """What cannot be right by its value alone; not heights of targets, which may be as thin as a millimetre."""
     if not (survey.readings or survey.distances or survey.pairs):
         return ()
     from adjust.diagnosis.units.heights import doubtful_heights  # here: as above

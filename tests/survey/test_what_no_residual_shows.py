@@ -1,4 +1,4 @@
-"""Heights and sigmas in another unit: told by `check`, named by `adjust`, mended by `--try`; sound ones are not."""
+"""What residuals do not show: heights and sigmas in another unit, table readings under another epoch."""
 
 import csv
 import json
@@ -106,3 +106,16 @@ def test_what_a_survey_may_have_is_not_told(tmp_path: Path) -> None:
     thin = tuple(replace(r, target_height=1e-3) for r in survey.readings)
     (only,) = doubtful_heights(replace(survey, readings=thin))
     assert only.place.kind == "point"
+
+
+def test_a_table_reading_of_another_epoch_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lab = planted(tmp_path / "lab", "head", "table_angles",
+                  lambda row: row["epoch_id"] == "tX03" and row.update(epoch_id="tX30x"))  # fmt: skip
+    assert main(["adjust", str(lab), "--quiet"]) == 0
+    solution = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))
+    (told,) = (w for w in solution["warnings"] if "table readings without images" in w)
+    assert ": tX30x; check the names" in told
+    assert told.endswith("(for tX30x perhaps tX03)")
+    shown = capsys.readouterr().out
+    assert "NEEDS A LOOK" in shown
+    assert told in shown
