@@ -22,6 +22,7 @@ from adjust.model.survey import Survey
 
 _NEAR, _OFF = 0.02, 0.1
 """Of a length and of a turn: what start values miss by at most, and what no right value does."""
+_THOUSAND = (1e3, 1e-3)
 _CLEAR = 20.0
 """Misfit before over misfit after of a single value: ten sigmas off, and then none."""
 
@@ -83,9 +84,11 @@ def _slipped(what: str, value: float, predicted: float, factor: float, unit: str
     """What is wrong; nothing where the value fits as it stands, or by no factor."""
     if abs(value - predicted) < _OFF * abs(predicted):
         return ""
-    by = next((by for by in SLIPS if abs(by * value - predicted) < _NEAR * abs(predicted)), None)
-    return "" if by is None else (f"{what}: its decimal point has slipped: {factor * value:.10g} {unit}, by what the "
-                                  f"rest says {factor * by * value:.10g} {unit}")  # fmt: skip
+    ways = SLIPS if unit == "deg" else (*SLIPS, *_THOUSAND)
+    by = next((by for by in ways if abs(by * value - predicted) < _NEAR * abs(predicted)), None)
+    how = "it is in another unit" if by in _THOUSAND else "its decimal point has slipped"
+    return "" if by is None else (f"{what}: {how}: {factor * value:.10g} {unit}, by what the rest says "
+                                  f"{factor * by * value:.10g} {unit}")  # fmt: skip
 
 
 def _in_another_unit(case: Case) -> Iterator[Finding]:

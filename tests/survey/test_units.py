@@ -1,4 +1,4 @@
-"""What residuals do not show: heights and sigmas in another unit, table readings under another epoch."""
+"""Values in another unit, and table readings under another epoch: told by `check`, named and mended by `adjust`."""
 
 import csv
 import json
@@ -119,3 +119,26 @@ def test_a_table_reading_of_another_epoch_is_told(tmp_path: Path, capsys: pytest
     shown = capsys.readouterr().out
     assert "NEEDS A LOOK" in shown
     assert told in shown
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_distances_in_metres_among_millimetres_are_left_out_and_named(
+    count: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With them in, 200 steps lead nowhere; without them, two do."""
+    names = [f"c{i + 1}" for i in range(count)]
+    lab = planted(tmp_path / "lab", "total-station", "distances",
+                  scaled("value_mm", 1e-3, lambda row: row["distance_id"] in names))  # fmt: skip
+    assert main(["check", str(lab)]) == 3
+    said = "distance c1: it is in another unit: 0.570043 mm, by what the rest says 570.043 mm"
+    assert said in capsys.readouterr().out
+    assert main(["adjust", str(lab), "--quiet"]) == 0
+    solution = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))
+    assert sorted(c["ids"][0] for c in solution["diagnosis"]) == names
+    assert {c["cause"].partition(": ")[2] for c in solution["diagnosis"]} == {
+        "its values are metres, read as millimetres"
+    }
+    assert solution["summary"]["iterations"] < 5
+    assert main(["adjust", str(lab), "--quiet", "--try", "1"]) == 0
+    left = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8")).get("diagnosis", [])
+    assert len(left) == count - 1
