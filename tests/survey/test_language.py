@@ -40,7 +40,8 @@ TERMINAL = {"beforehand", "between.py", "trajectory.py"}
 NAMES = """angles from another zero|axes or unit of given coordinates|axis of a table runs out|cameras exchanged
 cameras not simultaneous|clock drift|clock offset|correlated observations|encoder of a table|epochs exchanged
 epochs shifted|epochs without partners|focus touched|gear ratio|gear ratio of axis 7|given points exchanged
-images copied|images mirrored|images of another camera|images resized|images shifted|images turned|instrument height|left-handed frames|lens drifts
+images copied|images mirrored
+images of another camera|images resized|images shifted|images turned|instrument height|left-handed frames|lens drifts
 motion forgotten|odd sigma|order of Euler angles|order of quaternions|pairs inverted|pixel origin|point moved
 points exchanged|prism constant|rolling shutter|rotations inverted|rows and columns|rows of another set-up
 sense of rotation|set-up turned|shift in other axes|sigmas of a group|sign of height differences|slipped decimal
