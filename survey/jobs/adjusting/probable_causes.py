@@ -43,6 +43,8 @@ def explained(survey: Survey, error: SurveyError, project: Project) -> SurveyErr
     """What an adjustment of the ``survey`` of a project raised, with the probable causes in front, if any."""
     apart, contradictions = separate_epochs(survey), _probable_causes(survey)
     diagnosis, note = _named(_diagnosis(survey, None, error, contradictions), project)
+    if isinstance(error, IndeterminateError):
+        note = ()  # what is not observed contradicts nothing
     if diagnosis is not None and project.origins:  # of a project that has not grown there is nothing to try
         done = (replace(c, hypothesis=replace(c.hypothesis, edits=())) for c in diagnosis.candidates)
         diagnosis = replace(diagnosis, candidates=tuple(done))
