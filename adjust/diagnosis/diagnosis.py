@@ -55,7 +55,8 @@ class Diagnosis:
 
     tried: names of the kinds of causes that were tried, whether they explain anything or not. untried: of those that
     evidence speaks for, but the time of a diagnosis did not suffice for. passed_over: of those that were not looked for
-    in a survey of this size.
+    in a survey of this size. spoils: whether the first cause concerns observations that take part as well, although
+    those that showed it were left out.
     """
 
     candidates: tuple[Candidate, ...]
@@ -63,6 +64,7 @@ class Diagnosis:
     misfit: Misfit
     untried: tuple[str, ...] = ()
     passed_over: tuple[str, ...] = ()
+    spoils: bool = False
 
     @property
     def note(self) -> str:

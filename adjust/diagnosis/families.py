@@ -18,10 +18,11 @@ from adjust.diagnosis.targets.layout import other_layouts
 from adjust.diagnosis.targets.size import wrong_sizes
 from adjust.diagnosis.time.forgotten_motion import forgotten_motion
 from adjust.diagnosis.time.synchronisation import unsynchronised
-from adjust.diagnosis.units.heights import wrong_heights
+from adjust.diagnosis.units.heights import misread_heights, wrong_heights
 from adjust.diagnosis.units.pairs import misread_pairs
 from adjust.diagnosis.units.readings import misread_readings
 from adjust.diagnosis.weights.correlated import correlated_readings
+from adjust.diagnosis.weights.impossible import impossible_sigmas
 from adjust.diagnosis.weights.sigmas import odd_sigmas, wrong_factors
 
 Family = Callable[[Case], Iterable[Hypothesis]]
@@ -31,10 +32,14 @@ NAMES: tuple[Family, ...] = (
     exchanged_points, wrong_given, misplaced_epochs, misnamed_images, exchanged_in_images, rows_of_another_setup,
     exchanged_stations,
 )  # fmt: skip
+VALUES: tuple[Family, ...] = (misread_heights, impossible_sigmas)
+"""Told by the values alone: the first ones that are tried."""
 UNITS: tuple[Family, ...] = (misread_readings, wrong_heights, misread_pairs)
+IN_COMMON = (*VALUES, *UNITS)
+"""What several observations that were left out, with all others fitting, may have in common."""
 TIME: tuple[Family, ...] = (forgotten_motion, unsynchronised)
 WEIGHTS: tuple[Family, ...] = (odd_sigmas, wrong_factors, correlated_readings)
-CHEAP = (*IMAGES, *NAMES, *UNITS, *TIME, *WEIGHTS, lost_cameras)
+CHEAP = (*VALUES, *IMAGES, *NAMES, *UNITS, *TIME, *WEIGHTS, lost_cameras)
 LATER: tuple[tuple[Family, ...], ...] = ((wrong_sizes,), (changed_bodies,))
 """These adjust to find theirs: they are asked where what the first ones found does not explain everything."""
 

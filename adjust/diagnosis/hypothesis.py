@@ -80,12 +80,16 @@ class ExchangeColumns:
 
 @dataclass(frozen=True)
 class ChangeReadings:
-    """The values of readings or distances, by id: new = factor * old + offset (rad or m), each in its own unit."""
+    """The values of readings or distances, by id: new = factor * old + offset (rad or m), each in its own unit.
+
+    field: "sigma", "instrument_height" or the like: that quantity instead.
+    """
 
     ids: tuple[str, ...]
     factor: float
     offset: float = 0.0
     table: str = "terrestrial"
+    field: str = "value"
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,11 @@ class Explanation(Protocol):
         """For people: one for each cause, the likeliest first."""
         ...
 
+    @property
+    def spoils(self) -> bool:
+        """Whether the adjustment fits only because it left out what showed the first cause."""
+        ...
+
     def told(self) -> list[dict[str, str | float | bool | list[str]]]:
         """The causes for machines."""
         ...

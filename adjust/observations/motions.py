@@ -4,7 +4,7 @@ import gtsam
 import numpy as np
 
 from adjust.frames.unknowns import Unknown, Unknowns
-from adjust.model.survey import FloatArray, Surface, Survey, tilt_axes
+from adjust.model.survey import FloatArray, Surface, Survey, Vertical, tilt_axes
 from adjust.observations.terrestrial import equations as k
 from adjust.observations.terrestrial.batch import TerrestrialBatch
 from adjust.spatial.motions import point_motions
@@ -22,11 +22,20 @@ def vector_motions(survey: Survey, unknowns: Unknowns, unknown: Unknown, values:
         motions = np.zeros((4, 7))
         motions[:2, 6] = full[:2]
     elif unknown.name[0] == "vertical":
-        up = np.asarray(survey.vertical.up_in_world, dtype=float)
-        motions = direction_motions(up / np.linalg.norm(up), full)
+        motions = vertical_motions(survey.vertical, full)
     else:
         motions = surface_motions(next(s for s in survey.surfaces if s.surface_id == unknown.name[1]), full)
     return motions[[vector.names.index(x) for x in vector.free]]
+
+
+def vertical_motions(vertical: Vertical, tilt: FloatArray) -> FloatArray:
+    """Of the two tilts (2, 7) of the plumb line at the origin; the centre of curved level surfaces is shifted, too."""
+    up = np.asarray(vertical.up_in_world, dtype=float)
+    reference = up / np.linalg.norm(up)
+    motions = direction_motions(reference, tilt)
+    if vertical.radius is not None:
+        motions[:, :3] = -np.linalg.pinv(tilted(reference, tilt)[1]) / vertical.radius
+    return motions
 
 
 def direction_motions(reference: FloatArray, tilt: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ from adjust.model.subsets import positions_of
 from adjust.model.survey import Survey
 from adjust.statistics.group_sums import scaled_survey
 from adjust.statistics.outliers.outcome import OutlierSearch, SearchOptions
-from adjust.statistics.outliers.search import disagreeing_pairs, search_outliers
+from adjust.statistics.outliers.search import disagreeing_pairs, distances_in_the_way, search_outliers
 from adjust.statistics.outliers.watched import watchable
 from adjust.statistics.variance_components import Scaled, estimate_variance_components
 from adjust.testing.criteria import limits
@@ -21,6 +21,8 @@ from adjust.testing.criteria import limits
 _LARGEST, _ROOM = 6000, 1e8
 """Unknowns up to which gross errors are always searched; above, numbers that the search may need for its columns."""
 _PASSES = 3
+_FEW_STEPS = 30
+"""From which on it is asked what is in the way of a solution; what has one has it in ten or so."""
 _CONTROLLED = 1e-4
 """Redundancy number below which nothing controls an observation."""
 _SCREENED = "left out as gross errors"
@@ -72,12 +74,12 @@ def _cleaned(
     if options.reject_pairs and start is None:
         wrong = disagreeing_pairs(survey, only_large=True)
     try:
-        first = None if wrong is not None else adjust(survey, start, options.adjust, progress)
+        first = None if wrong is not None else adjust(survey, start, _soon(survey, options), progress)
     except NotConvergedError:
-        wrong = disagreeing_pairs(survey) if options.reject_pairs else None
-        if wrong is None:
+        wrong = disagreeing_pairs(survey) or distances_in_the_way(survey) if options.reject_pairs else None
+        if wrong is None and _soon(survey, options) is options.adjust:
             raise
-        first = None
+        first = adjust(survey, start, options.adjust, progress) if wrong is None else None
     if first is None:
         search = search_outliers(survey, None, _how(options), progress, wrong=wrong)
         first = search.adjustment
@@ -98,6 +100,14 @@ def _cleaned(
         now = scaled.adjustment
         factors = {c.group: factors.get(c.group, 1.0) * c.factor for c in scaled.components.components}
     return _told(now, first, search, scaled, factors, _unsearched(now, options))
+
+
+def _soon(survey: Survey, options: CleanOptions) -> AdjustOptions:
+    """With few steps, where distances may be in the way of more."""
+    if survey.image_blocks or not survey.distances or not options.reject_pairs:
+        return options.adjust
+    solve = options.adjust.solve
+    return replace(options.adjust, solve=replace(solve, max_iterations=min(_FEW_STEPS, solve.max_iterations)))
 
 
 def _unsearched(now: Adjustment, options: CleanOptions) -> tuple[str, ...]:

@@ -80,6 +80,7 @@ class Growing:
             left, reasons = list[Pair](), list[str]()
             for pair in waiting:
                 try:
+                    _check_ends(pair)
                     addition = self.session.add([pair])
                 except SurveyError as error:
                     left.append(pair)
@@ -119,6 +120,12 @@ class Growing:
             if station.motion != "fixed" or station.world_from_station.treatment != "free":
                 raise SurveyError(f"{where} is not placed by pairs alone, as --live needs it; add it without --live")
         return stations
+
+
+def _check_ends(pair: Pair) -> None:
+    other = next((ref.text for ref in (pair.a, pair.b) if ref.kind != "station" or ref.epoch_id is not None), None)
+    if other is not None:
+        raise SurveyError(f"{other} is no fixed station, as --live needs it; the pair counts once all is added")
 
 
 def _same(a: Pair, b: Pair) -> bool:

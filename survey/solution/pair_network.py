@@ -1,9 +1,9 @@
 """The measured pairs of a survey as a network: counts after theorem 1 of the relay paper.
 
-Frames are the eyes: stations, cameras, targets. What is known without pairs closes loops too: of the datum (held
-stations, stations with a full prior, the world) where there is more than one, each joined to the world; of a calibrated
-rig the cameras and targets whose poses on their station are held or have a full prior, where pairs reach more than one
-of its frames, each joined to the station.
+Frames are the eyes: stations, cameras, targets. What is known without pairs closes loops too: of the datum (the world,
+and stations, targets and tables that are held there or have a full prior) where there is more than one, each joined to
+the world; of a calibrated rig the cameras and targets whose poses on their station are held or have a full prior, where
+pairs reach more than one of its frames, each joined to the station.
 """
 
 from collections.abc import Iterable, Sequence
@@ -110,9 +110,18 @@ def _is_given(parameter: PoseParameter, dim: int) -> bool:
 
 def _given(survey: Survey, ends: Ends, dim: int) -> tuple[str, ...]:
     names = {name for _, *both in ends for name in both}
-    fixed = (s for s in survey.stations if s.motion == "fixed" and s.station_id in names)
-    given = tuple(s.station_id for s in fixed if _is_given(s.world_from_station, dim))
+    given = tuple(name for name, (_, pose) in _in_world(survey).items() if name in names and _is_given(pose, dim))
     return ((_WORLD,) if _WORLD in names else ()) + given
+
+
+def _in_world(survey: Survey) -> dict[str, tuple[ParameterName, PoseParameter]]:
+    """What stands in the world: stations, targets and tables by the names of their frames, with the pose there."""
+    fixed = {s.station_id: (("world_from_station", s.station_id), s.world_from_station)
+             for s in survey.stations if s.motion == "fixed"}  # fmt: skip
+    targets = {f"target:{t.target_id}": (("carrier_from_target", t.target_id), t.carrier_from_target)
+               for t in survey.targets if t.station_id is None and t.motion != "epoch"}  # fmt: skip
+    tables = {f"table:{t.table_id}": (("world_from_table", t.table_id), t.world_from_table) for t in survey.tables}
+    return {**fixed, **targets, **tables}
 
 
 def tied(ends: Ends, links: "Sequence[Link]", bare: tuple[str, ...] = ()) -> Topology:
@@ -137,9 +146,8 @@ class Link:
 
 def links_of(survey: Survey, pairs: Sequence[Pair], ends: Ends, dim: int) -> list[Link]:
     """What is known without pairs, where it closes loops."""
-    given, stations = _given(survey, ends, dim), survey.stations_by_id
-    fixed = [s for s in given if s != _WORLD] if len(given) > 1 else []
-    out = [Link(s, _WORLD, ("world_from_station", s), stations[s].world_from_station) for s in fixed]
+    given, stations, standing = _given(survey, ends, dim), survey.stations_by_id, _in_world(survey)
+    out = [Link(name, _WORLD, *standing[name]) for name in given if name != _WORLD] if len(given) > 1 else []
     frames, rig = dict[str, FrameRef](), dict[str, list[Link]]()
     for pair, (_, a, b) in zip(pairs, ends, strict=True):
         frames[a], frames[b] = pair.a, pair.b

@@ -51,12 +51,14 @@ _MOST_PARTS = 8
 def fit_of(adjustment: Adjustment, tested: Consistency | None = None) -> str:
     """Whether residuals agree with the sigmas: as a whole, in every part, and through time.
 
-    Residuals that are smaller than the sigmas say are cautious sigmas, and mislead nobody.
+    They do not where what does not fit was left out, and has a cause that concerns what was kept as well. Residuals
+    that are smaller than the sigmas say are cautious sigmas, and mislead nobody.
     """
     test = adjustment.global_test
     if test is None:
         return UNTESTED
-    if test.status == "failed" or (tested is not None and not tested.fits):
+    spoilt = adjustment.diagnosis is not None and adjustment.diagnosis.spoils
+    if test.status == "failed" or spoilt or (tested is not None and not tested.fits):
         return MISFIT
     return CAUTIOUS if test.status == "cautious" else FITS
 
@@ -93,6 +95,11 @@ def verdict(
         return "failed", (
             f"Global test failed: residuals are {adjustment.sigma0:.2f} times what the sigmas of the observations "
             "allow. Look for blunders, wrong sigmas or a model that lacks something, starting with the groups."
+        )
+    if adjustment.diagnosis is not None and adjustment.diagnosis.spoils:
+        return "failed", (
+            "What was left out has a cause that concerns what was kept as well, so that the numbers below are wrong; "
+            "it is named first among the warnings."
         )
     if fit == MISFIT:
         return "failed", (

@@ -295,7 +295,7 @@ def test_pairs_are_told_while_they_are_measured(lab, monkeypatch, capsys):
     assert all("; moved: " in line for line in said[-1].splitlines() if "is placed" not in line)
 
 
-@pytest.mark.parametrize("fault", ["free network", "no folder", "held", "twice"])
+@pytest.mark.parametrize("fault", ["free network", "no folder", "held", "twice", "world"])
 def test_what_cannot_be_told_live_is_said(lab, fault, monkeypatch, capsys):
     def stop(_: float) -> None:
         raise KeyboardInterrupt
@@ -316,10 +316,22 @@ def test_what_cannot_be_told_live_is_said(lab, fault, monkeypatch, capsys):
     elif fault == "twice":
         (more / "survey.toml").write_text("[stations.E1]\n[stations.E2]\n[stations.E3]\n[stations.K04]\n")
         message = f"! {more}/survey.toml: stations.K04: stands already in {lab}"
+    elif fault == "world":
+        _write(more, [row | {"a_id": "world"} if row["pair_id"] == "K10-E1" else row for row in _rows(more)])
+        message = "! K10-E1: world is no fixed station, as --live needs it; the pair counts once all is added\n"
     before = _files(lab)
     main(["add", str(lab), str(more), "--live"])
     assert message in capsys.readouterr().err
-    assert _files(lab) == before or fault == "held"
+    assert _files(lab) == before or fault in ("held", "world")
+
+
+def test_a_datum_that_is_not_there_is_no_contradiction(lab, capsys):
+    text = (lab / "survey.toml").read_text().replace('world_from_station = { treatment = "held" }', "")
+    (lab / "survey.toml").write_text(text)
+    assert main(["adjust", str(lab), "--quiet"]) == 1
+    said = capsys.readouterr().err
+    assert "the datum: no station is held or has a prior" in said
+    assert "contradict" not in said
 
 
 def _faulty(lab, fault):

@@ -8,13 +8,15 @@ import pytest
 from gtsam import Pose3, Rot3
 
 from adjust.diagnosis.case import Case
-from adjust.diagnosis.families import NAMES, UNITS, WEIGHTS
+from adjust.diagnosis.families import NAMES, UNITS, VALUES, WEIGHTS
 from adjust.diagnosis.units.heights import wrong_heights
 from adjust.diagnosis.units.pairs import misread_pairs
 from adjust.diagnosis.units.readings import misread_readings
 from adjust.model.survey import Survey
 from survey.project import read
+from tests.acceptance.planted_surveys import survey_of
 from tests.adjust.planted import case_of, diagnosed, hall, reread
+from tests.adjust.terrestrial_networks import measured, polar_network
 from tests.data import data_folder
 
 GON = 0.9
@@ -79,6 +81,34 @@ def test_height_of_an_instrument(metres: float) -> None:
         for s in (mine.changed(), good)
     ]
     assert heights[0] == pytest.approx(heights[1], rel=0, abs=0.1 * metres + 1e-3)
+
+
+@pytest.mark.parametrize("both", [False, True])
+def test_heights_in_metres_read_as_millimetres(both: bool) -> None:
+    """Of targets alone, or of instruments as well: the unit, and not twenty heights that are each wrong."""
+    survey, truth = polar_network(3)
+    tall = tuple(replace(r, target_height=1.3 + 0.1 * (i % 3)) for i, r in enumerate(survey.readings))
+    good = measured(replace(survey, readings=tall), truth, 103)
+    readings = tuple(replace(r, target_height=1e-3 * r.target_height,
+                             instrument_height=(1e-3 if both else 1.0) * r.instrument_height)
+                     for r in good.readings)  # fmt: skip
+    (first, *_) = diagnosed(replace(good, readings=readings), *VALUES, *UNITS, *NAMES).candidates
+    assert first.hypothesis.name == "unit of heights"
+    assert first.hypothesis.place.key == ("instrument_height" if both else "target_height")
+    mended = first.hypothesis.changed().readings
+    for field in ("target_height", "instrument_height"):
+        assert [getattr(r, field) for r in mended] == pytest.approx([getattr(r, field) for r in good.readings])
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_one_component_of_all_shifts_in_metres(axis: int) -> None:
+    survey, _ = survey_of("poses", 3)
+    by = np.where(np.arange(3) == axis, 1e-3, 1.0)
+    pairs = tuple(replace(p, b_from_a=Pose3(p.b_from_a.rotation(), by * p.b_from_a.translation()))
+                  for p in survey.pairs)  # fmt: skip
+    (first, *_) = diagnosed(replace(survey, pairs=pairs), *UNITS, *WEIGHTS).candidates
+    assert (first.hypothesis.name, first.hypothesis.place.ids) == ("unit of shifts", ("all",))
+    assert f"have t{'xyz'[axis]}_mm in metres" in first.hypothesis.cause
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Free networks of readings, and solutions moved to another datum without solving again."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import gtsam
@@ -12,13 +13,26 @@ from adjust.graph.datum import gauge, inner_datum
 from adjust.graph.solver import solve
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
-from adjust.model.survey import INSTRUMENT, TILT, Bearings, Datum, FloatArray, Survey, VectorParameter, Vertical
+from adjust.model.survey import (
+    INSTRUMENT,
+    TILT,
+    Bearings,
+    Datum,
+    FloatArray,
+    Survey,
+    VectorParameter,
+    VectorPrior,
+    Vertical,
+)
 from adjust.precision.other_datum import in_datum
 from adjust.precision.precision import Precision
 from tests.adjust import helpers as h
 from tests.adjust.terrestrial_networks import Truth, dense, measured, polar_network, start_near
 
 FREE_TILT = Vertical(tilt=VectorParameter(TILT, np.zeros(2), free=TILT))
+ROUND = replace(FREE_TILT, radius=60.0)
+PRIOR = VectorPrior(TILT, np.zeros(2), (5.0 * np.radians(1 / 3600)) ** 2 * np.eye(2))
+KNOWN_TILT = Vertical(tilt=VectorParameter(TILT, np.zeros(2), TILT, PRIOR), radius=6.371e6)
 SOME = Datum("inner", points=("P0", "P3", "P5"))
 
 
@@ -161,10 +175,14 @@ def test_a_datum_that_is_observed_cannot_be_chosen() -> None:
         in_datum(result, Datum("inner", points=("P4",)))
 
 
-def test_whole_survey_motions_change_no_reading() -> None:
-    """The seven motions, with orientation, tilt and scale unknowns, leave all predictions as they are."""
+@pytest.mark.parametrize(("vertical", "unseen"), [(FREE_TILT, range(7)), (ROUND, (0, 1, 3, 4, 5))])
+def test_whole_survey_motions_change_no_reading(vertical: Vertical, unseen: Sequence[int]) -> None:
+    """The seven motions, with orientation, tilt and scale unknowns, leave all predictions as they are.
+
+    Round level surfaces show heights and scale by their curvature.
+    """
     instrument = VectorParameter(INSTRUMENT, np.array([0.0, 1e-4, 0.0, 0.0]), free=("distance_scale",))
-    survey, truth = polar_network(3, held=0, extra=False, instrument=instrument, vertical=FREE_TILT)
+    survey, truth = polar_network(3, held=0, extra=False, instrument=instrument, vertical=vertical)
     truth["vertical",] = np.array([0.01, -0.02])
     level = tuple(replace(r, instrument_height=0.0, target_height=0.0) for r in survey.readings)
     survey = measured(replace(survey, readings=level), truth, None)
@@ -172,12 +190,23 @@ def test_whole_survey_motions_change_no_reading() -> None:
     graph.prepare(graph.start, jacobians=True)
     assert graph.terrestrial is not None
     motions = {u.key: gauge(graph, u, graph.start) for u in graph.unknowns.by_name.values()}
-    for i in range(7):
+    for i in unseen:
         moved = gtsam.VectorValues()
         for key, motion in motions.items():
             moved.insert(key, 1e-6 * motion[:, i])
         graph.terrestrial.evaluate(graph.start.retract(moved))
         assert np.abs(graph.terrestrial.residual).max() < 1e-9, i
+
+
+def test_inner_datum_where_level_surfaces_are_round_and_their_tilt_is_nearly_known() -> None:
+    """Along a level surface nothing changes, whatever is known of the plumb line: four directions are left open."""
+    survey, truth = free_network(("direction", "zenith", "slope_distance"), vertical=KNOWN_TILT)
+    result = solution(survey, truth, Datum("inner"))
+    assert result.datum_defect == 4
+    plane, _ = free_network(("direction", "zenith", "slope_distance"))
+    assert solution(plane, truth, Datum("inner")).datum_defect == 4
+    sigmas = np.array([np.sqrt(np.diag(result.estimates["point", f"P{i}"].cov)) for i in range(8)])
+    assert sigmas.max() < 0.01
 
 
 @pytest.mark.slow

@@ -39,13 +39,14 @@ TERMINAL = {"beforehand", "between.py", "trajectory.py"}
 """What speaks on a terminal alone, of the diagnosis."""
 NAMES = """angles from another zero|axes or unit of given coordinates|axis of a table runs out|cameras exchanged
 cameras not simultaneous|clock drift|clock offset|correlated observations|encoder of a table|epochs exchanged
-epochs shifted|focus touched|gear ratio|gear ratio of axis 7|given points exchanged|images copied|images mirrored
+epochs shifted|epochs without partners|focus touched|gear ratio|gear ratio of axis 7|given points exchanged
+images copied|images mirrored
 images of another camera|images resized|images shifted|images turned|instrument height|left-handed frames|lens drifts
 motion forgotten|odd sigma|order of Euler angles|order of quaternions|pairs inverted|pixel origin|point moved
 points exchanged|prism constant|rolling shutter|rotations inverted|rows and columns|rows of another set-up
 sense of rotation|set-up turned|shift in other axes|sigmas of a group|sign of height differences|slipped decimal
 station moved|stations exchanged|table moved|targets exchanged|the same twice|unit of angles|body of 7
-unit of lengths|unit of shifts|its images contradict those of all others
+unit of heights|unit of lengths|unit of shifts|unit of sigmas|its images contradict those of all others
 no exchange of the axes, unit or shift by one epoch explains it
 which no reading of table"""
 """Kinds of causes and marks of lines, by which programs tell them apart: shown to nobody."""

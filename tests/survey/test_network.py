@@ -14,7 +14,17 @@ from adjust.adjustment import AdjustOptions, adjust
 from adjust.graph.assembly import StartValues
 from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.observations import Coordinates, Distance, FrameRef, Pair, PositionRef
-from adjust.model.survey import Camera, Datum, LensParameter, Point, PointParameter, PoseParameter, Station, Survey
+from adjust.model.survey import (
+    Camera,
+    Datum,
+    LensParameter,
+    Point,
+    PointParameter,
+    PoseParameter,
+    Station,
+    Survey,
+    Target,
+)
 from adjust.pose_network.from_survey import network_of_pairs
 from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
 from survey import problem, solve
@@ -136,6 +146,21 @@ def test_loops_through_a_calibrated_rig_are_listed_and_close_after_the_adjustmen
     # a camera whose place only pairs tell closes no loop through its station
     free = replace(survey.cameras[1], station_from_camera=PoseParameter(poses["b"]))
     assert len(pair_loops(replace(survey, cameras=(survey.cameras[0], free))).test) == 1
+
+
+def test_a_target_held_in_the_world_controls_the_way_to_it():
+    survey, poses = _network(3, [(0, 1), (1, 2)])
+    end = replace(survey.pairs[1], b=FrameRef("target", "T"))
+    target = Target("T", ("c",), np.zeros((1, 3)), None, carrier_from_target=PoseParameter(poses[2], "held"))
+    survey = replace(survey, stations=survey.stations[:2], pairs=(survey.pairs[0], end), targets=(target,))
+    found = network_dict(pair_network(survey))
+    assert found["uncontrolled_pairs"] == []
+    assert (found["redundancy"], found["conditions_through_given_stations"]) == (6, 1)
+    assert adjust_cleaned(survey).redundancy == 6
+    (loop,) = range(len(pair_loops(survey).test))
+    assert set(pair_loops(survey).basis.stations(loop)) == {"S0", "S1", "target:T", "world"}
+    moving = replace(target, motion="epoch")
+    assert pair_network(replace(survey, targets=(moving,))).uncontrolled == ("p0-1", "p1-2")
 
 
 def test_two_held_stations_control_the_way_between_them():

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 
 from adjust.diagnosis.hypothesis import Finding
+from adjust.diagnosis.table.unseen import unseen_readings
 from adjust.model.errors import listed
 from adjust.model.names import grouped
 from adjust.model.observations import CoordinateDifferences, Coordinates
@@ -85,9 +86,4 @@ def _epochs(survey: Survey) -> Iterator[Finding]:
         yield Finding("weak", "epochs without partners", tuple(lonely),
                       f"{len(lonely)} of {len(seen)} epochs are seen by one camera alone: {listed(lonely, 6)}",
                       "they join no cameras; check the names of files, or take epochs that two see")  # fmt: skip
-    read = {t.epoch_id: t.table_id for t in survey.table_readings}
-    blind = [e for e in read if e not in seen]
-    if blind and survey.image_blocks:
-        yield Finding("weak", "epochs without partners", tuple(blind),
-                      f"{len(blind)} table readings have no image of their epoch: {listed(blind, 6)}",
-                      "check the names of epochs in table_angles.csv and of the image files")  # fmt: skip
+    yield from unseen_readings(survey)

@@ -9,7 +9,9 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Finding, Hypothesis
 from adjust.diagnosis.names.given import wrong_given
 from adjust.diagnosis.units.conventions import ANGLES, LENGTH_RATIOS, SLIPS
+from adjust.diagnosis.units.heights import doubtful_heights
 from adjust.diagnosis.units.readings import misread_readings
+from adjust.diagnosis.weights.impossible import doubtful_sigmas
 from adjust.diagnosis.weights.sigmas import ODD, id_of, odd_among
 from adjust.model.errors import listed
 from adjust.model.names import grouped
@@ -20,13 +22,17 @@ from adjust.model.survey import Survey
 
 _NEAR, _OFF = 0.02, 0.1
 """Of a length and of a turn: what start values miss by at most, and what no right value does."""
+_THOUSAND = (1e3, 1e-3)
 _CLEAR = 20.0
 """Misfit before over misfit after of a single value: ten sigmas off, and then none."""
 
 
 def valued(case: Case, expected: Adjustment | None) -> Iterator[Finding]:
     """All of them. expected: its survey has all observations as the start values predict them."""
-    yield from _sigmas(case.survey)
+    odd = list(_in_another_unit(case))
+    yield from odd
+    if any(f.kind == "suspicious unit" and f.level == "problem" for f in odd):
+        return  # the start values are spoilt by it
     slips = list(_slips(case.survey, expected.survey)) if expected is not None else []
     given = max(_tried(wrong_given, case), key=lambda h: h.evidence, default=None)  # which many readings contradict
     read = None if slips else max(_tried(misread_readings, case), key=lambda h: h.evidence, default=None)
@@ -78,16 +84,24 @@ def _slipped(what: str, value: float, predicted: float, factor: float, unit: str
     """What is wrong; nothing where the value fits as it stands, or by no factor."""
     if abs(value - predicted) < _OFF * abs(predicted):
         return ""
-    by = next((by for by in SLIPS if abs(by * value - predicted) < _NEAR * abs(predicted)), None)
-    return "" if by is None else (f"{what}: its decimal point has slipped: {factor * value:.10g} {unit}, by what the "
-                                  f"rest says {factor * by * value:.10g} {unit}")  # fmt: skip
+    ways = SLIPS if unit == "deg" else (*SLIPS, *_THOUSAND)
+    by = next((by for by in ways if abs(by * value - predicted) < _NEAR * abs(predicted)), None)
+    how = "it is in another unit" if by in _THOUSAND else "its decimal point has slipped"
+    return "" if by is None else (f"{what}: {how}: {factor * value:.10g} {unit}, by what the rest says "
+                                  f"{factor * by * value:.10g} {unit}")  # fmt: skip
 
 
-def _sigmas(survey: Survey) -> Iterator[Finding]:
-    """Sigmas and values that look like another unit."""
+def _in_another_unit(case: Case) -> Iterator[Finding]:
+    """Sigmas and values that look like another unit. A target may be as thin as a height of a millimetre says."""
+    survey, known = case.survey, set[str]()
+    for h in (*doubtful_heights(survey), *doubtful_sigmas(survey)):
+        kind = "suspicious sigma" if h.name == "unit of sigmas" else "suspicious unit"
+        known.update(h.place.ids)
+        yield Finding("weak" if h.place.kind == "point" else "problem", kind, h.place.ids, h.cause, h.change)
     every: tuple[Reading | Distance, ...] = (*survey.readings, *survey.distances)
     for kind, found in grouped((str(getattr(o, "kind", "distance")), o) for o in every).items():
-        if odd := [id_of(o) for o in odd_among(found)[1]]:
+        odd = [id_of(o) for o in odd_among(found)[1]]
+        if not known.issuperset(odd):
             yield Finding("problem", "suspicious sigma", tuple(odd), f"{kind} {listed(odd, 6)}: the sigma is more than "
                           f"{ODD:.0f} times off that of the others", "check its unit")  # fmt: skip
     yield from _lengths(survey)

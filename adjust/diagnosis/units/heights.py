@@ -1,16 +1,21 @@
 """Constants that shift readings: the height of an instrument or a target, the offset of a reflector (prism constant).
 
-Each is estimated as the median of what single readings say, and must explain nearly all of them.
+Each is estimated as the median of what single readings say, and must explain nearly all of them. Heights in another
+unit are told by the values alone: an instrument's axis lies in its housing, so that it stands neither within three
+millimetres of its point nor a hundred metres above it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from adjust.diagnosis.case import CAP, Case
-from adjust.diagnosis.hypothesis import Hypothesis, Place
+from adjust.diagnosis.hypothesis import ChangeReadings, Hypothesis, Place
 from adjust.diagnosis.screen import at_best
+from adjust.diagnosis.weights.impossible import SURE
+from adjust.model.errors import listed
+from adjust.model.observations import Reading, position_text
 from adjust.model.rewriting import Fields, with_rows
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.observations.terrestrial.batch import TerrestrialBatch
@@ -20,6 +25,9 @@ _CLEARLY = 3.0
 _FEWEST, _MOST = 3, 4
 _LARGEST = 10.0
 """m: what no height of an instrument or a target, and no reflector's constant, is wrong by."""
+_HEIGHTS = ("instrument_height", "target_height", "second_height")
+_UNITS = {1e3: ("are metres, read as millimetres", 2e-4, 3e-3), 1e-3: ("are millimetres, read as metres", 100.0, 1e5)}
+"""By the factor that mends them: heights in another unit, and from where to where (m) they then stand."""
 _SEEN = 1e-4
 """Share of a constant's column that no unknown takes over, below which it does not show."""
 
@@ -34,6 +42,46 @@ class _Constant:
     rows: IntArray
     by: FloatArray
     remedy: str
+
+
+def misread_heights(case: Case) -> Iterator[Hypothesis]:
+    """Heights in another unit, by their values alone."""
+    yield from doubtful_heights(case.survey)
+
+
+def doubtful_heights(survey: Survey) -> Iterator[Hypothesis]:
+    """Heights of instruments, with those of their targets; or of targets alone: where all of these are in that unit."""
+    for factor, (unit, least, most) in _UNITS.items():
+        given = {f: {i: h for i, r in enumerate(survey.readings) if (h := getattr(r, f))} for f in _HEIGHTS}
+        first, *others = _HEIGHTS
+        odd = {first: {i: h for i, h in given[first].items() if least <= abs(h) <= most}}
+        for field in others:
+            theirs = {i: h for i, h in given[field].items() if i in odd[first] or not odd[first]}
+            if all(least <= abs(h) <= most for h in theirs.values()):
+                odd[field] = theirs
+        if odd := {field: heights for field, heights in odd.items() if heights}:
+            yield _in_unit(survey, odd, factor, unit)
+
+
+def _in_unit(survey: Survey, odd: Mapping[str, Mapping[int, float]], factor: float, unit: str) -> Hypothesis:
+    """odd: by field the heights (m) that are wrong, by their rows."""
+    field, readings = next(iter(odd)), survey.readings
+    first, of_instruments = next(iter(odd[field].values())), field == "instrument_height"
+    some = [readings[i] for i in odd[field]]
+    names = [r.setup_id or position_text(r.at) if of_instruments else position_text(r.to) for r in some]
+    place = Place("setup" if of_instruments else "point", tuple(dict.fromkeys(names)), field)
+    new = dict[int, Reading]()
+    for name, heights in odd.items():
+        changes: dict[int, Fields] = {i: {name: factor * h} for i, h in heights.items()}
+        new |= {i: replace(new.get(i, readings[i]), **change) for i, change in changes.items()}
+    return Hypothesis(
+        "unit of heights", f"{listed(place.ids, 6)}: a height of {1e3 * first:.6g} mm of "
+        f"{'instruments' if of_instruments else 'targets'}: heights {unit}",
+        f"multiply {', '.join(odd)} by {factor:g} in {len(new)} rows of terrestrial.csv, or name the columns by their "
+        "unit", place, with_rows(survey, "readings", new),
+        tuple(ChangeReadings(tuple(readings[i].reading_id for i in rows), factor, field=f) for f, rows in odd.items()),
+        SURE, 0,
+    )  # fmt: skip
 
 
 def wrong_heights(case: Case) -> Iterator[Hypothesis]:

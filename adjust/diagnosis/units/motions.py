@@ -56,10 +56,13 @@ def _numbers(
     return Convention(name, said, remedy, mend, (columns, matrix), shifts)
 
 
-def _of_shifts(said: str) -> Convention:
+def _of_shifts(said: str, columns: tuple[str, ...] = _SHIFT) -> Convention:
     factor = LENGTH_RATIOS[f"are {said}"]
-    return _numbers("unit of shifts", f"have shifts in {said}", f"multiply tx, ty, tz by {factor:g}", _SHIFT,
-                    factor * np.eye(3), factor)  # fmt: skip
+    if columns is _SHIFT:
+        told = f"have shifts in {said}", f"multiply tx, ty, tz by {factor:g}"
+    else:
+        told = f"have {columns[0]} in {said}", f"multiply {columns[0]} by {factor:g}"
+    return _numbers("unit of shifts", *told, columns, factor * np.eye(len(columns)), factor)
 
 
 def _inverted(m: Motion) -> Motion:
@@ -89,6 +92,7 @@ CONVENTIONS: tuple[Convention, ...] = (
     _of_shifts("metres, read as millimetres"),
     _of_shifts("millimetres, read as metres"),
     _of_shifts("inches, read as millimetres"),
+    *(_of_shifts("metres, read as millimetres", (column,)) for column in _SHIFT),
     _numbers("order of quaternions", "have quaternions in the order x y z w, read as w x y z",
              "put the last of the four numbers first", _QUATERNION, np.roll(np.eye(4), 1, axis=0)),
     _numbers("order of quaternions", "have quaternions in the order w x y z, read as x y z w",

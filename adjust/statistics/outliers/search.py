@@ -35,10 +35,14 @@ _Leave = Callable[[tuple[int, ...], Adjustment], Adjustment]
 
 @dataclass(frozen=True, eq=False)
 class Disagreeing:
-    """Pairs (E,) of a network that do not agree with the others, and where these put the stations."""
+    """Pairs (E,) of a network that do not agree with the others, and where these put the stations.
+
+    field: of a survey that holds them, where they are no pairs.
+    """
 
     pairs: BoolArray
     start: StartValues
+    field: str = "pairs"
 
 
 def search_outliers(
@@ -62,9 +66,9 @@ def search_outliers(
         now = first or solved(survey, start)
         survey = as_given(now.survey, survey) if options.adjust.reject_points and not images else now.survey
     else:
-        now = solved(_with_pairs(survey, wrong.pairs), wrong.start)
+        now = solved(_without(survey, wrong), wrong.start)
         found = candidates(precision_of(now).graph, images)
-        given, out = used_at(now, found), found.of("pairs", np.flatnonzero(wrong.pairs))
+        given, out = used_at(now, found), found.of(wrong.field, np.flatnonzero(wrong.pairs))
         given[list(out)] = True
         now, out = _taken_back(now, out, options, leave)
     round_ = first_round = Round(now, options, images, given)
@@ -123,9 +127,20 @@ def disagreeing_pairs(survey: Survey, factor: float = 1.0, only_large: bool = Fa
     return Disagreeing(pairs, StartValues({}, poses, {}))
 
 
-def _with_pairs(survey: Survey, wrong: BoolArray) -> Survey:
-    """Without the wrong ones (E,)."""
-    return with_rows(survey, "pairs", {i: replace(survey.pairs[i], used=False) for i in np.flatnonzero(wrong).tolist()})
+def _without(survey: Survey, wrong: Disagreeing) -> Survey:
+    every = getattr(survey, wrong.field)
+    rows = np.flatnonzero(wrong.pairs).tolist()
+    return with_rows(survey, wrong.field, {i: replace(every[i], used=False) for i in rows})
+
+
+def distances_in_the_way(survey: Survey) -> Disagreeing | None:
+    """Distances that stand out at the start values of a survey without images; None where none do."""
+    if survey.image_blocks or not survey.distances:
+        return None
+    from adjust.statistics.outliers.standing_out import distances_that_stand_out  # here: where something fails
+
+    found = distances_that_stand_out(survey)
+    return None if found is None else Disagreeing(found[0], found[1], "distances")
 
 
 def _left_out(

@@ -29,7 +29,7 @@ from survey.project.tables.kinds import LAYOUTS
 
 KEPT = "kept"
 TableEdit = ChangeColumns | ExchangeColumns | ChangeReadings | Rename
-_VALUES = {"value_deg": "deg", "value_gon": "gon", "value_m": "m", "value_mm": "mm"}
+_UNITS = ("deg", "gon", "m", "mm", "arcsec", "mgon", "cc")
 _NUMBERED = "reading_id"
 """The column that rows may leave blank: their id is then that of their number."""
 _OF_IMAGE = ("u_px", "v_px")
@@ -147,11 +147,11 @@ def _changed(row: Mapping[str, str], edit: TableEdit) -> dict[str, str]:
         a, b = edit.columns
         return {a: row[b], b: row[a]}
     if isinstance(edit, ChangeReadings):
-        column = next((name for name in _VALUES if row.get(name)), None)
-        if column is None:
-            raise ValueError("written as degrees-minutes-seconds")
-        si = edit.factor * float(to_si(float(row[column]), _VALUES[column])) + edit.offset
-        return {column: f"{float(from_si(si, _VALUES[column])):.12g}"}
+        column, unit = next(((f"{edit.field}_{u}", u) for u in _UNITS if row.get(f"{edit.field}_{u}")), ("", ""))
+        if not column:
+            raise ValueError("written as degrees-minutes-seconds, or elsewhere")
+        si = edit.factor * float(to_si(float(row[column]), unit)) + edit.offset
+        return {column: f"{float(from_si(si, unit)):.12g}"}
     values = edit.matrix @ np.array([float(row[name]) for name in edit.columns]) + edit.offset
     new = {name: f"{value:.12g}" for name, value in zip(edit.columns, values, strict=True)}
     if edit.columns == _OF_IMAGE and all(row.get(name) for name in _SIGMAS_OF_IMAGE[:2]):

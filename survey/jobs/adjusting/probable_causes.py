@@ -21,6 +21,8 @@ _LARGE = 1.15
 """sigma0 from which a mistake is looked for by trial; below, sigmas that are a little small explain as much."""
 
 
+_SEVERAL = 3
+"""Observations that were left out from which on they may have one cause."""
 NOT_LOOKED_FOR = ("two mistakes at once", "bodies that bend or never rest", "refraction")
 """Told where nothing is named; the documentation says more."""
 
@@ -41,6 +43,8 @@ def explained(survey: Survey, error: SurveyError, project: Project) -> SurveyErr
     """What an adjustment of the ``survey`` of a project raised, with the probable causes in front, if any."""
     apart, contradictions = separate_epochs(survey), _probable_causes(survey)
     diagnosis, note = _named(_diagnosis(survey, None, error, contradictions), project)
+    if isinstance(error, IndeterminateError):
+        note = ()  # what is not observed contradicts nothing
     if diagnosis is not None and project.origins:  # of a project that has not grown there is nothing to try
         done = (replace(c, hypothesis=replace(c.hypothesis, edits=())) for c in diagnosis.candidates)
         diagnosis = replace(diagnosis, candidates=tuple(done))
@@ -58,11 +62,13 @@ def with_probable_causes(survey: Survey, result: Adjustment, project: Project) -
     """The adjustment of the ``survey`` of a project; its first warnings are the probable causes of what contradicts."""
     warnings: tuple[str, ...] = ()
     note: tuple[str, ...] = ()
+    alone: tuple[str, ...] = ()
     diagnosis: Diagnosis | None = None
     if survey.tables:
-        from adjust.diagnosis.table import sign_warnings  # here: a survey without a table starts without it
+        from adjust.diagnosis.table import sign_warnings, unseen_readings  # here: most surveys start without a table
 
         warnings = sign_warnings(survey, result)
+        alone = tuple(f"{f.found}; {f.remedy}" for f in unseen_readings(survey))
     if _contradicted(survey, result):
         # what does not fit may have spoilt the lenses too: then those that the images alone give
         causes = _probable_causes(survey, result) or _probable_causes(survey)
@@ -71,13 +77,26 @@ def with_probable_causes(survey: Survey, result: Adjustment, project: Project) -
             warnings = diagnosis.lines if diagnosis is not None else ()
         warnings += tuple(c for c in causes if c not in warnings)
     if diagnosis is None and not warnings:
-        diagnosis, _ = _named(_misread(survey, result), project)
+        diagnosis, _ = _named(_left_out(survey, result), project)
         warnings = diagnosis.lines if diagnosis is not None else ()
     lines = tuple(f"probable cause: {c}" for c in warnings)
     if diagnosis is None and not warnings:
         diagnosis, _ = _named(_too_cautious(survey, result), project)
         lines = tuple(f"too good: {c}" for c in diagnosis.lines) if diagnosis is not None else ()
-    return replace(result, warnings=(*lines, *result.warnings, *note), diagnosis=diagnosis)
+    if diagnosis is None or diagnosis.candidates[0].hypothesis.place.key not in ("sigma", "instrument_height"):
+        lines += doubtful_values(survey)
+    return replace(result, warnings=(*lines, *alone, *result.warnings, *note), diagnosis=diagnosis)
+
+
+def doubtful_values(survey: Survey) -> tuple[str, ...]:
+    """What cannot be right by its value alone; not heights of targets, which may be as thin as a millimetre."""
+    if not (survey.readings or survey.distances or survey.pairs):
+        return ()
+    from adjust.diagnosis.units.heights import doubtful_heights  # here: as above
+    from adjust.diagnosis.weights.impossible import doubtful_sigmas
+
+    found = (*doubtful_heights(survey), *doubtful_sigmas(survey))
+    return tuple(f"{h.cause}; {h.change}" for h in found if h.place.kind != "point")
 
 
 def _diagnosis(
@@ -107,15 +126,25 @@ def _too_cautious(survey: Survey, result: Adjustment) -> "Diagnosis | None":
     return diagnose(Case(survey, result), [wrong_factors])
 
 
-def _misread(survey: Survey, result: Adjustment) -> "Diagnosis | None":
-    """What was left out by the search for gross errors, and fits as it was meant; None where nothing does."""
-    left_out = survey.n_others_used - result.survey.n_others_used
-    if left_out <= 0 and result.other_arrays.used.all():
+def _left_out(survey: Survey, result: Adjustment) -> "Diagnosis | None":
+    """What was left out by the search for gross errors, and fits as it was meant; None where nothing does.
+
+    Of several first what they may have in common.
+    """
+    left_out = survey.n_others_used - result.survey.n_others_used + int((~result.other_arrays.used).sum())
+    if left_out <= 0:
         return None
-    from adjust.diagnosis.diagnosis import Diagnosis  # here: as above
+    from adjust.diagnosis.diagnosis import Diagnosis, diagnose  # here: as above
     from adjust.diagnosis.trial import misfit_of
     from adjust.diagnosis.units.singles import misread_singles
 
+    if left_out >= _SEVERAL:
+        from adjust.diagnosis.case import Case
+        from adjust.diagnosis.families import IN_COMMON
+
+        common = diagnose(Case(survey, result), IN_COMMON)
+        if common.candidates:
+            return replace(common, spoils=True)
     found = misread_singles(survey, result)
     names = tuple(dict.fromkeys(c.hypothesis.name for c in found))
     return Diagnosis(found, names, misfit_of(result, survey)) if found else None

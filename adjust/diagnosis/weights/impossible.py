@@ -1,0 +1,170 @@
+"""Sigmas that no instrument has and another unit makes usual: told by the values alone, whatever the residuals say.
+
+No theodolite is known to a hundredth of an arcsecond, and no length in air to a tenth of a millionth, for the air's
+refractive index is not.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import ChangeColumns, ChangeReadings, Edit, Hypothesis, Place, ScaleKey
+from adjust.diagnosis.units.conventions import ANGLES
+from adjust.model.errors import listed
+from adjust.model.names import grouped
+from adjust.model.observations import Distance, Reading
+from adjust.model.rewriting import with_rows
+from adjust.model.survey import FloatArray, Survey
+
+SURE = 1e6
+"""Evidence: these values cannot be right, so that what they should be is tried before all else."""
+_ARCSEC = float(np.radians(1.0 / 3600.0))
+_ANGLE, _LENGTH, _PART = 0.01 * _ARCSEC, 1e-7, 1e-7
+"""What every sigma is larger than: of an angle (rad), of a length (m), and of a length as a part of it."""
+_SETUP = 1e-6
+"""m: the same of a length that a total station or a level reads."""
+_USUAL = 0.05 * _ARCSEC, 120.0 * _ARCSEC
+_OF_ANGLES = {
+    3600.0: "are degrees, read as arcseconds", 1000.0: "are gon, read as milligon", 10000.0: "are gon, read as cc",
+}  # fmt: skip
+_OF_LENGTHS = {1000.0: "are metres, read as millimetres"}
+
+
+@dataclass(frozen=True, eq=False)
+class _Odd:
+    """Sigmas of observations of one kind and group that are too small.
+
+    rows: in the list ``field`` of a survey. part: of a pair's motion, "rotation" or "translation". whole: whether that
+    is all of the group. largest: of these sigmas (rad or m).
+    """
+
+    field: str
+    what: str
+    group: str
+    rows: tuple[int, ...]
+    ids: tuple[str, ...]
+    largest: float
+    whole: bool
+    part: str = ""
+
+    @property
+    def is_length(self) -> bool:
+        """Else they are angles."""
+        return self.part != "rotation" and self.what not in ANGLES
+
+
+def impossible_sigmas(case: Case) -> Iterator[Hypothesis]:
+    """All angles that cannot be right in the units that were probably meant, and all lengths."""
+    odd = _odd(case.survey)
+    for some in ([o for o in odd if o.is_length], [o for o in odd if not o.is_length]):
+        yield from _hypotheses(case.survey, some)
+
+
+def doubtful_sigmas(survey: Survey) -> Iterator[Hypothesis]:
+    """The same kind by kind, each only in the likeliest unit."""
+    for odd in _odd(survey):
+        yield from _hypotheses(survey, [odd])[:1]
+
+
+def _odd(survey: Survey) -> list[_Odd]:
+    return [*_of_values(survey), *_of_pairs(survey)]
+
+
+def _hypotheses(survey: Survey, some: Sequence[_Odd]) -> list[Hypothesis]:
+    """By unit. What larger variances take of the misfit is paid for only among these: smaller ones are impossible."""
+    if not some:
+        return []
+    largest, number = max(o.largest for o in some), sum(len(o.rows) for o in some)
+    units = _OF_LENGTHS if some[0].is_length else {
+        f: unit for f, unit in _OF_ANGLES.items() if _USUAL[0] <= f * largest <= _USUAL[1]} or _OF_ANGLES  # fmt: skip
+    size = f"{1e3 * largest:.2g} mm" if some[0].is_length else f"{largest / _ARCSEC:.2g} arcsec"
+    named = " and ".join(f"{o.what} {listed(o.ids, 5)}" for o in some)
+    place = Place("group", tuple(o.group for o in some), "sigma") if all(o.whole for o in some) else Place(
+        "pair" if some[0].part else "reading", tuple(i for o in some for i in o.ids), "sigma")  # fmt: skip
+    out = []
+    for factor, unit in units.items():
+        changed = survey
+        for odd in some:
+            changed = _with_sigmas(changed, odd, factor)
+        out.append(Hypothesis(
+            "unit of sigmas", f"{named}: no instrument has a sigma of {size}: these sigmas {unit}",
+            f"multiply these sigmas by {factor:g}, or name their column or key by their unit", place, changed,
+            tuple(e for odd in some for e in _edits(odd, factor)), SURE, 0, len(units),
+            penalty=2.0 * number * float(np.log(factor / min(units))), of_variances=True,
+        ))  # fmt: skip
+    return out
+
+
+def _of_values(survey: Survey) -> Iterator[_Odd]:
+    """Of readings by kind, and of distances."""
+    every: tuple[tuple[str, tuple[Reading | Distance, ...]], ...] = (
+        ("readings", survey.readings), ("distances", survey.distances))  # fmt: skip
+    for field, observed in every:
+        number = grouped((o.group, i) for i, o in enumerate(observed) if o.used)
+        odd = grouped(((_kind(o), o.group), i) for i, o in enumerate(observed) if o.used and o.sigma < _least(o))
+        for (kind, group), rows in odd.items():
+            ids = tuple(_id(observed[i]) for i in rows)
+            largest = max(observed[i].sigma for i in rows)
+            yield _Odd(field, kind, group, tuple(rows), ids, largest, len(rows) == len(number[group]))
+
+
+def _of_pairs(survey: Survey) -> Iterator[_Odd]:
+    """Of the rotations and of the shifts of pairs, where all sigmas of one are too small."""
+    used = [i for i, p in enumerate(survey.pairs) if p.used]
+    for group, rows in grouped((survey.pairs[i].group, i) for i in used).items():
+        largest = {i: _largest(survey.pairs[i].cov) for i in rows}
+        shifts = {i: float(np.linalg.norm(m.translation())) for i in rows
+                  if isinstance(m := survey.pairs[i].b_from_a, Pose3)}  # fmt: skip
+        for part, what, odd in (
+            ("rotation", "the rotation of pairs", [i for i in rows if largest[i][0] < _ANGLE]),
+            ("translation", "the translation of pairs",
+             [i for i, t in shifts.items() if largest[i][1] < max(_LENGTH, _PART * t)]),
+        ):  # fmt: skip
+            if odd:
+                ids = tuple(survey.pairs[i].pair_id for i in odd)
+                size = max(largest[i][part == "translation"] for i in odd)
+                yield _Odd("pairs", what, group, tuple(odd), ids, size, False, part)
+
+
+def _largest(cov: FloatArray) -> tuple[float, float]:
+    """Of a pair's sigmas, that of its rotation (rad) and that of its shift (m)."""
+    sigma = np.sqrt(np.diagonal(cov))
+    return float(sigma[:3].max()), float(sigma[3:].max(initial=0.0))
+
+
+def _kind(o: Reading | Distance) -> str:
+    return o.kind if isinstance(o, Reading) else "distance"
+
+
+def _id(o: Reading | Distance) -> str:
+    return o.reading_id if isinstance(o, Reading) else o.distance_id
+
+
+def _least(o: Reading | Distance) -> float:
+    if isinstance(o, Distance):
+        return max(_LENGTH, _PART * o.value)
+    return _ANGLE if o.kind in ANGLES else _SETUP
+
+
+def _with_sigmas(survey: Survey, odd: _Odd, factor: float) -> Survey:
+    every = getattr(survey, odd.field)
+    if not odd.part:
+        return with_rows(survey, odd.field, {i: replace(every[i], sigma=factor * every[i].sigma) for i in odd.rows})
+    by = np.repeat([factor, 1.0] if odd.part == "rotation" else [1.0, factor], 3)
+    new = {i: replace(p, cov=p.cov * np.outer(by[: len(p.cov)], by[: len(p.cov)]))
+           for i in odd.rows for p in (every[i],)}  # fmt: skip
+    return with_rows(survey, odd.field, new)
+
+
+def _edits(odd: _Odd, factor: float) -> tuple[Edit, ...]:
+    """Of a whole group as one number; of others in their rows."""
+    if odd.part:
+        columns = ("sigma_rotation_arcsec" if odd.part == "rotation" else "sigma_translation_mm",)
+        return (ChangeColumns("pairs", columns, factor * np.eye(1), np.zeros(1), {"pair_id": odd.ids}),)
+    if odd.whole:
+        return (ScaleKey(("sigmas", "scale", odd.group), factor),)
+    table = "terrestrial" if odd.field == "readings" else "distances"
+    return (ChangeReadings(odd.ids, factor, table=table, field="sigma"),)

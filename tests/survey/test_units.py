@@ -1,0 +1,144 @@
+"""Values in another unit, and table readings under another epoch: told by `check`, named and mended by `adjust`."""
+
+import csv
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from adjust.diagnosis.units.heights import doubtful_heights
+from adjust.diagnosis.weights.impossible import doubtful_sigmas
+from survey.cli import main
+from survey.examples import write_example
+from survey.project import read
+
+Row = dict[str, str]
+Change = Callable[[Row], object]
+
+
+def planted(folder: Path, example: str, table: str, change: Change) -> Path:
+    """A ready project with the rows of one table changed."""
+    write_example(example, folder)
+    path = folder / "observations" / f"{table}.csv"
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    for row in rows:
+        change(row)
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, list(dict.fromkeys(name for row in rows for name in row)), restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+    return folder
+
+
+def scaled(column: str, factor: float, chosen: Callable[[Row], bool] = lambda _: True) -> Change:
+    return lambda row: chosen(row) and row[column] and row.update({column: f"{factor * float(row[column]):.9g}"})
+
+
+def of_degrees(row: Row) -> None:
+    """The instrument's 0.5 mgon, as degrees in the column of arcseconds."""
+    if row["kind"] in ("direction", "zenith"):
+        row["sigma_arcsec"] = f"{0.5 * 0.9e-3:.6f}"
+
+
+def with_own_sigmas(rotation: float, shift: float) -> Change:
+    """Those that there are times a factor; in place of covariances 6 arcsec and 0.15 mm times it."""
+
+    def change(row: Row) -> None:
+        row.update({name: "" for name in row if name.startswith("cov_")})
+        turn, length = float(row["sigma_rotation_arcsec"] or 6.0), float(row["sigma_translation_mm"] or 0.15)
+        row.update(sigma_rotation_arcsec=f"{turn * rotation:.9g}", sigma_translation_mm=f"{length * shift:.9g}")
+
+    return change
+
+
+CASES: dict[str, tuple[str, str, Change, str, str]] = {
+    "heights in m": ("total-station", "terrestrial", scaled("instrument_height_mm", 1e-3), "suspicious unit",
+                     "unit of heights"),
+    "of one set-up": ("total-station", "terrestrial", scaled("instrument_height_mm", 1e-3,
+                      lambda row: row["setup_id"] == "S2a"), "suspicious unit", "unit of heights"),
+    "angles in degrees": ("total-station", "terrestrial", of_degrees, "suspicious sigma", "unit of sigmas"),
+    "turns in degrees": ("relay", "pairs", with_own_sigmas(1 / 3600, 1.0), "suspicious sigma", "unit of sigmas"),
+    "shifts in m": ("relay", "pairs", with_own_sigmas(1.0, 1e-3), "suspicious sigma", "unit of sigmas"),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_another_unit_is_told_named_and_mended(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    example, table, change, kind, cause = CASES[name]
+    lab = planted(tmp_path / "lab", example, table, change)
+    assert main(["check", str(lab), "--json"]) == 3
+    assert kind in {f["kind"] for f in json.loads(capsys.readouterr().out)["findings"] if f["level"] == "problem"}
+    assert main(["adjust", str(lab), "--quiet"]) == 3
+    solution = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))
+    assert solution["diagnosis"][0]["name"] == cause
+    assert solution["summary"]["fit"] == "does_not_fit"
+    assert main(["adjust", str(lab), "--quiet", "--try", "1"]) == 0
+    assert main(["check", str(lab), "--quiet"]) == 0
+
+
+def test_a_sigma_that_cannot_be_is_told_where_everything_fits(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A caliper's 0.05 mm as metres: six distances, that nothing contradicts."""
+    lab = planted(tmp_path / "lab", "total-station", "distances", scaled("sigma_mm", 1e-3))
+    assert main(["adjust", str(lab), "--quiet"]) == 0
+    shown = capsys.readouterr().out
+    assert "NEEDS A LOOK" in shown
+    assert "no instrument has a sigma of 5e-05 mm: these sigmas are metres, read as millimetres" in shown
+
+
+def test_what_a_survey_may_have_is_not_told(tmp_path: Path) -> None:
+    """An instrument on its point, a target of a millimetre, a tower; 0.1 arcsec, a tenth of a micrometre and more."""
+    write_example("total-station", tmp_path / "lab")
+    survey = read(tmp_path / "lab").survey
+    for height in (0.0, 0.1, 90.0):
+        least = {"direction": 5e-7, "zenith": 5e-7, "slope_distance": 2e-6, "height_difference": 2e-6}
+        readings = tuple(replace(r, instrument_height=height, sigma=least[r.kind]) for r in survey.readings)
+        assert not list(doubtful_heights(replace(survey, readings=readings)))
+        assert not list(doubtful_sigmas(replace(survey, readings=readings, distances=tuple(
+            replace(d, sigma=1.01e-7) for d in survey.distances))))  # fmt: skip
+    thin = tuple(replace(r, target_height=1e-3) for r in survey.readings)
+    (only,) = doubtful_heights(replace(survey, readings=thin))
+    assert only.place.kind == "point"
+
+
+def test_a_table_reading_of_another_epoch_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lab = planted(tmp_path / "lab", "head", "table_angles",
+                  lambda row: row["epoch_id"] == "tX03" and row.update(epoch_id="tX30x"))  # fmt: skip
+    assert main(["adjust", str(lab), "--quiet"]) == 0
+    solution = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))
+    (told,) = (w for w in solution["warnings"] if "table readings without images" in w)
+    assert ": tX30x; check the names" in told
+    assert told.endswith("(for tX30x perhaps tX03)")
+    shown = capsys.readouterr().out
+    assert "NEEDS A LOOK" in shown
+    assert told in shown
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_distances_in_metres_among_millimetres_are_left_out_and_named(
+    count: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With them in, 200 steps lead nowhere; without them, two do."""
+    names = [f"c{i + 1}" for i in range(count)]
+    lab = planted(tmp_path / "lab", "total-station", "distances",
+                  scaled("value_mm", 1e-3, lambda row: row["distance_id"] in names))  # fmt: skip
+    assert main(["check", str(lab)]) == 3
+    said = "distance c1: it is in another unit: 0.570043 mm, by what the rest says 570.043 mm"
+    assert said in capsys.readouterr().out
+    assert main(["adjust", str(lab), "--quiet"]) == 0
+    solution = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))
+    assert sorted(c["ids"][0] for c in solution["diagnosis"]) == names
+    assert {c["cause"].partition(": ")[2] for c in solution["diagnosis"]} == {
+        "its values are metres, read as millimetres"
+    }
+    assert solution["summary"]["iterations"] < 5
+    assert main(["adjust", str(lab), "--quiet", "--try", "1"]) == 0
+    left = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8")).get("diagnosis", [])
+    assert len(left) == count - 1
