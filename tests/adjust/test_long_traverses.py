@@ -145,6 +145,7 @@ def test_what_rounding_took_is_said() -> None:
     survey, truth = polar_network(4)
     result = adjust(measured(survey, truth, 4), start_near(survey, truth, 2, 1e-3))
     precision = precision_of(result)
-    assert precision.solved.lost < 1e-9 and not any("rounding" in said for said in result.warnings)
+    assert precision.solved.lost < 1e-9
+    assert not any("rounding" in said for said in result.warnings)
     precision.solved = replace(precision.solved, lost=2e-3)
     assert any("0.001 of its largest sigmas is rounding" in said for said in warnings(precision.graph, result))
