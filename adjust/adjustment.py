@@ -12,8 +12,8 @@ from adjust.frames.tables import check_harmonics
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS
 from adjust.graph.assembly import AdjustmentGraph, StartValues
 from adjust.graph.building import GraphBuilder
+from adjust.graph.elimination import EXACT
 from adjust.graph.solver import Solved, SolveOptions, settled, solve
-from adjust.graph.trial import EXACT
 from adjust.lenses.models import MODELS, camera_constants, monotone_radius_px, principal_point_px
 from adjust.model.errors import NotConvergedError, listed
 from adjust.model.observations import ImageBlock, ImageBlocks

@@ -14,8 +14,7 @@ from gtsam import Pose3
 from scipy import sparse
 
 from adjust.graph.assembly import AdjustmentGraph, Evaluation
-from adjust.graph.elimination import numbers, pose_cliques
-from adjust.graph.trial import EXACT, force_on, lost
+from adjust.graph.elimination import EXACT, force_on, lost, numbers, pose_cliques
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.elimination import PoseFactor, PoseTree, pair_gradient
 from adjust.native.pairs import compose_poses

@@ -14,10 +14,10 @@ from adjust.graph.assembly import AdjustmentGraph, Evaluation
 from adjust.graph.cliques import Cliques, SolvedTree
 from adjust.graph.datum import InnerDatum, inner_datum, normal_diagonal, stacking, visible_keys
 from adjust.graph.divergence import describe_divergence, stopped_at
-from adjust.graph.elimination import Elimination
+from adjust.graph.elimination import EXACT, Elimination
 from adjust.graph.pair_normals import PairLinear, PairNormals
 from adjust.graph.rank import describe_null_space, unobserved_unknowns
-from adjust.graph.trial import EXACT, tried
+from adjust.graph.trial import tried
 from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
 from adjust.native.elimination import PoseTree
 

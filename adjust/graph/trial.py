@@ -12,11 +12,8 @@ import numpy as np
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.cliques import Cliques
 from adjust.graph.datum import normal_diagonal, stacking, visible_keys
+from adjust.graph.elimination import force_on, lost
 from adjust.graph.rank import is_seen, rows_along
-from adjust.model.survey import FloatArray
-
-EXACT = 1e-6
-"""Share of its variance that the weakest motion may lose before rows are eliminated instead of their squares."""
 
 
 @dataclass(frozen=True)
@@ -25,17 +22,6 @@ class Trial:
 
     lost: float
     seen: bool = True
-
-
-def force_on(diagonal: FloatArray) -> FloatArray:
-    """On every unknown, by the diagonal of the normal matrix: as much as one sigma of it alone, either way."""
-    return np.asarray(np.sqrt(diagonal) * np.random.default_rng(0).choice([-1.0, 1.0], diagonal.shape))
-
-
-def lost(force: FloatArray, x: FloatArray, square: float) -> float:
-    """Of a force, the x by which it moves the unknowns, and the square sum of the whitened rows along x."""
-    work = float(np.sum(force * x))
-    return abs(square - work) / work if work > 0.0 else np.inf
 
 
 def tried(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, cliques: Cliques) -> Trial:
