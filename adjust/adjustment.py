@@ -12,6 +12,7 @@ from adjust.frames.tables import check_harmonics
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS
 from adjust.graph.assembly import AdjustmentGraph, StartValues
 from adjust.graph.building import GraphBuilder
+from adjust.graph.elimination import EXACT
 from adjust.graph.solver import Solved, SolveOptions, settled, solve
 from adjust.lenses.models import MODELS, camera_constants, monotone_radius_px, principal_point_px
 from adjust.model.errors import NotConvergedError, listed
@@ -271,6 +272,12 @@ def warnings(graph: AdjustmentGraph, result: Adjustment, given: Survey | None = 
         out.append(
             f"the redundancy numbers add up to {total:.4f} instead of {result.redundancy}: the survey is so weak that "
             "its covariances lose digits"
+        )
+    lost = result.precision.solved.lost if isinstance(result.precision, Precision) else 0.0
+    if lost > EXACT:
+        out.append(
+            f"the survey is so long or weak that its normal equations lose digits: {lost / 2:.1g} of its largest "
+            "sigmas is rounding"
         )
     test = result.global_test
     if test is not None and not test.passed:

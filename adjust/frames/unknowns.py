@@ -149,6 +149,11 @@ class Unknowns:
     """By key: the components of an unknown that keep their value; the others are estimated."""
 
     @property
+    def dims(self) -> dict[int, int]:
+        """Components of every unknown by key, held ones too."""
+        return {key: unknown.dim for key, unknown in self.by_key.items()}
+
+    @property
     def n_unknowns(self) -> int:
         """Number of components that are estimated."""
         return sum(u.dim for u in self.by_name.values()) - sum(len(held) for held in self.held.values())

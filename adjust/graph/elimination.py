@@ -9,13 +9,15 @@ import gtsam
 import numpy as np
 from scipy import sparse
 
-from adjust.model.survey import IntArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.native.elimination import CliquePattern, clique_pattern
 
 if TYPE_CHECKING:
     from scipy.sparse.linalg import SuperLU
 
 _Found = TypeVar("_Found")
+EXACT = 1e-6
+"""Share of its variance that the weakest motion may lose before rows are eliminated instead of their squares."""
 _LARGE = 2000
 """Poses of networks from which their order is looked for in a second way: smaller ones take no time in either."""
 
@@ -49,6 +51,17 @@ class Elimination:
             return tree, tree.optimize()
         except RuntimeError:
             return None
+
+
+def force_on(diagonal: FloatArray) -> FloatArray:
+    """On every unknown, by the diagonal of the normal matrix: as much as one sigma of it alone, either way."""
+    return np.asarray(np.sqrt(diagonal) * np.random.default_rng(0).choice([-1.0, 1.0], diagonal.shape))
+
+
+def lost(force: FloatArray, x: FloatArray, square: float) -> float:
+    """Of a force, the x by which it moves the unknowns, and the square sum of the whitened rows along x."""
+    work = float(np.sum(force * x))
+    return abs(square - work) / work if work > 0.0 else np.inf
 
 
 def positive_definite_lu(N: sparse.csc_array) -> "SuperLU":

@@ -1,8 +1,7 @@
 """Normal equations of surveys of nothing but pairs and priors, in the compiled core.
 
 A view of the one graph: the same system as GTSAM's factors give, eliminated in the same order. What is analysed once
-serves every step, and near the solution one factor serves several of them. Eigenvalues of a corridor's normal matrix
-differ by the fourth power of its length, as those of a clamped beam: long ones are eliminated by their rows.
+serves every step, and near the solution one factor serves several of them. Long corridors are eliminated by their rows.
 """
 
 from collections.abc import Iterable
@@ -15,16 +14,13 @@ from gtsam import Pose3
 from scipy import sparse
 
 from adjust.graph.assembly import AdjustmentGraph, Evaluation
-from adjust.graph.elimination import numbers, pose_cliques
+from adjust.graph.elimination import EXACT, force_on, lost, numbers, pose_cliques
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.elimination import PoseFactor, PoseTree, pair_gradient
 from adjust.native.pairs import compose_poses
 from adjust.spatial.motions import poses_at
 from adjust.spatial.rigid import rigid
 from adjust.spatial.rigid_motions import Motions
-
-_EXACT = 1e-6
-"""Share of its variance that the weakest motion may lose before rows are eliminated instead of their squares."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,15 +163,14 @@ class PairNormals:
         system = self.b, self.a, linear.by_b, linear.by_a, linear.own
         refused = not self.by_rows and self.factor.eliminate(*system) >= 0
         if self.by_rows is None or refused:
-            self.by_rows = refused or not self._exact(linear)
+            self.by_rows = refused or self.lost(linear) > EXACT
         return not self.by_rows or self.factor.eliminate_rows(*system) < 0
 
-    def _exact(self, linear: PairLinear) -> bool:
-        """Whether the factor knows the weakest motions of all: by them a random force moves the poses."""
-        force = np.sqrt(linear.diagonal()) * np.random.default_rng(0).choice([-1.0, 1.0], linear.right.shape)
-        x = force.copy()
+    def lost(self, linear: PairLinear) -> float:
+        """Share of its variance that the weakest motion of all has lost in the factor."""
+        x = (force := force_on(linear.diagonal())).copy()
         self.factor.solve(x)
-        return bool(abs(linear.square(x) - (work := float(np.sum(force * x)))) < _EXACT * work)
+        return lost(force, x, linear.square(x))
 
     def _solved(self, linear: PairLinear) -> tuple[gtsam.VectorValues, float]:
         g = linear.gradient()

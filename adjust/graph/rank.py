@@ -13,6 +13,8 @@ from adjust.observations.images.bundle_hidden import BundleHidden
 _MOST_DIMS = 6000
 BLIND_BUNDLE = 2e-7
 """As ``BLIND``, where poses and points are hidden; undetermined directions reach 3e-8, determined ones 6e-6."""
+_BLIND_FOR_SURE = 1e-11
+"""As ``BLIND``, of long corridors, whose ends tell little of each other."""
 _READABLE = {"rx": "rotation x", "ry": "rotation y", "rz": "rotation z", "tx": "x", "ty": "y", "tz": "z"}
 
 
@@ -76,7 +78,7 @@ def null_space(
     V = V[:, w < 1e-7] / scale[:, None]
     if V.shape[1] == 0:
         return V, scale
-    _, s, Vt = np.linalg.svd(_rows_along(linear, stack, V, graph), full_matrices=False)
+    _, s, Vt = np.linalg.svd(rows_along(linear, stack, V, graph), full_matrices=False)
     # what is hidden in a bundle follows from its normal equations, to about the root of their rounding
     limit = BLIND if graph is None or not graph.bundles else BLIND_BUNDLE
     return V @ Vt[s < limit].T, scale
@@ -107,7 +109,17 @@ def describe_null_space(
     return IndeterminateError("\n  - ".join([head, *naming.lines]), tuple(names) or tuple(naming.lines))
 
 
-def _rows_along(
+def is_seen(graph: AdjustmentGraph, stack: Stacking, length: float) -> bool:
+    """Whether a direction is surely determined, whose whitened Jacobian has this length, of one in its scale.
+
+    Where what is undetermined could be named nothing but what is far from it is sure.
+    """
+    if graph.bundles:
+        return length > 10.0 * BLIND_BUNDLE
+    return length > (10.0 * BLIND if stack.n <= _MOST_DIMS else _BLIND_FOR_SURE)
+
+
+def rows_along(
     linear: gtsam.GaussianFactorGraph, stack: Stacking, V: FloatArray, graph: AdjustmentGraph | None
 ) -> FloatArray:
     """The whitened Jacobian times V; a bundle's part from its image points, not through its normal equations."""

@@ -11,14 +11,15 @@ import gtsam
 import numpy as np
 
 from adjust.graph.assembly import AdjustmentGraph, Evaluation
+from adjust.graph.cliques import Cliques, SolvedTree
 from adjust.graph.datum import InnerDatum, inner_datum, normal_diagonal, stacking, visible_keys
 from adjust.graph.divergence import describe_divergence, stopped_at
-from adjust.graph.elimination import Elimination
+from adjust.graph.elimination import EXACT, Elimination
 from adjust.graph.pair_normals import PairLinear, PairNormals
 from adjust.graph.rank import describe_null_space, unobserved_unknowns
+from adjust.graph.trial import tried
 from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
 from adjust.native.elimination import PoseTree
-from adjust.observations.images.reduction import Leaves
 
 _SIGMA_ROUNDS, _SIGMA_CHANGE = 3, 1e-6
 """Sigmas that depend on distances (target centring) follow the solution until they change by no more than this."""
@@ -35,6 +36,9 @@ _LEAST_GAIN = 0.1
 """Share of the promised decrease of chi-square that a step must bring."""
 _PROMISED = 0.9
 """Share of the promised decrease from which a long corridor need not be bent instead."""
+_WORTH_QR = 0.1
+"""Of the share that the weakest motion may lose: what it hardly moves may lose more, and GTSAM's QR takes but twice the
+time of its Cholesky."""
 _STATIONARY = 1e-2
 """Sigmas that a step moves at most where the rank of the system is judged."""
 _CLOSE = (1.0, 0.25), (10.0, 0.1)
@@ -69,17 +73,19 @@ class SolveOptions:
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """The minimum and how it was reached. tree: what the system there was eliminated to, by QR or Cholesky."""
+    """The minimum and how it was reached. tree: what the system there was eliminated to, by QR or Cholesky.
+
+    lost: share of its variance that the weakest motion of all has lost on the way, by rounding.
+    """
 
     values: gtsam.Values
-    tree: gtsam.GaussianBayesTree | PoseTree
+    tree: SolvedTree
     use_qr: bool
     omega: float
     iterations: int
     max_step: float
     datum: InnerDatum | None
-    leaves: Leaves | None = None
-    """The poses that were reduced before, as cliques of the Bayes tree."""
+    lost: float = 0.0
 
 
 class _Loop:
@@ -96,7 +102,7 @@ class _Loop:
         self.damping, self.length = 0.0, 1.0
         self.reduced, self.use_qr = True, False
         self.moved = self.before = np.inf
-        self.judging = True
+        self.judging, self.asked = True, False
         self._orderings: dict[bool, gtsam.Ordering] = {}
         self.linear: gtsam.GaussianFactorGraph | PairLinear
         self.at = self._evaluated(start)
@@ -177,13 +183,46 @@ class _Loop:
             self.at = self._evaluated(self.at.values)
             self._linearize()
             return self.step()
-        names = None
-        if not self.options.determined:
+        self.use_qr = True  # where it is weak, but determined: GTSAM's Cholesky refuses pivots that QR still resolves
+        if not self.options.determined and not self._seen():
             names = describe_null_space(self.graph, self.linear, self.at.values)
-        if names is not None:
-            raise names
-        self.use_qr = True  # weak, but determined: GTSAM's Cholesky refuses pivots that QR still resolves
+            if names is not None:
+                raise names
         return self.step()
+
+    def _seen(self) -> bool:
+        """Whether the observations tell of the weakest motion of all for sure."""
+        found = self._tree()
+        if found is None or isinstance(self.linear, PairLinear):
+            return False
+        try:
+            return tried(self.graph, self.linear, Cliques.of(found[0], self.graph.unknowns.dims)).seen
+        except ZeroDivisionError:
+            return False
+
+    def _lost(self, eliminated: SolvedTree) -> float:
+        """Share of its variance that the weakest motion of all has lost in the elimination."""
+        if isinstance(self.linear, PairLinear):
+            return self.linear.normals.lost(self.linear)
+        return tried(self.graph, self.linear, eliminated.cliques).lost
+
+    def _by_rows(self) -> bool:
+        """Whether the steps go on by rows, because their squares have lost digits; asked once, before damping."""
+        if self.use_qr or self.pairs is not None or self.damping > 0.0 or self.asked or not self._prepared_here():
+            return False
+        self.asked = True
+        found = self._tree()
+        if found is None:
+            return False
+        return self._turned_to_rows(self._lost(SolvedTree(found[0], self.graph.unknowns.dims)))
+
+    def _turned_to_rows(self, lost: float) -> bool:
+        """By QR from here, with all poses in sight, where this is more than a solution may lose and that may help."""
+        if lost <= _WORTH_QR * EXACT or self.use_qr:
+            return False
+        self.use_qr, self.reduced, self.moved, self.idle = True, False, np.inf, 0
+        self.length, self.steps = 1.0, []
+        return self._prepared_here()
 
     def _tree(self) -> tuple[gtsam.GaussianBayesTree | PoseTree, gtsam.VectorValues] | None:
         """The Bayes tree of the system as it is now, and its solution; None where the elimination finds none."""
@@ -220,7 +259,8 @@ class _Loop:
             found = self._watched(delta, promised) if watched else self._along(delta, promised)
             if found is None:
                 self.at, self.omega = self.best
-                self._damp(iteration)
+                if not self._by_rows():
+                    self._damp(iteration)
                 continue
             gained = abs(self.omega - found[1]) >= self.options.settled * found[1]
             self.idle = 0 if gained else self.idle + 1
@@ -230,7 +270,10 @@ class _Loop:
             if self.progress:
                 self.progress(iteration, self.omega)
             if self._arrived() or (self.idle > 1 and self.damping == 0.0):
-                return self._finish(iteration)
+                solved = self._finish(iteration)
+                if isinstance(self.linear, PairLinear) or not self._turned_to_rows(solved.lost):
+                    return solved
+                continue
             if self.idle > 1:
                 break
             self._relax(gain)
@@ -371,9 +414,10 @@ class _Loop:
         tree, step = found
         delta, _ = self.completed(step)
         leaves = None if self.at.reduction is None else self.at.reduction.leaves()
+        eliminated = SolvedTree(tree, self.graph.unknowns.dims, leaves)
         return Solved(
-            self.at.values.retract(delta), tree, self.use_qr, self.omega, iteration, self.moved,
-            self.datum, leaves,
+            self.at.values.retract(delta), eliminated, self.use_qr, self.omega, iteration, self.moved, self.datum,
+            self._lost(eliminated) if self.options.covariances else 0.0,
         )  # fmt: skip
 
 

@@ -103,8 +103,7 @@ class Precision(Covariances):
     def __init__(self, graph: AdjustmentGraph, solved: Solved) -> None:
         self.graph, self.solved, self.unknowns = graph, solved, graph.unknowns
         self._rows: dict[ObservationFactor, ObservationRows] = {}
-        dims = {key: unknown.dim for key, unknown in graph.unknowns.by_key.items()}
-        self.tree = TreeCovariance(solved.tree, dims, solved.leaves)
+        self.tree = TreeCovariance(solved.tree.cliques, solved.tree.dims)
         self.hidden: dict[int, FloatArray] = {}
         self._together: dict[tuple[int, int], FloatArray] = {}
         """Joint covariances, as solved, of pairs of keys that were brought together."""

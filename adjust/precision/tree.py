@@ -8,24 +8,19 @@ lie together in one clique, so all redundancy numbers follow from it.
 from collections.abc import Callable, Mapping, Sequence
 from typing import TypeAlias
 
-import gtsam
 import numpy as np
 from scipy import sparse
 
+from adjust.graph.cliques import Cliques
 from adjust.model.survey import FloatArray, IntArray
-from adjust.native.elimination import PoseTree
 from adjust.native.trees import (
-    TreeArrays,
     clique_covariance,
     covariance_rows,
     fill_block,
-    invert_cliques,
     joint_blocks,
     sets_among,
     solve_cliques,
 )  # fmt: skip
-from adjust.observations.images.reduction import Leaves
-from adjust.precision.cliques import Cliques
 
 _COLUMNS = 96
 """Columns that go up the tree at once."""
@@ -81,17 +76,11 @@ def squares_of_sums(half: Callable[[sparse.csr_array], Half], A: sparse.csr_arra
 class TreeCovariance:
     """Marginal and joint covariances. ``dims`` gives the dimension of every key; keys are also counted 0, 1, ..."""
 
-    def __init__(
-        self, tree: gtsam.GaussianBayesTree | PoseTree, dims: Mapping[int, int], leaves: Leaves | None = None
-    ) -> None:
-        self.dims = dims
-        c = Cliques.of_poses(tree) if isinstance(tree, PoseTree) else Cliques.of_tree(tree, dims, leaves)
-        self.cliques, self.number = c, c.number
-        if invert_cliques(c.front, c.width, c.at, c.data) >= 0:
-            raise ZeroDivisionError("the Bayes tree is singular")
-        self.arrays = TreeArrays(c.home, c.key_ptr, c.keys, c.dims, c.front, c.width, c.at, np.empty_like(c.data))
+    def __init__(self, cliques: Cliques, dims: Mapping[int, int]) -> None:
+        self.dims, self.cliques, self.number = dims, cliques, cliques.number
+        self.arrays = cliques.arrays(np.empty_like(cliques.data))
         """What the compiled look-up of two keys' covariance needs."""
-        covariance_rows(self.arrays, c.n_front, c.data)
+        covariance_rows(self.arrays, cliques.n_front, cliques.data)
 
     def shared(self, a: int, b: int) -> FloatArray | None:
         """Covariance (dim a, dim b) of two keys; None where they share no clique."""
@@ -155,10 +144,7 @@ class TreeCovariance:
 
     def multiply(self, x: FloatArray) -> None:
         """Multiply the whole covariance matrix by columns (n, m), in place, without forming it."""
-        c, every = self.cliques, np.arange(len(self.cliques), dtype=np.int64)
-        begun = set(c.home[c.key_of[x.any(axis=1)]].tolist())
-        up = every if 2 * len(begun) > len(c) else c.ancestors(begun)
-        solve_cliques(self.arrays, up, every, c.first, c.data, x)
+        self.cliques.multiply(x)
 
     def drawn(self, w: FloatArray) -> FloatArray:
         """R^-1 w (n, m): errors with the whole covariance matrix, where w are independent with unit variance."""

@@ -13,6 +13,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
 
+from adjust.graph.cliques import Cliques
 from adjust.graph.elimination import Elimination, positive_definite_lu
 from adjust.model.survey import FloatArray, IntArray
 from adjust.observations.factors import Jacobians, custom
@@ -74,7 +75,8 @@ class SparseNormals:
             if len(rows):
                 members[e] = ([int(k) for k in loop[rows]], np.swapaxes(self.blocks[rows], -1, -2))
                 graph.add(_linear_factor(members[e][0], root[e] @ members[e][1], dim))
-        tree = TreeCovariance(_eliminate(graph), dict.fromkeys(range(len(self.basis)), dim))
+        dims = dict.fromkeys(range(len(self.basis)), dim)
+        tree = TreeCovariance(Cliques.of(_eliminate(graph), dims), dims)
         for e, (keys, transposed) in members.items():
             G = self.Q[e] @ np.concatenate(list(transposed), axis=1)
             out[e] -= G @ tree.joint(keys) @ G.T

@@ -9,6 +9,7 @@ import numpy as np
 
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.elimination import PoseTree
+from adjust.native.trees import TreeArrays, invert_cliques, solve_cliques
 from adjust.observations.images.reduction import Leaves
 
 
@@ -17,8 +18,8 @@ class Cliques:
     """C cliques of K keys, which are numbered where they first appear: in the clique that has them as frontal ones.
 
     number: of every key. dims: (K,) its dimension. home: (K,) its clique. keys[key_ptr[c]:key_ptr[c + 1]]: of clique c,
-    the first n_front[c] frontal. front, width: (C,) rows and columns of its [R S], which begins at at[c] in ``data``.
-    parents: (C,), -1: none.
+    the first n_front[c] frontal. front, width: (C,) rows and columns of its [R^-1, -R^-1 S] of [R S], which begins at
+    at[c] in ``data``. parents: (C,), -1: none.
     """
 
     number: Mapping[int, int]
@@ -34,15 +35,23 @@ class Cliques:
     data: FloatArray
 
     @staticmethod
-    def of_poses(tree: PoseTree) -> "Cliques":
-        """Of the Bayes tree of a network of poses."""
+    def of(
+        tree: gtsam.GaussianBayesTree | PoseTree, dims: Mapping[int, int], leaves: Leaves | None = None
+    ) -> "Cliques":
+        """Of a tree, with the cliques that were reduced before it below it. Raises ZeroDivisionError: singular."""
+        c = Cliques._of_poses(tree) if isinstance(tree, PoseTree) else Cliques._of_tree(tree, dims, leaves)
+        if invert_cliques(c.front, c.width, c.at, c.data) >= 0:
+            raise ZeroDivisionError("the Bayes tree is singular")
+        return c
+
+    @staticmethod
+    def _of_poses(tree: PoseTree) -> "Cliques":
         p, number = tree.pattern, {key: i for i, key in enumerate(tree.keys.tolist())}
         return Cliques(number, np.full(len(number), 6), p.home, p.key_ptr, p.keys, p.n_front, p.front, p.width,
                        p.at[:-1], p.parents, tree.data.copy())  # fmt: skip
 
     @staticmethod
-    def of_tree(tree: gtsam.GaussianBayesTree, dims: Mapping[int, int], leaves: Leaves | None) -> "Cliques":
-        """Of GTSAM's Bayes tree, with the cliques that were reduced before it below it."""
+    def _of_tree(tree: gtsam.GaussianBayesTree, dims: Mapping[int, int], leaves: Leaves | None) -> "Cliques":
         blocks, clique_keys, parents = _collected(tree)
         rows, columns = (np.array([b.shape[i] for b in blocks], dtype=np.int64) for i in (0, 1))
         sizes, data = np.array([len(keys) for keys in clique_keys], dtype=np.int64), [b.ravel() for b in blocks]
@@ -69,6 +78,17 @@ class Cliques:
 
     def __len__(self) -> int:
         return len(self.front)
+
+    def arrays(self, cov: FloatArray) -> TreeArrays:
+        """The same for the compiled look-up of covariances, which stand in ``cov``, as long as ``data``."""
+        return TreeArrays(self.home, self.key_ptr, self.keys, self.dims, self.front, self.width, self.at, cov)
+
+    def multiply(self, x: FloatArray) -> None:
+        """Multiply the whole covariance matrix by columns (n, m), in place, without forming it."""
+        every = np.arange(len(self), dtype=np.int64)
+        begun = set(self.home[self.key_of[x.any(axis=1)]].tolist())
+        up = every if 2 * len(begun) > len(self) else self.ancestors(begun)
+        solve_cliques(self.arrays(self.data), up, every, self.first, self.data, x)
 
     def keys_in(self, c: int) -> IntArray:
         """Of one clique, the frontal ones first."""
@@ -124,6 +144,20 @@ class Cliques:
         for numbers, parent in zip(own, self.parents.tolist(), strict=True):  # parents first
             way.append(numbers + (way[parent] if parent >= 0 else 0))
         return eliminations * float(self.front @ self.width.astype(float) ** 2) / max(way, default=1)
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedTree:
+    """What a system was eliminated to; ``dims`` of every key, and the poses that were reduced before."""
+
+    tree: gtsam.GaussianBayesTree | PoseTree
+    dims: Mapping[int, int]
+    leaves: Leaves | None = None
+
+    @cached_property
+    def cliques(self) -> Cliques:
+        """The same as arrays. Raises ZeroDivisionError where it is singular."""
+        return Cliques.of(self.tree, self.dims, self.leaves)
 
 
 def _collected(tree: gtsam.GaussianBayesTree) -> tuple[list[FloatArray], list[list[int]], list[int]]:
