@@ -182,7 +182,7 @@ def test_no_group_is_taken_for_too_confident_because_its_tests_agree_with_each_o
     """Corridors of pairs, of whose redundancy there is a third: their tests vary 1.5 times as much as as many coins."""
     alarms = 0
     for seed in range(150):
-        now = adjust(simulate(40, 2, seed).network.as_survey)
+        now = adjust(simulate(300, 2, seed).network.as_survey)
         tests = rounds.tests_of_all(now)
         assert tests.redundancy[0] == pytest.approx(now.redundancy, rel=1e-9)
         alarms += bool(rounds.typical(tests).max() > 1.0)

@@ -10,8 +10,11 @@ from adjust.model.observations import FrameRef, PositionRef
 from adjust.model.survey import Survey
 
 
-def unseen_readings(survey: Survey) -> Iterator[Finding]:
-    """All of them as one, with the nearest name of an epoch that has images of the table's cameras and no reading."""
+def unseen_readings(survey: Survey, misspelt: bool = False) -> Iterator[Finding]:
+    """All of them as one, with the nearest name of an epoch that has images of the table's cameras and no reading.
+
+    misspelt: only where there is such a name; else nothing may have been in view.
+    """
     read = {r.epoch_id for r in survey.table_readings}
     seen = {b.epoch_id for b in survey.image_blocks}
     others = {e for name, kind in survey.others.items() if name != "table_readings" for o in kind for e in _epochs(o)}
@@ -21,8 +24,10 @@ def unseen_readings(survey: Survey) -> Iterator[Finding]:
     mounted = {s.station_id for s in survey.stations if s.motion == "table"}
     cameras = {c.camera_id for c in survey.cameras if c.station_id in mounted}
     waiting = sorted({b.epoch_id for b in survey.image_blocks if b.camera_id in cameras} - read)
-    near = (get_close_matches(e, waiting, 1, 0.5) for e in alone[: len(waiting)])
+    near = (get_close_matches(e, waiting, 1) for e in alone[: len(waiting)])
     meant = "; ".join(f"for {e} perhaps {name}" for e, names in zip(alone, near, strict=False) for name in names)
+    if misspelt and not meant:
+        return
     yield Finding(
         "weak", "epochs without partners", alone,
         f"{len(alone)} of {len(read)} table readings without images of their epoch, or anything else: "

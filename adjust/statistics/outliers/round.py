@@ -26,6 +26,8 @@ from adjust.testing.single_tests import CONTROLLED
 
 _CROWD = 0.05
 """Share of the observations that fail, from which a network of pairs is first looked at without a solution."""
+_FEW = 200
+"""Tests of a group up to which they count as independent of each other."""
 _NONE: IntArray = np.zeros(0, dtype=np.int64)
 
 
@@ -230,8 +232,8 @@ class Round:
 def typical(tests: Verdicts) -> FloatArray:
     """Of groups (G,) of many the factor that their typical test shows.
 
-    Tests of n observations that share r / n of their redundancy vary like r independent ones at most: the squared
-    correlations of a projection's rows add up to n / r.
+    Tests of n observations that share r / n of their redundancy vary no more than r independent ones: the squared
+    correlations of a projection's rows add up to n / r. Of few that is not asked: what is wrong takes it away.
     """
     factor = np.ones(len(tests.omega))
     n = np.bincount(tests.group[tests.used & (tests.freedom > 0)], minlength=len(factor))
@@ -239,7 +241,7 @@ def typical(tests: Verdicts) -> FloatArray:
         mine = tests.used & (tests.group == g) & (tests.freedom > 0)
         freedom, of = np.unique(tests.freedom[mine], return_inverse=True)
         ratio = tests.statistic[mine] / chi2.ppf(0.5, freedom)[of]
-        independent = min(float(n[g]), float(tests.redundancy[g] / np.mean(tests.freedom[mine])))
+        independent = min(n[g], max(tests.redundancy[g] / np.mean(tests.freedom[mine]), _FEW))
         if np.mean(ratio > 1.0) > 0.5 + 1.5 / np.sqrt(independent):  # three sigmas of a fair coin
             factor[g] = max(1.0, float(np.median(ratio)))
     return factor

@@ -68,7 +68,7 @@ def with_probable_causes(survey: Survey, result: Adjustment, project: Project) -
         from adjust.diagnosis.table import sign_warnings, unseen_readings  # here: most surveys start without a table
 
         warnings = sign_warnings(survey, result)
-        alone = tuple(f"{f.found}; {f.remedy}" for f in unseen_readings(survey))
+        alone = tuple(f"{f.found}; {f.remedy}" for f in unseen_readings(survey, misspelt=True))
     if _contradicted(survey, result):
         # what does not fit may have spoilt the lenses too: then those that the images alone give
         causes = _probable_causes(survey, result) or _probable_causes(survey)
