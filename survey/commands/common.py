@@ -66,7 +66,12 @@ def run_command(program: str, build_parser: Callable[[], argparse.ArgumentParser
 
 
 def run_as_program(main: Callable[[], int]) -> NoReturn:
-    """``main()`` as a program of its own, with little done for a memory that goes away with it."""
+    """``main()`` as a program of its own, with little done for a memory that goes away with it.
+
+    All cores work on parts of a survey already: threads of NumPy's and SciPy's OpenBLAS beside them mostly wait for
+    each other, and would make the last digits depend on the number of cores.
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     gc.set_threshold(_OBJECTS)
     code = main()
     gc.freeze()  # at its end Python looks for cycles once more, in all that was ever loaded

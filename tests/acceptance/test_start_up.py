@@ -1,13 +1,16 @@
 """What a small network loads: the clock is for benchmarks, the list of modules does not depend on the machine."""
 
+import os
 import platform
 import re
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
+from adjust.native.parallel import cores
 from survey.cli import main
 
 NEEDLESS = (
@@ -89,3 +92,25 @@ def test_memory_that_was_freed_is_used_again():
     """Else every array of 32 MB is 8192 pages that the system clears once more."""
     run = subprocess.run([sys.executable, "-c", FREED], capture_output=True, text=True, timeout=60, check=True)
     assert int(run.stdout) < 8192
+
+
+THREADS = """
+import os
+from survey.commands.common import run_as_program
+
+def main():
+    import numpy
+    print(len(os.listdir("/proc/self/task")))
+    return 0
+
+run_as_program(main)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="threads of a process are counted by Linux")
+@pytest.mark.parametrize(("said", "expected"), [({}, 1), ({"OPENBLAS_NUM_THREADS": "2"}, 2)])
+def test_linear_algebra_has_one_thread_in_a_command(said, expected):
+    """The command's own threads share out the survey."""
+    unsaid = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
+    out = subprocess.run([sys.executable, "-c", THREADS], env=unsaid | said, capture_output=True, text=True, check=True)
+    assert int(out.stdout) == min(expected, cores())
