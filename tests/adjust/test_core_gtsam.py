@@ -14,8 +14,10 @@ import pytest
 from adjust.adjustment import adjust
 from adjust.graph.assembly import AdjustmentGraph, StartValues, values_of
 from adjust.graph.solver import SolveOptions, solve
+from adjust.lenses.conversion import convert
+from adjust.lenses.models import MODELS, lens_constants
 from adjust.model.observations import Closure, FrameRef, Pair
-from adjust.model.survey import Survey, VectorPrior
+from adjust.model.survey import INSTRUMENT, LensParameter, Setup, Survey, VectorParameter, VectorPrior, Vertical
 from adjust.observations.images import helmert_blocks
 from adjust.pose_network.network import survey_of
 from adjust.precision.precision import Precision
@@ -54,6 +56,25 @@ def reduced_epochs() -> Problem:
     return resample(survey, truth, 4), h.shaken(h.start_at(truth), 1, 0.003)
 
 
+def of_lens(model: str) -> Callable[[], Problem]:
+    """The same images through lenses of another model, all of its parameters free that boards can tell apart."""
+
+    def make() -> Problem:
+        survey, start = reduced_epochs()
+        old, new, cameras, lenses = MODELS["brown"], MODELS[model], [], {}
+        for camera in survey.cameras:
+            size = camera.image_size
+            pixels, constants = lens_constants(old, size), lens_constants(new, size, 0.005, 2.0)
+            free = [name for name in new.names if name not in ("skew", "k3", "k4", "a3")]
+            lens = convert(old, start.lenses[camera.camera_id], pixels, new, constants, size, free=free)
+            lenses[camera.camera_id] = lens.values
+            given = LensParameter(model, tuple(free), pixel_size_mm=0.005, balance_radius_mm=2.0 * (model == "aicon"))
+            cameras.append(replace(camera, lens=given))
+        return replace(survey, cameras=tuple(cameras)), replace(start, lenses=lenses)
+
+    return make
+
+
 def lab() -> Problem:
     """Boards and a table, beacons seen by cameras and total station."""
     survey, truth = laboratory(2)
@@ -63,6 +84,18 @@ def lab() -> Problem:
 def readings() -> Problem:
     """Every kind of reading."""
     survey, truth = polar_network(4)
+    return measured(survey, truth, 4), start_near(survey, truth, 2, 1e-3)
+
+
+def instruments() -> Problem:
+    """What instruments do not know of themselves, refraction over round level surfaces, centring and heights."""
+    values = np.array([0.0, 0.0, 0.13, 0.0])
+    prior = VectorPrior(INSTRUMENT, values, np.diag([1e-6, 1e-8, 25.0, 1e-8]))
+    free = VectorParameter(INSTRUMENT, values, free=INSTRUMENT, prior=prior)
+    survey, truth = polar_network(
+        4, n=6, stations=3, held=3, instrument=free, vertical=Vertical(radius=6.38e6),
+        setup=Setup("", "T", centring_sigma=1e-3, height_sigma=5e-4),
+    )  # fmt: skip
     return measured(survey, truth, 4), start_near(survey, truth, 2, 1e-3)
 
 
@@ -138,6 +171,8 @@ GRAPHS = {
     "bundle": problem(bundle), "reduced epochs": problem(reduced_epochs), "lab": problem(lab),
     "readings": problem(readings), "pairs and others": of_pairs_and_others, "geometry": of_geometry,
     "pairs alone": problem(pair_graph), "closed loop": problem(closed_loop), "Helmert blocks": cut_bundle,
+    "instruments": problem(instruments),
+    **{f"lens {m}": problem(of_lens(m)) for m in ("fisheye", "brown_backward", "brown_backward_dbat", "aicon")},
 }  # fmt: skip
 
 
