@@ -46,7 +46,7 @@ class Judgement:
 
 def judgement_of(adjustment: Adjustment, project: Project) -> Judgement:
     """As the results would have it. Raises SurveyError for a tolerance that is about nothing."""
-    from survey.solution.dictionary import summary_dict
+    from survey.solution.dictionary import summary_dict  # here: the page comes before what adjusts is loaded
     from survey.solution.quantities import scale_of
     from survey.solution.statistics import tested_parts
     from survey.solution.tolerances import verdicts

@@ -12,7 +12,7 @@ from adjust.diagnosis.units.conventions import ANGLES, LENGTH_RATIOS, SLIPS
 from adjust.diagnosis.units.heights import doubtful_heights
 from adjust.diagnosis.units.readings import misread_readings
 from adjust.diagnosis.weights.impossible import doubtful_sigmas
-from adjust.diagnosis.weights.sigmas import ODD, id_of, odd_among
+from adjust.diagnosis.weights.sigmas import ODD, id_of, kind_of, odd_among
 from adjust.model.errors import listed
 from adjust.model.names import grouped
 from adjust.model.observations import Distance, Reading
@@ -71,7 +71,7 @@ def _slips(given: Survey, predicted: Survey) -> Iterator[_Slip]:
     every: tuple[Distance | Reading, ...] = (*given.distances, *given.readings)
     known = {(type(o), id_of(o)): o.value for o in there}
     for o in (o for o in every if o.used and (type(o), id_of(o)) in known):
-        to, kind = known[type(o), id_of(o)], o.kind if isinstance(o, Reading) else "distance"
+        to, kind = known[type(o), id_of(o)], kind_of(o)
         factor, unit = (1e3, "mm") if isinstance(o, Distance) else (1.0, "m")
         if kind in ANGLES:
             to, factor, unit = to % (2.0 * np.pi), 180.0 / np.pi, "deg"
@@ -99,7 +99,7 @@ def _in_another_unit(case: Case) -> Iterator[Finding]:
         known.update(h.place.ids)
         yield Finding("weak" if h.place.kind == "point" else "problem", kind, h.place.ids, h.cause, h.change)
     every: tuple[Reading | Distance, ...] = (*survey.readings, *survey.distances)
-    for kind, found in grouped((str(getattr(o, "kind", "distance")), o) for o in every).items():
+    for kind, found in grouped((kind_of(o), o) for o in every).items():
         odd = [id_of(o) for o in odd_among(found)[1]]
         if not known.issuperset(odd):
             yield Finding("problem", "suspicious sigma", tuple(odd), f"{kind} {listed(odd, 6)}: the sigma is more than "

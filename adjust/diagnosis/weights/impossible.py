@@ -13,6 +13,7 @@ from gtsam import Pose3
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import ChangeColumns, ChangeReadings, Edit, Hypothesis, Place, ScaleKey
 from adjust.diagnosis.units.conventions import ANGLES
+from adjust.diagnosis.weights.sigmas import id_of, kind_of
 from adjust.model.errors import listed
 from adjust.model.names import grouped
 from adjust.model.observations import Distance, Reading
@@ -104,9 +105,9 @@ def _of_values(survey: Survey) -> Iterator[_Odd]:
         ("readings", survey.readings), ("distances", survey.distances))  # fmt: skip
     for field, observed in every:
         number = grouped((o.group, i) for i, o in enumerate(observed) if o.used)
-        odd = grouped(((_kind(o), o.group), i) for i, o in enumerate(observed) if o.used and o.sigma < _least(o))
+        odd = grouped(((kind_of(o), o.group), i) for i, o in enumerate(observed) if o.used and o.sigma < _least(o))
         for (kind, group), rows in odd.items():
-            ids = tuple(_id(observed[i]) for i in rows)
+            ids = tuple(id_of(observed[i]) for i in rows)
             largest = max(observed[i].sigma for i in rows)
             yield _Odd(field, kind, group, tuple(rows), ids, largest, len(rows) == len(number[group]))
 
@@ -133,14 +134,6 @@ def _largest(cov: FloatArray) -> tuple[float, float]:
     """Of a pair's sigmas, that of its rotation (rad) and that of its shift (m)."""
     sigma = np.sqrt(np.diagonal(cov))
     return float(sigma[:3].max()), float(sigma[3:].max(initial=0.0))
-
-
-def _kind(o: Reading | Distance) -> str:
-    return o.kind if isinstance(o, Reading) else "distance"
-
-
-def _id(o: Reading | Distance) -> str:
-    return o.reading_id if isinstance(o, Reading) else o.distance_id
 
 
 def _least(o: Reading | Distance) -> float:

@@ -115,6 +115,11 @@ def _with_usual(case: Case, field: str, kind: str, group: str, odd: list[_One], 
     )  # fmt: skip
 
 
+def kind_of(o: Reading | Distance) -> str:
+    """Of a reading; "distance" of all other lengths."""
+    return o.kind if isinstance(o, Reading) else "distance"
+
+
 def id_of(o: _One) -> str:
     """Of an observation."""
     names = ("reading_id", "distance_id", "level_id", "surface_id")

@@ -29,9 +29,9 @@ def findings(bench: Jobs) -> dict[str, Any]:
     found, kept = bench.situation.judgement, bench.kept
     known: dict[str, Any] = {"verdict": "failed", "reason": message(str(bench.failure or "")), "warnings": [],
                              "causes": [], "n_failing": 0, "findings": []}  # fmt: skip
-    summary = found.snapshot.summary if found is not None else kept.summary if kept is not None else None
-    if summary is not None:
-        known = _of_solution(bench, in_words(summary))
+    said = kept if found is None else found.snapshot
+    if said is not None:
+        known = _of_solution(bench, in_words(said.summary))
     return dict(plain({"version": bench.version, **known, "remedies": remedies(bench)}))
 
 
