@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from adjust.diagnosis.between import Between, causes_between
 from adjust.epochs.congruence import CongruenceOptions, congruence
 from adjust.epochs.congruence_result import Congruence, CongruenceTest, Motion
 from adjust.epochs.deformation import Deformation, station_deformations
+from adjust.epochs.shared import shared_observations
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from survey.folder.plain import attributes, plain
@@ -44,7 +46,21 @@ class CompareOutcome:
         """Causes other than motions; what the adjustments warn of: wrong sigmas there make wrong tests here."""
         pairs = zip(self.folders, self.adjustments, strict=True)
         causes = (f"probable cause: {c.cause}; {c.change} (then p {c.p:.2g})" for c in self.causes)
-        return (*causes, *(f"{folder}: {warning}" for folder, adjustment in pairs for warning in adjustment.warnings))
+        warnings = (f"{folder}: {warning}" for folder, adjustment in pairs for warning in adjustment.warnings)
+        return (*self._dependence, *causes, *warnings)
+
+    @cached_property
+    def _dependence(self) -> tuple[str, ...]:
+        """What says that the epochs are not independent; empty where they may be."""
+        shared = shared_observations(*(a.survey for a in self.adjustments))
+        if not shared:
+            return ()
+        told = ", ".join(f"{kind}: {n}" for kind, n in shared.items())
+        return (
+            f"the same values stand in both epochs ({told}): they are not independent, as the tests take them, so that "
+            "sigmas of motions are too large and what moved may stay hidden; compare epochs that were measured anew "
+            "(how far observations move a solution, 'labsurvey add' and 'labsurvey remove' say)",
+        )
 
     def summary(self) -> dict[str, object]:
         """As plain values; None where something was not measured or cannot be tested."""

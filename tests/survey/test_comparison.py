@@ -1,11 +1,15 @@
 """The command ``compare`` on two epochs of a chain of stations."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from adjust.epochs.shared import shared_observations
+from adjust.model.observations import Distance, PositionRef
+from adjust.model.survey import Survey
 from survey.cli import main
 from survey.project import write_project
 from tests.adjust.test_deformation import chain, measured, small
@@ -94,3 +98,24 @@ def test_images_without_detection_are_not_passed_over(epochs, capsys):
     (epochs[1] / "images" / "C" / "e1.png").write_bytes(b"")
     assert main(["compare", *map(str, epochs), "--quiet"]) == 1
     assert f"run 'labsurvey detect {epochs[1]}' first" in capsys.readouterr().err
+
+
+def test_an_epoch_and_what_was_added_to_it_are_not_independent(epochs, tmp_path, capsys):
+    survey = measured(chain(), np.random.default_rng(1))
+    write_project(tmp_path / "first", survey)
+    write_project(tmp_path / "again", measured(chain(), np.random.default_rng(2)))
+    write_project(tmp_path / "grown", replace(survey, pairs=survey.pairs[:-1]))
+    found = _json(capsys, tmp_path / "first", tmp_path / "grown")
+    assert found["warnings"][0].startswith(f"the same values stand in both epochs (pairs: {len(survey.pairs) - 1})")
+    assert not any("independent" in w for w in _json(capsys, tmp_path / "first", tmp_path / "again")["warnings"])
+
+
+def test_single_numbers_may_be_read_twice():
+    def tape(*values):
+        ends = [PositionRef(p) for p in "AB"]
+        return Survey(distances=tuple(Distance(f"d{k}", *ends, v, 1e-3) for k, v in enumerate(values)))
+
+    first = tape(1.001, 1.002, 1.003, 1.004, 1.005, 1.006, 1.007)
+    assert shared_observations(first, tape(1.001, 1.002, 1.003, 1.005, 1.004, 1.007, 1.008)) == {}
+    assert shared_observations(first, tape(1.001, 1.002, 1.003, 1.004)) == {"distances": 4}
+    assert shared_observations(tape(1.0, 2.0), tape(1.0, 2.0)) == {}
