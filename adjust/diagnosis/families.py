@@ -21,6 +21,7 @@ from adjust.diagnosis.time.synchronisation import unsynchronised
 from adjust.diagnosis.units.heights import misread_heights, wrong_heights
 from adjust.diagnosis.units.pairs import misread_pairs
 from adjust.diagnosis.units.readings import misread_readings
+from adjust.diagnosis.weights.centring import missing_centring
 from adjust.diagnosis.weights.correlated import correlated_readings
 from adjust.diagnosis.weights.impossible import impossible_sigmas
 from adjust.diagnosis.weights.sigmas import odd_sigmas, wrong_factors
@@ -38,7 +39,7 @@ UNITS: tuple[Family, ...] = (misread_readings, wrong_heights, misread_pairs)
 IN_COMMON = (*VALUES, *UNITS)
 """What several observations that were left out, with all others fitting, may have in common."""
 TIME: tuple[Family, ...] = (forgotten_motion, unsynchronised)
-WEIGHTS: tuple[Family, ...] = (odd_sigmas, wrong_factors, correlated_readings)
+WEIGHTS: tuple[Family, ...] = (odd_sigmas, wrong_factors, correlated_readings, missing_centring)
 CHEAP = (*VALUES, *IMAGES, *NAMES, *UNITS, *TIME, *WEIGHTS, lost_cameras)
 LATER: tuple[tuple[Family, ...], ...] = ((wrong_sizes,), (changed_bodies,))
 """These adjust to find theirs: they are asked where what the first ones found does not explain everything."""

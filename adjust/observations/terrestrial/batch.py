@@ -14,7 +14,7 @@ from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.observations.adapter import evaluated
 from adjust.observations.factors import Jacobians
 from adjust.observations.terrestrial import equations as k
-from adjust.observations.terrestrial.layout import Chunk, Layout, ReadingArrays
+from adjust.observations.terrestrial.layout import Chunk, Layout
 from adjust.observations.terrestrial.parameters import TerrestrialParameters
 from adjust.spatial.averaging import circular_median
 from adjust.spatial.vertical import Horizon
@@ -199,9 +199,26 @@ class TerrestrialBatch:
         self.evaluate(values)
         joint = [r for c in self.correlated for r in self.layout.chunks[c].rows]
         out = copy(self)  # its working memory is that of the last evaluation, whichever of them was evaluated
-        out.sigma = sigmas(self.layout.arrays, self.horizon.axes, self.A)
+        out.sigma = self._sigmas()
         out.sigma[joint] = self.sigma[joint]
         return out, float(np.max(np.abs(out.sigma / self.sigma - 1.0)))
+
+    def _sigmas(self) -> FloatArray:
+        """Sigmas (N,) of readings with targets off by ``target_centring`` in any horizontal direction."""
+        a = self.layout.arrays
+        off = np.where((a.kind != k.HEIGHT) & (a.target_centring > 0.0), a.target_centring, 0.0)
+        rows, variance = np.flatnonzero(off), a.sigma**2
+        for column, target in ((k.TO, a.to), (k.SECOND, a.second)):
+            variance[rows] += off[rows] ** 2 * (self.by_horizontal(column, target)[rows] ** 2).sum(axis=1)
+        return np.sqrt(variance)
+
+    def by_horizontal(self, column: int, position: IntArray) -> FloatArray:
+        """Derivatives (N, 2) by horizontal movements of positions (N,), of which A has those from ``column`` on.
+
+        Zero where there is none.
+        """
+        along = self.A[:, None, column : column + 3] @ np.swapaxes(self.horizon.axes[position, :2], 1, 2)
+        return np.where(position[:, None] >= 0, along[:, 0], 0.0)
 
     # -- GTSAM -------------------------------------------------------------------------------------------------------
 
@@ -272,20 +289,6 @@ class TerrestrialBatch:
                 turn_about_z = self.sign * circular_median(turn[np.isfinite(turn)])
                 station = values.atPose3(poses[setup_id])
                 values.update(poses[setup_id], station * gtsam.Pose3(gtsam.Rot3.Rz(turn_about_z), np.zeros(3)))
-
-
-def sigmas(a: ReadingArrays, axes: FloatArray, A: FloatArray) -> FloatArray:
-    """Sigmas (N,) of readings with targets off by ``target_centring`` in any horizontal direction.
-
-    A (N, 22): their derivatives; those by the targets' horizontal movements carry the error over.
-    """
-    variance = a.sigma**2
-    for column, target in ((k.TO, a.to), (k.SECOND, a.second)):
-        rows = np.flatnonzero((target >= 0) & (a.target_centring > 0.0) & (a.kind != k.HEIGHT))
-        horizontal = axes[target[rows], :2]
-        by_target = np.einsum("nij,nj->ni", horizontal, A[rows, column : column + 3])
-        variance[rows] += a.target_centring[rows] ** 2 * (by_target**2).sum(axis=1)
-    return np.sqrt(variance)
 
 
 def _blocks(chunk: Chunk, J: FloatArray) -> list[FloatArray]:
