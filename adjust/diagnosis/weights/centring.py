@@ -13,6 +13,7 @@ from scipy import sparse
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.model.names import grouped
+from adjust.model.result import Adjustment
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, Survey
 from adjust.observations.terrestrial import equations as k
@@ -27,6 +28,8 @@ _SEEN = 0.05
 """Share of a set-up's error that the unknowns leave, below which its point moves with it and it does no harm."""
 _SIZES = 1e-5 * np.geomspace(1.0, 3_000.0, 25)
 """m, of sigmas that are tried: 0.01 to 30 mm, two of each doubling; what the largest suits best is something else."""
+_LESS_LIKELY = 10.0
+"""Minus twice the log likelihood by which the sigma of one explains less than that of another, and is not tried."""
 _LAST = 1.5
 """Evidence: as for sigmas, larger variances fit anything, so what else there is to try is tried first."""
 
@@ -57,9 +60,11 @@ def missing_centring(case: Case) -> Iterator[Hypothesis]:
         return
     batch.evaluate(linear.system.precision.solved.values)
     some = [e for e in (_of_targets(survey, linear, batch), _of_instruments(survey, linear, batch)) if e.parts]
-    for errors in ([some[:1], some[1:], some] if len(some) > 1 else [some] * len(some)):
-        size, cost = _likeliest(linear, errors)
-        if cost < -float(chi2.isf(_ALPHA, 1)) and size < _SIZES[-1]:
+    every = [(errors, *_likeliest(linear, errors)) for errors in (some[:1], some[1:], some)[: 2 * len(some) - 1]]
+    least = min((cost for *_, cost in every), default=0.0)
+    most = min(-float(chi2.isf(_ALPHA, 1)), least + _LESS_LIKELY, _with_factors(linear.result))
+    for errors, size, cost in every:
+        if cost < most and size < _SIZES[-1]:
             yield _hypothesis(survey, errors, size)
 
 
@@ -107,6 +112,13 @@ def _likeliest(linear: LinearScores, errors: Sequence[_Errors]) -> tuple[float, 
     costs = (np.log1p(left) - _SIZES[:, None] ** 2 * along / (1.0 + left)).sum(axis=1)
     best = int(np.argmin(costs))
     return float(_SIZES[best]), float(costs[best])
+
+
+def _with_factors(result: Adjustment) -> float:
+    """As :func:`_likeliest`, with sigmas of every group of readings times a factor instead: where that says more."""
+    groups = {r.group for r in result.survey.readings}
+    tested = [g for g in result.groups if g.group in groups and g.omega > g.redundancy > 0.0]
+    return sum(g.redundancy * float(np.log(g.omega / g.redundancy) + 1.0) - g.omega for g in tested)
 
 
 def _in_common(parts: Sequence[Part]) -> FloatArray:
