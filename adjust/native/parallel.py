@@ -7,10 +7,11 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
 from itertools import pairwise
 from typing import Any, Self, TypeVar
+from weakref import WeakSet
 
 import numpy as np
 
-from adjust.model.survey import IntArray
+from adjust.model.arrays import IntArray
 
 _WORTHWHILE = 5_000
 _here = threading.local()
@@ -81,7 +82,7 @@ class Beside:
 
     def __init__(self) -> None:
         self.alone = workers() == 1 or hasattr(_here, "step") or hasattr(_here, "busy")
-        self._begun = list[Future[Any]]()
+        self._begun = WeakSet[Future[Any]]()  # what nobody asks for any more need not stay in memory
 
     def of(self, step: Callable[[], _Result]) -> Callable[[], _Result]:
         """What gives the result of a step, or raises what it raised."""
@@ -89,15 +90,14 @@ class Beside:
             result = step()
             return lambda: result
         begun = _stages(workers()).submit(step)
-        self._begun.append(begun)
+        self._begun.add(begun)
         return begun.result
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        wait(self._begun)
-        self._begun.clear()
+        wait(list(self._begun))
 
 
 def run_split(kernel: Callable[..., object], runs: list[IntArray], *arguments: object) -> None:

@@ -78,17 +78,20 @@ def adjust(arguments: argparse.Namespace) -> int:
 def _adjust_one(folder: Path, arguments: argparse.Namespace) -> int:
     begin_adjusting()
     require_project(folder, arguments.out)
-    from survey.jobs.adjusting.job import adjust_job
-    from survey.report.language import ReportOptions
-
     if arguments.candidate is not None:
         from survey.jobs.adjusting.trying import try_job
 
         say(arguments, try_job(folder, arguments.candidate))
-    outcome = adjust_job(
-        folder, out=arguments.out, progress=not is_set(arguments, "quiet"), redetect=arguments.redetect,
-        method=arguments.method, report=ReportOptions(parquet=arguments.parquet),
-    )  # fmt: skip
+    from survey.project.tables.files import reading_ahead
+
+    with reading_ahead(folder) as ahead:
+        from survey.jobs.adjusting.job import adjust_job
+        from survey.report.language import ReportOptions
+
+        outcome = adjust_job(
+            folder, out=arguments.out, progress=not is_set(arguments, "quiet"), redetect=arguments.redetect,
+            method=arguments.method, report=ReportOptions(parquet=arguments.parquet), ahead=ahead,
+        )  # fmt: skip
     show(arguments, outcome, outcome.paths.values())
     if is_set(arguments, "verbose"):
         say(arguments, *(f"{step}: {seconds:.2f} s" for step, seconds in outcome.run.seconds.items()))
@@ -144,16 +147,20 @@ def report(arguments: argparse.Namespace) -> int:
     """The command ``report``."""
     begin_adjusting()
     require_project(arguments.folder, arguments.out)
-    from survey.jobs.adjusting.job import adjust_job
-    from survey.report.language import ReportOptions
-    from survey.solution.earlier.runs import command_line
+    from survey.project.tables.files import reading_ahead
 
     language = arguments.language if arguments.language != "en" else None
     flags = {"language": language, "pdf": arguments.pdf, "check": arguments.check, "out": arguments.out}
-    outcome = adjust_job(
-        arguments.folder, out=arguments.out, progress=not is_set(arguments, "quiet"),
-        report=ReportOptions(arguments.language, arguments.pdf), said=command_line("report", arguments.folder, **flags),
-    )  # fmt: skip
+    with reading_ahead(arguments.folder) as ahead:
+        from survey.jobs.adjusting.job import adjust_job
+        from survey.report.language import ReportOptions
+        from survey.solution.earlier.runs import command_line
+
+        outcome = adjust_job(
+            arguments.folder, out=arguments.out, progress=not is_set(arguments, "quiet"), ahead=ahead,
+            report=ReportOptions(arguments.language, arguments.pdf),
+            said=command_line("report", arguments.folder, **flags),
+        )  # fmt: skip
     unmet = [v for v in outcome.statistics.verdicts if not v.met] if outcome.statistics is not None else []
     lines = (f"\n  tolerance {v.tolerance} not met: {' '.join(v.result)} {v.quantity}, {v.found / v.allowed:.2f} times "
              "what is allowed" for v in unmet)  # fmt: skip

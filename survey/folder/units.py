@@ -5,7 +5,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from adjust.model.survey import FloatArray
+from adjust.model.arrays import FloatArray
 
 RAD_PER_DEG = math.pi / 180.0
 RAD_PER_ARCSEC = math.pi / 648000.0

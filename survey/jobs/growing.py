@@ -19,7 +19,8 @@ from survey.project.declared.owners import read_stations
 from survey.project.merging import check_new
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
 from survey.project.tables.files import read_table
-from survey.project.tables.pairs import PAIRS, read_pairs
+from survey.project.tables.layouts import PAIRS
+from survey.project.tables.pairs import read_pairs
 from survey.project.tables.references import Names
 from survey.solution.earlier.previous import read_previous
 

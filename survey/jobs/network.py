@@ -15,15 +15,15 @@ from survey.project import Definition, Project, read_definition
 from survey.project.merging import Merged, merge, read_copy
 from survey.project.project import OBSERVATIONS_FOLDER
 from survey.project.tables.files import read_table
-from survey.project.tables.pairs import (
+from survey.project.tables.layouts import (
     COVARIANCE_COLUMNS,
     EULER,
     PAIRS,
     QUATERNION,
     SIGMA_COLUMNS,
     TRANSLATION,
-    read_ends,
 )
+from survey.project.tables.pairs import read_ends
 from survey.project.tables.reading import Table
 from survey.project.tables.references import Names
 from survey.solution.earlier.runs import command_line

@@ -1,16 +1,16 @@
-"""The project folder: ``read`` gives a ``Project``, ``write_project`` writes one."""
+"""The project folder: ``read`` gives a ``Project``, ``write_project`` writes one.
 
-from survey.folder.text import atomic_write
-from survey.project.project import (
-    AdjustmentOptions,
-    Definition,
-    Project,
-    Sigmas,
-    SpotBlock,
-    SpotsRequest,
-)
-from survey.project.reading import read, read_definition
-from survey.project.writing import write_project
+Every name is loaded when it is first used: large tables are read while all that their project needs is still loaded.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from survey.folder.text import atomic_write
+    from survey.project.project import AdjustmentOptions, Definition, Project, Sigmas, SpotBlock, SpotsRequest
+    from survey.project.reading import read, read_definition
+    from survey.project.writing import write_project
 
 __all__ = [
     "AdjustmentOptions",
@@ -24,3 +24,18 @@ __all__ = [
     "read_definition",
     "write_project",
 ]
+_PLACES = {
+    "atomic_write": "survey.folder.text",
+    "read": "survey.project.reading",
+    "read_definition": "survey.project.reading",
+    "write_project": "survey.project.writing",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, loaded now."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(_PLACES.get(name, "survey.project.project")), name)
+    globals()[name] = value
+    return value

@@ -19,7 +19,7 @@ from survey.project.exclusions import EXCLUSIONS_FILE, appended, read_exclusions
 from survey.project.project import DEFINITION_FILE, FORMAT, IMAGES_FOLDER, OBSERVATIONS_FOLDER, Project
 from survey.project.reading import read
 from survey.project.tables.files import read_table
-from survey.project.tables.kinds import LAYOUTS
+from survey.project.tables.layouts import LAYOUTS
 
 _KINDS = ("cameras", "stations", "tables", "targets", "points", "instruments", "setups", "beams", "surfaces")
 Origin = tuple[Path, int]

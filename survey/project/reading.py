@@ -1,7 +1,7 @@
 """Reading a project folder."""
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
@@ -11,7 +11,6 @@ import numpy as np
 from adjust.model.errors import SurveyError
 from adjust.model.names import natural_key
 from adjust.model.survey import Datum, FloatArray, Point, PointParameter, Survey
-from adjust.native.parallel import Beside
 from survey.folder.locking import settled
 from survey.folder.text import id_problem, suggestion
 from survey.project.declared.clocks import are_timed, read_times
@@ -44,9 +43,10 @@ from survey.project.project import (
     Sigmas,
     SpotsRequest,
 )
-from survey.project.tables.files import Begun, begun_table, large_tables, read_table
+from survey.project.tables.files import Begun, read_table
 from survey.project.tables.image_points import read_image_blocks, read_spots, world_names
-from survey.project.tables.kinds import GROUPS, KINDS, LAYOUTS, with_observations
+from survey.project.tables.kinds import GROUPS, KINDS, with_observations
+from survey.project.tables.layouts import LAYOUTS
 from survey.project.tables.reading import Layout, Table
 from survey.project.tables.references import Names
 
@@ -57,37 +57,32 @@ def read_definition(folder: Path) -> Definition:
         return _read_definition(Path(folder))[0]
 
 
-def read(folder: Path, meanwhile: Callable[[], object] = lambda: None) -> Project:
+def read(folder: Path, ahead: dict[Path, Begun] | None = None) -> Project:
     """Read a whole project folder; tables of observations that are not there yet are empty. Raises SurveyError.
 
     What ``exclusions.csv`` leaves out is not used. ``notes`` say which of its rows name nothing, ``image_notes``
-    which images are not those any more that the points come from. meanwhile: called while large tables are being read.
+    which images are not those any more that the points come from. ahead: see :func:`read_all`.
     """
-    project = read_all(folder, meanwhile=meanwhile)
+    project = read_all(folder, ahead=ahead)
     return leaving_out(project, in_force(read_exclusions(project.folder / OBSERVATIONS_FOLDER)[0]).values())
 
 
 def read_all(
-    folder: Path, texts: Mapping[str, str] = MappingProxyType({}), meanwhile: Callable[[], object] = lambda: None
+    folder: Path, texts: Mapping[str, str] = MappingProxyType({}), ahead: dict[Path, Begun] | None = None
 ) -> Project:
     """:func:`read`, with what is excluded as if it were not.
 
-    texts: what is to stand in files of the folder, not yet written, by their paths in it.
+    texts: what is to stand in files of the folder, not yet written, by their paths in it. ahead: tables that are being
+    read already; they are taken from it, so that nothing of them stays in memory.
     """
     place = Path(folder) / OBSERVATIONS_FOLDER
-    with settled(Path(folder)), Beside() as loading:
-        large = [] if texts or loading.alone else large_tables(place, LAYOUTS)
-        loaded = loading.of(meanwhile if large else lambda: None)
-        with Beside() as reading:
-            begun = {path: begun_table(path, reading) for path in large}
-            definition, root = _read_definition(Path(folder), texts.get(DEFINITION_FILE))
-            tables = _read_tables(place, {Path(folder) / name: text for name, text in texts.items()}, begun)
-            begun.clear()
-            _, digest = read_exclusions(place)
-            known = read_detected(place)
-            images = _image_news(definition, tables, known)
+    with settled(Path(folder)):
+        definition, root = _read_definition(Path(folder), texts.get(DEFINITION_FILE))
+        tables = _read_tables(place, {Path(folder) / name: text for name, text in texts.items()}, ahead or {})
+        _, digest = read_exclusions(place)
+        known = read_detected(place)
+        images = _image_news(definition, tables, known)
         project = _observed(definition, root, tables)
-        loaded()
     hashes = dict(sorted({**project.inputs, f"{OBSERVATIONS_FOLDER}/{EXCLUSIONS_FILE}": digest}.items()))
     if digest:
         project = dataclasses.replace(project, inputs=hashes)
@@ -256,10 +251,10 @@ def _check_scales(root: Node, sigmas: Sigmas, tables: dict[str, Table]) -> None:
             raise root.table("sigmas").table("scale").error(problem, group)
 
 
-def _read_tables(folder: Path, instead: Mapping[Path, str], begun: Mapping[Path, Begun]) -> dict[str, Table]:
+def _read_tables(folder: Path, instead: Mapping[Path, str], ahead: dict[Path, Begun]) -> dict[str, Table]:
     """All tables in the folder by name; raises where a file is no known table or one is there twice.
 
-    instead: what is to stand in some of them, not yet written. begun: those of which the reading has begun.
+    instead: what is to stand in some of them, not yet written. ahead: those that are being read already.
     """
     tables: dict[str, Table] = {}
     paths = sorted(folder.iterdir()) if folder.is_dir() else []
@@ -274,7 +269,7 @@ def _read_tables(folder: Path, instead: Mapping[Path, str], begun: Mapping[Path,
             raise SurveyError(f"{path}: unknown table {path.stem!r}; {near}")
         if path.stem in tables:
             raise SurveyError(f"{path}: {tables[path.stem].path.name} is there too; keep one of the two")
-        tables[path.stem] = read_table(path, layout, instead.get(path), begun.get(path))
+        tables[path.stem] = read_table(path, layout, instead.get(path), ahead.pop(path, None))
     return tables
 
 

@@ -9,7 +9,7 @@ from survey.project.declared.declarations import DECLARATIONS, declared
 from survey.project.declared.keys import NOTHING, REQUIRED, Declared, Key
 from survey.project.exclusions import EXCLUSIONS
 from survey.project.tables.column_texts import COLUMN_TEXTS, column_text
-from survey.project.tables.kinds import LAYOUTS
+from survey.project.tables.layouts import LAYOUTS
 from survey.project.tables.reading import Layout
 
 _HEAD = """\

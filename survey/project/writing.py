@@ -23,7 +23,8 @@ from survey.project.project import (
 )
 from survey.project.tables.files import write_table
 from survey.project.tables.image_points import image_point_columns, spot_columns
-from survey.project.tables.kinds import LAYOUTS, observation_tables
+from survey.project.tables.kinds import observation_tables
+from survey.project.tables.layouts import LAYOUTS
 from survey.project.tables.reading import Columns
 from survey.project.targets import PointList, TargetKind
 

@@ -54,14 +54,11 @@ def image_rows(adjustment: Adjustment) -> ImageRows:
     """Observed values, sigmas and names of all image points, row by row."""
     survey = adjustment.survey
     point_ids, start = _point_names(survey)
-    blocks, ptr = survey.image_blocks, adjustment.image_residuals.block_ptr
-    lengths, none = np.diff(ptr), np.zeros((0, 2))
-    uv = np.concatenate([none, *(b.uv for b in blocks)])
-    cov = np.concatenate([np.zeros((0, 2, 2)), *(b.cov for b in blocks)])
-    first = np.array([start[b.target_id] for b in blocks], dtype=np.int64)
-    point = np.concatenate([np.zeros(0, dtype=np.int64), *(b.point_idx for b in blocks)]) + np.repeat(first, lengths)
-    sigmas = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
-    return ImageRows(np.repeat(np.arange(len(blocks)), lengths), uv, sigmas, point, point_ids)
+    points, lengths = survey.image_points, np.diff(survey.image_points.ptr)
+    first = np.array([start[b.target_id] for b in survey.image_blocks], dtype=np.int64)
+    point = points.point_idx + np.repeat(first, lengths)
+    sigmas = np.sqrt(np.diagonal(points.cov, axis1=1, axis2=2))
+    return ImageRows(np.repeat(np.arange(len(lengths)), lengths), points.uv, sigmas, point, point_ids)
 
 
 def _point_names(survey: Survey) -> tuple[tuple[str, ...], dict[str | None, int]]:

@@ -47,7 +47,7 @@ def jobs(monkeypatch):
     """``survey.jobs`` whose result depends on the folder's name."""
     calls = []
 
-    def adjust_job(folder, *, out, progress, redetect, method="joint", report=None):
+    def adjust_job(folder, *, out, progress, redetect, method="joint", report=None, ahead=None):
         calls.append(SimpleNamespace(folder=folder, out=out, progress=progress, redetect=redetect))
         if folder.name == "bad":
             raise SurveyError(f"{folder}/survey.toml:3: no such thing; write another")

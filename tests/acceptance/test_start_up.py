@@ -47,6 +47,19 @@ def test_a_network_of_readings_loads_nothing_that_it_does_not_need(network):
     assert loaded(network, NEEDLESS) == []
 
 
+AHEAD = """
+import sys
+import survey.project.tables.files
+print(*sorted(name for name in ("gtsam", "scipy", "survey.project.reading") if name in sys.modules))
+"""
+
+
+def test_tables_are_read_by_what_loads_little():
+    """It is loaded before all else, which loads while large tables are read."""
+    run = subprocess.run([sys.executable, "-c", AHEAD], capture_output=True, text=True, timeout=60, check=True)
+    assert run.stdout.split() == []
+
+
 def test_a_list_of_runs_loads_nothing_that_adjusts(network):
     names = ("scipy.special", "scipy.sparse", "adjust.adjustment", "adjust.graph", "adjust.precision", "jinja2")
     assert loaded(network, (*NEEDLESS, *names), "runs") == []

@@ -9,32 +9,31 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable
 
-EVENTS = "sched:sched_switch,sched:sched_wakeup,sched:sched_process_fork"
+EVENTS = "sched:sched_switch,sched:sched_wakeup,sched:sched_process_fork,sched:sched_process_exec"
 _LINE = re.compile(r"\s*(\d+)\s+\[(\d+)\]\s+([\d.]+):\s+sched:(\w+):\s+(.*)")
 _FORK, _WAKE = re.compile(r"child_pid=(\d+)"), re.compile(r" pid=(\d+)")
 _SWITCH = re.compile(r"prev_pid=(\d+) .*prev_state=(\S+) ==> .*next_pid=(\d+)")
 
 
-def traced(command: list[str], threads: int) -> tuple[int, Iterator[re.Match[str]]]:
+def traced(command: list[str], threads: int) -> tuple[int, list[re.Match[str]]]:
     """The process of a command, and what the scheduler did meanwhile."""
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     environment |= {"LABSURVEY_THREADS": str(threads), "OPENBLAS_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as place:
         data = f"{place}/perf.data"
-        record = ["perf", "record", "-q", "-e", EVENTS, "-a", "-m", "4096", "-o", data]
-        recorded = subprocess.Popen(record, stderr=subprocess.DEVNULL)
-        run = subprocess.Popen([sys.executable, "-m", "survey", *command], env=environment, stdout=subprocess.DEVNULL)
-        run.wait()
-        recorded.terminate()
-        recorded.wait()
+        record = ["perf", "record", "-q", "-e", EVENTS, "-a", "-m", "4096", "-o", data, "--"]
+        run = [sys.executable, "-m", "survey", *command]
+        subprocess.run(record + run, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=False)
         said = subprocess.run(["perf", "script", "-i", data, "--ns", "-F", "tid,cpu,time,event,trace"], text=True,
                               capture_output=True, check=True)  # fmt: skip
-    return run.pid, filter(None, map(_LINE.match, said.stdout.splitlines()))
+    events = list(filter(None, map(_LINE.match, said.stdout.splitlines())))
+    begun = f"filename={sys.executable} "
+    return next(int(e[1]) for e in events if e[4] == "sched_process_exec" and e[5].startswith(begun)), events
 
 
-def seconds(process: int, events: Iterator[re.Match[str]]) -> tuple[float, float]:
+def seconds(process: int, events: Iterable[re.Match[str]]) -> tuple[float, float]:
     """Of all threads of a process: on the processors, and of that while no other could run."""
     mine, ready, running, before = {process}, set[int](), dict[str, int](), 0.0
     whole = alone = 0.0

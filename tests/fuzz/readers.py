@@ -109,7 +109,7 @@ def _by_arrow(folder: Path) -> Read:
     """A small table through the reader of large ones; the rows must say the same of it."""
     from survey.project.tables import arrow as arrow_columns
     from survey.project.tables import files as table_reading
-    from survey.project.tables.image_points import IMAGE_POINTS
+    from survey.project.tables.layouts import IMAGE_POINTS
 
     arrow_columns.LARGE = 0
     path = folder / "image_points.csv"
@@ -320,7 +320,7 @@ def _rounds(path: Path) -> object:
 
 def _rows(path: Path) -> object:
     """As detection keeps them: every image's hash, who is marked, and the text again."""
-    from survey.project.tables.image_points import IMAGE_POINTS
+    from survey.project.tables.layouts import IMAGE_POINTS
     from survey.project.tables.rows import read_rows
 
     found = read_rows(path.parent, IMAGE_POINTS)

@@ -8,7 +8,7 @@ import pytest
 from survey import project as files
 from survey.project.declared.declarations import INSTRUMENT_UNITS, SURFACE_UNITS, declared
 from survey.project.declared.vectors import vector_keys
-from survey.project.tables.kinds import LAYOUTS
+from survey.project.tables.layouts import LAYOUTS
 
 PAGE = Path(__file__).parents[2] / "docs" / "observations.md"
 NEW = ("terrestrial", "terrestrial_covariance", "coordinate_differences", "coordinate_differences_covariance", "levels",

@@ -3,9 +3,11 @@
 import csv
 import dataclasses
 import math
+import threading
 import time
 import tomllib
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +33,7 @@ from survey.folder.units import from_si, to_si
 from survey.project.declared.toml_text import key_lines, read_tables
 from survey.project.tables import files as table_reading
 from survey.project.tables import reading as tables
-from survey.project.tables.image_points import IMAGE_POINTS
+from survey.project.tables.layouts import IMAGE_POINTS
 from survey.project.tables.pairs import pair_columns
 from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList
 from survey.simulate import full_lab
@@ -308,22 +310,84 @@ def test_blank_lines_and_quotes_go_the_other_way(good: Path) -> None:
     assert table_reading.read_table(path, IMAGE_POINTS).lines.tolist() == [2, 3, 5, 6, 7, 8]
 
 
-@pytest.mark.parametrize(("threads", "begun"), [("1", []), ("2", [True])])
-def test_large_tables_are_read_beside_the_rest(
-    good: Path, monkeypatch: pytest.MonkeyPatch, threads: str, begun: list[bool]
-) -> None:
-    before, path, called = files.read(good), good / "observations" / "image_points.csv", list[bool]()
-    monkeypatch.setenv("LABSURVEY_THREADS", threads)
+@pytest.fixture
+def two_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two threads, and every table is a large one."""
+    monkeypatch.setenv("LABSURVEY_THREADS", "2")
     for module in ("files", "arrow"):
         monkeypatch.setattr(f"survey.project.tables.{module}.LARGE", 0)
-    after = files.read(good, lambda: called.append(True))
-    assert (called, differences(before.survey, after.survey), after.inputs) == (begun, [], before.inputs)
-    path.write_text(path.read_text().replace("e10,X", "e10,Z"))
-    with pytest.raises(SurveyError, match=r"image_points\.csv:4: camera_id: unknown camera 'Z'"):
-        files.read(good)
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_large_tables_are_read_ahead(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before, read, asked = files.read(good), table_reading._read, list[Path]()
+
+    def asking(path: Path, *more: Any) -> tables.Table:
+        asked.append(path)
+        return read(path, *more)
+
+    monkeypatch.setattr(table_reading, "_read", asking)
+    with table_reading.reading_ahead(good) as ahead:
+        expected = sorted([*ahead, good / "sheet_points.csv"])
+        after = files.read(good, ahead)
+        assert ahead == {}  # nothing of them stays
+    assert good / "observations" / "image_points.csv" in expected
+    assert (sorted(asked), differences(before.survey, after.survey), after.inputs) == (expected, [], before.inputs)
+    monkeypatch.setenv("LABSURVEY_THREADS", "1")
+    with table_reading.reading_ahead(good) as ahead:
+        assert ahead == {}
+
+
+@pytest.mark.usefixtures("two_threads")
+@pytest.mark.parametrize("replaced", [True, False])
+def test_a_table_that_changed_since_it_was_read_ahead_is_read_again(good: Path, replaced: bool) -> None:
+    path = good / "observations" / "image_points.csv"
+    text = path.read_text()
+    with table_reading.reading_ahead(good) as ahead:
+        for begun in ahead.values():
+            begun.table()
+        if replaced:
+            files.atomic_write(path, text.replace("e10,X", "e10,Z"))
+        else:
+            path.write_text(text + "e10\n")
+        expected = r"image_points\.csv:4: camera_id: unknown camera 'Z'" if replaced else "found 1 fields, expected"
+        with pytest.raises(SurveyError, match=expected):
+            files.read(good, ahead)
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_what_is_wrong_with_a_table_is_told_when_it_is_asked_for(good: Path) -> None:
+    path = good / "observations" / "image_points.csv"
     path.write_text(path.read_text() + "e10\n")
-    with pytest.raises(SurveyError, match=r"image_points\.csv:\d+: found 1 fields, expected"):
-        files.read(good)
+    with table_reading.reading_ahead(good) as ahead:
+        begun = ahead[path]
+        with pytest.raises(SurveyError, match=r"image_points\.csv:\d+: found 1 fields, expected"):
+            files.read(good, ahead)
+    with table_reading.reading_ahead(good):
+        pass  # nobody asks
+    (good / "survey.toml").write_text("format = 0\n")
+    with table_reading.reading_ahead(good) as ahead, pytest.raises(SurveyError, match=r"survey\.toml:1: format"):
+        files.read(good, ahead)
+    with pytest.raises(SurveyError, match="found 1 fields"):
+        begun.table()
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_nothing_is_read_any_more_when_a_command_has_failed(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun, go_on, done = threading.Event(), threading.Event(), list[bool]()
+
+    def content(path: Path) -> bytes:
+        begun.set()
+        assert go_on.wait(30.0)
+        done.append(True)
+        return path.read_bytes()
+
+    monkeypatch.setattr(table_reading, "content", content)
+    with suppress(SurveyError), table_reading.reading_ahead(good) as ahead:
+        assert begun.wait(30.0)
+        threading.Timer(0.1, go_on.set).start()
+        raise SurveyError("a command that failed")
+    assert len(done) == len(ahead) > 0
 
 
 @pytest.mark.parametrize("quote", ["", '"'])

@@ -20,7 +20,7 @@ from survey.project.project import DEMANDED
 from survey.project.reading import read_definition
 from survey.project.reference import reference_page, survey_schema
 from survey.project.tables.column_texts import COLUMN_TEXTS, column_text
-from survey.project.tables.kinds import LAYOUTS
+from survey.project.tables.layouts import LAYOUTS
 
 jsonschema = pytest.importorskip("jsonschema")
 ROOT = Path(__file__).parents[2]

@@ -5,7 +5,8 @@ from adjust.model.survey import Point
 from survey.folder.plain import plain
 from survey.folder.text import json_text
 from survey.interop.networks.values import NetworkValues, between_points, point_of
-from survey.project.tables.terrestrial import ANGLES, HEIGHTS
+from survey.project.tables.layouts import HEIGHTS
+from survey.project.tables.terrestrial import ANGLES
 
 FORMAT = "labsurvey-network-1"
 

@@ -30,7 +30,8 @@ from survey.interop.networks.foreign import (
     text_of,
 )
 from survey.interop.networks.values import NetworkValues, point_of, readings_of, triples_of
-from survey.project.tables.terrestrial import ANGLES, HEIGHTS
+from survey.project.tables.layouts import HEIGHTS
+from survey.project.tables.terrestrial import ANGLES
 
 COLUMNS = (
     "kind", "id", "from_id", "to_id", "second_id", "setup_id", "value_m", "value_gon", "value_deg", "sigma_mm",

@@ -25,7 +25,7 @@ from survey.folder.text import csv_rows, csv_text, read_text
 from survey.folder.units import from_si, to_si
 from survey.project.declared.editing import with_product, with_value
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
-from survey.project.tables.kinds import LAYOUTS
+from survey.project.tables.layouts import LAYOUTS
 
 KEPT = "kept"
 TableEdit = ChangeColumns | ExchangeColumns | ChangeReadings | Rename

@@ -1,4 +1,4 @@
-"""The main job: read, detect, adjust, write. What comes after reading is loaded while large tables are being read."""
+"""The main job: read, detect, adjust, write."""
 
 from dataclasses import replace
 from importlib import import_module
@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from adjust.model.errors import SurveyError
+from adjust.native.parallel import Beside
 from survey.folder.replacing import changing, replace_parts
 from survey.jobs.detecting.job import detect_in, detect_job, remember_images
 from survey.project import read
 from survey.project.project import RESULTS
+from survey.project.tables.files import Begun
 from survey.report.language import ENGLISH_PAGE, ReportOptions
 from survey.solution.earlier.runs import Clock, command_line, remove_empty
 
@@ -26,11 +28,13 @@ def adjust_job(
     report: ReportOptions = ENGLISH_PAGE,
     method: str = "joint",
     said: str = "",
+    ahead: dict[Path, Begun] | None = None,
 ) -> "AdjustOutcome":
     """The main job: detect where that has not been done, adjust everything, write the results. Raises SurveyError.
 
     method: "published" runs the published step-by-step methods too and sets them beside the adjustment. said: the
-    command that asked for it, where it is not ``adjust``.
+    command that asked for it, where it is not ``adjust``. ahead: tables that are being read already; what comes after
+    them is loaded meanwhile.
     """
     clock, folder = Clock(), Path(folder)
     target = folder if out is None else Path(out)
@@ -45,8 +49,10 @@ def adjust_job(
                 else:
                     detect_job(folder, progress=progress, everything=redetect)
 
-        with clock.step("read"):
-            project = read(folder, _load)
+        with clock.step("read"), Beside() as loading:
+            loaded = loading.of(_load if ahead else lambda: None)
+            project = read(folder, ahead)
+            loaded()
         nothing_yet = bool(project.images) and not (project.survey.image_blocks or project.spots)
         if redetect or project.to_detect or (nothing_yet and not project.detected):
             detected()
@@ -72,6 +78,6 @@ def adjust_job(
 
 
 def _load() -> None:
-    """What large tables are read with, and their project adjusted and tested."""
-    for name in ("pyarrow.csv", "scipy.special", "survey.jobs.adjusting.outcome", "survey.jobs.adjusting.steps"):
+    """What a project is adjusted, tested and reported with."""
+    for name in ("scipy.special", "survey.jobs.adjusting.outcome", "survey.jobs.adjusting.steps"):
         import_module(name)

@@ -15,7 +15,7 @@ from survey.project.declared.editing import LENGTHS
 from survey.project.declared.toml_text import key_lines
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER, Project
 from survey.project.tables.files import read_table
-from survey.project.tables.kinds import LAYOUTS
+from survey.project.tables.layouts import LAYOUTS
 from survey.project.tables.reading import Table
 
 Wanted = Mapping[str, Collection[str] | Callable[[str], bool]]

@@ -34,7 +34,8 @@ from survey.project.detected import (
 from survey.project.exclusions import EXCLUSIONS_FILE, Exclusion, Name, Row, appended, in_force, read_exclusions
 from survey.project.images import Sought, sought_in
 from survey.project.project import IMAGES_FOLDER, OBSERVATIONS_FOLDER
-from survey.project.tables.image_points import IMAGE_POINTS, SPOTS, image_point_columns, spot_columns
+from survey.project.tables.image_points import image_point_columns, spot_columns
+from survey.project.tables.layouts import IMAGE_POINTS, SPOTS
 from survey.project.tables.rows import RowTable, read_rows, rows_of
 
 if TYPE_CHECKING:  # brings in OpenCV, which a folder that is detected already does without

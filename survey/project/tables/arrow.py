@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from adjust.model.arrays import BoolArray, FloatArray
 from adjust.model.errors import SurveyError
-from adjust.model.survey import BoolArray, FloatArray
 from adjust.native.parallel import side_by_side, workers
 from survey.folder.text import LARGEST_NUMBER, csv_text, utf8
 from survey.project.tables.reading import LARGEST_ROWS, Columns, Layout, TextColumn, check_header, check_rows, first_row

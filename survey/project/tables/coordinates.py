@@ -11,22 +11,9 @@ from adjust.model.survey import FloatArray
 from survey.folder.units import from_si, to_si
 from survey.project.project import Sigmas
 from survey.project.tables.covariance import joint_problem, read_triples, sigmas_and_correlations
-from survey.project.tables.reading import FLAGS, Columns, Layout, Table, filled, group_columns, marks
+from survey.project.tables.layouts import COORDINATE_COLUMNS, DIFFERENCE_COLUMNS
+from survey.project.tables.reading import Columns, Table, filled, group_columns, marks
 from survey.project.tables.references import Names, read_ends, timed_position
-
-_RHO = ("rho_xy", "rho_xz", "rho_yz")
-_XYZ = ("x_mm", "y_mm", "z_mm", "sigma_x_mm", "sigma_y_mm", "sigma_z_mm", *_RHO)
-COORDINATES = Layout("coordinates", ("point_id",), (), ("set_id", *FLAGS), _XYZ)
-COORDINATES_COVARIANCE = Layout(
-    "coordinates_covariance", ("set_id", "a_id", "a_axis", "b_id", "b_axis"), ("covariance_mm2",)
-)
-_DIFFERENCE = ("dx_mm", "dy_mm", "dz_mm", "sigma_dx_mm", "sigma_dy_mm", "sigma_dz_mm", *_RHO)
-DIFFERENCES = Layout(
-    "coordinate_differences", ("difference_id", "from_id", "to_id"), (), ("set_id", *FLAGS), _DIFFERENCE
-)
-DIFFERENCES_COVARIANCE = Layout(
-    "coordinate_differences_covariance", ("a_id", "a_axis", "b_id", "b_axis"), ("covariance_mm2",)
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +35,7 @@ def read_coordinates(table: Table, names: Names, sigmas: Sigmas) -> tuple[Coordi
     """Coordinates sorted by set and position; a row without set_id is an observation of its own."""
     texts = table.text("point_id").values()
     positions = [timed_position(text, names, table.fail(row, "point_id")) for row, text in enumerate(texts)]
-    found = _sets(table, texts, _XYZ, "coordinates", "point", sigmas)
+    found = _sets(table, texts, COORDINATE_COLUMNS, "coordinates", "point", sigmas)
     found.sort(key=lambda s: (bool(s.of_set), natural_key(s.of_set)))
     return tuple(
         Coordinates(tuple(positions[row] for row in s.rows), s.values, s.cov, s.group, s.used, s.of_set) for s in found
@@ -65,7 +52,7 @@ def read_differences(table: Table, names: Names, sigmas: Sigmas) -> tuple[Coordi
             tuple(ends[row][0] for row in s.rows), tuple(ends[row][1] for row in s.rows), s.values, s.cov,
             s.group, s.used, s.of_set or ids[s.rows[0]],
         )
-        for s in _sets(table, ids, _DIFFERENCE, "coordinate_difference", "difference", sigmas)
+        for s in _sets(table, ids, DIFFERENCE_COLUMNS, "coordinate_difference", "difference", sigmas)
     )  # fmt: skip
 
 
@@ -155,7 +142,7 @@ def coordinate_columns(coordinates: Sequence[Coordinates]) -> tuple[Columns, Col
     set_ids = [set_id for set_id, names, _ in sets for _ in names]
     return {
         "point_id": [name for _, names, _ in sets for name in names],
-        **_triple_columns(_XYZ, coordinates),
+        **_triple_columns(COORDINATE_COLUMNS, coordinates),
         **({"set_id": set_ids} if any(set_ids) else {}),
         **group_columns([c for c in coordinates for _ in c.positions], "coordinates"),
     }, between_columns(sets)
@@ -172,7 +159,7 @@ def difference_columns(items: Sequence[CoordinateDifferences]) -> tuple[Columns,
             names.append(own or f"d{len(names) + 1}")
         sets.append(("", names[first:], item.cov))
     set_ids = [(x.set_id or f"set{n}") if len(x.at) > 1 else "" for n, x in enumerate(items, 1) for _ in x.at]
-    numbers = _triple_columns(_DIFFERENCE, items)
+    numbers = _triple_columns(DIFFERENCE_COLUMNS, items)
     between = between_columns(sets)
     del between["set_id"]
     return {

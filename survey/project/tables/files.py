@@ -6,15 +6,17 @@ import itertools
 import re
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from adjust.model.arrays import FloatArray, IntArray
 from adjust.model.errors import SurveyError
-from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import Beside
+from survey.folder.locking import OBSERVATIONS_FOLDER
 from survey.folder.text import (
     LARGEST_NUMBER,
     atomic_write,
@@ -27,6 +29,7 @@ from survey.folder.text import (
     with_digest,
 )
 from survey.project.tables.arrow import LARGE, csv_bytes, csv_columns, parquet_bytes, parquet_columns
+from survey.project.tables.layouts import LAYOUTS
 from survey.project.tables.reading import Columns, Layout, Table, TextColumn, check_header, check_rows, first_row
 
 CHUNK = 65536
@@ -35,49 +38,75 @@ Chunk = tuple[IntArray, Sequence[Sequence[str]]]
 
 
 @dataclass(frozen=True, eq=False)
-class Begun:
-    """A file that is being read: its bytes, and their sha256."""
+class _Content:
+    """What is in a file: its bytes, and their sha256."""
 
     data: Callable[[], bytes]
     digest: Callable[[], str]
 
 
-def large_tables(folder: Path, layouts: Mapping[str, Layout]) -> list[Path]:
-    """Those of these tables that take time to read."""
-    return [path for path in sorted(folder.glob("*.csv"))
-            if path.stem in layouts and path.is_file() and path.stat().st_size >= LARGE]  # fmt: skip
+@dataclass(frozen=True, eq=False)
+class Begun:
+    """A table that is being read: the file as it was then, by inode, size and time, and what gives the table."""
+
+    file: tuple[int, ...]
+    table: Callable[[], Table]
 
 
-def begun_table(path: Path, beside: Beside, instead: str | None = None) -> Begun:
-    """:func:`read_table`, begun ``beside`` what comes next."""
+@contextmanager
+def reading_ahead(folder: Path) -> Iterator[dict[Path, Begun]]:
+    """The large tables of a project, which are read while what comes next is loaded; none where there is one thread.
+
+    Nothing of it goes on when this ends. What is wrong with a table is told to who asks for it.
+    """
+    with Beside() as beside:
+        paths = [] if beside.alone else sorted((folder / OBSERVATIONS_FOLDER).glob("*.csv"))
+        large = [path for path in paths if path.stem in LAYOUTS and path.is_file() and path.stat().st_size >= LARGE]
+        yield {path: _begun(path, beside) for path in large}
+
+
+def _begun(path: Path, beside: Beside) -> Begun:
+    file, found = _version(path), _content(path, None, beside)
+    return Begun(file, beside.of(lambda: _read(path, LAYOUTS[path.stem], found)))
+
+
+def _version(path: Path) -> tuple[int, ...]:
+    """Another one where a file was replaced or written to."""
+    status = path.stat()
+    return status.st_ino, status.st_size, status.st_mtime_ns
+
+
+def _content(path: Path, instead: str | None, beside: Beside) -> _Content:
     data = beside.of(lambda: content(path) if instead is None else instead.encode())
-    return Begun(data, beside.of(lambda: with_digest(data())[1]))
+    return _Content(data, beside.of(lambda: with_digest(data())[1]))
 
 
 def read_table(path: Path, layout: Layout, instead: str | None = None, begun: Begun | None = None) -> Table:
     """Read ``.csv`` or ``.parquet``; raises SurveyError with file and line for whatever does not fit the layout.
 
-    instead: what is to stand in it, not yet written. begun: what was begun of it.
+    instead: what is to stand in it, not yet written. begun: where it was read ahead, taken if the file is as it was.
     """
+    if begun is not None and instead is None and begun.file == _version(path):
+        return begun.table()
     with Beside() as beside:
-        return _read(path, layout, begun or begun_table(path, beside, instead))
+        return _read(path, layout, _content(path, instead, beside))
 
 
-def _read(path: Path, layout: Layout, begun: Begun) -> Table:
+def _read(path: Path, layout: Layout, found: _Content) -> Table:
     if path.suffix == ".parquet":
-        columns = parquet_columns(path, begun.data(), layout)
+        columns = parquet_columns(path, found.data(), layout)
         lines = np.arange(1, len(next(iter(columns.values()))) + 1)
-        return _table(path, layout, begun.digest(), lines, columns)
-    plain = csv_columns(begun.data(), layout)
+        return _table(path, layout, found.digest(), lines, columns)
+    plain = csv_columns(found.data(), layout)
     if plain is not None:
-        return _table(path, layout, begun.digest(), np.arange(2, len(next(iter(plain.values()))) + 2), plain)
-    text = decode(path, begun.data())
+        return _table(path, layout, found.digest(), np.arange(2, len(next(iter(plain.values()))) + 2), plain)
+    text = decode(path, found.data())
     if not text.strip():
         raise SurveyError(f"{path}:1: the file is empty; the first line names the columns: {','.join(layout.required)}")
     check_rows(path, text.count("\n"))
     header, chunks = csv_chunks(path, text)
     check_header(path, header, layout)
-    return _assemble(path, layout, begun.digest(), header, chunks)
+    return _assemble(path, layout, found.digest(), header, chunks)
 
 
 def _assemble(path: Path, layout: Layout, digest: str, header: Sequence[str], chunks: Iterable[Chunk]) -> Table:

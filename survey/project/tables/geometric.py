@@ -11,10 +11,9 @@ from survey.folder.text import LARGEST_NUMBER
 from survey.folder.units import from_si, to_si
 from survey.project.project import Sigmas
 from survey.project.tables.covariance import covariance_from_sigmas, sigmas_and_correlations, table_correlations
+from survey.project.tables.layouts import TILT_UNITS
 from survey.project.tables.reading import (
-    FLAGS,
     Columns,
-    Layout,
     Table,
     both_or_each,
     filled,
@@ -26,34 +25,6 @@ from survey.project.tables.reading import (
     quantity,
 )
 from survey.project.tables.references import Names, timed_frame, timed_position
-
-_TILTS = ("arcsec", "mgon", "deg", "mm_per_m")
-LEVELS = Layout(
-    "levels",
-    ("level_id", "frame_id", "axis"),
-    (),
-    FLAGS,
-    (*(f"value_{unit}" for unit in (*_TILTS, "g")), *(f"sigma_{unit}" for unit in (*_TILTS, "g"))),
-)
-ALIGNMENTS = Layout(
-    "alignments",
-    ("alignment_id", "a_id", "axis_a", "b_id", "axis_b"),
-    (),
-    FLAGS,
-    (
-        *(f"value_{i}_{unit}" for i in (1, 2) for unit in ("arcsec", "deg")),
-        *(f"sigma_{i}_{unit}" for i in (1, 2) for unit in ("arcsec", "deg")),
-        "rho_12",
-    ),
-)
-LASER_SPOTS = Layout(
-    "laser_spots",
-    ("spot_id", "beam_id", "epoch_id", "target_id"),
-    ("x_mm", "y_mm"),
-    FLAGS,
-    ("sigma_mm", "sigma_x_mm", "sigma_y_mm", "rho_xy"),
-)
-ON_SURFACES = Layout("on_surfaces", ("surface_id", "point_id"), ("sigma_mm",), FLAGS, ("offset_mm",))
 
 
 def read_axis(table: Table, row: int, column: str, text: str) -> FloatArray:
@@ -90,10 +61,11 @@ def read_levels(table: Table, names: Names, sigmas: Sigmas) -> tuple[Level, ...]
         row = first_row(wrong)
         raise table.error(row, f"value_g: found {force[row]:g}; along a level axis it lies between -1 and 1")
     angle = np.arcsin(force)
-    values = one_of(table, {"value": quantity(table, "value", _TILTS), "value_g": angle})
+    values = one_of(table, {"value": quantity(table, "value", TILT_UNITS), "value_g": angle})
     with np.errstate(invalid="ignore"):
         # of asin(f / g): sigma / cos
-        own = {"sigma": quantity(table, "sigma", _TILTS, True), "sigma_g": force_sigma / np.cos(np.nan_to_num(values))}
+        by_force = force_sigma / np.cos(np.nan_to_num(values))
+        own = {"sigma": quantity(table, "sigma", TILT_UNITS, True), "sigma_g": by_force}
     sigma = one_of(table, own)
     every = np.ones(len(table), dtype=bool)
     needed(table, values, every, "value: is blank; fill in value_arcsec, value_mm_per_m, value_g or the like")

@@ -3,8 +3,10 @@
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from adjust.lenses.crops import possible_sizes
 from adjust.model.names import natural_key
@@ -14,19 +16,10 @@ from adjust.native.parallel import side_by_side
 from survey.folder.text import suggestion
 from survey.project.project import Sigmas, SpotBlock
 from survey.project.tables.covariance import covariance_from_sigmas, sigmas_and_correlations, table_correlations
-from survey.project.tables.reading import Columns, Layout, Table, TextColumn, checked_groups, first_row
+from survey.project.tables.reading import Columns, Table, TextColumn, checked_groups, first_row
 from survey.project.tables.references import Names
 
 _PART = 2**15  # rows at a time
-_SIGMAS = ("sigma_u_px", "sigma_v_px", "rho_uv")
-IMAGE_POINTS = Layout(
-    "image_points",
-    ("epoch_id", "camera_id", "point_id"),
-    ("u_px", "v_px"),
-    ("target_id", "group", "used"),
-    _SIGMAS,
-)
-SPOTS = Layout("spots", ("epoch_id", "camera_id", "spot_id"), ("u_px", "v_px"), (), _SIGMAS)
 
 
 def world_names(table: Table) -> set[str]:
@@ -51,7 +44,8 @@ def read_image_blocks(table: Table, names: Names, sigmas: Sigmas) -> tuple[Image
     first, used = order[ptr[:-1]], table.flags("used")
     texts = [TextColumn(c.names, c.codes[first]).values() for c in (cameras, epochs, targets, groups)]
     if (order != np.arange(len(order))).any():
-        point_idx, uv, cov, used = point_idx[order], uv[order], cov[order], used[order]
+        arrays: list[npt.NDArray[Any]] = [cov, uv, point_idx, used]
+        cov, uv, point_idx, used = side_by_side(lambda x: x.take(order, axis=0), arrays)
     all_used = [True] * len(first) if used.all() else np.logical_and.reduceat(used, ptr[:-1]).tolist()
     blocks = []
     ranges = pairwise(ptr.tolist())

@@ -7,9 +7,8 @@ from typing import Any
 from adjust.model.observations import position_text
 from adjust.model.survey import Survey
 from survey.project.project import Sigmas
-from survey.project.tables import coordinates, geometric, measurements, terrestrial
-from survey.project.tables.image_points import IMAGE_POINTS, SPOTS
-from survey.project.tables.pairs import PAIRS, pair_columns, read_pairs
+from survey.project.tables import coordinates, geometric, layouts, measurements, terrestrial
+from survey.project.tables.pairs import pair_columns, read_pairs
 from survey.project.tables.reading import Columns, Layout, Table
 from survey.project.tables.references import Names
 
@@ -34,31 +33,27 @@ class Kind:
 
 _ENDS = ("from_id", "to_id")
 KINDS = (
-    Kind(measurements.ANGLES, "table_readings", ("table",), lambda r: f"{r.table_id}/{r.epoch_id}",
+    Kind(layouts.TABLE_ANGLES, "table_readings", ("table",), lambda r: f"{r.table_id}/{r.epoch_id}",
          measurements.read_angles, measurements.angle_columns),
-    Kind(PAIRS, "pairs", ("pair",), lambda p: p.pair_id, read_pairs, pair_columns),
-    Kind(measurements.DISTANCES, "distances", ("distance",), lambda d: d.distance_id, measurements.read_distances,
+    Kind(layouts.PAIRS, "pairs", ("pair",), lambda p: p.pair_id, read_pairs, pair_columns),
+    Kind(layouts.DISTANCES, "distances", ("distance",), lambda d: d.distance_id, measurements.read_distances,
          measurements.distance_columns, _ENDS),
-    Kind(coordinates.COORDINATES, "coordinates", ("coordinates",), lambda c: c.set_id or position_text(c.positions[0]),
+    Kind(layouts.COORDINATES, "coordinates", ("coordinates",), lambda c: c.set_id or position_text(c.positions[0]),
          coordinates.read_coordinates, coordinates.coordinate_columns, ("point_id",),
-         coordinates.COORDINATES_COVARIANCE),
-    Kind(terrestrial.TERRESTRIAL, "readings", terrestrial.READING_KINDS, lambda r: r.reading_id,
+         layouts.COORDINATES_COVARIANCE),
+    Kind(layouts.TERRESTRIAL, "readings", terrestrial.READING_KINDS, lambda r: r.reading_id,
          terrestrial.read_readings, terrestrial.reading_columns, (*_ENDS, "second_id"),
-         terrestrial.TERRESTRIAL_COVARIANCE),
-    Kind(coordinates.DIFFERENCES, "coordinate_differences", ("coordinate_difference",), lambda d: d.set_id,
-         coordinates.read_differences, coordinates.difference_columns, _ENDS, coordinates.DIFFERENCES_COVARIANCE),
-    Kind(geometric.LEVELS, "levels", ("level",), lambda x: x.level_id, geometric.read_levels, geometric.level_columns),
-    Kind(geometric.ALIGNMENTS, "alignments", ("alignment",), lambda x: x.alignment_id, geometric.read_alignments,
+         layouts.TERRESTRIAL_COVARIANCE),
+    Kind(layouts.DIFFERENCES, "coordinate_differences", ("coordinate_difference",), lambda d: d.set_id,
+         coordinates.read_differences, coordinates.difference_columns, _ENDS, layouts.DIFFERENCES_COVARIANCE),
+    Kind(layouts.LEVELS, "levels", ("level",), lambda x: x.level_id, geometric.read_levels, geometric.level_columns),
+    Kind(layouts.ALIGNMENTS, "alignments", ("alignment",), lambda x: x.alignment_id, geometric.read_alignments,
          geometric.alignment_columns),
-    Kind(geometric.LASER_SPOTS, "laser_spots", ("laser",), lambda x: x.spot_id, geometric.read_laser_spots,
+    Kind(layouts.LASER_SPOTS, "laser_spots", ("laser",), lambda x: x.spot_id, geometric.read_laser_spots,
          geometric.laser_columns),
-    Kind(geometric.ON_SURFACES, "on_surfaces", ("surface",), lambda o: f"{o.surface_id}/{position_text(o.position)}",
+    Kind(layouts.ON_SURFACES, "on_surfaces", ("surface",), lambda o: f"{o.surface_id}/{position_text(o.position)}",
          geometric.read_on_surfaces, geometric.surface_columns, ("point_id",)),
 )  # fmt: skip
-LAYOUTS = {
-    layout.name: layout
-    for layout in (IMAGE_POINTS, SPOTS, *(x for k in KINDS for x in (k.layout, k.beside) if x is not None))
-}
 GROUPS = ("image", *(name for kind in KINDS for name in kind.called))
 
 
@@ -74,7 +69,7 @@ def with_observations(survey: Survey, tables: Mapping[str, Table], sigmas: Sigma
             elif extra is not None:
                 raise extra.error(0, f"there is no table of {name} beside it; add {name}.csv or remove this file")
         survey = replace(survey, **found)
-    joint = tables.get(terrestrial.TERRESTRIAL_COVARIANCE.name)
+    joint = tables.get(layouts.TERRESTRIAL_COVARIANCE.name)
     return survey if joint is None else replace(
         survey, reading_covariances=terrestrial.read_reading_covariances(joint, survey.readings)
     )  # fmt: skip
@@ -89,5 +84,5 @@ def observation_tables(survey: Survey) -> dict[str, Columns]:
             found |= dict(zip((kind.layout.name, kind.beside.name if kind.beside else ""), made, strict=True))
         else:
             found[kind.layout.name] = made
-    found[terrestrial.TERRESTRIAL_COVARIANCE.name] = terrestrial.correlation_columns(survey.reading_covariances)
+    found[layouts.TERRESTRIAL_COVARIANCE.name] = terrestrial.correlation_columns(survey.reading_covariances)
     return found

@@ -10,17 +10,8 @@ from adjust.model.survey import FloatArray
 from survey.folder.units import from_si, to_si
 from survey.project.project import Sigmas
 from survey.project.tables.covariance import covariance_from_sigmas, sigmas_and_correlations, table_correlations
-from survey.project.tables.reading import FLAGS, Columns, Layout, Table, both_or_each, first_row, group_columns, marks
+from survey.project.tables.reading import Columns, Table, both_or_each, first_row, group_columns, marks
 from survey.project.tables.references import Names, read_ends
-
-ANGLES = Layout(
-    "table_angles",
-    ("epoch_id", "table_id"),
-    ("axis1_deg",),
-    FLAGS[:1],
-    ("axis2_deg", "sigma_arcsec", "sigma_axis1_arcsec", "sigma_axis2_arcsec", "rho_12"),
-)
-DISTANCES = Layout("distances", ("distance_id", "from_id", "to_id"), (), FLAGS, ("value_mm", "value_m", "sigma_mm"))
 
 
 def read_angles(table: Table, names: Names, sigmas: Sigmas) -> tuple[TableReading, ...]:

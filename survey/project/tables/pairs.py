@@ -15,40 +15,17 @@ from survey.folder.units import from_si, to_si, unit_in
 from survey.project.declared.poses import is_unit, quaternion_wxyz, rotation_from_euler
 from survey.project.project import Sigmas
 from survey.project.tables.covariance import covariance_from_sigmas, covariance_problem
-from survey.project.tables.reading import FLAGS, Columns, Layout, Table, first_row, group_columns, marks, one_of
-from survey.project.tables.references import Names, check_epochs, read_frame
-
-QUATERNION = ("qw", "qx", "qy", "qz")
-EULER = ("euler_x_deg", "euler_y_deg", "euler_z_deg")
-TRANSLATION = ("tx_mm", "ty_mm", "tz_mm")
-_TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
-
-
-def covariance_column(i: int, j: int) -> str:
-    """Column of one element of a pair's covariance, in rad and m."""
-    unit = {0: "rad2", 1: "rad_m", 2: "m2"}[(i >= 3) + (j >= 3)]
-    return f"cov_{_TANGENT[i]}_{_TANGENT[j]}_{unit}"
-
-
-EULER_SIGMAS = [tuple(f"sigma_euler_{a}_{unit}" for a in "xyz") for unit in ("deg", "arcsec")]
-SIGMA_COLUMNS = {
-    "rotation": [("sigma_rotation_deg",) * 3, ("sigma_rotation_arcsec",) * 3]
-    + [tuple(f"sigma_{a}_{unit}" for a in _TANGENT[:3]) for unit in ("deg", "arcsec")]
-    + EULER_SIGMAS,
-    "translation": [("sigma_translation_mm",) * 3, tuple(f"sigma_{a}_mm" for a in _TANGENT[3:])],
-}
-COVARIANCE_COLUMNS = tuple(covariance_column(i, j) for i in range(6) for j in range(6))
-PAIRS = Layout(
-    "pairs",
-    ("pair_id", "a_id", "b_id"),
-    (),
-    FLAGS,
-    QUATERNION
-    + EULER
-    + TRANSLATION
-    + tuple(dict.fromkeys(name for columns in SIGMA_COLUMNS.values() for names in columns for name in names))
-    + COVARIANCE_COLUMNS,
+from survey.project.tables.layouts import (
+    COVARIANCE_COLUMNS,
+    EULER,
+    EULER_SIGMAS,
+    QUATERNION,
+    SIGMA_COLUMNS,
+    TRANSLATION,
+    covariance_column,
 )
+from survey.project.tables.reading import Columns, Table, first_row, group_columns, marks, one_of
+from survey.project.tables.references import Names, check_epochs, read_frame
 
 
 def read_pairs(table: Table, names: Names, sigmas: Sigmas) -> tuple[Pair, ...]:

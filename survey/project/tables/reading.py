@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from adjust.model.arrays import BoolArray, FloatArray, IntArray
 from adjust.model.errors import SurveyError
-from adjust.model.survey import BoolArray, FloatArray, IntArray
 from survey.folder.text import formula_problem, id_problem, suggestion
 from survey.folder.units import to_si
 

@@ -12,11 +12,10 @@ from survey.folder.units import from_si, to_si
 from survey.project.declared.instruments import setup_problem
 from survey.project.project import Accuracy, Sigmas
 from survey.project.tables.covariance import covariance_problem
+from survey.project.tables.layouts import HEIGHTS
 from survey.project.tables.reading import (
     ANGLE_UNITS,
-    FLAGS,
     Columns,
-    Layout,
     Table,
     dms_angles,
     filled,
@@ -31,21 +30,6 @@ READING_KINDS: tuple[ReadingKind, ...] = (
     "direction", "angle", "zenith", "azimuth", "slope_distance", "horizontal_distance", "height_difference",
 )  # fmt: skip
 ANGLES = READING_KINDS[:4]
-HEIGHTS = ("instrument_height", "target_height", "second_height")
-TERRESTRIAL = Layout(
-    "terrestrial",
-    ("kind", "from_id", "to_id"),
-    (),
-    ("reading_id", "setup_id", "second_id", "value_dms", *FLAGS),
-    (
-        *(f"value_{unit}" for unit in ("deg", "gon", "m", "mm")),
-        *(f"sigma_{unit}" for unit in (*ANGLE_UNITS, "mm")),
-        *(f"{name}_{unit}" for name in HEIGHTS for unit in ("mm", "m")),
-        "sigma_target_centring_mm",
-        "length_m",
-    ),
-)
-TERRESTRIAL_COVARIANCE = Layout("terrestrial_covariance", ("a_id", "b_id"), ("rho",))
 
 
 def read_readings(table: Table, names: Names, sigmas: Sigmas) -> tuple[Reading, ...]:
