@@ -1,34 +1,35 @@
 """Whether a folder's results are still those of its inputs: then it need not be adjusted again."""
 
 import hashlib
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
 from adjust.model.errors import SurveyError
+from survey.batch.record import KEPT
 from survey.folder.text import NOT_OURS
 from survey.project.detected import read_detected, same_file
 from survey.project.project import IMAGES_FOLDER
 from survey.solution.earlier.runs import installed_versions
+from survey.solution.records import sections
 
 _BESIDE = ("covariance.npz", "residuals.csv", "residuals_other.csv", "report.html")
 
 
 def unchanged_solution(folder: Path) -> dict[str, object] | None:
-    """What ``results/solution.json`` holds where it was made from the files that are there now, by these versions.
+    """What a batch keeps of ``results/solution.json`` where it was made from the files of now, by these versions.
 
     The files read, the images their points come from, the sha256 of all and the versions stand in the solution itself;
     options are in ``survey.toml``.
     """
     results = folder / "results"
     try:
-        solution = json.loads((results / "solution.json").read_bytes())
+        solution = sections((results / "solution.json").read_bytes(), "inputs", *KEPT)
         inputs = solution["inputs"]
         if not all((results / name).is_file() for name in _BESIDE) or not inputs["hashes"]:
             return None
         same = same_versions(inputs["versions"]) and _digests(folder, inputs["hashes"]) == inputs["hashes"]
         same = same and _tables(folder) <= set(inputs["hashes"]) and _images_are(folder, inputs["images"])
-        return dict(solution) if same else None
+        return solution if same else None
     except (SurveyError, *NOT_OURS):
         return None  # no results, or not ours: adjusting says what is wrong
 
