@@ -12,11 +12,11 @@ from survey.folder.text import atomic_write, read_text
 from survey.jobs.adjusting.edits import changed_files, kept_name, left_out
 from survey.jobs.excluding import FILE, author_name, included_rows, new_rows
 from survey.project.declared.editing import with_datum, with_sigma_scale, with_treatment
-from survey.project.exclusions import Exclusion, Name, Row, appended, in_force, read_exclusions
+from survey.project.exclusions import Exclusion, Name, Row, appended
 from survey.project.finding import find
 from survey.project.observed import IMAGES, Observed, union
-from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER, Project
-from survey.project.reading import leaving_out, read_all
+from survey.project.project import DEFINITION_FILE, Project
+from survey.project.reading import leaving_out, read_all, with_exclusions
 from survey.report.language import message
 from survey.solution.earlier.changes import Changes
 from survey.workbench.resident import Resident, Watch
@@ -245,10 +245,7 @@ class Deciding(Resident):
 
     def _as_written(self, situation: Situation) -> Situation:
         """With the hashes of the files as they are now, and the lines on which exclusions stand."""
-        rows, digest = read_exclusions(self.folder / OBSERVATIONS_FOLDER)
-        exclusions = in_force(rows)
-        inputs = {**situation.everything.inputs, **({FILE: digest} if digest else {})}
-        everything = replace(situation.everything, inputs=dict(sorted(inputs.items())))
+        everything, exclusions = with_exclusions(situation.everything, self.folder)
         project = leaving_out(everything, exclusions.values())
         return replace(situation, everything=everything, project=project, exclusions=exclusions)
 

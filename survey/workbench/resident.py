@@ -15,9 +15,8 @@ from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
 from survey.folder.locking import LOCK, holder_of
 from survey.folder.text import read_text
-from survey.project.exclusions import in_force, read_exclusions
-from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
-from survey.project.reading import leaving_out, read_all
+from survey.project.project import DEFINITION_FILE
+from survey.project.reading import leaving_out, read_all, with_exclusions
 from survey.solution.earlier.changes import Changes, solution_changes
 from survey.solution.quantities import Scale, scale_of
 from survey.workbench.kept import Kept, kept_results, with_kept
@@ -66,9 +65,8 @@ class Resident(Folder):
 
     def _read(self) -> Situation:
         signature = signature_of(self.folder)  # first: what changes while it is read shows as changed afterwards
-        everything = read_all(self.folder)
+        everything, exclusions = with_exclusions(read_all(self.folder), self.folder)
         text = read_text(self.folder / DEFINITION_FILE)
-        exclusions = in_force(read_exclusions(self.folder / OBSERVATIONS_FOLDER)[0])
         return Situation(everything, leaving_out(everything, exclusions.values()), text, exclusions, signature)
 
     # what is there
