@@ -27,7 +27,7 @@ from survey.project.tables.pairs import (
 from survey.project.tables.reading import Table
 from survey.project.tables.references import Names
 from survey.solution.earlier.runs import command_line
-from survey.solution.pair_network import network_dict, pair_network
+from survey.solution.network.counts import network_dict, pair_network
 
 _MOST_SHOWN = 8
 _MOST_NAMED = 12
