@@ -10,7 +10,7 @@ from survey.folder.text import atomic_write, read_text
 from survey.jobs.adjusting.edits import changed_files, kept_name, left_out
 from survey.jobs.excluding import FILE, author_name, included_rows, new_rows
 from survey.project.declared.editing import with_datum, with_sigma_scale, with_treatment
-from survey.project.exclusions import Exclusion, Name, Row, appended
+from survey.project.exclusions import Exclusion, Name, Row, appended, in_force
 from survey.project.finding import find
 from survey.project.observed import IMAGES, Observed, union
 from survey.project.project import DEFINITION_FILE
@@ -196,11 +196,7 @@ def _apply(bench: Resident, step: Step, rows: Sequence[Row], may_fail: bool = Fa
         if text != _text(bench, name):
             raise ChangedError(f"{bench.folder / name}: has changed since; undo cannot put it back")
     everything = read_all(bench.folder, texts) if texts else now.everything
-    exclusions = dict(now.exclusions)
-    for row in rows:
-        exclusions.pop(row.exclusion.name, None)
-        if row.excluded:
-            exclusions[row.exclusion.name] = row.exclusion
+    exclusions = in_force(rows, now.exclusions)
     trial = replace(
         now, everything=everything, project=leaving_out(everything, exclusions.values()), exclusions=exclusions,
         definition_text=texts.get(DEFINITION_FILE, now.definition_text),

@@ -14,6 +14,7 @@ from adjust.model.errors import DiagnosedError, SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
 from survey.folder.locking import LOCK, holder_of
+from survey.folder.plain import differing
 from survey.folder.text import read_text
 from survey.project.project import DEFINITION_FILE, Project
 from survey.project.reading import leaving_out, read_all, with_exclusions
@@ -121,8 +122,7 @@ class Resident(Folder):
 
     def changed_files(self) -> tuple[str, ...]:
         """Files of the project that were written since they were read, by path in the folder."""
-        now, before = signature_of(self.folder), self.situation.signature
-        return tuple(sorted(name for name in {*now, *before} if now.get(name) != before.get(name)))
+        return tuple(differing(signature_of(self.folder), self.situation.signature))
 
     def check(self, base: int | None = None) -> None:
         """Raise SurveyError where nothing may be written, or what is decided about solution ``base`` is out of date."""

@@ -13,6 +13,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.spatial.averaging import mean_pose
 from survey.folder.locking import settled
+from survey.folder.plain import differing
 from survey.folder.shapes import POSITIVE, WHOLE, Either, misfit
 from survey.folder.text import NOT_OURS, read_bytes
 from survey.project import Project
@@ -111,7 +112,7 @@ def _previous_solution(folder: Path, inputs: Mapping[str, str] | None) -> Snapsh
     except NOT_OURS as error:
         raise SurveyError(f"{path}: cannot be read as a solution ({error}); {again}") from error
     now = input_hashes(folder, hashes) if inputs is None else inputs
-    changed = sorted(k for k in {*hashes, *now} if hashes.get(k) != now.get(k))
+    changed = differing(hashes, now)
     if changed:
         raise SurveyError(f"{folder}: {', '.join(changed)} changed since the project was adjusted; {again}")
     return previous
