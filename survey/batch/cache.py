@@ -1,34 +1,36 @@
 """Whether a folder's results are still those of its inputs: then it need not be adjusted again."""
 
 import hashlib
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
 from adjust.model.errors import SurveyError
+from survey.batch.record import KEPT
 from survey.folder.text import NOT_OURS
 from survey.project.detected import read_detected, same_file
 from survey.project.project import IMAGES_FOLDER
+from survey.solution.earlier.previous import input_hashes, tables_in
 from survey.solution.earlier.runs import installed_versions
+from survey.solution.records import sections
 
 _BESIDE = ("covariance.npz", "residuals.csv", "residuals_other.csv", "report.html")
 
 
 def unchanged_solution(folder: Path) -> dict[str, object] | None:
-    """What ``results/solution.json`` holds where it was made from the files that are there now, by these versions.
+    """What a batch keeps of ``results/solution.json`` where it was made from the files of now, by these versions.
 
     The files read, the images their points come from, the sha256 of all and the versions stand in the solution itself;
     options are in ``survey.toml``.
     """
     results = folder / "results"
     try:
-        solution = json.loads((results / "solution.json").read_bytes())
+        solution = sections((results / "solution.json").read_bytes(), "inputs", *KEPT)
         inputs = solution["inputs"]
         if not all((results / name).is_file() for name in _BESIDE) or not inputs["hashes"]:
             return None
-        same = same_versions(inputs["versions"]) and _digests(folder, inputs["hashes"]) == inputs["hashes"]
-        same = same and _tables(folder) <= set(inputs["hashes"]) and _images_are(folder, inputs["images"])
-        return dict(solution) if same else None
+        same = same_versions(inputs["versions"]) and input_hashes(folder, inputs["hashes"]) == inputs["hashes"]
+        same = same and _images_are(folder, inputs["images"])
+        return solution if same else None
     except (SurveyError, *NOT_OURS):
         return None  # no results, or not ours: adjusting says what is wrong
 
@@ -36,21 +38,6 @@ def unchanged_solution(folder: Path) -> dict[str, object] | None:
 def same_versions(versions: Mapping[str, str]) -> bool:
     """Whether this Python and these packages are installed in these versions."""
     return bool(versions) and versions.items() <= installed_versions().items()
-
-
-def _digests(folder: Path, names: Mapping[str, str]) -> dict[str, str]:
-    return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names}
-
-
-def _tables(folder: Path) -> set[str]:
-    """Tables of observations that a reader of the folder would take."""
-    place = folder / "observations"
-    found = place.iterdir() if place.is_dir() else ()
-    return {
-        p.relative_to(folder).as_posix()
-        for p in found
-        if p.suffix in (".csv", ".parquet") and not p.name.startswith(".")
-    }
 
 
 def _images_are(folder: Path, recorded: Mapping[str, Mapping[str, object]]) -> bool:
@@ -70,7 +57,7 @@ def fingerprint(folder: Path) -> str:
     digest = hashlib.sha256(str(installed_versions()).encode())
     try:
         own = sorted(p for p in folder.iterdir() if p.suffix in (".toml", ".csv", ".parquet") and p.is_file())
-        for path in (*own, *(folder / name for name in sorted(_tables(folder)))):
+        for path in (*own, *(folder / name for name in sorted(tables_in(folder)))):
             digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
         for path in sorted((folder / "images").glob("*/*")):
             status = path.stat()

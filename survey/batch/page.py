@@ -12,7 +12,7 @@ from survey.batch.charts import control_chart
 from survey.batch.control import ONE_SIDE, TREND, Chart
 from survey.batch.record import CAUSES, FAILED, TEST_FAILED, Record
 from survey.batch.run import counts
-from survey.batch.tables import folders_csv, overview_json, short_names, trends_csv
+from survey.batch.tables import MOST_OUTSIDE, folders_csv, overview_json, short_names, trends_csv
 from survey.batch.trends import LEVEL, Trends
 from survey.folder.replacing import write_set
 from survey.folder.text import time_text
@@ -43,7 +43,7 @@ def overview_html(
 
 def _header(records: Sequence[Record], trends: Trends, date: str) -> Markup:
     n = counts(records)
-    alarming = [c for c in trends.charts if trends.is_alarming(c)]
+    alarming = trends.alarming
     if n["failed"]:
         kind, word = "failed", t("{n} failed", n=m.count(n["failed"]))
     elif n["test_failed"] or alarming:
@@ -125,7 +125,7 @@ def _why(record: Record) -> list[str]:
 def _control(records: Sequence[Record], trends: Trends) -> Markup:
     if not trends.charts:
         return Markup()
-    alarming = [c for c in trends.charts if trends.is_alarming(c)]
+    alarming = trends.alarming
     quality = [c for c in trends.charts if c.series.name == "sigma0" and c not in alarming]
     shown = [*quality, *alarming[:_MOST_CHARTS]]
     shown += [c for c in trends.charts if c not in shown][: max(0, _LEAST_CHARTS - len(shown))]
@@ -184,19 +184,17 @@ def _slope(c: Chart) -> Markup:
 
 
 def _alarm(trends: Trends, c: Chart, names: Sequence[str]) -> Markup:
+    words = {"disagrees": ("bad", t("epochs disagree")), "drifts": ("warn", t("drift")),
+             "one_side": ("soft", t("on one side")), "rising": ("soft", t("rising")),
+             "falling": ("soft", t("falling"))}  # fmt: skip
     out: list[str] = []
-    if trends.disagrees(c):
-        out.append(m.pill("bad", t("epochs disagree")))
-    if trends.drifts(c):
-        out.append(m.pill("warn", t("drift")))
-    outside = [names[int(c.series.epoch[i])] for i in np.flatnonzero(c.outside)]
-    if outside:
-        listed = ", ".join(outside[:4]) + (" …" if len(outside) > 4 else "")
-        out.append(f"{t('outside:')} {listed}")
-    for run in c.runs:
-        first, last = (names[int(c.series.epoch[i])] for i in (run.first, run.last))
-        word = {"one_side": t("on one side"), "rising": t("rising"), "falling": t("falling")}[run.kind]
-        out.append(m.joined((m.pill("soft", word), f"{first} – {last}"), " "))
+    for f in trends.findings(c):
+        epochs = [names[i] for i in f.epochs]
+        if f.kind == "outside":
+            out.append(f"{t('outside:')} {', '.join(epochs[:MOST_OUTSIDE])}{' …' * (len(epochs) > MOST_OUTSIDE)}")
+        else:
+            pill = m.pill(*words[f.kind])
+            out.append(m.joined((pill, f"{epochs[0]} – {epochs[-1]}"), " ") if epochs else pill)
     return _wrapped([m.joined(out, " ")]) if out else Markup()
 
 

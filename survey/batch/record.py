@@ -42,6 +42,8 @@ _SINGLE_POSES = (
 )  # fmt: skip
 _VECTORS = (("cameras", "lens"), ("tables", "geometry"), ("targets", "warp"), ("cameras", "clock"), ("tables", "clock"),
             ("stations", "clock"))  # fmt: skip
+KEPT = ("summary", "warnings", "groups", "points", "cameras", "stations", "tables", "targets", "free_datum")
+"""The entries of a solution from which a record is made."""
 _ROTATION = POSE_COMPONENTS[:3]
 
 

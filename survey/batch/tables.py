@@ -14,7 +14,8 @@ from survey.folder.plain import plain
 from survey.folder.text import cell_text, csv_text, json_text
 
 STATES = {DONE: "done", FAILED: "error", TEST_FAILED: "does not fit"}
-_MOST_TOLD = 8
+_MOST_TOLD, MOST_OUTSIDE = 8, 5
+_RUNS = {"one_side": "on one side of the mean", "rising": "rising", "falling": "falling"}
 
 
 def row_of(record: Record) -> dict[str, object]:
@@ -56,8 +57,8 @@ def count_line(records: Sequence[Record]) -> str:
 
 def trend_lines(trends: Trends, records: Sequence[Record]) -> list[str]:
     """The most alarming charts in words."""
-    alarming = [c for c in trends.charts if trends.is_alarming(c)]
-    lines = [f"  {c.series.name}: {'; '.join(findings(trends, c, records))}" for c in alarming[:_MOST_TOLD]]
+    alarming, names = trends.alarming, short_names(records)
+    lines = [f"  {c.series.name}: {'; '.join(findings(trends, c, names))}" for c in alarming[:_MOST_TOLD]]
     more = len(alarming) - len(lines)
     lines += [f"  and {more} more in the overview"] if more > 0 else []
     head = f"{len(alarming)} of {len(trends.charts)} numbers are not in control over the epochs"
@@ -74,29 +75,26 @@ def short_names(records: Sequence[Record]) -> list[str]:
     return ["/".join(p[common:]) for p in parts]
 
 
-def findings(trends: Trends, c: Chart, records: Sequence[Record]) -> list[str]:
-    """What is wrong with a chart, in words: English only, as result files are."""
-    names, out = short_names(records), []
-    epoch = c.series.epoch
-    outside = c.outside & c.outside_scatter if np.isfinite(c.by_scatter) else c.outside
-    if trends.disagrees(c):
-        out.append(f"epochs differ {c.ratio:.1f} times as much as their sigmas say (p {c.p:.1g})")
-    if trends.drifts(c):
-        unit = f" {c.series.unit}" if c.series.unit else ""
-        out.append(f"drifts {c.slope:+.2g} ± {c.slope_sigma:.1g}{unit} per epoch")
-    if outside.any():
-        out.append("outside: " + listed([names[int(epoch[i])] for i in np.flatnonzero(outside)], 5))
-    for run in c.runs:
-        words = {"one_side": "on one side of the mean", "rising": "rising", "falling": "falling"}[run.kind]
-        first, last = (names[int(epoch[i])] for i in (run.first, run.last))
-        out.append(f"{run.last - run.first + 1} in a row {words}: {first} to {last}")
+def findings(trends: Trends, c: Chart, names: Sequence[str]) -> list[str]:
+    """What is wrong with a chart, in words: English only, as result files are. names: of the folders, short."""
+    unit = f" {c.series.unit}" if c.series.unit else ""
+    out = []
+    for kind, epochs in ((f.kind, [names[i] for i in f.epochs]) for f in trends.findings(c)):
+        if kind in _RUNS:
+            out.append(f"{len(epochs)} in a row {_RUNS[kind]}: {epochs[0]} to {epochs[-1]}")
+        elif kind == "outside":
+            out.append("outside: " + listed(epochs, MOST_OUTSIDE))
+        elif kind == "drifts":
+            out.append(f"drifts {c.slope:+.2g} ± {c.slope_sigma:.1g}{unit} per epoch")
+        else:
+            out.append(f"epochs differ {c.ratio:.1f} times as much as their sigmas say (p {c.p:.1g})")
     return out
 
 
 def overview_json(records: Sequence[Record], trends: Trends) -> str:
     """All of the overview as JSON: counts, folders, charts."""
     names = short_names(records)
-    charts = {c.series.name: _chart(trends, c, records, names) for c in trends.charts}
+    charts = {c.series.name: _chart(trends, c, names) for c in trends.charts}
     value = {
         "counts": counts(records), "exit_code": exit_code(records), "folders": [row_of(r) for r in records],
         "trends": {"alpha_of_all_tests": LEVEL, "level_of_a_test": trends.level, "n_points": trends.n_points,
@@ -106,7 +104,7 @@ def overview_json(records: Sequence[Record], trends: Trends) -> str:
     return json_text(plain(value))
 
 
-def _chart(trends: Trends, c: Chart, records: Sequence[Record], names: Sequence[str]) -> dict[str, object]:
+def _chart(trends: Trends, c: Chart, names: Sequence[str]) -> dict[str, object]:
     at = [names[int(i)] for i in c.series.epoch]
 
     def named(mask: BoolArray) -> list[str]:
@@ -115,7 +113,7 @@ def _chart(trends: Trends, c: Chart, records: Sequence[Record], names: Sequence[
     runs = [{"kind": r.kind, "first": at[r.first], "last": at[r.last], "n": r.last - r.first + 1} for r in c.runs]
     return {
         "unit": c.series.unit, "n_epochs": len(at), "in_control": not trends.is_alarming(c),
-        "findings": findings(trends, c, records), "mean": c.mean, "sigma_mean": c.mean_sigma,
+        "findings": findings(trends, c, names), "mean": c.mean, "sigma_mean": c.mean_sigma,
         "limit_from_scatter": c.by_scatter, "outside_of_sigma_limits": named(c.outside),
         "outside_of_scatter_limits": named(c.outside_scatter), "set_aside": named(~c.used), "runs": runs,
         "rms_deviation_over_sigma": c.ratio, "p_agreement": c.p, "slope_per_epoch": c.slope,

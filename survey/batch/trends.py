@@ -18,6 +18,17 @@ LEVEL = 0.05
 """Error probability of all charts together, for the tests of agreement and of slopes."""
 
 
+@dataclass(frozen=True)
+class Finding:
+    """What is wrong with a chart: ``disagrees``, ``drifts``, ``outside`` of own sigmas, or the kind of a run.
+
+    epochs: positions in the batch, of those outside or from the first to the last of a run.
+    """
+
+    kind: str
+    epochs: tuple[int, ...] = ()
+
+
 @dataclass(frozen=True, eq=False)
 class Trends:
     """Charts of all numbers that two epochs or more have, most alarming first.
@@ -62,6 +73,19 @@ class Trends:
     def is_alarming(self, c: Chart) -> bool:
         """Whether a person should look: a test of all charts together fails, or a run is too long for chance."""
         return self.disagrees(c) or self.drifts(c) or self.strays(c) or any(self.unlikely(run) for run in c.runs)
+
+    @property
+    def alarming(self) -> list[Chart]:
+        """The charts that a person should look at."""
+        return [c for c in self.charts if self.is_alarming(c)]
+
+    def findings(self, c: Chart) -> list[Finding]:
+        """What every form of the overview says of a chart, in this order."""
+        tests = (("disagrees", self.disagrees(c)), ("drifts", self.drifts(c)))
+        outside = tuple(c.series.epoch[c.outside].tolist())
+        runs = (Finding(r.kind, tuple(c.series.epoch[r.first : r.last + 1].tolist())) for r in c.runs)
+        return [*(Finding(kind) for kind, fails in tests if fails), *([Finding("outside", outside)] if outside else []),
+                *runs]  # fmt: skip
 
 
 def trends_of(records: Sequence[Record]) -> Trends:

@@ -19,6 +19,11 @@ def attributes(thing: object, *names: str) -> dict[str, Any]:
     return {name: getattr(thing, name) for name in names}
 
 
+def differing(a: Mapping[str, object], b: Mapping[str, object]) -> list[str]:
+    """Keys under which two mappings have different values, or one has none, in order."""
+    return sorted(key for key in {*a, *b} if a.get(key) != b.get(key))
+
+
 def plain(value: Any) -> Any:
     """Only what JSON knows: mappings and sequences kept, numbers as Python's, None for what is not finite."""
     kind = type(value)

@@ -12,10 +12,10 @@ from survey.folder.replacing import place_for, replace_parts
 from survey.folder.whole import complete
 from survey.jobs.adjusting.outcome import AdjustOutcome, made
 from survey.jobs.adjusting.warm_start import warm_adjustment
-from survey.project import Project, read
+from survey.project import Project
 from survey.report.results import RESULTS
 from survey.solution.earlier.changes import Snapshot
-from survey.solution.earlier.previous import Move, change_dict, change_lines, moves, read_previous
+from survey.solution.earlier.previous import Move, change_dict, change_lines, moves, previous_solution
 from survey.solution.earlier.runs import Clock
 
 
@@ -76,7 +76,7 @@ class ChangeOutcome:
 
 
 def changed_project(
-    folder: Path, out: Path | None, change: Callable[[Project, Path], Change], *, progress: bool, compared: bool
+    folder: Path, out: Path | None, change: Callable[[Path], Change], *, progress: bool, compared: bool
 ) -> ChangeOutcome:
     """Change an adjusted project, or a copy of it at ``out``; the project is as before whatever goes wrong.
 
@@ -85,9 +85,8 @@ def changed_project(
     begin, clock = time.perf_counter(), Clock()
     with place_for(folder, out) as place:
         with clock.step("read"):
-            project = read(folder)
-            before, why = _before(project, compared)
-            new = change(project, place)
+            before, why = _before(folder, compared)
+            new = change(place)
         with clock.step("adjust"), new.guard:
             adjustment, start = warm_adjustment(new.project, before, progress)
         outcome = made(new.project, adjustment, place, clock, command=new.command)
@@ -99,10 +98,10 @@ def changed_project(
     return ChangeOutcome(outcome.at(out or folder), new, moved, before, why, start, time.perf_counter() - begin)
 
 
-def _before(project: Project, needed: bool) -> tuple[Snapshot | None, str]:
+def _before(folder: Path, needed: bool) -> tuple[Snapshot | None, str]:
     """The last solution, or why there is none to compare with; raises SurveyError for that where one is needed."""
     try:
-        return read_previous(project), ""
+        return previous_solution(folder), ""
     except SurveyError as error:
         if needed:
             raise

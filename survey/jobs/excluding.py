@@ -8,7 +8,7 @@ Nothing is adjusted: every command obeys the file from then on.
 
 import getpass
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,9 +49,7 @@ class ExcludeOutcome:
         return "\n".join([*lines, f"{self.path}: {self.n_in_force} exclusions in force"])
 
 
-def exclude_job(
-    folder: Path, names: Sequence[str], reason: str, author: str = ""
-) -> ExcludeOutcome:  # fmt: skip
+def exclude_job(folder: Path, names: Sequence[str], reason: str, author: str = "") -> ExcludeOutcome:
     """Leave observations out from now on, all of ``names`` or none.
 
     names: ``image:X/h05``, ``epoch:h05``, ``camera:X``, ``target:board``, ``point:board/r7c2``, ``distances:B1-B2`` and
@@ -61,11 +59,7 @@ def exclude_job(
     folder = Path(folder)
     if not reason.strip():
         raise SurveyError(f"{folder}: say why, as --reason \"motion blur\"; the report lists it")  # fmt: skip
-    with changing(folder, inputs=True) as place:
-        project = read_all(folder)
-        rows = new_rows(project, names, reason, author)
-        _add(folder, place, rows)
-    return _outcome(folder, project, rows, True)
+    return _changed(folder, True, lambda project: new_rows(project, names, reason, author))
 
 
 def include_job(folder: Path, names: Sequence[str], reason: str = "", author: str = "") -> ExcludeOutcome:
@@ -73,20 +67,15 @@ def include_job(folder: Path, names: Sequence[str], reason: str = "", author: st
 
     Raises SurveyError for what is not excluded by that name.
     """
-    folder = Path(folder)
+    return _changed(Path(folder), False, lambda project: included_rows(project, names, reason, author))
+
+
+def _changed(folder: Path, excluded: bool, decided: Callable[[Project], Sequence[Row]]) -> ExcludeOutcome:
     with changing(folder, inputs=True) as place:
         project = read_all(folder)
-        rows = included_rows(project, names, reason, author)
-        _add(folder, place, rows)
-    return _outcome(folder, project, rows, False)
-
-
-def _add(folder: Path, place: Path, rows: Sequence[Row]) -> None:
-    atomic_write(place / FILE, appended(folder / FILE, rows))
-    replace_parts(folder)
-
-
-def _outcome(folder: Path, project: Project, rows: Sequence[Row], excluded: bool) -> ExcludeOutcome:
+        rows = decided(project)
+        atomic_write(place / FILE, appended(folder / FILE, rows))
+        replace_parts(folder)
     observed = Observed(project.survey, project.spots)
     hits = [observed.hits(row.exclusion.name, row.exclusion.at) for row in rows]
     done = tuple(h.left_out(row.exclusion) for row, h in zip(rows, hits, strict=True))

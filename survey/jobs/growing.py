@@ -13,7 +13,7 @@ from adjust.relay.session import Addition, NetworkSession
 from adjust.testing.distributions import chi2
 from survey.folder.text import read_text
 from survey.jobs.adjusting.warm_start import warm_adjustment
-from survey.project import Definition, read, read_definition
+from survey.project import Definition, read
 from survey.project.declared.node import read_toml
 from survey.project.declared.owners import read_stations
 from survey.project.merging import check_new
@@ -49,7 +49,7 @@ class Growing:
         project = read(folder)
         adjusted, _ = warm_adjustment(project, read_previous(project), False)
         try:
-            return cls(read_definition(folder), new, NetworkSession(adjusted))
+            return cls(project, new, NetworkSession(adjusted))
         except SurveyError as error:
             raise SurveyError(f"{folder}: {error}, without --live") from error
 

@@ -11,8 +11,8 @@ from gtsam import Pose3, Rot3
 from adjust.model.errors import SurveyError, listed
 from adjust.model.observations import Pair
 from survey.jobs.changing import Change, ChangeOutcome, changed_project
-from survey.project import Definition, Project, read_definition
-from survey.project.merging import Merged, merge, read_copy
+from survey.project import Definition, read_definition
+from survey.project.merging import merge, read_merged
 from survey.project.project import OBSERVATIONS_FOLDER
 from survey.project.tables.files import read_table
 from survey.project.tables.layouts import (
@@ -27,7 +27,7 @@ from survey.project.tables.pairs import read_ends
 from survey.project.tables.reading import Table
 from survey.project.tables.references import Names
 from survey.solution.earlier.runs import command_line
-from survey.solution.pair_network import network_dict, pair_network
+from survey.solution.network.counts import network_dict, pair_network
 
 _MOST_SHOWN = 8
 _MOST_NAMED = 12
@@ -129,23 +129,15 @@ def add_job(folder: Path, new: Path, *, out: Path | None = None, progress: bool 
     """
     folder, new = Path(folder), Path(new)
 
-    def grown(project: Project, place: Path) -> Change:
+    def grown(place: Path) -> Change:
         merged = merge(folder, new, place)
         added: dict[str, Sequence[str] | int] = {**merged.new_ids, **merged.rows}
         said = "; ".join(f"{kind} {_added(what)}" for kind, what in added.items())
-        return Change(_read_merged(merged, project, out or folder), merged.entries,
-                      command_line("add", folder, new, out=out), {"added": added}, (f"added: {said}",),
-                      told=True)  # fmt: skip
+        return Change(read_merged(merged, out or folder), merged.entries, command_line("add", folder, new, out=out),
+                      {"added": added}, (f"added: {said}",), told=True)  # fmt: skip
 
     return changed_project(folder, out, grown, progress=progress, compared=True)
 
 
 def _added(what: Sequence[str] | int) -> str:
     return str(what) if isinstance(what, int) else listed(what, _MOST_NAMED)
-
-
-def _read_merged(merged: Merged, project: Project, folder: Path) -> Project:
-    try:
-        return replace(read_copy(merged.place, project, folder), files=merged.place, origins=merged.origins)
-    except SurveyError as error:
-        raise merged.translated(error) from error

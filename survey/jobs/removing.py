@@ -7,9 +7,9 @@ Nothing is deleted: the observations are listed in ``observations/exclusions.csv
 on as long as the rest determines what they hang on.
 """
 
-import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from adjust.model.errors import IndeterminateError, SurveyError
@@ -20,11 +20,9 @@ from survey.folder.text import atomic_write
 from survey.folder.whole import copy_folder
 from survey.jobs.changing import Change, ChangeOutcome, changed_project
 from survey.jobs.excluding import FILE, new_rows
-from survey.project import Project
 from survey.project.exclusions import Name, appended
-from survey.project.merging import point_files, read_copy
-from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
-from survey.project.reading import read_all
+from survey.project.project import OBSERVATIONS_FOLDER
+from survey.project.reading import leaving_out, read_all, with_exclusions
 from survey.solution.earlier.runs import command_line
 
 
@@ -39,13 +37,16 @@ def remove_job(
     """
     folder = Path(folder)
 
-    def reduced(project: Project, place: Path) -> Change:
-        rows = new_rows(read_all(folder), names, reason, author)
-        _copy(folder, place)
+    def reduced(place: Path) -> Change:
+        everything, before = with_exclusions(read_all(folder), folder)
+        rows = new_rows(everything, names, reason, author)
+        if out is not None and (folder / OBSERVATIONS_FOLDER).is_dir():
+            copy_folder(folder / OBSERVATIONS_FOLDER, place / OBSERVATIONS_FOLDER)
         atomic_write(place / FILE, appended(folder / FILE, rows))
-        left, out_of_it = read_copy(place, project, out or folder), [row.exclusion.name for row in rows]
+        now, after = with_exclusions(replace(everything, folder=out or folder, files=folder), place)
+        left, out_of_it = leaving_out(now, after.values()), [row.exclusion.name for row in rows]
         with _refusing(folder, out_of_it):
-            _require_nothing_lost(project.survey, left.survey, out_of_it)
+            _require_nothing_lost(leaving_out(everything, before.values()).survey, left.survey, out_of_it)
         removed = [str(name) for name in out_of_it]
         said = (f"removed: {', '.join(removed)}",
                 f"to take them back: labsurvey include FOLDER {' '.join(removed)}, and adjust again")  # fmt: skip
@@ -82,12 +83,3 @@ def _require_nothing_lost(survey: Survey, reduced: Survey, names: Sequence[Name]
 def _is_declared(survey: Survey, name: ParameterName) -> bool:
     """Whether an unknown is one of the project itself, and not the pose or reading of a moment."""
     return len(name) == 2 and (name[0] != "point" or any(p.point_id == name[1] for p in survey.points))
-
-
-def _copy(folder: Path, place: Path) -> None:
-    """All that is read of a project, except images, which no adjustment reads."""
-    if (folder / OBSERVATIONS_FOLDER).is_dir():
-        copy_folder(folder / OBSERVATIONS_FOLDER, place / OBSERVATIONS_FOLDER)
-    for name in (DEFINITION_FILE, *point_files(folder)):
-        (place / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy2(folder / name, place / name)

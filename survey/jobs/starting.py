@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from adjust.model.errors import SurveyError
-from adjust.model.names import natural_key
 from survey.folder.replacing import filling
 from survey.folder.text import atomic_write, id_problem
-from survey.project.images import IMAGE_ENDINGS
+from survey.project.images import IMAGE_ENDINGS, visible
 from survey.project.project import DEFINITION_FILE, IMAGES_FOLDER
 
 if TYPE_CHECKING:  # detection brings in OpenCV
@@ -110,8 +109,7 @@ def cameras_in(images: Path) -> dict[str, list[Path]]:
     """Images by camera, in natural order. Raises SurveyError as :func:`start_project`."""
     if not images.is_dir():
         raise SurveyError(f"{images}: there is no such folder")
-    entries = sorted((p for p in images.iterdir() if not p.name.startswith(".")), key=lambda p: natural_key(p.name))
-    folders = [p for p in entries if p.is_dir()]
+    folders = [p for p in visible(images) if p.is_dir()]
     found = {p.name: _images(p) for p in folders} if folders else {images.resolve().name: _images(images)}
     cameras = {name: paths for name, paths in found.items() if paths}
     if not cameras:
@@ -129,8 +127,7 @@ def cameras_in(images: Path) -> dict[str, list[Path]]:
 
 
 def _images(folder: Path) -> list[Path]:
-    found = (p for p in folder.iterdir() if p.is_file() and p.suffix.lower() in IMAGE_ENDINGS)
-    return sorted(found, key=lambda p: natural_key(p.name))
+    return [p for p in visible(folder) if p.is_file() and p.suffix.lower() in IMAGE_ENDINGS]
 
 
 def _shown(image: "AnyImage") -> tuple[tuple[int, int] | None, bool]:

@@ -57,11 +57,12 @@ class Batch:
     @property
     def charts(self) -> Any:
         """Data frame: mean, scatter, slope and findings of every number, most alarming first."""
+        names = short_names(self.records)
         return frame(self.trends.charts, ["name"], {
             "name": "series.name", "unit": "series.unit", "n": lambda c: len(c.series.value), "mean": "mean",
             "sigma_mean": "mean_sigma", "ratio": "ratio", "p": "p", "slope": "slope", "sigma_slope": "slope_sigma",
             "p_slope": "p_slope", "in_control": lambda c: not self.trends.is_alarming(c),
-            "findings": lambda c: "; ".join(findings(self.trends, c, self.records)),
+            "findings": lambda c: "; ".join(findings(self.trends, c, names)),
         })  # fmt: skip
 
     def plot(self, name: str) -> Plot:

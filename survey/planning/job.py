@@ -34,7 +34,7 @@ from survey.planning.text import plan_text
 from survey.planning.wanted import required_sigmas, wanted_components
 from survey.project import Project, atomic_write, read
 from survey.project.project import RESULTS
-from survey.solution.pair_network import network_dict, pair_network
+from survey.solution.network.counts import network_dict, pair_network
 
 
 @dataclass(frozen=True)

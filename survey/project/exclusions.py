@@ -23,6 +23,7 @@ spot         ``camera/epoch/spot``; u_px and v_px tell which one it was when it 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 from adjust.model.errors import SurveyError
 from survey.folder.plain import attributes
@@ -157,9 +158,9 @@ def _pixel(path: Path, line: int, row: Mapping[str, str]) -> tuple[float, float]
     return u, v
 
 
-def in_force(rows: Sequence[Row]) -> dict[Name, Exclusion]:
-    """What is excluded: of every name the last row counts."""
-    found: dict[Name, Exclusion] = {}
+def in_force(rows: Sequence[Row], before: Mapping[Name, Exclusion] = MappingProxyType({})) -> dict[Name, Exclusion]:
+    """What is excluded: of every name the last row counts, none where nothing was excluded ``before``."""
+    found = dict(before)
     for row in rows:
         found.pop(row.exclusion.name, None)
         if row.excluded:

@@ -21,13 +21,13 @@ def find_images(folder: Path, camera_ids: Iterable[str]) -> dict[tuple[str, str]
     """Images below ``folder`` by (camera_id, epoch_id), in natural order; hidden files are passed over."""
     camera_ids = tuple(camera_ids)
     images: dict[tuple[str, str], Path] = {}
-    for entry in _visible(folder):
+    for entry in visible(folder):
         if not entry.is_dir():
             raise SurveyError(f"{entry}: a file among the cameras' folders; move it to {folder}/<camera_id>/ or out")
         if entry.name not in camera_ids:
             near = suggestion(entry.name, camera_ids)
             raise SurveyError(f"{entry}: images of the unknown camera {entry.name!r}; {near}")
-        for path in _visible(entry):
+        for path in visible(entry):
             key = (entry.name, _epoch_id(path))
             if key in images:
                 raise SurveyError(f"{path}: epoch {key[1]!r} has an image already, {images[key].name}; remove one")
@@ -35,7 +35,8 @@ def find_images(folder: Path, camera_ids: Iterable[str]) -> dict[tuple[str, str]
     return images
 
 
-def _visible(folder: Path) -> list[Path]:
+def visible(folder: Path) -> list[Path]:
+    """What lies in a folder, in natural order, without hidden files; nothing where there is none."""
     if not folder.is_dir():
         return []
     return sorted((p for p in folder.iterdir() if not p.name.startswith(".")), key=lambda p: natural_key(p.name))

@@ -17,7 +17,7 @@ from survey.project.declared.toml_text import KeyLines, KeyPath, read_tables, to
 from survey.project.detected import ImageKey, file_of
 from survey.project.exclusions import EXCLUSIONS_FILE, appended, read_exclusions
 from survey.project.project import DEFINITION_FILE, FORMAT, IMAGES_FOLDER, OBSERVATIONS_FOLDER, Project
-from survey.project.reading import read
+from survey.project.reading import leaving_out, read_all, with_exclusions
 from survey.project.tables.files import read_table
 from survey.project.tables.layouts import LAYOUTS
 
@@ -68,8 +68,10 @@ def merge(folder: Path, new: Path, place: Path) -> Merged:
     """Write the merged survey.toml and observations into ``place``; raises SurveyError for what cannot be added."""
     check_new(folder, new)
     merged = Merged(folder, new, place)
-    _merge_definition(merged)
+    old = _merge_definition(merged)
     _merge_tables(merged)
+    for path in sorted((merged.folder / name for name in _point_files(old)), key=str):
+        _link_into(path, merged)
     _take_images(merged)
     if not merged.rows and not any(merged.new_ids.values()):
         raise SurveyError(f"{new}: nothing to add; put tables into {new}/{OBSERVATIONS_FOLDER}, such as pairs.csv")
@@ -84,7 +86,8 @@ def check_new(folder: Path, new: Path) -> None:
         raise SurveyError(f"{new}: is the project itself; give the folder that holds what is new")
 
 
-def _merge_definition(merged: Merged) -> None:
+def _merge_definition(merged: Merged) -> dict[str, Any]:
+    """What the old survey.toml says."""
     old_path, new_path = merged.folder / DEFINITION_FILE, merged.new / DEFINITION_FILE
     text = read_text(old_path)
     old = read_tables(text)
@@ -103,6 +106,7 @@ def _merge_definition(merged: Merged) -> None:
             ) from error
     merged.origins[DEFINITION_FILE] = origins
     atomic_write(merged.place / DEFINITION_FILE, text)
+    return old
 
 
 def _new_sections(
@@ -150,8 +154,6 @@ def _merge_tables(merged: Merged) -> None:
     if old.is_dir():
         copy_folder(old, target)
     target.mkdir(exist_ok=True)
-    for path in sorted((merged.folder / name for name in point_files(merged.folder)), key=str):
-        _link_into(path, merged)
     source = merged.new / OBSERVATIONS_FOLDER
     for path in sorted(source.iterdir()) if source.is_dir() else []:
         if path.suffix not in (".csv", ".parquet") or path.name.startswith("."):
@@ -169,27 +171,30 @@ def _merge_tables(merged: Merged) -> None:
         merged.entries.append(f"{OBSERVATIONS_FOLDER}/{path.name}")
 
 
-def read_copy(place: Path, project: Project, folder: Path) -> Project:
-    """Read what was made of ``project`` in ``place``, as it will be at ``folder``; images that are not copied count."""
-    copy = read(place)
+def read_merged(merged: Merged, folder: Path) -> Project:
+    """Read what was merged, as it will be at ``folder``. Raises SurveyError with the lines that the user knows."""
+    place = merged.place
+    try:
+        everything, exclusions = with_exclusions(read_all(place, beside=merged.folder), place)
+    except SurveyError as error:
+        raise merged.translated(error) from error
     points = Counter[ImageKey]()
-    for block in copy.survey.image_blocks:
+    for block in everything.survey.image_blocks:
         points[block.camera_id, block.epoch_id] += len(block.uv)
     new = {
         key: replace(file_of(path, path.relative_to(place).as_posix()), status="given", n_image_points=points[key])
-        for key, path in copy.images.items()
-        if key not in project.images
+        for key, path in everything.images.items()
+        if path.is_relative_to(place)
     }
-    return replace(
-        copy, folder=folder, title=project.title, images={**copy.images, **project.images},
-        detected={**project.detected, **new}, image_notes=project.image_notes,
-        notes=tuple(note.replace(str(place), str(folder)) for note in copy.notes),
-    )  # fmt: skip
+    grown = replace(everything, folder=folder, detected={**everything.detected, **new}, files=place,
+                    origins=merged.origins)  # fmt: skip
+    notes = tuple(note.replace(str(place), str(folder)) for note in everything.image_notes)
+    return leaving_out(replace(grown, image_notes=notes), exclusions.values())
 
 
-def point_files(folder: Path) -> list[str]:
+def _point_files(old: Mapping[str, Any]) -> list[str]:
     """Point lists that the old survey.toml names; the merged project is read with them."""
-    targets = read_tables(read_text(folder / DEFINITION_FILE)).get("targets")
+    targets = old.get("targets")
     tables = [t for t in targets.values() if isinstance(t, dict)] if isinstance(targets, dict) else []
     return [file for t in tables if isinstance(file := t.get("file"), str)]
 

@@ -28,7 +28,7 @@ from survey.project.declared.owners import read_cameras, read_stations, read_tab
 from survey.project.declared.poses import flat_point, read_point
 from survey.project.declared.targets import read_targets
 from survey.project.detected import DetectedImage, ImageKey, ImageNews, image_news, read_detected
-from survey.project.exclusions import EXCLUSIONS, EXCLUSIONS_FILE, Exclusion, in_force, read_exclusions
+from survey.project.exclusions import EXCLUSIONS, EXCLUSIONS_FILE, Exclusion, Name, in_force, read_exclusions
 from survey.project.finding import near
 from survey.project.images import find_images, sought_in
 from survey.project.observed import Observed, union
@@ -63,29 +63,37 @@ def read(folder: Path, ahead: dict[Path, Begun] | None = None) -> Project:
     What ``exclusions.csv`` leaves out is not used. ``notes`` say which of its rows name nothing, ``image_notes``
     which images are not those any more that the points come from. ahead: see :func:`read_all`.
     """
-    project = read_all(folder, ahead=ahead)
-    return leaving_out(project, in_force(read_exclusions(project.folder / OBSERVATIONS_FOLDER)[0]).values())
+    everything, exclusions = with_exclusions(read_all(folder, ahead=ahead), Path(folder))
+    return leaving_out(everything, exclusions.values())
+
+
+def with_exclusions(everything: Project, place: Path) -> tuple[Project, dict[Name, Exclusion]]:
+    """The project with the hash of ``exclusions.csv`` as it stands in the folder ``place``, and what that leaves out.
+
+    Nothing is left out yet. Raises SurveyError.
+    """
+    rows, digest = read_exclusions(place / OBSERVATIONS_FOLDER)
+    inputs = {**everything.inputs, **({f"{OBSERVATIONS_FOLDER}/{EXCLUSIONS_FILE}": digest} if digest else {})}
+    return dataclasses.replace(everything, inputs=dict(sorted(inputs.items()))), in_force(rows)
 
 
 def read_all(
-    folder: Path, texts: Mapping[str, str] = MappingProxyType({}), ahead: dict[Path, Begun] | None = None
-) -> Project:
+    folder: Path, texts: Mapping[str, str] = MappingProxyType({}), ahead: dict[Path, Begun] | None = None,
+    beside: Path | None = None,
+) -> Project:  # fmt: skip
     """:func:`read`, with what is excluded as if it were not.
 
     texts: what is to stand in files of the folder, not yet written, by their paths in it. ahead: tables that are being
-    read already; they are taken from it, so that nothing of them stays in memory.
+    read already; they are taken from it, so that nothing of them stays in memory. beside: a folder whose images belong
+    to the project too.
     """
     place = Path(folder) / OBSERVATIONS_FOLDER
     with settled(Path(folder)):
-        definition, root = _read_definition(Path(folder), texts.get(DEFINITION_FILE))
+        definition, root = _read_definition(Path(folder), texts.get(DEFINITION_FILE), beside)
         tables = _read_tables(place, {Path(folder) / name: text for name, text in texts.items()}, ahead or {})
-        _, digest = read_exclusions(place)
         known = read_detected(place)
         images = _image_news(definition, tables, known)
         project = _observed(definition, root, tables)
-    hashes = dict(sorted({**project.inputs, f"{OBSERVATIONS_FOLDER}/{EXCLUSIONS_FILE}": digest}.items()))
-    if digest:
-        project = dataclasses.replace(project, inputs=hashes)
     notes = images.notes(definition.folder)
     detected = {**known, **(images.same or {})}
     return dataclasses.replace(project, detected=detected, to_detect=images.to_detect, image_notes=notes)
@@ -154,7 +162,7 @@ def _observed(definition: Definition, root: Node, tables: dict[str, Table]) -> P
     return Project(**fields, spots=spots)
 
 
-def _read_definition(folder: Path, text: str | None = None) -> tuple[Definition, Node]:
+def _read_definition(folder: Path, text: str | None = None, beside: Path | None = None) -> tuple[Definition, Node]:
     path = folder / DEFINITION_FILE
     if not path.is_file():
         raise SurveyError(f"{path}: there is no such file; a project folder holds a {DEFINITION_FILE}")
@@ -193,7 +201,8 @@ def _read_definition(folder: Path, text: str | None = None) -> tuple[Definition,
         tie_points=tie_points,
         survey=survey,
         target_kinds=kinds,
-        images=find_images(folder / IMAGES_FOLDER, camera_ids),
+        images={key: path for place in (folder, beside) if place is not None
+                for key, path in find_images(place / IMAGES_FOLDER, camera_ids).items()},
         spots_request=_read_spots_request(root.table("spots"), camera_ids) if root.has("spots") else None,
         options=read_options(root),
         sigmas=dataclasses.replace(_read_sigmas(root.table("sigmas"), table_sigmas), instruments=accuracies),

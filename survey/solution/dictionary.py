@@ -165,7 +165,7 @@ def _group(group: GroupSummary) -> dict[str, Any]:
 def _pairs(adjustment: Adjustment, scale: q.Scale) -> Mapping[str, Any]:
     if not adjustment.survey.pairs:
         return {}
-    from survey.solution.pairs import pairs_dict  # here: as above
+    from survey.solution.network.pairs import pairs_dict  # here: as above
 
     return pairs_dict(adjustment, scale)
 
@@ -176,8 +176,8 @@ def _network(adjustment: Adjustment) -> dict[str, Any]:
     if not survey.pairs:
         return {}
     # here: a survey without pairs is reported without it
-    from survey.solution.loops import closures_dict, loops_after, loops_dict, pair_loops
-    from survey.solution.pair_network import network_dict, pair_network
+    from survey.solution.network.counts import network_dict, pair_network
+    from survey.solution.network.loops import closures_dict, loops_after, loops_dict, pair_loops
 
     loops = pair_loops(survey)
     if loops is None:

@@ -171,15 +171,16 @@ def solution_json(solution: Mapping[str, Any]) -> str:
 
 
 def sections(document: bytes, *names: str) -> dict[str, Any]:
-    """Some of the topmost entries of what :func:`solution_json` wrote, the others unread; all of what looks otherwise.
+    """Those topmost entries that there are of what :func:`solution_json` wrote; all of what looks otherwise.
 
     Raises ValueError for what is no JSON.
     """
-    entry = rb'\n %b: (.+?)(?:,\n "|\n}\s*\Z)'
-    found = [re.findall(entry % re.escape(_key(name).encode()), document, re.DOTALL) for name in names]
-    if not document.startswith(b"{\n ") or any(len(texts) != 1 for texts in found):
+    heads, last = list(re.finditer(rb'\n ("[^"]+"): ', document)), document.rfind(b"\n}")
+    if not document.startswith(b"{\n ") or not heads or last < 0:
         return dict(json.loads(document))
-    return {name: json.loads(texts[0]) for name, texts in zip(names, found, strict=True)}
+    ends = [*(head.start() - 1 for head in heads[1:]), last]  # before a comma
+    found = ((json.loads(head[1]), document[head.end() : end]) for head, end in zip(heads, ends, strict=True))
+    return {name: json.loads(text) for name, text in found if name in names}
 
 
 def _lines(value: Any, depth: int) -> str:

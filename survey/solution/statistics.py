@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
-from gtsam import Pose3
 
+from adjust.epochs.states import origin
 from adjust.model.result import Adjustment, Decision, Estimate, ParameterName, VarianceComponents
 from adjust.model.survey import FloatArray
 from adjust.native.parallel import Beside
@@ -173,7 +173,7 @@ def neighbours(adjustment: Adjustment, scale: Scale) -> tuple[RelativePrecision,
     names, places = [], []
     for name, e in adjustment.estimates.items():
         if len(name) == 2 and name[0] in ("point", "world_from_station"):
-            x = np.asarray(e.value.translation() if isinstance(e.value, Pose3) else e.value, dtype=float)
+            x = origin(e.value)
             if np.isfinite(x).all():
                 names.append(name)
                 places.append(x)

@@ -18,9 +18,9 @@ from survey.report.language import text_said
 from survey.solution.earlier.runs import Clock, command_line, remove_empty
 from survey.solution.frames import AdjustedFrames
 from survey.solution.quantities import scale_of
-from survey.workbench.deciding import Deciding
 from survey.workbench.pages.beginning import Drawn, Told
 from survey.workbench.places import Places
+from survey.workbench.resident import Resident
 
 if TYPE_CHECKING:  # detection brings in OpenCV, planning much else
     from adjust.graph.assembly import StartValues
@@ -29,119 +29,117 @@ if TYPE_CHECKING:  # detection brings in OpenCV, planning much else
     from survey.jobs.adjusting.outcome import AdjustOutcome
     from survey.jobs.cross_validation import CrossValidation
     from survey.planning.job import PlanningOutcome, PlanRequest
-    from survey.solution.dictionary import RunInfo
 
 _MOST_LINES = 300
 
 
-class Jobs(Deciding):
-    """A project folder with its other jobs; each is the command of the same name, and raises as that does."""
+def save(bench: Resident) -> "AdjustOutcome":
+    """Write ``results`` as ``labsurvey adjust`` does, and a run beside the others. Raises as :func:`exclude`."""
+    from survey.jobs.adjusting.outcome import kept_run, made
 
-    def save(self) -> "AdjustOutcome":
-        """Write ``results`` as ``labsurvey adjust`` does, and a run beside the others. Raises as :meth:`exclude`."""
-        from survey.jobs.adjusting.outcome import kept_run, made
+    with bench.lock:
+        bench.check()
+        clock = Clock({"adjust": bench.situation.seconds})
+        with changing(bench.folder) as place:
+            bench.require_unchanged()
+            said = command_line("open", bench.folder)
+            outcome = made(bench.situation.project, bench.adjustment, place, clock, command=said)
+            gone = kept_run(bench.folder, place, bench.situation.project, outcome)
+            replace_parts(bench.folder, gone=gone)
+        remove_empty(bench.folder, gone)
+        bench.n_unsaved = 0
+        return outcome.at(bench.folder)
 
-        with self._lock:
-            self._check(None)
-            clock = Clock({"adjust": self.situation.seconds})
-            with changing(self.folder) as place:
-                self._require_unchanged()
-                said = command_line("open", self.folder)
-                outcome = made(self.situation.project, self.adjustment, place, clock, command=said)
-                gone = kept_run(self.folder, place, self.situation.project, outcome)
-                replace_parts(self.folder, gone=gone)
-            remove_empty(self.folder, gone)
-            self.n_unsaved = 0
-            return outcome.at(self.folder)
 
-    def run(self) -> "RunInfo":
-        """What was run, for reports."""
-        from survey.jobs.adjusting.outcome import run_info
+def detect(bench: Resident, *, everything: bool = False, told: "Callable[[ImageReport], None] | None" = None) -> Told:
+    """Find targets and spots in images that are new or have changed (everything: in all), and adjust again.
 
-        return run_info(self.situation.project, {})
+    told: called with what was found in each image as it comes.
+    """
+    from survey.jobs.detecting.job import detect_job
 
-    def detect(self, *, everything: bool = False, told: "Callable[[ImageReport], None] | None" = None) -> Told:
-        """Find targets and spots in images that are new or have changed (everything: in all), and adjust again.
+    bench.check()
+    outcome = detect_job(bench.folder, progress=False, everything=everything, told=told)
+    bench.reload()
+    return Told(outcome.text(), outcome.summary())
 
-        told: called with what was found in each image as it comes.
-        """
-        from survey.jobs.detecting.job import detect_job
 
-        self._check(None)
-        outcome = detect_job(self.folder, progress=False, everything=everything, told=told)
-        self.reload()
-        return Told(outcome.text(), outcome.summary())
+def plan(bench: Resident, request: "PlanRequest | None" = None) -> Told:
+    """Precision before measuring, and what to measure next, as ``plan.toml`` lists it; drawn: what was chosen."""
+    from survey.planning.job import PlanRequest, planning_job
 
-    def plan(self, request: "PlanRequest | None" = None) -> Told:
-        """Precision before measuring, and what to measure next, as ``plan.toml`` lists it; drawn: what was chosen."""
-        from survey.planning.job import PlanRequest, planning_job
+    bench.check()
+    if not (bench.folder / "plan.toml").is_file():
+        raise SurveyError(f"{bench.folder / 'plan.toml'}: there is no such file; it says what could be measured")
+    outcome = planning_job(bench.folder, request or PlanRequest(), progress=False)
+    return Told(outcome.text(), outcome.summary(), _chosen(outcome))
 
-        self._check(None)
-        if not (self.folder / "plan.toml").is_file():
-            raise SurveyError(f"{self.folder / 'plan.toml'}: there is no such file; it says what could be measured")
-        outcome = planning_job(self.folder, request or PlanRequest(), progress=False)
-        return Told(outcome.text(), outcome.summary(), _chosen(outcome))
 
-    def navigate(self, station: str = "", interval_s: float | None = None) -> Told:
-        """A pose for every epoch that shows beacons and no target; drawn: the path with its covariances."""
-        from survey.jobs.navigating.job import NavigateRequest, navigate_job
+def navigate(bench: Resident, station: str = "", interval_s: float | None = None) -> Told:
+    """A pose for every epoch that shows beacons and no target; drawn: the path with its covariances."""
+    from survey.jobs.navigating.job import NavigateRequest, navigate_job
 
-        self._check(None)
-        outcome = navigate_job(self.folder, NavigateRequest(station or None, interval_s=interval_s), progress=False)
-        poses = [(e, e.world_from_station) for e in outcome.trajectory.epochs]
-        path = [(e.epoch_id, np.asarray(pose.translation()), _in_world(pose, e.cov), str(e.status))
-                for e, pose in poses if pose is not None]  # fmt: skip
-        alone = None if self.situation.adjustment is not None else _beacons(outcome.calibration.beacons)
-        return Told(outcome.text(), outcome.summary(), Drawn(path=path, scene=alone))
+    bench.check()
+    request = NavigateRequest(station or None, interval_s=interval_s)
+    outcome = navigate_job(bench.folder, request, progress=False)
+    poses = [(e, e.world_from_station) for e in outcome.trajectory.epochs]
+    path = [(e.epoch_id, np.asarray(pose.translation()), _in_world(pose, e.cov), str(e.status))
+            for e, pose in poses if pose is not None]  # fmt: skip
+    alone = None if bench.situation.adjustment is not None else _beacons(outcome.calibration.beacons)
+    return Told(outcome.text(), outcome.summary(), Drawn(path=path, scene=alone))
 
-    def add(self, new: str | Path) -> Told:
-        """Let the network grow by the stations or observations of another folder, and adjust again.
 
-        It begins at the results: where they are not those of now, they are saved first.
-        """
-        from survey.jobs.network import add_job
+def add(bench: Resident, new: str | Path) -> Told:
+    """Let the network grow by the stations or observations of another folder, and adjust again.
 
-        self._check(None)
-        if self.n_unsaved or not (self.folder / RESULTS / "solution.json").is_file():
-            self.save()
-        outcome = add_job(self.folder, self._other(new), progress=False)
-        self.reload()
-        return Told(outcome.text(), outcome.summary())
+    It begins at the results: where they are not those of now, they are saved first.
+    """
+    from survey.jobs.network import add_job
 
-    def compare_with(self, other: str | Path) -> Told:
-        """The project as the later of two epochs, and what moved since the other; nothing is written.
+    bench.check()
+    if bench.n_unsaved or not (bench.folder / RESULTS / "solution.json").is_file():
+        save(bench)
+    outcome = add_job(bench.folder, bench.other_folder(new), progress=False)
+    bench.reload()
+    return Told(outcome.text(), outcome.summary())
 
-        drawn: how points and stations moved.
-        """
-        from survey.jobs.comparing import compare_job
 
-        outcome = compare_job(self._other(other), self.folder, progress=False)
-        before, after = (_positions(a) for a in outcome.adjustments)
-        lines = [(name, [before[name], x]) for name, x in after.items() if name in before]
-        return Told(outcome.text(), outcome.summary(), Drawn(lines=lines))
+def compare_with(bench: Resident, other: str | Path) -> Told:
+    """The project as the later of two epochs, and what moved since the other; nothing is written.
 
-    def cross_validate(self, distance: float = float("inf")) -> "CrossValidation":
-        """The lenses of two halves of the epochs compared, for points at ``distance`` (m); nothing is written."""
-        from survey.jobs.cross_validation import cross_validate
+    drawn: how points and stations moved.
+    """
+    from survey.jobs.comparing import compare_job
 
-        return cross_validate(self.situation.project, distance)
+    outcome = compare_job(bench.other_folder(other), bench.folder, progress=False)
+    before, after = (_positions(a) for a in outcome.adjustments)
+    lines = [(name, [before[name], x]) for name, x in after.items() if name in before]
+    return Told(outcome.text(), outcome.summary(), Drawn(lines=lines))
 
-    def batch(self, folders: Sequence[str | Path] = ()) -> Told:
-        """Adjust several projects (none: all beside this one), side by side; each has its results afterwards.
 
-        ``summary["rows"]``: of each its ``folder``, ``state``, ``verdict``, ``sigma0``, ``redundancy`` and ``error``.
-        """
-        from survey.batch.run import BatchOptions, run_batch
-        from survey.batch.tables import summary_table
+def cross_validate(bench: Resident, distance: float = float("inf")) -> "CrossValidation":
+    """The lenses of two halves of the epochs compared, for points at ``distance`` (m); nothing is written."""
+    from survey.jobs.cross_validation import cross_validate
 
-        self._check(None)
-        chosen = [self._other(f) for f in folders] or sorted(
-            p.parent for p in self.folder.resolve().parent.glob(f"*/{DEFINITION_FILE}"))  # fmt: skip
-        found = run_batch(chosen, BatchOptions(progress=False))
-        rows = [{"folder": str(r.folder), "state": str(r.state), "error": text_said(r.error),
-                 **{k: r.summary.get(k) for k in ("verdict", "sigma0", "redundancy")}} for r in found]  # fmt: skip
-        return Told(summary_table(found), {"folders": [row["folder"] for row in rows],
-                                           "states": [row["state"] for row in rows], "rows": rows})  # fmt: skip
+    return cross_validate(bench.situation.project, distance)
+
+
+def batch(bench: Resident, folders: Sequence[str | Path] = ()) -> Told:
+    """Adjust several projects (none: all beside this one), side by side; each has its results afterwards.
+
+    ``summary["rows"]``: of each its ``folder``, ``state``, ``verdict``, ``sigma0``, ``redundancy`` and ``error``.
+    """
+    from survey.batch.run import BatchOptions, run_batch
+    from survey.batch.tables import summary_table
+
+    bench.check()
+    chosen = [bench.other_folder(f) for f in folders] or sorted(
+        p.parent for p in bench.folder.resolve().parent.glob(f"*/{DEFINITION_FILE}"))  # fmt: skip
+    found = run_batch(chosen, BatchOptions(progress=False))
+    rows = [{"folder": str(r.folder), "state": str(r.state), "error": text_said(r.error),
+             **{k: r.summary.get(k) for k in ("verdict", "sigma0", "redundancy")}} for r in found]  # fmt: skip
+    return Told(summary_table(found), {"folders": [row["folder"] for row in rows],
+                                       "states": [row["state"] for row in rows], "rows": rows})  # fmt: skip
 
 
 def _positions(adjustment: Adjustment) -> dict[str, FloatArray]:

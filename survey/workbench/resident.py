@@ -1,6 +1,6 @@
 """A project in memory that is adjusted again, and again, from the values of everything that was ever solved.
 
-What is decided about it stands in :mod:`survey.workbench.session`.
+All that is known of it stands here; decisions, jobs and views are functions of it.
 """
 
 import threading
@@ -14,10 +14,10 @@ from adjust.model.errors import DiagnosedError, SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
 from survey.folder.locking import LOCK, holder_of
+from survey.folder.plain import differing
 from survey.folder.text import read_text
-from survey.project.exclusions import in_force, read_exclusions
-from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
-from survey.project.reading import leaving_out, read_all
+from survey.project.project import DEFINITION_FILE, Project
+from survey.project.reading import leaving_out, read_all, with_exclusions
 from survey.solution.earlier.changes import Changes, solution_changes
 from survey.solution.quantities import Scale, scale_of
 from survey.workbench.kept import Kept, kept_results, with_kept
@@ -25,18 +25,19 @@ from survey.workbench.pages.beginning import Folder
 from survey.workbench.rows import PointRows, point_rows
 from survey.workbench.situation import (
     CancelledError,
+    ChangedError,
     KnownValues,
     Mode,
     Situation,
+    Step,
     identified_in,
-    in_complex,
     judgement_of,
     signature_of,
     spot_places,
 )
 
 if TYPE_CHECKING:  # what adjusts comes when something is adjusted: the first view is there before
-    from adjust.diagnosis.diagnosis import Diagnosis
+    from adjust.diagnosis.diagnosis import Candidate, Diagnosis
     from adjust.graph.assembly import StartValues
     from survey.solution.statistics import Statistics
 
@@ -46,18 +47,23 @@ _MOST_KEPT = 300_000  # image points: of more only the verdict is taken from the
 
 
 class Resident(Folder):
-    """A project folder, kept in memory. Every method may be called from any thread.
+    """A project folder, kept in memory, with what was decided about it. Every method may be called from any thread.
 
-    read_only: nothing is ever written. watch: called with (iteration, v'Pv) while something is adjusted.
+    folder: or a project that was read, whose folder is meant: what is decided is written there. read_only: nothing is
+    ever written. watch: called with (iteration, v'Pv) while something is adjusted. lock: of who changes anything.
+    done, undone: decisions, and those that were taken back, the last behind.
     """
 
-    def __init__(self, folder: str | Path, *, read_only: bool = False, watch: Watch | None = None) -> None:
-        super().__init__(folder, read_only)
-        self.watch, self.version = watch, 0
+    def __init__(
+        self, folder: str | Path | Project, *, read_only: bool = False, watch: Watch | None = None
+    ) -> None:  # fmt: skip
+        super().__init__(folder.folder if isinstance(folder, Project) else folder, read_only)
+        self.watch, self.version, self.n_unsaved = watch, 0, 0
+        self.done, self.undone = list[Step](), list[Step]()
         self.layout = 0  # counts changes of which image points there are, and in which order
         self.changes: Changes | None = None
         self.failure: SurveyError | None = None
-        self._values, self._lock, self._cancel = KnownValues(), threading.RLock(), threading.Event()
+        self._values, self.lock, self._cancel = KnownValues(), threading.RLock(), threading.Event()
         self._joining = threading.Lock()
         self._statistics: tuple[int, Statistics] | None = None
         self._rows: tuple[Situation, PointRows] | None = None
@@ -66,9 +72,8 @@ class Resident(Folder):
 
     def _read(self) -> Situation:
         signature = signature_of(self.folder)  # first: what changes while it is read shows as changed afterwards
-        everything = read_all(self.folder)
+        everything, exclusions = with_exclusions(read_all(self.folder), self.folder)
         text = read_text(self.folder / DEFINITION_FILE)
-        exclusions = in_force(read_exclusions(self.folder / OBSERVATIONS_FOLDER)[0])
         return Situation(everything, leaving_out(everything, exclusions.values()), text, exclusions, signature)
 
     # what is there
@@ -108,30 +113,29 @@ class Resident(Folder):
         """Reliability, correlations, budgets and so on, computed when first asked for. Raises SurveyError."""
         from survey.solution.statistics import statistics_of
 
-        with self._lock:
+        with self.lock:
             if self._statistics is None or self._statistics[0] != self.version:
                 found, options = self.situation.solved, self.situation.project.options
                 made = statistics_of(found.adjustment, options, self.scale, found.tested)
                 self._statistics = self.version, made
             return self._statistics[1]
 
-    def spot_name(self, row: int) -> str:
-        """The name under which a spot that has got a name is left out, by its row; raises IndexError for others."""
-        at, there = row, self.situation.everything
-        at -= sum(len(b.uv) for b in there.survey.image_blocks)
-        for block in self.situation.identified:
-            if 0 <= at < len(block.uv):
-                place, z = (block.camera_id, block.epoch_id), complex(*block.uv[at].tolist())
-                return next(f"spot:{'/'.join(place)}/{name}" for s in there.spots for name, spot in
-                            zip(s.spot_ids, in_complex(s.uv), strict=True)
-                            if (s.camera_id, s.epoch_id) == place and spot == z)  # fmt: skip
-            at -= len(block.uv)
-        raise IndexError(row)
-
     def changed_files(self) -> tuple[str, ...]:
         """Files of the project that were written since they were read, by path in the folder."""
-        now, before = signature_of(self.folder), self.situation.signature
-        return tuple(sorted(name for name in {*now, *before} if now.get(name) != before.get(name)))
+        return tuple(differing(signature_of(self.folder), self.situation.signature))
+
+    def check(self, base: int | None = None) -> None:
+        """Raise SurveyError where nothing may be written, or what is decided about solution ``base`` is out of date."""
+        self.require_writable()
+        if base is not None and base != self.version:
+            raise ChangedError(f"the solution has changed since (now {self.version}, not {base}); look at it again")
+        self.require_unchanged()
+
+    def require_unchanged(self) -> None:
+        """Raise ChangedError where others wrote files of the project."""
+        changed = self.changed_files()
+        if changed:
+            raise ChangedError(f"{self.folder}: {', '.join(changed)} changed meanwhile; load the project again")
 
     def holder(self) -> str | None:
         """Who writes the folder at the moment."""
@@ -141,9 +145,9 @@ class Resident(Folder):
 
     def adjust(self, mode: Mode = "warm") -> Changes | None:
         """Adjust what is in memory; what that changed, None the first time. Raises SurveyError, CancelledError."""
-        with self._lock:
+        with self.lock:
             try:
-                return self._take(self._solved(self.situation, mode))
+                return self.take(self.solved(self.situation, mode))
             except CancelledError:
                 raise
             except SurveyError as error:
@@ -151,11 +155,13 @@ class Resident(Folder):
                 raise
 
     def reload(self) -> Changes | None:
-        """Read the folder again and adjust it, where there is anything to adjust."""
-        with self._lock:
+        """Read the folder again and adjust it, where there is anything to adjust; nothing can be undone any more."""
+        with self.lock:
             new = self._read()
             still_empty = new.everything.is_empty and self.situation.adjustment is None
-            return self._take(new if still_empty else self._solved(new, "warm"))
+            changes = self.take(new if still_empty else self.solved(new, "warm"))
+            self.done, self.undone = [], []
+            return changes
 
     @property
     def diagnosis(self) -> "Diagnosis | None":
@@ -169,11 +175,27 @@ class Resident(Folder):
 
         return found if isinstance(found, Diagnosis) else None
 
+    @property
+    def undoable(self) -> tuple[str, ...]:
+        """What can be undone, the last decision first."""
+        return tuple(s.label for s in reversed(self.done))
+
+    @property
+    def redoable(self) -> tuple[str, ...]:
+        """What was undone and can be done again, the next first."""
+        return tuple(s.label for s in reversed(self.undone))
+
+    @property
+    def remedies(self) -> "tuple[Candidate, ...]":
+        """What the diagnosis of the last adjustment, failed or not, says would mend it, the best first."""
+        return () if self.diagnosis is None else self.diagnosis.candidates
+
     def cancel(self) -> None:
         """Give up the adjustment that runs, at its next step."""
         self._cancel.set()
 
-    def _take(self, new: Situation, failure: SurveyError | None = None) -> Changes | None:
+    def take(self, new: Situation, failure: SurveyError | None = None) -> Changes | None:
+        """What is new from now on; what that changed."""
         old, before, after = self.situation, self.situation.judgement, new.judgement
         same = new.everything.survey is old.everything.survey and new.identified is old.identified
         self.layout += not same
@@ -184,7 +206,8 @@ class Resident(Folder):
             self.changes = None if before is None else solution_changes(before.snapshot, after.snapshot)
         return self.changes
 
-    def _solved(self, situation: Situation, mode: Mode) -> Situation:
+    def solved(self, situation: Situation, mode: Mode) -> Situation:
+        """Adjusted; raises SurveyError, CancelledError."""
         self._cancel.clear()
         begin_s = perf_counter()
         found, how = self._adjusted(situation, mode)

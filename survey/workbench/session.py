@@ -10,19 +10,15 @@ Three sets are kept apart: what a table marks ``used = false``, what people excl
 itself. Only the third is found anew by every adjustment, which begins at the values of everything that was ever solved.
 """
 
-from dataclasses import replace
-
-from survey.jobs.excluding import FILE, author_name
-from survey.project.exclusions import Row
-from survey.project.project import DEFINITION_FILE
 from survey.solution.earlier.changes import Changes, Snapshot, solution_changes
-from survey.solution.earlier.runs import Run, definition_of, find_run, load_run, pin_run
-from survey.workbench.jobs import Jobs
+from survey.solution.earlier.runs import Run, load_run, pin_run
+from survey.workbench import deciding, jobs
 from survey.workbench.pictures import picture
+from survey.workbench.resident import Resident
 from survey.workbench.views import cameras, findings, project
 
 
-class Workbench(Jobs):
+class Workbench(Resident):
     """A project or its folder, kept in memory; see the module. Every method may be called from any thread.
 
     read_only: nothing is ever written. watch: called with (iteration, v'Pv) while something is adjusted.
@@ -39,30 +35,30 @@ class Workbench(Jobs):
     table_residuals = project.table_residuals
     statistics_part = project.statistics_part
     runs = project.runs
+    run = project.run
     camera_view = cameras.camera_view
     lens_change = cameras.lens_change
 
-    def restore(self, number: int, base: int | None = None) -> tuple[str, ...]:
-        """survey.toml and exclusions as they were at a run, as one decision; what else has changed since, for people.
+    preview = deciding.preview
+    exclude = deciding.exclude
+    include = deciding.include
+    decide = deciding.decide
+    apply_remedy = deciding.apply_remedy
+    set_sigma_scale = deciding.set_sigma_scale
+    set_treatment = deciding.set_treatment
+    set_datum = deciding.set_datum
+    undo = deciding.undo
+    redo = deciding.redo
+    restore = deciding.restore
 
-        Raises as :meth:`exclude`, and where there is no such run.
-        """
-        with self._lock:
-            self._check(base)
-            run, text, now = find_run(self.folder, number), definition_of(self.folder, number), self.situation
-            then = {e.name: e for e in run.exclusions}
-            who = author_name(now.project.options.identification)
-            why = f"run {number}"
-            rows = [Row(True, replace(e, line=0)) for name, e in then.items() if name not in now.exclusions]
-            rows += [Row(False, replace(e, reason=why, author=who)) for n, e in now.exclusions.items() if n not in then]
-            texts = {DEFINITION_FILE: text} if text != now.definition_text else {}
-            if rows or texts:
-                self._decided(rows, texts, f"restore run {number}")
-            inputs = self.situation.everything.inputs
-            other = sorted(k for k in {*inputs, *run.hashes} if inputs.get(k) != run.hashes.get(k))
-            known = {DEFINITION_FILE, FILE}
-            return tuple(f"{name}: is not as it was at run {number}; it stays as it is" for name in other
-                         if name not in known)  # fmt: skip
+    save = jobs.save
+    detect = jobs.detect
+    plan = jobs.plan
+    navigate = jobs.navigate
+    add = jobs.add
+    compare_with = jobs.compare_with
+    cross_validate = jobs.cross_validate
+    batch = jobs.batch
 
     def compare(self, a: int | None = None, b: int | None = None) -> Changes:
         """From run ``a`` to run ``b``, every parameter in sigmas of ``a``; None: the solution in memory."""
@@ -73,7 +69,7 @@ class Workbench(Jobs):
 
     def pin(self, number: int, pinned: bool = True) -> Run:
         """Keep a run for ever, or no more. Raises SurveyError."""
-        self._require_writable()
+        self.require_writable()
         return pin_run(self.folder, number, pinned)
 
     def picture(self, camera_id: str, epoch_id: str, size: int | None = None) -> tuple[bytes, str]:

@@ -22,9 +22,9 @@ from survey.batch.cache import unchanged_solution
 from survey.batch.control import Series, chart, runs
 from survey.batch.journal import Journal, read_journal
 from survey.batch.page import overview_html, write_overview
-from survey.batch.record import CAUSES, FAILED, Record, cause_of, record_from
+from survey.batch.record import CAUSES, FAILED, KEPT, Record, cause_of, record_from, solved_record
 from survey.batch.run import BatchOptions, run_batch
-from survey.batch.tables import folders_csv, overview_json, short_names, summary_table, trends_csv
+from survey.batch.tables import folders_csv, overview_json, short_names, summary_table, trend_lines, trends_csv
 from survey.batch.trends import all_series, trends_of
 from survey.batch.worker import Worker, WorkerDiedError, adjust_task, attempts
 from tests.browsing import CONTRAST, asked
@@ -93,7 +93,10 @@ def test_results_are_taken_over_only_while_nothing_changes(nights: list[Path], t
     folder = tmp_path / "night"
     shutil.copytree(nights[0], folder)
     table, solution = folder / "observations" / "image_points.csv", folder / "results" / "solution.json"
-    assert unchanged_solution(folder) == json.loads(solution.read_text())
+    found, written = unchanged_solution(folder), json.loads(solution.read_text())
+    assert found is not None
+    assert found == {name: written[name] for name in ("inputs", *KEPT) if name in written}
+    assert solved_record("", found, {}) == solved_record("", written, {})
     whole = table.read_bytes()
     table.write_bytes(whole.rstrip(b"\n") + b" \n")
     assert unchanged_solution(folder) is None
@@ -303,6 +306,25 @@ def test_trends_are_calm_on_noise_and_find_one_bad_epoch() -> None:
     found = trends_of(made(7.0))
     assert found.charts[0].series.name == "lens/left/c"
     assert found.strays(found.charts[0])
+
+
+def test_text_and_page_name_the_same_epochs() -> None:
+    """Epochs that scatter by more than they claim: those outside of their own sigmas, drawn red, are named in both."""
+    from survey.batch.record import Number
+
+    rng = np.random.default_rng(5)
+    made = tuple(Record(f"n{i:02d}", "done", summary={}, numbers=(Number("point/P/x", "mm", x, 1.0),))
+                 for i, x in enumerate(rng.normal(0.0, 2.5, 14)))  # fmt: skip
+    found = trends_of(made)
+    (c,) = found.charts
+    outside = [f"n{i:02d}" for i in np.flatnonzero(c.outside)]
+    assert len(outside) >= 2
+    assert not c.outside_scatter[c.outside].all()
+    (line,) = trend_lines(found, made)[1:]
+    page = overview_html(made, found, Path("."))
+    row = page[page.index("outside:") :].split("</td>")[0]
+    assert re.findall(r"n\d\d", line[line.index("outside:") :].split(";")[0]) == outside[:5]
+    assert re.findall(r"n\d\d", row) == outside[:5]
 
 
 def test_the_drift_of_the_principal_point_is_found_in_the_right_place(records: tuple[Record, ...]) -> None:

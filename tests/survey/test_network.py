@@ -32,8 +32,8 @@ from survey.cli import main
 from survey.project import read, write_project
 from survey.project.merging import merge
 from survey.solution.dictionary import RunInfo, solution_dict
-from survey.solution.loops import loops_after, loops_dict, pair_loops
-from survey.solution.pair_network import network_dict, pair_network
+from survey.solution.network.counts import network_dict, pair_network
+from survey.solution.network.loops import loops_after, loops_dict, pair_loops
 from survey.solution.quantities import ARCSEC_PER_RAD, scale_of
 
 HELD = PoseParameter(Pose3(), "held")

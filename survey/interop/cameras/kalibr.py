@@ -118,7 +118,7 @@ def read_target(root: Entry) -> TargetKind:
         spacing = _length(root, "spacingMeters")
         shifted = "asymmetricGrid" in root and root.get("asymmetricGrid").text.lower() in ("1", "true", "yes")
         x = [(2 * c + r % 2, r) if shifted else (c, r) for r in range(rows) for c in range(columns)]
-        ids = tuple(f"r{r}c{c}" for r in range(rows) for c in range(columns))
+        ids, _ = Checkerboard(columns, rows, 1.0).points()
         return PointList(ids, spacing * np.column_stack([np.array(x, dtype=float), np.zeros(len(x))]))
     raise name.error(f"found {name.text!r}; checkerboard, aprilgrid and circlegrid are read")
 

@@ -13,6 +13,7 @@ from adjust.model.errors import listed
 from adjust.model.observations import Reading, ReadingKind
 from adjust.model.survey import Bearings, FloatArray, Survey
 from survey.interop.networks.foreign import MM
+from survey.interop.networks.values import ends_of
 from survey.project.tables.terrestrial import ANGLES
 
 _MOST_NAMED = 6
@@ -79,7 +80,7 @@ def absolute_terms(
     found: dict[str, float] = {}
     sets: dict[str, list[tuple[str, float, float]]] = {}
     for r in readings:
-        ends = [x.get(e.point_id or "") for e in (r.at, r.to, *([r.second] if r.second else []))]
+        ends = [x.get(e.point_id or "") for e in ends_of(r)]
         if any(e is None for e in ends):
             continue
         at, to, *second = (e for e in ends if e is not None)

@@ -19,6 +19,7 @@ from adjust.model.observations import (
 from adjust.model.survey import Bearings, Datum, FloatArray, Point, PointParameter, Setup, Survey
 from survey.folder.text import suggestion
 from survey.interop.networks.foreign import Where, check_cov
+from survey.interop.networks.values import ends_of
 
 AXES = "xyz"
 _NEEDS: Mapping[ReadingKind, str] = {
@@ -220,8 +221,7 @@ class NetworkDraft:
 
 
 def _ends(reading: Reading) -> list[str]:
-    ends = (reading.at, reading.to, *([reading.second] if reading.second else []))
-    return [e.point_id or "" for e in ends]
+    return [e.point_id or "" for e in ends_of(reading)]
 
 
 def _refs(ids: Sequence[str]) -> tuple[PositionRef, ...]:

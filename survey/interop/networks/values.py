@@ -45,8 +45,12 @@ def point_of(position: PositionRef) -> str | None:
 
 def between_points(reading: Reading) -> bool:
     """Whether all ends of a reading are world points."""
-    ends = (reading.at, reading.to, *([reading.second] if reading.second else []))
-    return all(point_of(e) is not None for e in ends)
+    return all(point_of(e) is not None for e in ends_of(reading))
+
+
+def ends_of(reading: Reading) -> list[PositionRef]:
+    """Where a reading stands, and what it sights."""
+    return [e for e in (reading.at, reading.to, reading.second) if e is not None]
 
 
 def readings_of(survey: Survey) -> list[Reading]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from adjust.model.errors import SurveyError
 from adjust.native.parallel import Beside
 from survey.folder.replacing import changing, replace_parts
-from survey.jobs.detecting.job import detect_in, detect_job, remember_images
+from survey.jobs.detecting.job import detect_job, remember_images
 from survey.project import read
 from survey.project.project import RESULTS
 from survey.project.tables.files import Begun
@@ -44,10 +44,8 @@ def adjust_job(
 
         def detected() -> None:
             with clock.step("detect"):
-                if out is None:
-                    detect_in(folder, place, jobs=None, pictures=False, progress=progress, everything=redetect)
-                else:
-                    detect_job(folder, progress=progress, everything=redetect)
+                here = place if out is None else None
+                detect_job(folder, progress=progress, everything=redetect, place=here)
 
         with clock.step("read"), Beside() as loading:
             loaded = loading.of(_load if ahead else lambda: None)

@@ -17,7 +17,7 @@ from adjust.published import ComparedPose, compare_head
 from adjust.published.relay import PaperOptions, PaperSolution, adjusted_covariances, euler_covariances, paper_iteration
 from adjust.relay.network import network_from_pairs
 from survey.folder.plain import plain
-from survey.solution.pairs import pairs_dict
+from survey.solution.network.pairs import pairs_dict
 from survey.solution.quantities import ARCSEC_PER_RAD, Scale, sigmas_in
 
 MOST_PAIRS = 400  # its equations are dense: 3 corrections a pair, 9 equations a loop

@@ -7,6 +7,7 @@ person decided about a row that is replaced (``used = false``) goes into ``obser
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -49,22 +50,6 @@ def _without_folder(folder: Path, texts: Mapping[str, str]) -> dict[str, str]:
     return {name: text.removeprefix(f"{folder}/") for name, text in texts.items()}
 
 
-def detect_job(
-    folder: Path, *, jobs: int | None = None, pictures: bool = False, progress: bool = True, everything: bool = False,
-    told: "Callable[[ImageReport], None] | None" = None,
-) -> DetectOutcome:  # fmt: skip
-    """Find targets and spots in the images of a project that are new or have changed, and write their tables.
-
-    everything: in the others too, but for rows that people have changed since. pictures: also write the images that are
-    looked at, with what was found. told: called with what became of each image, as it
-    comes. Raises SurveyError where there is nothing to look at or to look for.
-    """
-    with changing(folder) as place:
-        return detect_in(
-            Path(folder), place, jobs=jobs, pictures=pictures, progress=progress, everything=everything, told=told
-        )
-
-
 @dataclass(eq=False)
 class _State:
     """A project before detection: its definition, tables as text, and what is known of its images."""
@@ -102,44 +87,47 @@ def _state(folder: Path) -> _State:
     return _State(definition, sought, points, spots, known, news)
 
 
-def detect_in(
-    folder: Path, place: Path, *, jobs: int | None, pictures: bool, progress: bool, everything: bool,
-    told: "Callable[[ImageReport], None] | None" = None,
+def detect_job(
+    folder: Path, *, jobs: int | None = None, pictures: bool = False, progress: bool = True, everything: bool = False,
+    told: "Callable[[ImageReport], None] | None" = None, place: Path | None = None,
 ) -> DetectOutcome:  # fmt: skip
-    """:func:`detect_job` for who is changing the folder already; ``place`` is where what is new is made."""
+    """Find targets and spots in the images of a project that are new or have changed, and write their tables.
+
+    everything: in the others too, but for rows that people have changed since. pictures: also write the images that are
+    looked at, with what was found. told: called with what became of each image, as it comes. place: where what is new
+    is made, of who is changing the folder already. Raises SurveyError where there is nothing to look at or for.
+    """
     from survey.detection import DetectionTask, SpotOptions, detect_images
 
-    state = _state(folder)
-    _require_something(folder, state)
-    wanted = _wanted(state, everything)
-    tasks = [
-        DetectionTask(state.definition.images[key], *key, dict(one.targets),
-                      None if one.spots_px is None else SpotOptions(diameter_px=one.spots_px))
-        for key in wanted for one in [state.sought[key]]
-    ]  # fmt: skip
-    files = {key: state.file(key) for key in wanted}
-    dropped = _without_image(state, files, everything)
-    reports = detect_images(tasks, jobs, progress, place / PICTURES if pictures else None, told)
-    blocks, spots = _blocks(state.definition, reports)
-    kept = {*state.points.images, *state.spots.images} - set(wanted) - dropped
-    wrong, bad = wrong_sizes(folder, state.definition, reports), defects(reports)
-    if not blocks and not spots and not kept:
-        if wrong:
-            raise SurveyError("\n".join(wrong.values()))
-        each = (*defect_warnings(bad), *(f"{r.path}: {r.message}" for r in reports[:10]))
-        lines = "\n".join(f"  {line}" for line in each)
-        raise SurveyError(f"{folder}: no target and no spot was found in {len(reports)} images:\n{lines}")
-    names = _write(folder, place, state, wanted, dropped, blocks, spots)
-    now = _known_now(state, files, reports, _without_folder(folder, wrong), bad)
-    known = {key: entry for key, entry in now.items() if key not in dropped}
-    atomic_write(place / OBSERVATIONS_FOLDER / DETECTED_FILE, detected_text(known))
-    replace_parts(folder, gone=[name.with_suffix(".parquet").as_posix() for name in names])
-    gone = [key for key in state.news.gone if key not in dropped]
-    if gone:
-        state.notes.append(f"gone, their points are used as before: {named(gone)}")
-    same = len([key for key in state.definition.images if key not in files])
-    paths, said = tuple(folder / n for n in names), defect_warnings(bad)
-    return DetectOutcome(folder, tuple(reports), paths, same, tuple(state.notes), wrong, said)
+    folder = Path(folder)
+    with changing(folder) if place is None else nullcontext(place) as made:
+        state = _state(folder)
+        _require_something(folder, state)
+        wanted = _wanted(state, everything)
+        tasks = [
+            DetectionTask(state.definition.images[key], *key, dict(one.targets),
+                          None if one.spots_px is None else SpotOptions(diameter_px=one.spots_px))
+            for key in wanted for one in [state.sought[key]]
+        ]  # fmt: skip
+        files = {key: state.file(key) for key in wanted}
+        dropped = _without_image(state, files, everything)
+        reports = detect_images(tasks, jobs, progress, made / PICTURES if pictures else None, told)
+        blocks, spots = _blocks(state.definition, reports)
+        kept = {*state.points.images, *state.spots.images} - set(wanted) - dropped
+        wrong, bad = wrong_sizes(folder, state.definition, reports), defects(reports)
+        if not blocks and not spots and not kept:
+            raise _nothing_found(folder, reports, wrong, bad)
+        names = _write(folder, made, state, wanted, dropped, blocks, spots)
+        now = _known_now(state, files, reports, _without_folder(folder, wrong), bad)
+        known = {key: entry for key, entry in now.items() if key not in dropped}
+        atomic_write(made / OBSERVATIONS_FOLDER / DETECTED_FILE, detected_text(known))
+        replace_parts(folder, gone=[name.with_suffix(".parquet").as_posix() for name in names])
+        gone = [key for key in state.news.gone if key not in dropped]
+        if gone:
+            state.notes.append(f"gone, their points are used as before: {named(gone)}")
+        same = len([key for key in state.definition.images if key not in files])
+        paths, said = tuple(folder / n for n in names), defect_warnings(bad)
+        return DetectOutcome(folder, tuple(reports), paths, same, tuple(state.notes), wrong, said)
 
 
 def _require_something(folder: Path, state: _State) -> None:
@@ -150,6 +138,15 @@ def _require_something(folder: Path, state: _State) -> None:
             f"{folder}/survey.toml: nothing to look for; name a target that can be detected (checkerboard, charuco, "
             "marker_grid, marker_block) or a table [spots]"
         )
+
+
+def _nothing_found(
+    folder: Path, reports: "Sequence[ImageReport]", wrong: Mapping[str, str], bad: Mapping[ImageKey, str]
+) -> SurveyError:
+    each = (*defect_warnings(bad), *(f"{r.path}: {r.message}" for r in reports[:10]))
+    lines = "\n".join(f"  {line}" for line in each)
+    said = f"{folder}: no target and no spot was found in {len(reports)} images:\n{lines}"
+    return SurveyError("\n".join(wrong.values()) if wrong else said)
 
 
 def _wanted(state: _State, everything: bool) -> list[ImageKey]:

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -10,28 +10,23 @@ from pathlib import Path
 from survey.folder.text import csv_rows, csv_text, read_text
 from survey.project.detected import ImageKey
 from survey.project.tables.files import cells_of, read_table
-from survey.project.tables.reading import Columns, Layout
+from survey.project.tables.reading import FLAGS, Columns, Layout
 
 _FALSE = ("false", "0")
 
 
 @dataclass(frozen=True, eq=False)
 class RowTable:
-    """Rows of a table. header: its columns in their order; rows: their cells."""
+    """Rows of a table. header: its columns in their order; rows: their cells by column."""
 
     layout: Layout
     header: tuple[str, ...]
-    rows: tuple[Sequence[object], ...] = ()
-
-    def _column(self, name: str) -> list[str]:
-        i = self.header.index(name) if name in self.header else -1
-        return [str(row[i]) for row in self.rows] if i >= 0 else [""] * len(self.rows)
+    rows: tuple[Mapping[str, object], ...] = ()
 
     @cached_property
     def _keys(self) -> list[tuple[ImageKey, str]]:
         """Image and target of every row."""
-        columns = (self._column(name) for name in ("camera_id", "epoch_id", "target_id"))
-        return [((camera, epoch), target) for camera, epoch, target in zip(*columns, strict=True)]
+        return [((camera, epoch), target) for camera, epoch, target, _ in self.points()]
 
     @cached_property
     def images(self) -> Counter[ImageKey]:
@@ -39,9 +34,9 @@ class RowTable:
         return Counter(key for key, _ in self._keys)
 
     @cached_property
-    def _by_image(self) -> dict[ImageKey, list[int]]:
-        found: dict[ImageKey, list[int]] = {}
-        for row, (key, _) in enumerate(self._keys):
+    def _by_image(self) -> dict[ImageKey, list[Mapping[str, object]]]:
+        found: dict[ImageKey, list[Mapping[str, object]]] = {}
+        for row, (key, _) in zip(self.rows, self._keys, strict=True):
             found.setdefault(key, []).append(row)
         return found
 
@@ -50,13 +45,8 @@ class RowTable:
         rows = self._by_image.get(key, [])
         if not rows:
             return ""
-        places = [self.header.index(name) if name in self.header else -1 for name in self.layout.columns
-                  if name not in ("group", "used")]  # fmt: skip
-        numbers = [not self.layout.is_text(n) for n in self.layout.columns if n not in ("group", "used")]
-        said = sorted(
-            repr([_canonical("" if i < 0 else self.rows[row][i], number)
-                  for i, number in zip(places, numbers, strict=True)]) for row in rows
-        )  # fmt: skip
+        names = [(n, not self.layout.is_text(n)) for n in self.layout.columns if n not in FLAGS]
+        said = sorted(repr([_canonical(row.get(name, ""), number) for name, number in names]) for row in rows)
         return hashlib.sha256("\n".join(said).encode()).hexdigest()
 
     def taken(self, wanted: Callable[[ImageKey, str], bool]) -> "RowTable":
@@ -72,40 +62,29 @@ class RowTable:
         """With the rows of another table behind its own; that one's header where this one has no rows."""
         if not self.rows:
             return more
-        header = (*self.header, *(name for name in more.header if name not in self.header))
-        return replace(self, header=header, rows=(*_in_order(self, header), *_in_order(more, header)))
+        return replace(self, header=tuple(dict.fromkeys((*self.header, *more.header))), rows=(*self.rows, *more.rows))
 
     def with_cells_of(self, other: "RowTable", column: str) -> "RowTable":
         """With the cells of a column that ``other`` has for the same points."""
-        said = {key: cell for key, cell in zip(other.points(), other._column(column), strict=True) if cell}
-        cells = [said.get(key, "") for key in self.points()]
-        if not any(cells):
-            return self
-        old = [name for name in self.header if name != column]
-        rows = _in_order(self, old)
-        return replace(self, header=(*old, column), rows=tuple((*r, c) for r, c in zip(rows, cells, strict=True)))
+        said = {key: cell for key, row in zip(other.points(), other.rows, strict=True) if (cell := row.get(column))}
+        rows = tuple({**row, column: said.get(key, "")} for key, row in zip(self.points(), self.rows, strict=True))
+        header = (*(name for name in self.header if name != column), column)
+        return replace(self, header=header, rows=rows) if any(row[column] for row in rows) else self
 
-    def points(self) -> list[tuple[str, ...]]:
+    def points(self) -> list[tuple[str, str, str, str]]:
         """Camera, epoch, target and point of every row."""
         point = "point_id" if "point_id" in self.layout.ids else "spot_id"
-        return list(zip(*(self._column(n) for n in ("camera_id", "epoch_id", "target_id", point)), strict=True))
+        return [(str(r["camera_id"]), str(r["epoch_id"]), str(r.get("target_id", "")), str(r[point]))
+                for r in self.rows]  # fmt: skip
 
-    def marked_unused(self) -> list[tuple[str, ...]]:
+    def marked_unused(self) -> list[tuple[str, str, str, str]]:
         """Points of the rows that are marked ``used = false``."""
-        marks = self._column("used")
-        return [key for key, used in zip(self.points(), marks, strict=True) if used.strip().lower() in _FALSE]
+        return [key for key, row in zip(self.points(), self.rows, strict=True)
+                if str(row.get("used", "")).strip().lower() in _FALSE]  # fmt: skip
 
     def text(self) -> str:
         """The table as CSV."""
-        return csv_text([self.header, *self.rows])
-
-
-def _in_order(table: RowTable, header: Sequence[str]) -> list[Sequence[object]]:
-    if tuple(header) == table.header:
-        return list(table.rows)
-    at = {name: i for i, name in enumerate(table.header)}
-    order = [at.get(name) for name in header]
-    return [["" if i is None else row[i] for i in order] for row in table.rows]
+        return csv_text([self.header, *([row.get(name, "") for name in self.header] for row in self.rows)])
 
 
 def _canonical(cell: object, number: bool) -> str:
@@ -125,7 +104,7 @@ def read_rows(folder: Path, layout: Layout) -> RowTable:
     if csv_path.is_file():
         read_table(csv_path, layout)  # its faults, with their lines
         header, *rows = (cells for _, cells in csv_rows(csv_path, read_text(csv_path)))
-        return RowTable(layout, tuple(header), tuple(rows))
+        return RowTable(layout, tuple(header), tuple(dict(zip(header, cells, strict=True)) for cells in rows))
     if parquet.is_file():
         table = read_table(parquet, layout)
         columns: Columns = {**table.text_columns, **table.number_columns}
@@ -135,4 +114,5 @@ def read_rows(folder: Path, layout: Layout) -> RowTable:
 
 def rows_of(layout: Layout, columns: Columns) -> RowTable:
     """The rows of ready columns."""
-    return RowTable(layout, tuple(columns), tuple(zip(*map(cells_of, columns.values()), strict=True)))
+    rows = zip(*map(cells_of, columns.values()), strict=True)
+    return RowTable(layout, tuple(columns), tuple(dict(zip(columns, cells, strict=True)) for cells in rows))

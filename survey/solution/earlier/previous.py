@@ -1,7 +1,8 @@
 """What an earlier adjustment of a project left in its results: values to start from, and sigmas to compare with."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,11 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.spatial.averaging import mean_pose
 from survey.folder.locking import settled
+from survey.folder.plain import differing
 from survey.folder.shapes import POSITIVE, WHOLE, Either, misfit
 from survey.folder.text import NOT_OURS, read_bytes
 from survey.project import Project
-from survey.project.project import RESULTS
+from survey.project.project import OBSERVATIONS_FOLDER, RESULTS
 from survey.solution.covariances import read_estimates
 from survey.solution.earlier.changes import Snapshot
 from survey.solution.quantities import ARCSEC_PER_RAD, SigmaKind, sigmas_in
@@ -72,13 +74,31 @@ def _sigma0(summary: Mapping[str, Any]) -> str:
 
 def read_previous(project: Project) -> Snapshot:
     """The results of a project. Raises SurveyError where it was not adjusted, or has changed since."""
-    with settled(project.folder):
-        return _read_previous(project)
+    return previous_solution(project.folder, project.inputs)
 
 
-def _read_previous(project: Project) -> Snapshot:
-    path = project.folder / RESULTS / "solution.json"
-    again = f"run 'labsurvey adjust {project.folder}' first"
+def previous_solution(folder: Path, inputs: Mapping[str, str] | None = None) -> Snapshot:
+    """The results in a folder; inputs: hashes of what was read, None: of the files as they are. Raises SurveyError."""
+    with settled(folder):
+        return _previous_solution(folder, inputs)
+
+
+def input_hashes(folder: Path, names: Iterable[str]) -> dict[str, str]:
+    """By its path, sha256 of every file of these that is there, and of every table. Raises SurveyError."""
+    there = {name for name in names if (folder / name).is_file()}
+    return {name: read_bytes(folder / name)[1] for name in sorted({*there, *tables_in(folder)})}
+
+
+def tables_in(folder: Path) -> set[str]:
+    """Paths of the tables of observations that a reader of the folder would take."""
+    place = folder / OBSERVATIONS_FOLDER
+    return {p.relative_to(folder).as_posix() for p in (place.iterdir() if place.is_dir() else ())
+            if p.suffix in (".csv", ".parquet") and not p.name.startswith(".")}  # fmt: skip
+
+
+def _previous_solution(folder: Path, inputs: Mapping[str, str] | None) -> Snapshot:
+    path = folder / RESULTS / "solution.json"
+    again = f"run 'labsurvey adjust {folder}' first"
     archive = path.with_name("covariance.npz")
     for file in (path, archive):
         if not file.is_file():
@@ -91,9 +111,10 @@ def _read_previous(project: Project) -> Snapshot:
         hashes = {str(name): str(digest) for name, digest in found["inputs"]["hashes"].items()}
     except NOT_OURS as error:
         raise SurveyError(f"{path}: cannot be read as a solution ({error}); {again}") from error
-    changed = sorted(k for k in {*hashes, *project.inputs} if hashes.get(k) != project.inputs.get(k))
+    now = input_hashes(folder, hashes) if inputs is None else inputs
+    changed = differing(hashes, now)
     if changed:
-        raise SurveyError(f"{project.folder}: {', '.join(changed)} changed since the project was adjusted; {again}")
+        raise SurveyError(f"{folder}: {', '.join(changed)} changed since the project was adjusted; {again}")
     return previous
 
 

@@ -74,24 +74,25 @@ class Folder:
         """
         from survey.jobs.starting import start_project
 
-        self._require_writable()
+        self.require_writable()
         if not str(folder).strip():
             raise SurveyError("name the folder of the new project; it is made beside this one")
-        outcome = start_project(self._other(images), self.folder.resolve().parent / Path(folder).expanduser())
+        outcome = start_project(self.other_folder(images), self.folder.resolve().parent / Path(folder).expanduser())
         return Told(outcome.text(), outcome.summary())
 
     def show(self, folder: str | Path) -> Told:
         """Another project folder, for a page that is to show it instead of this one: ``summary["folder"]``."""
-        path = self._other(folder)
+        path = self.other_folder(folder)
         if not (path / DEFINITION_FILE).is_file():
             raise SurveyError(f"{path}: holds no {DEFINITION_FILE}; begin a project with its images")
         return Told(str(path), {"folder": str(path)})
 
-    def _require_writable(self) -> None:
+    def require_writable(self) -> None:
+        """Raise SurveyError where nothing may be written."""
         if self.read_only:
             raise SurveyError(f"{self.folder}: is open for reading only; open it without --read-only to change it")
 
-    def _other(self, folder: str | Path) -> Path:
+    def other_folder(self, folder: str | Path) -> Path:
         """Another project folder; a relative one lies beside this one. Raises SurveyError."""
         path = self.folder.resolve().parent / Path(folder).expanduser()
         if not str(folder).strip() or not path.is_dir():

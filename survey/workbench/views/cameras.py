@@ -23,10 +23,10 @@ from survey.folder.plain import plain
 from survey.folder.text import suggestion
 from survey.solution.earlier.changes import Snapshot
 from survey.solution.earlier.runs import load_run
-from survey.workbench.jobs import Jobs
+from survey.workbench.resident import Resident
 
 
-def camera_of(bench: Jobs, camera_id: str) -> Camera:
+def camera_of(bench: Resident, camera_id: str) -> Camera:
     """A camera by its name. Raises SurveyError."""
     cameras = bench.adjustment.survey.cameras_by_id
     if camera_id not in cameras:
@@ -34,7 +34,7 @@ def camera_of(bench: Jobs, camera_id: str) -> Camera:
     return cameras[camera_id]
 
 
-def camera_view(bench: Jobs, camera_id: str, distance: float = np.inf) -> dict[str, Any]:
+def camera_view(bench: Resident, camera_id: str, distance: float = np.inf) -> dict[str, Any]:
     """Residual field, coverage, distortion and uncertainty of a camera; distance: m, of the point that is seen.
 
     cells: over the image, in rows: number of points in use, mean residual (px), rms (px). distortion: pixels without
@@ -65,7 +65,7 @@ def camera_view(bench: Jobs, camera_id: str, distance: float = np.inf) -> dict[s
     }))  # fmt: skip
 
 
-def _in_use(bench: Jobs, camera_id: str) -> tuple[FloatArray, FloatArray]:
+def _in_use(bench: Resident, camera_id: str) -> tuple[FloatArray, FloatArray]:
     rows = bench.rows
     blocks = [(i, b) for i, b in enumerate(rows.survey.image_blocks) if b.camera_id == camera_id]
     parts = [(b.uv[u], rows.residuals[rows.ptr[i] : rows.ptr[i + 1]][u]) for i, b in blocks
@@ -90,7 +90,7 @@ def _undistorted(lens: Optics, uv: FloatArray) -> FloatArray:
     return np.asarray(centre + focal * away[:, :2] / away[:, 2:])
 
 
-def _uncertainty(bench: Jobs, camera: Camera, lens: Optics, uv: FloatArray, distance: float) -> dict[str, Any]:
+def _uncertainty(bench: Resident, camera: Camera, lens: Optics, uv: FloatArray, distance: float) -> dict[str, Any]:
     names: list[ParameterName] = [("lens", camera.camera_id), ("station_from_camera", camera.camera_id)]
     estimates, factor = bench.adjustment.estimates, bench.scale.factor
     free = np.array([s in ("free", "prior") for s in estimates[names[0]].status])
@@ -107,7 +107,7 @@ def _uncertainty(bench: Jobs, camera: Camera, lens: Optics, uv: FloatArray, dist
 
 
 def lens_change(
-    bench: Jobs, camera_id: str, before: int | None = None, other: str = "", distance: float = np.inf
+    bench: Resident, camera_id: str, before: int | None = None, other: str = "", distance: float = np.inf
 ) -> dict[str, Any]:
     """The lens of a camera against that of a run (``before``), or of another camera of the same image size.
 

@@ -8,8 +8,9 @@ import numpy as np
 from survey.folder.plain import attributes, plain
 from survey.report.anchors import ANCHORED, anchor, anchors_in
 from survey.report.language import message
-from survey.workbench.jobs import Jobs
+from survey.workbench.resident import Resident
 from survey.workbench.rows import BY_THIS_RUN, IN_USE
+from survey.workbench.situation import in_complex
 from survey.workbench.views.project import in_words, limits, readings, warnings_of
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ _MOST_FITTING = 20
 _CAUSE = "probable cause: "
 
 
-def findings(bench: Jobs) -> dict[str, Any]:
+def findings(bench: Resident) -> dict[str, Any]:
     """The verdict, warnings, and what is suspect or was left out by this run, worst first, each with its remedies.
 
     remedies: what the diagnosis says would mend it; also of a survey that cannot be adjusted, of which nothing else is
@@ -35,7 +36,7 @@ def findings(bench: Jobs) -> dict[str, Any]:
     return dict(plain({"version": bench.version, **known, "remedies": remedies(bench)}))
 
 
-def remedies(bench: Jobs) -> list[dict[str, Any]]:
+def remedies(bench: Resident) -> list[dict[str, Any]]:
     """The candidates of the diagnosis, the best first: cause, change, evidence, and whether a program can do it."""
     out = []
     for number, candidate in enumerate(bench.remedies, start=1):
@@ -53,7 +54,7 @@ def _anchor_of(place: "Place") -> str | None:
     return anchor(place.kind, "/".join(place.ids)) if place.kind in ANCHORED and place.ids else None
 
 
-def _of_solution(bench: Jobs, summary: Mapping[str, Any]) -> dict[str, Any]:
+def _of_solution(bench: Resident, summary: Mapping[str, Any]) -> dict[str, Any]:
     (image_limit, limit), warnings = limits(bench), warnings_of(bench)
     found = [*_of_points(bench, image_limit), *_of_readings(bench, limit)]
     worst = sorted(found, key=lambda f: -(f["share"] or 0.0))
@@ -74,7 +75,7 @@ def _said(text: str) -> dict[str, Any]:
     return {"text": message(text), "anchors": anchors_in(text)}
 
 
-def _of_points(bench: Jobs, limit: float) -> Iterable[dict[str, Any]]:
+def _of_points(bench: Resident, limit: float) -> Iterable[dict[str, Any]]:
     rows = bench.rows
     test = np.where((rows.why == IN_USE) | (rows.why == BY_THIS_RUN), np.nan_to_num(rows.test, nan=-1.0), -1.0)
     most = min(_MOST_FINDINGS + _MOST_FITTING, len(test))
@@ -90,13 +91,27 @@ def _of_points(bench: Jobs, limit: float) -> Iterable[dict[str, Any]]:
             }  # fmt: skip
 
 
-def _exclude(bench: Jobs, name: str, row: int | None = None) -> dict[str, Any]:
+def _exclude(bench: Resident, name: str, row: int | None = None) -> dict[str, Any]:
     if row is not None and row >= sum(len(b.uv) for b in bench.situation.everything.survey.image_blocks):
-        name = bench.spot_name(row)
+        name = _spot_name(bench, row)
     return {"label": f"exclude {name}", "changes": [{"name": name, "excluded": True}]}
 
 
-def _of_readings(bench: Jobs, limit: float) -> Iterable[dict[str, Any]]:
+def _spot_name(bench: Resident, row: int) -> str:
+    """The name under which a spot that has got a name is left out, by its row; raises IndexError for others."""
+    at, there = row, bench.situation.everything
+    at -= sum(len(b.uv) for b in there.survey.image_blocks)
+    for block in bench.situation.identified:
+        if 0 <= at < len(block.uv):
+            place, z = (block.camera_id, block.epoch_id), complex(*block.uv[at].tolist())
+            return next(f"spot:{'/'.join(place)}/{name}" for s in there.spots for name, spot in
+                        zip(s.spot_ids, in_complex(s.uv), strict=True)
+                        if (s.camera_id, s.epoch_id) == place and spot == z)  # fmt: skip
+        at -= len(block.uv)
+    raise IndexError(row)
+
+
+def _of_readings(bench: Resident, limit: float) -> Iterable[dict[str, Any]]:
     for row in readings(bench)["rows"]:
         if row["w"] is not None and row["why"] in (IN_USE, BY_THIS_RUN):
             yield {
@@ -107,7 +122,7 @@ def _of_readings(bench: Jobs, limit: float) -> Iterable[dict[str, Any]]:
             }  # fmt: skip
 
 
-def _of_images(bench: Jobs, failing: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _of_images(bench: Resident, failing: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Images of which a fifth of the points or more do not fit: the image is wrong rather than each of them."""
     counts: dict[str, int] = {}
     for f in failing:

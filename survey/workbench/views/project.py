@@ -1,7 +1,7 @@
 """What the views of the workbench show, as plain values: state, findings, parameters, scene, exclusions."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gtsam import Pose3
@@ -23,21 +23,24 @@ from survey.solution.quantities import (
     unit_for_people,
 )
 from survey.solution.verdict import suspects
-from survey.workbench.jobs import Jobs
 from survey.workbench.places import Places, refs_of
+from survey.workbench.resident import Resident
 from survey.workbench.rows import columns, reading_rows
+
+if TYPE_CHECKING:
+    from survey.solution.dictionary import RunInfo
 
 _MOST_LOOPS = 1000
 
 
-def limits(bench: Jobs) -> tuple[float, float]:
+def limits(bench: Resident) -> tuple[float, float]:
     """Of ``|w|`` of image points (square root of the chi-square test's) and of other observations."""
     adjustment = bench.situation.adjustment
     found = bench.kept if adjustment is None else suspects(adjustment)
     return (1.0, 1.0) if found is None else (float(np.sqrt(found.image_limit)), found.w_limit)
 
 
-def state(bench: Jobs) -> dict[str, Any]:
+def state(bench: Resident) -> dict[str, Any]:
     """What there is, how it stands, and what can be done; the tree of names among it."""
     now = bench.situation
     solved, empty = now.adjustment, now.everything.is_empty
@@ -67,13 +70,13 @@ def in_words(summary: Mapping[str, Any]) -> dict[str, Any]:
     return {**summary, "reason": message(str(summary["reason"]))}
 
 
-def warnings_of(bench: Jobs) -> Sequence[str]:
+def warnings_of(bench: Resident) -> Sequence[str]:
     """Of the solution, or of the results until there is one."""
     found = bench.situation.judgement or bench.kept
     return () if found is None else found.warnings
 
 
-def _tree(bench: Jobs) -> dict[str, Any]:
+def _tree(bench: Resident) -> dict[str, Any]:
     survey, project = bench.situation.survey, bench.situation.project
     images: dict[str, list[str]] = {c.camera_id: [] for c in survey.cameras}
     seen = dict.fromkeys([*project.images, *((b.camera_id, b.epoch_id) for b in survey.image_blocks)])
@@ -90,7 +93,7 @@ def _tree(bench: Jobs) -> dict[str, Any]:
 
 
 def points(
-    bench: Jobs, camera: str = "", epoch: str = "", worst: int = 0, known: int | None = None
+    bench: Resident, camera: str = "", epoch: str = "", worst: int = 0, known: int | None = None
 ) -> bytes:
     """Image points as :func:`survey.workbench.rows.columns`: all, those of one image, or the ``worst`` by ``|w|``.
 
@@ -105,7 +108,7 @@ def points(
     return columns(rows, limits(bench)[0], bench.version, chosen, bench.layout, whole)
 
 
-def readings(bench: Jobs) -> dict[str, Any]:
+def readings(bench: Resident) -> dict[str, Any]:
     """All observations that are no image points."""
     now = bench.situation
     limit = limits(bench)[1]
@@ -113,7 +116,7 @@ def readings(bench: Jobs) -> dict[str, Any]:
     return {"version": bench.version, "limit": limit, "rows": rows}
 
 
-def parameters(bench: Jobs) -> dict[str, Any]:
+def parameters(bench: Resident) -> dict[str, Any]:
     """Every component of every parameter: value, sigma and status in the units shown, as columns.
 
     The turns of a pose are Euler angles (deg) with R = Rz Ry Rx, beside the sigma of a small turn about the same axis.
@@ -147,31 +150,38 @@ def _coded(values: Sequence[str]) -> dict[str, list[Any]]:
     return {"texts": list(places), "codes": codes}
 
 
-def runs(bench: Jobs) -> dict[str, Any]:
+def runs(bench: Resident) -> dict[str, Any]:
     """The runs that were kept, the last first."""
     found = [r.as_dict() for r in reversed(list_runs(bench.folder))]
     return {"version": bench.version, "runs": [r | {"summary": in_words(r["summary"])} for r in found]}
 
 
-def scene(bench: Jobs) -> dict[str, Any]:
+def scene(bench: Resident) -> dict[str, Any]:
     """Cameras, targets, tables, points and stations in the world (m), covariances (m^2) as sigmas are given."""
     from survey.report.scene import scene_values
 
     return {"version": bench.version, **scene_values(bench.adjustment, bench.scale)}
 
 
-def loops(bench: Jobs) -> dict[str, Any]:
+def run(bench: Resident) -> "RunInfo":
+    """What was run, for reports."""
+    from survey.jobs.adjusting.outcome import run_info
+
+    return run_info(bench.situation.project, {})
+
+
+def loops(bench: Resident) -> dict[str, Any]:
     """The loops of measured pairs that close worst, and how many there are; None where there are none."""
     from survey.solution.dictionary import solution_dict
 
-    solution = solution_dict(bench.adjustment, bench.run(), None)
+    solution = solution_dict(bench.adjustment, run(bench), None)
     found = solution.get("loops")
     if found is not None:
         found = found | {"worst_first": found["worst_first"][:_MOST_LOOPS]}
     return {"version": bench.version, "loops": found, "network": solution.get("network")}
 
 
-def table_residuals(bench: Jobs) -> dict[str, Any]:
+def table_residuals(bench: Resident) -> dict[str, Any]:
     """Residuals of turntables (arcsec) over the adjusted angles (deg) of all their axes, by table, in use or not."""
     out: dict[str, list[dict[str, Any]]] = {}
     for o in bench.adjustment.other_residuals:
@@ -192,17 +202,17 @@ PARTS = {
 """What statistics there are, by the key of ``solution.json`` that has them; ``solution``: all of it."""
 
 
-def statistics_part(bench: Jobs, part: str) -> dict[str, Any]:
+def statistics_part(bench: Resident, part: str) -> dict[str, Any]:
     """A part of what ``solution.json`` says, one of ``PARTS``; computed when first asked for. Raises SurveyError."""
     from survey.solution.dictionary import solution_dict
 
     if part not in PARTS:
         raise SurveyError(f"there are no statistics {part!r}; {suggestion(part, PARTS)}")
-    solution, key = solution_dict(bench.adjustment, bench.run(), bench.statistics), PARTS[part]
+    solution, key = solution_dict(bench.adjustment, run(bench), bench.statistics), PARTS[part]
     return {"version": bench.version, part: solution if key is None else solution[key]}
 
 
-def network(bench: Jobs) -> dict[str, Any]:
+def network(bench: Resident) -> dict[str, Any]:
     """Every reading that joins places, and the set-ups of instruments.
 
     lines: ``id``, ``table``, ``kind``, ends in the world ``x`` (m), largest ``w`` of its components and ``share`` of

@@ -1,6 +1,6 @@
 """The loops of the measured pairs of a survey one by one: how well they close, before and after the adjustment.
 
-Through what is known without pairs too, as :mod:`survey.solution.pair_network` counts them.
+Through what is known without pairs too, as :mod:`survey.solution.network.counts` counts them.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,7 +17,7 @@ from adjust.relay.closed import play
 from adjust.relay.loops import LoopMisclosures, loop_misclosures
 from adjust.relay.network import MeasuredPairs, topology
 from adjust.spatial.rigid_motions import Motions
-from survey.solution.pair_network import ends_of, links_of, measured_only, tied
+from survey.solution.network.counts import ends_of, links_of, measured_only, tied
 from survey.solution.quantities import ARCSEC_PER_RAD
 
 ALPHA = 0.001
