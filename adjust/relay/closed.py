@@ -22,10 +22,11 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import Closure, FrameRef, Pair
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.survey import FloatArray, PoseParameter, Station, Survey
+from adjust.observations.pair_arrays import whitening
 from adjust.pose_network.cycles import connected_parts
 from adjust.precision.precision import Precision, adjusted_motion, global_test
 from adjust.relay.network import network_from_pairs
-from adjust.relay.result import AdjustedPairs, whitening
+from adjust.relay.result import AdjustedPairs
 
 _OBSERVED = (
     "image_blocks", "distances", "coordinates", "readings", "coordinate_differences", "levels", "alignments",

@@ -19,6 +19,7 @@ import numpy as np
 
 from adjust.model.errors import NotConvergedError
 from adjust.model.survey import FloatArray
+from adjust.observations.pair_arrays import whitening
 from adjust.pose_network.loops import evaluate_loops, loop_vectors
 from adjust.relay.loops import LoopBasis, loop_basis, loop_misclosures
 from adjust.relay.network import MeasuredPairs
@@ -29,7 +30,7 @@ from adjust.relay.normal_equations import (
     condition_matrix,
     joint_covariance,
 )
-from adjust.relay.result import AdjustedPairs, adjusted_pairs, whitening
+from adjust.relay.result import AdjustedPairs, adjusted_pairs
 from adjust.spatial.rigid_motions import Motions, right_jacobian
 
 # side of the dense matrix that the spanning tree's way may need

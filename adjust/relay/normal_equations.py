@@ -17,9 +17,9 @@ from adjust.graph.cliques import Cliques
 from adjust.graph.elimination import Elimination, positive_definite_lu
 from adjust.model.survey import FloatArray, IntArray
 from adjust.observations.factors import Jacobians, custom
+from adjust.observations.pair_arrays import whitening
 from adjust.precision.tree import TreeCovariance
 from adjust.relay.loops import LoopBasis
-from adjust.relay.result import whitening
 
 
 class NormalEquations(Protocol):

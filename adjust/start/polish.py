@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import bsr_array, csc_array, diags_array
+from scipy.sparse import csc_array
 
 from adjust.graph.elimination import positive_definite_lu
 from adjust.model.survey import BoolArray, FloatArray, IntArray
@@ -118,11 +118,22 @@ def _step(
     columns: IntArray, residuals: FloatArray, jacobians: FloatArray, weights: FloatArray, n_moving: int
 ) -> FloatArray:
     """One damped Gauss-Newton step (n_moving, 6)."""
-    inside, root = columns >= 0, np.sqrt(weights)[:, None]
-    blocks, ptr = (root[..., None, None] * jacobians)[inside], np.append(0, np.cumsum(inside.sum(axis=1)))
-    J = bsr_array((blocks, columns[inside], ptr), shape=(residuals.size, 6 * n_moving)).tocsc()
-    normal = J.T @ J
+    size = 6 * n_moving
+    weighted = np.swapaxes(jacobians, 2, 3) * weights[:, None, None, None]
+    right = np.zeros((n_moving, 6))
+    inside = columns >= 0
+    np.add.at(right, columns[inside], (weighted @ residuals[:, None, :, None])[..., 0][inside])
+    blocks, row_idx, column_idx = [], [], []
+    for a in range(columns.shape[1]):
+        for b in range(columns.shape[1]):
+            both = inside[:, a] & inside[:, b]
+            blocks.append((weighted[both, a] @ jacobians[both, b]).ravel())
+            row, column = 6 * columns[both, a], 6 * columns[both, b]
+            row_idx.append((row[:, None, None] + np.arange(6)[:, None] + np.zeros(6, dtype=np.int64)).ravel())
+            column_idx.append((column[:, None, None] + np.zeros((6, 1), dtype=np.int64) + np.arange(6)).ravel())
+    entries = (np.concatenate(blocks), (np.concatenate(row_idx), np.concatenate(column_idx)))
+    normal = csc_array(entries, shape=(size, size))
     diagonal = normal.diagonal()
-    damping = diags_array(_DAMPING * diagonal + 1e-12 * float(diagonal.max()))
-    step = positive_definite_lu(csc_array(normal + damping)).solve(J.T @ (root * residuals).ravel())
-    return np.asarray(-step.reshape(-1, 6))
+    damping = _DAMPING * diagonal + 1e-12 * float(diagonal.max())
+    damped = csc_array(normal + csc_array((damping, (np.arange(size), np.arange(size))), shape=(size, size)))
+    return np.asarray(-positive_definite_lu(damped).solve(right.ravel()).reshape(-1, 6))
