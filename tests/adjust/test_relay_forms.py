@@ -258,6 +258,15 @@ def test_parts_adjust_by_conditions_but_not_as_stations():
         adjust_parametric(network)
 
 
+@pytest.mark.parametrize("dim", [3, 6])
+def test_covariances_where_gtsam_refuses_the_normal_equations(dim, monkeypatch):
+    network = simulate(NETWORKS["chain"], dim, seed=2).network
+    expected = adjust_parametric(network).pairs.cov
+    monkeypatch.setattr("adjust.relay.normal_equations.Elimination.of", lambda *_: None)
+    found = adjust_conditions(network, ConditionOptions(loops="shortest")).pairs.cov
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+
+
 def test_failure_names_the_loop():
     network = simulate(complete(5), 3, seed=0).network
     options = ConditionOptions(max_iterations=1)
