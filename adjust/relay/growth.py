@@ -38,8 +38,8 @@ class Tree:
 
     def update(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, removed: Sequence[int] = ()
-    ) -> tuple[list[int], int]:
-        """Add factors and start values, drop factors by number; numbers of the new ones, variables solved anew."""
+    ) -> list[int]:
+        """Add factors and start values, drop factors by number; numbers of the new ones."""
         old = not self.settled.keys().isdisjoint(graph.keyVector())
         if self.settled and (old or any(n not in self.place for n in removed)):
             self._bring_back(self.isam.calculateEstimate())
@@ -52,15 +52,15 @@ class Tree:
             self.all.remove(n)
         numbers = list(range(first, self.all.size()))
         self.active += new
-        touched = self._into_tree(graph, values, numbers, gone)
+        self._into_tree(graph, values, numbers, gone)
         if len(self.active) > self.limit:
             self._settle()
-        return numbers, touched
+        return numbers
 
     def _into_tree(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, own: Sequence[int], gone: Sequence[int] = ()
-    ) -> int:
-        """Put factors with our own numbers (-1 of what is none of ours) into the tree; how many variables that solved.
+    ) -> None:
+        """Put factors with our own numbers (-1 of what is none of ours) into the tree.
 
         Where Cholesky refuses, everything is eliminated by QR from then on.
         """
@@ -70,10 +70,10 @@ class Tree:
             if self.use_qr or "ndetermin" not in str(error):
                 raise
             self.use_qr = True
-            return self._bring_back(gtsam.Values(self.isam.getLinearizationPoint()))
-        new = zip(own, result.getNewFactorsIndices(), strict=True)
-        self.place |= {n: int(place) for n, place in new if n >= 0}
-        return int(result.getVariablesReeliminated())
+            self._bring_back(gtsam.Values(self.isam.getLinearizationPoint()))
+        else:
+            new = zip(own, result.getNewFactorsIndices(), strict=True)
+            self.place |= {n: int(place) for n, place in new if n >= 0}
 
     def _settle(self) -> None:
         """Eliminate all stations but the latest; not where too many of these are touched by the others."""
@@ -106,7 +106,7 @@ class Tree:
         self.limit = 2 * self.section
         self._into_tree(stay, _chosen(values, self.active), own_numbers)
 
-    def _bring_back(self, values: gtsam.Values) -> int:
+    def _bring_back(self, values: gtsam.Values) -> None:
         """All stations and factors into one tree again; values: of those that are in it."""
         for key, pose in self.settled.items():
             values.insert(key, pose)
@@ -119,7 +119,7 @@ class Tree:
                 own_numbers.append(n)
         self._restart()
         self.limit = max(2 * self.section, 2 * len(self.active))  # not at every turn
-        return self._into_tree(graph, values, own_numbers)
+        self._into_tree(graph, values, own_numbers)
 
     def estimate(self, key: int) -> Pose3:
         """Present value of one pose."""

@@ -39,13 +39,12 @@ class Addition:
     """What an addition did.
 
     new: ``world_from_station`` of the stations added. moved: how far the others went, (rad, m).
-    misfit: v'Pv of every pair added, at the new estimates. touched: stations that were solved anew.
+    misfit: v'Pv of every pair added, at the new estimates.
     """
 
     new: dict[str, Pose3]
     moved: dict[str, tuple[float, float]]
     misfit: dict[str, float]
-    touched: int
 
 
 class NetworkSession:
@@ -137,12 +136,12 @@ class NetworkSession:
                 kept.append(pair)
         self._added += pairs
         self._pair_ids |= {pair.pair_id for pair in pairs}
-        positions, touched = self._growth.update(graph, values)
+        positions = self._growth.update(graph, values)
         self._factor_of |= {pair.pair_id: n for pair, n in zip(kept, positions, strict=True)}
         ends = sorted({self._index[r.frame_id] for p in pairs for r in (p.a, p.b)})
         moved = self._moved(ends, {self._index[s] for s in new})
         misfit = {p.pair_id: self._misfit(p) for p in kept}
-        return Addition({s: self.estimate(s) for s in new}, moved, misfit, touched)
+        return Addition({s: self.estimate(s) for s in new}, moved, misfit)
 
     def _placed(self, pairs: Sequence[Pair]) -> tuple[list[str], dict[str, Pose3]]:
         """New stations in the order found and where the best of their pairs puts them; checks all pairs first."""
