@@ -42,9 +42,7 @@ class PairArrays:
         out = np.zeros((len(self.used), 6, 6))
         for rows, n in ((self.is_pose, 6), (~self.is_pose, 3)):
             if rows.any():
-                info = np.linalg.inv(self.cov[rows][:, :n, :n])
-                W = np.swapaxes(np.linalg.cholesky(0.5 * (info + np.swapaxes(info, 1, 2))), 1, 2)
-                out[np.ix_(rows, np.arange(n), np.arange(n))] = W
+                out[np.ix_(rows, np.arange(n), np.arange(n))] = whitening(self.cov[rows][:, :n, :n])
         return out
 
     @cached_property
@@ -81,6 +79,13 @@ class PairArrays:
     def logs(self) -> FloatArray:
         """Logarithms (E, 6), of rotations the first three components."""
         return self.motions.log()
+
+
+def whitening(cov: FloatArray) -> FloatArray:
+    """Upper triangular W (E, dim, dim) with W'W = cov^-1, as GTSAM's noise models have it."""
+    # a Cholesky of the reversed matrix: cov = U U' with U upper triangular, W = U^-1
+    flipped = np.linalg.cholesky(cov[..., ::-1, ::-1])[..., ::-1, ::-1]
+    return np.linalg.inv(flipped)
 
 
 @lru_cache(2)  # of a survey as it was given, and as it is solved

@@ -22,10 +22,11 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import Closure, FrameRef, Pair
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.survey import FloatArray, PoseParameter, Station, Survey
+from adjust.observations.pair_arrays import whitening
 from adjust.pose_network.cycles import connected_parts
 from adjust.precision.precision import Precision, adjusted_motion, global_test
 from adjust.relay.network import network_from_pairs
-from adjust.relay.result import AdjustedPairs, whitening
+from adjust.relay.result import AdjustedPairs
 
 _OBSERVED = (
     "image_blocks", "distances", "coordinates", "readings", "coordinate_differences", "levels", "alignments",
@@ -222,9 +223,9 @@ def in_condition_form(result: Adjustment) -> Adjustment:
     kinds = {isinstance(p.b_from_a, Rot3) for p in used}
     if len(given) > 1 or len(kinds) != 1:
         return result
-    from adjust.relay.conditions import adjust_loops  # here: what is not solved by conditions goes without
+    from adjust.relay.conditions import adjust_conditions  # here: what is not solved by conditions goes without
 
-    found = adjust_loops(network_from_pairs(used))
+    found = adjust_conditions(network_from_pairs(used))
     pairs, precision = found.pairs, result.precision
     if not len(found.basis) or not isinstance(precision, Precision):
         return result

@@ -1,38 +1,15 @@
-"""Two ways to keep a growing graph solved: a Bayes tree that is updated where it changes, or batch iterations."""
+"""A growing graph of pose factors kept solved: a Bayes tree that is updated where it changes."""
 
 from collections.abc import Sequence
-from typing import Protocol
 
 import gtsam
-import numpy as np
 from gtsam import Pose3
 
-from adjust.graph.elimination import Elimination
-
-_STEPS = 6
 _MOST_TOUCHED = 24
 
 
-class Growth(Protocol):
-    """A graph of pose factors that grows and stays solved."""
-
-    def update(
-        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, removed: Sequence[int] = ()
-    ) -> tuple[list[int], int]:
-        """Add factors and start values, drop factors by number; numbers of the new ones, variables solved anew."""
-
-    def estimate(self, key: int) -> Pose3:
-        """Present value of one pose."""
-
-    def values(self) -> gtsam.Values:
-        """Present values of all poses."""
-
-    def factors(self) -> gtsam.NonlinearFactorGraph:
-        """All factors by number, with gaps where some were dropped."""
-
-
 class Tree:
-    """iSAM2, eliminating by QR, over the latest stations only.
+    """iSAM2 over the latest stations only; by Cholesky until that refuses a weak one (a long corridor), then by QR.
 
     What iSAM2 does at an update costs a little for every station it holds. So when ``2 section`` stations are in the
     tree the older ones are settled: eliminated exactly, and represented by their linear factor on the stations that
@@ -44,7 +21,7 @@ class Tree:
         self.settled: dict[int, Pose3] = {}
         self.active: list[int] = []
         self.all = gtsam.NonlinearFactorGraph()
-        self.limit = 2 * section
+        self.limit, self.use_qr = 2 * section, False
         self._restart()
 
     def _restart(self) -> None:
@@ -52,7 +29,7 @@ class Tree:
         parameters.setRelinearizeThreshold(self.relinearize)
         parameters.relinearizeSkip = 1
         parameters.enablePartialRelinearizationCheck = True  # looks only where the step changed, not at every station
-        parameters.setFactorization("QR")
+        parameters.setFactorization("QR" if self.use_qr else "CHOLESKY")
         inner = gtsam.ISAM2GaussNewtonParams()
         inner.setWildfireThreshold(self.wildfire)
         parameters.setOptimizationParams(inner)
@@ -61,24 +38,42 @@ class Tree:
 
     def update(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, removed: Sequence[int] = ()
-    ) -> tuple[list[int], int]:
-        """See :class:`Growth`."""
+    ) -> list[int]:
+        """Add factors and start values, drop factors by number; numbers of the new ones."""
         old = not self.settled.keys().isdisjoint(graph.keyVector())
         if self.settled and (old or any(n not in self.place for n in removed)):
-            self._bring_back()
+            self._bring_back(self.isam.calculateEstimate())
         first, new = self.all.size(), list(values.keys())
         if not self.all.size():  # a network to begin with may be added to anywhere
             self.limit = max(self.limit, 2 * len(new))
         self.all.push_back(graph)
-        result = self.isam.update(graph, values, [self.place.pop(n) for n in removed])
+        gone = [self.place.pop(n) for n in removed]
         for n in removed:
             self.all.remove(n)
         numbers = list(range(first, self.all.size()))
-        self.place |= dict(zip(numbers, (int(n) for n in result.getNewFactorsIndices()), strict=True))
         self.active += new
+        self._into_tree(graph, values, numbers, gone)
         if len(self.active) > self.limit:
             self._settle()
-        return numbers, int(result.getVariablesReeliminated())
+        return numbers
+
+    def _into_tree(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, own: Sequence[int], gone: Sequence[int] = ()
+    ) -> None:
+        """Put factors with our own numbers (-1 of what is none of ours) into the tree.
+
+        Where Cholesky refuses, everything is eliminated by QR from then on.
+        """
+        try:
+            result = self.isam.update(graph, values, list(gone))
+        except RuntimeError as error:
+            if self.use_qr or "ndetermin" not in str(error):
+                raise
+            self.use_qr = True
+            self._bring_back(gtsam.Values(self.isam.getLinearizationPoint()))
+        else:
+            new = zip(own, result.getNewFactorsIndices(), strict=True)
+            self.place |= {n: int(place) for n, place in new if n >= 0}
 
     def _settle(self) -> None:
         """Eliminate all stations but the latest; not where too many of these are touched by the others."""
@@ -108,13 +103,13 @@ class Tree:
         self.settled |= {k: values.atPose3(k) for k in gone}
         self.active = self.active[-self.section :]
         self._restart()
-        found = self.isam.update(stay, _chosen(values, self.active)).getNewFactorsIndices()
-        self.place = {own: int(n) for own, n in zip(own_numbers, found, strict=True) if own >= 0}
         self.limit = 2 * self.section
+        self._into_tree(stay, _chosen(values, self.active), own_numbers)
 
-    def _bring_back(self) -> None:
-        """All stations and factors into one tree again."""
-        values = self.values()
+    def _bring_back(self, values: gtsam.Values) -> None:
+        """All stations and factors into one tree again; values: of those that are in it."""
+        for key, pose in self.settled.items():
+            values.insert(key, pose)
         self.active = [*self.settled, *self.active]
         self.settled = {}
         graph, own_numbers = gtsam.NonlinearFactorGraph(), []
@@ -123,24 +118,19 @@ class Tree:
                 graph.push_back(self.all.at(n))
                 own_numbers.append(n)
         self._restart()
-        found = self.isam.update(graph, values).getNewFactorsIndices()
-        self.place = {own: int(n) for own, n in zip(own_numbers, found, strict=True)}
         self.limit = max(2 * self.section, 2 * len(self.active))  # not at every turn
+        self._into_tree(graph, values, own_numbers)
 
     def estimate(self, key: int) -> Pose3:
-        """See :class:`Growth`."""
+        """Present value of one pose."""
         return self.settled[key] if key in self.settled else self.isam.calculateEstimatePose3(key)
 
     def values(self) -> gtsam.Values:
-        """See :class:`Growth`."""
+        """Present values of all poses."""
         values = self.isam.calculateEstimate()
         for key, pose in self.settled.items():
             values.insert(key, pose)
         return values
-
-    def factors(self) -> gtsam.NonlinearFactorGraph:
-        """See :class:`Growth`."""
-        return self.all
 
 
 def _chosen(values: gtsam.Values, keys: Sequence[int]) -> gtsam.Values:
@@ -148,59 +138,3 @@ def _chosen(values: gtsam.Values, keys: Sequence[int]) -> gtsam.Values:
     for key in keys:
         out.insert(key, values.atPose3(key))
     return out
-
-
-class Batch:
-    """Gauss-Newton over everything at every addition, from the present values: exact, and cheap on small networks."""
-
-    def __init__(self, small: float) -> None:
-        self.graph, self.present = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        self.small, self.use_qr = small, False
-
-    def update(
-        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, removed: Sequence[int] = ()
-    ) -> tuple[list[int], int]:
-        """See :class:`Growth`."""
-        for n in removed:
-            self.graph.remove(n)
-        first = self.graph.size()
-        self.graph.push_back(graph)
-        self.present.insert(values)
-        ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(self.graph)
-        for _ in range(_STEPS):
-            delta = self._step(ordering)
-            self.present = self.present.retract(delta)
-            if float(np.abs(delta.vector()).max(initial=0.0)) < self.small:
-                break
-        return list(range(first, self.graph.size())), self.present.size()
-
-    def _step(self, ordering: gtsam.Ordering) -> gtsam.VectorValues:
-        linear = self.graph.linearize(self.present)
-        found = Elimination(ordering, self.use_qr).of(linear.optimize)
-        if found is None:
-            self.use_qr = True  # GTSAM's Cholesky refuses pivots of weak networks that QR still resolves
-            found = linear.optimize(ordering, gtsam.EliminateQR)
-        return found
-
-    def estimate(self, key: int) -> Pose3:
-        """See :class:`Growth`."""
-        return self.present.atPose3(key)
-
-    def values(self) -> gtsam.Values:
-        """See :class:`Growth`."""
-        return self.present
-
-    def factors(self) -> gtsam.NonlinearFactorGraph:
-        """See :class:`Growth`."""
-        return self.graph
-
-
-def moved_over(old: Growth, new: Growth) -> dict[int, int]:
-    """Put everything of one into the other, still empty; new number by old number of every factor."""
-    graph, factors, numbers = gtsam.NonlinearFactorGraph(), old.factors(), {}
-    for n in range(factors.size()):
-        if factors.exists(n):
-            numbers[n] = graph.size()
-            graph.push_back(factors.at(n))
-    new.update(graph, old.values())
-    return numbers

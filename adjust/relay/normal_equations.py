@@ -16,10 +16,9 @@ import scipy.sparse as sp
 from adjust.graph.cliques import Cliques
 from adjust.graph.elimination import Elimination, positive_definite_lu
 from adjust.model.survey import FloatArray, IntArray
-from adjust.observations.factors import Jacobians, custom
+from adjust.observations.pair_arrays import whitening
 from adjust.precision.tree import TreeCovariance
 from adjust.relay.loops import LoopBasis
-from adjust.relay.result import whitening
 
 
 class NormalEquations(Protocol):
@@ -50,36 +49,31 @@ class SparseNormals:
 
     def __init__(self, basis: LoopBasis, blocks: FloatArray, Q: FloatArray) -> None:
         self.basis, self.blocks, self.Q = basis, blocks, Q
-        B = condition_matrix(basis, blocks)
-        N = (B @ block_diagonal(Q) @ B.T).tocsc()
-        self.factor = positive_definite_lu(N)
+        self.B = condition_matrix(basis, blocks)
+        self.N = (self.B @ block_diagonal(Q) @ self.B.T).tocsc()
+        self.factor = positive_definite_lu(self.N)
 
     def solve(self, right: FloatArray) -> FloatArray:
         """N^-1 applied to ``right``."""
         return np.asarray(self.factor.solve(right))
 
     def adjusted_covariances(self) -> FloatArray:
-        """One pass over the Bayes tree of the loops' multipliers.
+        """One pass over the Bayes tree of the loops' multipliers; pair by pair where GTSAM refuses weak pivots.
 
-        N is the sum over the pairs of (B_e Q_e^1/2)(...)': a linear factor per pair on the loops through it. These
-        loops share a clique, so the tree's one pass gives all blocks of N^-1 that the covariances ask for.
+        Loops that share a pair share a clique, so the tree's one pass gives all blocks of N^-1 that are asked for.
         """
         dim: int = self.Q.shape[-1]
-        loop = np.repeat(np.arange(len(self.basis)), self.basis.lengths)
-        order = np.argsort(self.basis.pair_idx, kind="stable")
-        pair_ptr = np.searchsorted(self.basis.pair_idx[order], np.arange(self.basis.topology.n_pairs + 1))
-        root = np.swapaxes(np.linalg.cholesky(self.Q), -1, -2)
-        out, graph, members = self.Q.copy(), gtsam.GaussianFactorGraph(), {}
-        for e in range(len(self.Q)):
-            rows = order[pair_ptr[e] : pair_ptr[e + 1]]
-            if len(rows):
-                members[e] = ([int(k) for k in loop[rows]], np.swapaxes(self.blocks[rows], -1, -2))
-                graph.add(_linear_factor(members[e][0], root[e] @ members[e][1], dim))
-        dims = dict.fromkeys(range(len(self.basis)), dim)
-        tree = TreeCovariance(Cliques.of(_eliminate(graph), dims), dims)
-        for e, (keys, transposed) in members.items():
-            G = self.Q[e] @ np.concatenate(list(transposed), axis=1)
-            out[e] -= G @ tree.joint(keys) @ G.T
+        of_pair = self.basis.pair_idx
+        graph, dims = _as_factors(self.N, dim), dict.fromkeys(range(len(self.basis)), dim)
+        found = Elimination(gtsam.Ordering.ColamdGaussianFactorGraph(graph)).of(graph.eliminateMultifrontal)
+        if found is None:
+            return np.array([joint_covariance(self, self.B, self.Q, [e]) for e in range(len(self.Q))])
+        tree, out = TreeCovariance(Cliques.of(found, dims), dims), self.Q.copy()
+        loop, order = np.repeat(np.arange(len(self.basis)), self.basis.lengths), np.argsort(of_pair, kind="stable")
+        for rows in np.split(order, np.flatnonzero(np.diff(of_pair[order])) + 1) if len(order) else ():
+            e = of_pair[rows[0]]
+            G = self.Q[e] @ np.concatenate(list(np.swapaxes(self.blocks[rows], -1, -2)), axis=1)
+            out[e] -= G @ tree.joint(loop[rows].tolist()) @ G.T
         return out
 
 
@@ -138,20 +132,14 @@ def joint_covariance(
     return np.asarray(own - BQ.T @ normals.solve(BQ))
 
 
-def _linear_factor(keys: list[int], blocks: FloatArray, dim: int) -> gtsam.GaussianFactor:
-    """A linear factor on any number of keys; GTSAM's own constructors in Python take three at most."""
-    values = gtsam.Values()
-    for key in keys:
-        values.insert(key, np.zeros(6) if dim == 6 else np.zeros(3))
-
-    def residual(_: gtsam.Values) -> tuple[FloatArray, Jacobians]:
-        return np.zeros(dim), list(zip(keys, blocks, strict=True))
-
-    return custom(keys, np.eye(dim), residual).linearize(values)
-
-
-def _eliminate(graph: gtsam.GaussianFactorGraph) -> gtsam.GaussianBayesTree:
-    order = gtsam.Ordering.ColamdGaussianFactorGraph(graph)
-    found = Elimination(order).of(graph.eliminateMultifrontal)
-    # weak but determined: GTSAM's Cholesky refuses pivots that QR still resolves
-    return graph.eliminateMultifrontal(order, gtsam.EliminateQR) if found is None else found
+def _as_factors(N: sp.csc_array, dim: int) -> gtsam.GaussianFactorGraph:
+    """A normal matrix (n dim, n dim), a factor for each of its blocks on and above the diagonal."""
+    graph, none, zero = gtsam.GaussianFactorGraph(), np.zeros(dim), np.zeros((dim, dim))
+    blocks = N.tobsr(blocksize=(dim, dim))
+    row = np.repeat(np.arange(len(blocks.indptr) - 1), np.diff(blocks.indptr))
+    for i, j, block in zip(row.tolist(), blocks.indices.tolist(), blocks.data, strict=True):
+        if i == j:
+            graph.add(gtsam.HessianFactor(i, block, none, 0.0))
+        elif i < j:
+            graph.add(gtsam.HessianFactor(i, j, zero, block, none, zero, none, 0.0))
+    return graph

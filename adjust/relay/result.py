@@ -7,6 +7,7 @@ import numpy as np
 
 from adjust.model.result import GlobalTest
 from adjust.model.survey import FloatArray, IntArray
+from adjust.observations.pair_arrays import whitening
 from adjust.observations.pairs import pair_tests
 from adjust.precision.precision import global_test
 from adjust.relay.network import MeasuredPairs
@@ -75,10 +76,3 @@ def adjusted_pairs(
         network, b_from_a, v, cov, np.diagonal(Q, axis1=1, axis2=2).copy(), standardized,
         *pair_tests(Q, e, _UNCONTROLLED), float(np.sum(e * e)), redundancy_total, iterations, joint,
     )  # fmt: skip
-
-
-def whitening(cov: FloatArray) -> FloatArray:
-    """Upper triangular W (E, dim, dim) with W'W = cov^-1, as GTSAM's noise models have it."""
-    # a Cholesky of the reversed matrix: cov = U U' with U upper triangular, W = U^-1
-    flipped = np.linalg.cholesky(cov[..., ::-1, ::-1])[..., ::-1, ::-1]
-    return np.linalg.inv(flipped)

@@ -1,9 +1,7 @@
 """A network that grows: stations and pairs added to a solved network, one by one or in groups.
 
-iSAM2 (Kaess et al., IJRR 2012) over native factors, with QR, since its Cholesky refuses long corridors: an addition
-re-eliminates only what it touches, so on corridors the time stays flat however long they are. Where additions keep
-touching a large share of the network (grids, small networks), a batch iteration is cheaper and is used instead.
-:meth:`NetworkSession.finish` ends in the adjustment of all the pairs.
+iSAM2 (Kaess et al., IJRR 2012) over native factors: an addition re-eliminates only what it touches, so on corridors the
+time stays flat however long they are. :meth:`NetworkSession.finish` ends in the adjustment of all the pairs.
 """
 
 from collections.abc import Sequence
@@ -25,7 +23,7 @@ from adjust.observations.pairs import NoiseCache, native_factor
 from adjust.pose_network.from_survey import network_from_survey
 from adjust.pose_network.network import PoseNetwork
 from adjust.pose_network.start import carried
-from adjust.relay.growth import Batch, Growth, Tree, moved_over
+from adjust.relay.growth import Tree
 
 _RELINEARIZE = 1e-3
 """Change (rad, m) from which a station is linearised anew."""
@@ -34,9 +32,6 @@ _WILDFIRE = 1e-5
 _MOVED_RAD, _MOVED_M = 1e-6, 1e-5
 _SECTION = 1000
 """Latest stations that are always kept moving; older ones may rest until :meth:`NetworkSession.finish`."""
-_SHARE, _WINDOW = 0.3, 20
-"""Of the network, that additions may touch, on average over so many, before batch iterations take over."""
-_LEAST = 50  # stations; below it nothing is worth a thought
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,13 +39,12 @@ class Addition:
     """What an addition did.
 
     new: ``world_from_station`` of the stations added. moved: how far the others went, (rad, m).
-    misfit: v'Pv of every pair added, at the new estimates. touched: stations that were solved anew.
+    misfit: v'Pv of every pair added, at the new estimates.
     """
 
     new: dict[str, Pose3]
     moved: dict[str, tuple[float, float]]
     misfit: dict[str, float]
-    touched: int
 
 
 class NetworkSession:
@@ -81,10 +75,8 @@ class NetworkSession:
         poses = [adjusted.estimates["world_from_station", s].value for s in self._ids]
         self._last = {i: p for i, p in enumerate(poses) if isinstance(p, Pose3)}
         self._constant = {i: self._last[i] for i in np.flatnonzero(base.constants).tolist()}
-        self._shares: list[float] = []
-        self._switched_at = 0
         self._factor_of: dict[str, int] = {}
-        self._growth: Growth = Tree(_RELINEARIZE, _WILDFIRE, _SECTION)
+        self._growth = Tree(_RELINEARIZE, _WILDFIRE, _SECTION)
         self._begin(base)
 
     def _begin(self, network: PoseNetwork) -> None:
@@ -144,13 +136,12 @@ class NetworkSession:
                 kept.append(pair)
         self._added += pairs
         self._pair_ids |= {pair.pair_id for pair in pairs}
-        positions, touched = self._growth.update(graph, values)
+        positions = self._growth.update(graph, values)
         self._factor_of |= {pair.pair_id: n for pair, n in zip(kept, positions, strict=True)}
-        self._choose(touched)
         ends = sorted({self._index[r.frame_id] for p in pairs for r in (p.a, p.b)})
         moved = self._moved(ends, {self._index[s] for s in new})
         misfit = {p.pair_id: self._misfit(p) for p in kept}
-        return Addition({s: self.estimate(s) for s in new}, moved, misfit, touched)
+        return Addition({s: self.estimate(s) for s in new}, moved, misfit)
 
     def _placed(self, pairs: Sequence[Pair]) -> tuple[list[str], dict[str, Pose3]]:
         """New stations in the order found and where the best of their pairs puts them; checks all pairs first."""
@@ -213,21 +204,6 @@ class NetworkSession:
         positions = [self._factor_of.pop(p) for p in pair_ids]
         self._growth.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), positions)
         self._removed |= set(pair_ids)
-
-    def _choose(self, touched: int) -> None:
-        """Batch iterations where additions touch so much that these are cheaper; judged again at twice the size."""
-        n = len(self._ids)
-        self._shares = [*self._shares[1 - _WINDOW :], touched / max(1, n)]
-        often = len(self._shares) == _WINDOW and float(np.mean(self._shares)) > _SHARE
-        if isinstance(self._growth, Tree) and often and n >= _LEAST:
-            self._switch(Batch(_WILDFIRE))
-        elif isinstance(self._growth, Batch) and n >= 2 * self._switched_at:
-            self._switch(Tree(_RELINEARIZE, _WILDFIRE, _SECTION))
-
-    def _switch(self, growth: Growth) -> None:
-        table = moved_over(self._growth, growth)
-        self._factor_of = {pair: table[n] for pair, n in self._factor_of.items()}
-        self._growth, self._shares, self._switched_at = growth, [], len(self._ids)
 
     def survey(self) -> Survey:
         """All pairs and the stations that they reach, as they stand."""

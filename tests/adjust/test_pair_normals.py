@@ -12,7 +12,7 @@ from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.cliques import Cliques
 from adjust.graph.elimination import pose_cliques
 from adjust.graph.pair_normals import PairNormals
-from adjust.graph.solver import damped
+from adjust.graph.system import damped
 from adjust.native.elimination import clique_pattern
 from adjust.pose_network.solve import minimize
 from adjust.precision import tree as tree_module

@@ -37,6 +37,17 @@ def test_a_grown_network_equals_its_batch_solution(nx: int, ny: int, group: int)
 
 
 @pytest.mark.slow
+def test_a_long_corridor_goes_on_by_qr_where_cholesky_refuses_it() -> None:
+    sim = simulate(400, 2, seed=3)
+    session = grown(sim, 20)
+    assert session._growth.use_qr
+    assert difference(session.poses(), solve_network(sim.network))[1] < 0.05
+    assert session.uses(sim.network.pair_ids[0])
+    session.remove(sim.network.pair_ids[:1])
+    assert not session.uses(sim.network.pair_ids[0])
+
+
+@pytest.mark.slow
 def test_settled_stations_wake_when_they_are_needed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(session_module, "_SECTION", 30)
     sim = simulate(100, 2, seed=9)

@@ -1,4 +1,8 @@
-"""AX = XB and AX = ZB: what is rigidly fixed to something that moves by known motions."""
+"""AX = XB and AX = ZB: what is rigidly fixed to something that moves by known motions.
+
+Beside OpenCV's calibrateHandEye and calibrateRobotWorldHandEye: wrong poses weigh little, several things are found at
+once, and what one axis leaves open is named or chosen.
+"""
 
 import numpy as np
 

@@ -24,8 +24,9 @@ def pinhole_from_homographies(
     """fx, fy, u0, v0 from homographies (m, 3, 3) of planes, without skew; the richest variant the images determine.
 
     Source: Zhang, PAMI 22(11), 2000, eq. 3-9: h1' B h2 = 0, h1' B h1 = h2' B h2 with B = K^-T K^-1, in pixels shifted
-    to the image centre and scaled. Homographies should come from targets scaled to unit size. Raises SurveyError where
-    not even the focal length is determined (all planes parallel to the image).
+    to the image centre and scaled. Homographies should come from targets scaled to unit size. OpenCV's
+    initCameraMatrix2D holds the principal point in the middle: from views turned about one axis that starts far off.
+    Raises SurveyError where not even the focal length is determined (all planes parallel to the image).
     """
     width, height = image_size
     centre, scale = np.array([(width - 1) / 2.0, (height - 1) / 2.0]), max(width, height) / 2.0
