@@ -223,9 +223,9 @@ def in_condition_form(result: Adjustment) -> Adjustment:
     kinds = {isinstance(p.b_from_a, Rot3) for p in used}
     if len(given) > 1 or len(kinds) != 1:
         return result
-    from adjust.relay.conditions import adjust_conditions  # here: what is not solved by conditions goes without
+    from adjust.relay.conditions import adjust_loops  # here: what is not solved by conditions goes without
 
-    found = adjust_conditions(network_from_pairs(used))
+    found = adjust_loops(network_from_pairs(used))
     pairs, precision = found.pairs, result.precision
     if not len(found.basis) or not isinstance(precision, Precision):
         return result

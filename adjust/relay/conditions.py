@@ -7,22 +7,29 @@ tangent's cofactors are Q_e = Jr C_e Jr', and with misclosures w and their deriv
     N = B Q B',   lambda = N^-1 (w - B r),   d = -r - Q B' lambda,   cov = Q - Q B' N^-1 B Q
 
 (Koch 1999, section 3.2; Jr(r) r = r). At a fixed point the loops close and r = -Q B' lambda, so it is the constrained
-minimum, the same as that by the poses of the stations in the one graph. GTSAM eliminates hard constraints in an order
-that knows nothing of their size and loses them in large sets, so the normal equations are formed here.
+minimum, the same as that by the poses of the stations in the one graph.
+
+As a graph of GTSAM: a prior factor per pair, a hard closure factor per loop, and our own loop. GTSAM's optimisers stop
+on such graphs without a word, and its elimination takes the constraints in an order that knows nothing of their size,
+so it loses them in large sets: the loop here takes full steps, checks the closure itself, and refuses more loops than
+were found safe.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import gtsam
 import numpy as np
 
-from adjust.model.errors import NotConvergedError
+from adjust.model.errors import NotConvergedError, SurveyError
 from adjust.model.survey import FloatArray
+from adjust.observations.factors import Jacobians, custom
 from adjust.observations.pair_arrays import whitening
-from adjust.pose_network.loops import evaluate_loops, loop_vectors
+from adjust.pose_network.cycles import connected_parts
+from adjust.pose_network.loops import Loops, evaluate_loops, loop_vectors
 from adjust.relay.loops import LoopBasis, loop_basis, loop_misclosures
-from adjust.relay.network import MeasuredPairs
+from adjust.relay.network import MeasuredPairs, gtsam_motion, prior_factor, station_values
 from adjust.relay.normal_equations import (
     NormalEquations,
     SparseNormals,
@@ -33,6 +40,8 @@ from adjust.relay.normal_equations import (
 from adjust.relay.result import AdjustedPairs, adjusted_pairs
 from adjust.spatial.rigid_motions import Motions, right_jacobian
 
+# complete networks were exact far beyond; grids of loops went wrong from about 300 on
+MAX_HARD_LOOPS = 200
 # side of the dense matrix that the spanning tree's way may need
 MAX_TREE_SIDE = 3000
 
@@ -61,29 +70,81 @@ class ConditionAdjustment:
 
 
 def adjust_conditions(network: MeasuredPairs, options: ConditionOptions = ConditionOptions()) -> ConditionAdjustment:
-    """Adjust by full Gauss-Newton steps until all loops close and nothing moves; any size, connected or not.
+    """Adjust by the normal equations of the conditions; any size, connected or not.
 
     Raises NotConvergedError, naming the loop that closes worst.
     """
     basis = loop_basis(network.topology, _loop_kind(network, options))
-    limit, root = options.closure * max(1.0, _reach(network)), whitening(network.cov)
-    X, moved, closure = network.b_from_a, np.inf, np.inf
-    for iteration in range(1, options.max_iterations + 1):
-        d = _Linearised(network, basis, X).step()
-        X = X.retract(d)
-        moved = float(np.abs(root @ d[..., None]).max())
-        closure = float(np.abs(loop_vectors(basis, X)).max()) if len(basis) else 0.0
-        if not np.isfinite(moved):
-            break
-        if closure < limit and moved < options.max_step:
-            at = _Linearised(network, basis, X)
-            cov, total = at.normals.adjusted_covariances(), network.dim * len(basis)
-            return ConditionAdjustment(adjusted_pairs(network, X, cov, total, iteration, at.joint), basis, closure)
-    worst = loop_misclosures(network)
-    raise NotConvergedError(
-        f"the loops do not close after {options.max_iterations} steps (misclosure left {closure:.2g}, last step "
-        f"{moved:.2g} sigma); look for a wrong pair in {worst.text(int(np.argmax(worst.test)))}"
+
+    def step(X: Motions) -> FloatArray:
+        at = _Linearised(network, basis, X)
+        multipliers = at.normals.solve(at.w.ravel() - at.B @ at.r.ravel())
+        return np.asarray(-at.r - (at.Q @ (at.B.T @ multipliers).reshape(*at.r.shape, 1))[..., 0])
+
+    def advice() -> str:
+        worst = loop_misclosures(network)
+        return f"look for a wrong pair in {worst.text(int(np.argmax(worst.test)))}"
+
+    X, closure, iterations = _closed(network, basis, options, step, advice)
+    at = _Linearised(network, basis, X)
+    cov = at.normals.adjusted_covariances()
+    pairs = adjusted_pairs(network, X, cov, network.dim * len(basis), iterations, at.joint)
+    return ConditionAdjustment(pairs, basis, closure)
+
+
+def adjust_condition_factors(
+    network: MeasuredPairs, options: ConditionOptions = ConditionOptions()
+) -> ConditionAdjustment:
+    """The same by GTSAM: a prior per pair and a hard closure factor per loop; for small sets of loops.
+
+    Raises SurveyError for more loops than GTSAM eliminates safely, NotConvergedError where they do not close.
+    """
+    basis = loop_basis(network.topology, _loop_kind(network, options))
+    if len(basis) > MAX_HARD_LOOPS:
+        raise SurveyError(
+            f"{len(basis)} loops are too many hard constraints (at most {MAX_HARD_LOOPS}); use the normal equations of "
+            "the conditions, or the parametric form"
+        )
+    graph, every = condition_graph(network, basis), range(network.topology.n_pairs)
+
+    def step(X: Motions) -> FloatArray:
+        delta = graph.linearize(station_values(X)).optimize()
+        return np.array([delta.at(e) for e in every])
+
+    def advice() -> str:
+        return "use the normal equations of the conditions, which name the loop that closes worst"
+
+    X, closure, iterations = _closed(network, basis, options, step, advice)
+    marginals = gtsam.Marginals(graph, station_values(X))
+    cov = np.array([marginals.marginalCovariance(e) for e in every])
+    # GTSAM's own joint covariance inverts an information matrix, which pairs that close a loop do not have
+    joint = _Linearised(network, basis, X).joint
+    return ConditionAdjustment(
+        adjusted_pairs(network, X, cov, network.dim * len(basis), iterations, joint), basis, closure
     )
+
+
+def adjust_loops(network: MeasuredPairs) -> ConditionAdjustment:
+    """By GTSAM's graph of priors and hard closures where that is safe, else by the normal equations; any size.
+
+    Safe: few enough loops, all of them closed, and redundancy numbers that sum to the equations, which constraints lost
+    in the elimination would not do. Raises NotConvergedError, naming the loop that closes worst.
+    """
+    top = network.topology
+    n_parts = int(connected_parts(top.n_stations, top.a_idx, top.b_idx).max(initial=-1)) + 1
+    if top.n_pairs - top.n_stations + n_parts <= MAX_HARD_LOOPS:
+        try:
+            found = adjust_condition_factors(network)
+        except NotConvergedError:
+            return adjust_conditions(network)
+        except RuntimeError as error:
+            if "ndetermin" not in str(error):
+                raise
+            return adjust_conditions(network)
+        total = found.pairs.redundancy_total
+        if abs(float(found.pairs.redundancy.sum()) - total) < 1e-6 * max(1, total):
+            return found
+    return adjust_conditions(network)
 
 
 def _loop_kind(network: MeasuredPairs, options: ConditionOptions) -> Literal["shortest", "tree"]:
@@ -114,11 +175,62 @@ class _Linearised:
         by_tree = basis.tree is not None and 2 * len(basis) > len(np.unique(basis.pair_idx))
         self.normals: NormalEquations = (TreeNormals if by_tree else SparseNormals)(basis, blocks, self.Q)
 
-    def step(self) -> FloatArray:
-        """Of all pairs (E, dim), in their tangents."""
-        multipliers = self.normals.solve(self.w.ravel() - self.B @ self.r.ravel())
-        return np.asarray(-self.r - (self.Q @ (self.B.T @ multipliers).reshape(*self.r.shape, 1))[..., 0])
-
     def joint(self, pair_idx: Sequence[int]) -> FloatArray:
         """Joint covariance of some adjusted pairs, stacked."""
         return joint_covariance(self.normals, self.B, self.Q, pair_idx)
+
+
+def _closed(
+    network: MeasuredPairs, basis: LoopBasis, options: ConditionOptions, step: Callable[[Motions], FloatArray],
+    advice: Callable[[], str],
+) -> tuple[Motions, float, int]:  # fmt: skip
+    """Full Gauss-Newton steps until all loops close and nothing moves; the largest misclosure left, and how many."""
+    limit, root = options.closure * max(1.0, _reach(network)), whitening(network.cov)
+    X, moved, closure = network.b_from_a, np.inf, np.inf
+    for iteration in range(1, options.max_iterations + 1):
+        d = step(X)
+        X = X.retract(d)
+        moved = float(np.abs(root @ d[..., None]).max())
+        closure = float(np.abs(loop_vectors(basis, X)).max()) if len(basis) else 0.0
+        if not np.isfinite(moved):
+            break
+        if closure < limit and moved < options.max_step:
+            return X, closure, iteration
+    raise NotConvergedError(
+        f"the loops do not close after {options.max_iterations} steps (misclosure left {closure:.2g}, last step "
+        f"{moved:.2g} sigma); {advice()}"
+    )
+
+
+# -- the conditions as factors of GTSAM's graph -----------------------------------------------------------------------
+
+
+def condition_graph(network: MeasuredPairs, basis: LoopBasis) -> gtsam.NonlinearFactorGraph:
+    """Priors on the pairs (keys are their positions) and hard closures of the loops."""
+    graph = gtsam.NonlinearFactorGraph()
+    for e in range(network.topology.n_pairs):
+        graph.add(prior_factor(e, gtsam_motion(network.b_from_a, e), network.cov[e]))
+    for k in range(len(basis)):
+        graph.add(_closure_factor(basis, k, network.dim))
+    return graph
+
+
+def _closure_factor(basis: LoopBasis, loop: int, dim: int) -> gtsam.CustomFactor:
+    """The misclosure of one loop, to be zero. Its noise is a constraint, which no covariance can say."""
+    rows = slice(basis.ptr[loop], basis.ptr[loop + 1])
+    keys = [int(e) for e in basis.pair_idx[rows]]
+    n = len(keys)
+    alone = Loops(np.array([0, n]), np.arange(n), basis.sense[rows], basis.start_idx[loop : loop + 1])
+
+    def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
+        if dim == 3:
+            motions = Motions(np.array([values.atRot3(key).matrix() for key in keys]))
+        else:
+            poses = [values.atPose3(key) for key in keys]
+            motions = Motions(
+                np.array([p.rotation().matrix() for p in poses]), np.array([p.translation() for p in poses])
+            )
+        w, blocks = evaluate_loops(alone, motions)
+        return w[0], list(zip(keys, blocks, strict=True))
+
+    return custom(keys, gtsam.noiseModel.Constrained.All(dim), residual)

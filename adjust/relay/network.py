@@ -9,12 +9,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain
 
+import gtsam
 import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Pair, frame_text
 from adjust.model.survey import FloatArray
+from adjust.observations.factors import gaussian
 from adjust.observations.pair_arrays import checked_arrays
 from adjust.pose_network.network import Topology
 from adjust.spatial.rigid_motions import Motions
@@ -80,3 +82,18 @@ def gtsam_motion(motions: Motions, idx: int) -> Rot3 | Pose3:
     """One motion as GTSAM's type."""
     rotation = Rot3(motions.rotation[idx])
     return rotation if motions.translation is None else Pose3(rotation, motions.translation[idx])
+
+
+def station_values(motions: Motions) -> gtsam.Values:
+    """Values with one rotation or pose per station, under the station's number as key."""
+    values = gtsam.Values()
+    for i in range(len(motions)):
+        values.insert(i, gtsam_motion(motions, i))
+    return values
+
+
+def prior_factor(key: int, motion: Rot3 | Pose3, cov: FloatArray) -> gtsam.NonlinearFactor:
+    """A rotation or pose known with covariance in its tangent."""
+    if isinstance(motion, Rot3):
+        return gtsam.PriorFactorRot3(key, motion, gaussian(cov))
+    return gtsam.PriorFactorPose3(key, motion, gaussian(cov))

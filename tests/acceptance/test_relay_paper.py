@@ -9,12 +9,11 @@ from scipy.stats import chi2
 
 from adjust.model.errors import IndeterminateError
 from adjust.published.relay import paper_iteration
-from adjust.relay.conditions import ConditionOptions, adjust_conditions
+from adjust.relay.conditions import MAX_HARD_LOOPS, ConditionOptions, adjust_condition_factors, adjust_conditions
 from adjust.relay.counts import count
 from adjust.relay.loops import loop_misclosures
 from adjust.relay.network import MeasuredPairs, topology
 from adjust.spatial.rigid_motions import Motions
-from tests.adjust.relay_hard_constraints import MOST_LOOPS, adjust_condition_factors
 from tests.adjust.relay_monte_carlo import MonteCarloOptions, simulate_complete
 from tests.adjust.relay_networks import ARCMIN, chain_with_chords, complete, differences, grid, simulate, suspects
 from tests.adjust.relay_parametric import adjust_parametric
@@ -73,7 +72,7 @@ def test_both_forms_agree_on_complete_networks(n):
     network = simulate(complete(n), seed=n).network
     conditions = adjust_conditions(network)
     forms = [conditions.pairs]
-    if len(conditions.basis) <= MOST_LOOPS:
+    if len(conditions.basis) <= MAX_HARD_LOOPS:
         forms.append(adjust_condition_factors(network).pairs)
         forms.append(adjust_conditions(network, ConditionOptions(loops="shortest")).pairs)
     reference = agree(network, *forms)

@@ -12,11 +12,10 @@ from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import Datum, PoseParameter, Station, Survey
 from adjust.pose_network import loops as loops_module
 from adjust.pose_network.loops import evaluate_loops, loop_vectors, misclosures
-from adjust.relay.conditions import ConditionOptions, adjust_conditions
+from adjust.relay.conditions import MAX_HARD_LOOPS, ConditionOptions, adjust_condition_factors, adjust_conditions
 from adjust.relay.loops import loop_basis, loop_misclosures
 from adjust.relay.network import MeasuredPairs, network_from_pairs, topology
 from adjust.spatial.rigid_motions import Motions
-from tests.adjust.relay_hard_constraints import adjust_condition_factors
 from tests.adjust.relay_networks import (
     ARCMIN,
     as_gtsam,
@@ -267,11 +266,19 @@ def test_covariances_where_gtsam_refuses_the_normal_equations(dim, monkeypatch):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
 
 
+def test_too_many_hard_loops_are_refused():
+    network = simulate(grid(16, 16), 3, seed=0).network
+    with pytest.raises(SurveyError, match=rf"225 loops are too many hard constraints \(at most {MAX_HARD_LOOPS}\)"):
+        adjust_condition_factors(network)
+
+
 def test_failure_names_the_loop():
     network = simulate(complete(5), 3, seed=0).network
     options = ConditionOptions(max_iterations=1)
-    with pytest.raises(NotConvergedError, match=r"do not close after 1 steps .*wrong pair in C\d -> C\d"):
+    with pytest.raises(NotConvergedError, match=r"wrong pair in C\d -> C\d"):
         adjust_conditions(network, options)
+    with pytest.raises(NotConvergedError, match=r"do not close after 1 steps .*use the normal equations"):
+        adjust_condition_factors(network, options)
 
 
 def test_large_misclosures_still_agree():
