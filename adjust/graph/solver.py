@@ -27,13 +27,11 @@ _SHORTEST = 0.125
 """Share of an undamped step below which damping leads on better: the whole system bends."""
 _LEAST_GAIN = 0.1
 """Share of the promised decrease of chi-square that a step must bring."""
-_PROMISED = 0.9
-"""Share of the promised decrease from which a long corridor need not be bent instead."""
+_PROMISED = 0.9  # of the decrease: from there on a long corridor need not be bent instead
 _WORTH_QR = 0.1
 """Of the share that the weakest motion may lose: what it hardly moves may lose more, and GTSAM's QR takes but twice the
 time of its Cholesky."""
-_STATIONARY = 1e-2
-"""Sigmas that a step moves at most where the rank of the system is judged."""
+_STATIONARY = 1e-2  # sigmas that a step moves at most where the rank of the system is judged
 _CLOSE = (1.0, 0.25), (10.0, 0.1)
 """Sigmas that a step moves at most, and its share of the one before, where one factor of pairs serves the next step.
 
@@ -96,9 +94,8 @@ class _Loop(System):
         self.length, self.asked = 1.0, False
         self.moved = self.before = np.inf
         self.behind = self._images_behind()
-        self.best, self.waited = (self.at, self.omega), 0
+        self.best, self.waited, self.idle = (self.at, self.omega), 0, 0
         self.steps: list[float] = []
-        self.idle = 0
 
     def _by_rows(self) -> bool:
         """Whether the steps go on by rows, because their squares have lost digits; asked once, before damping."""

@@ -5,11 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.model.result import GlobalTest
 from adjust.model.survey import FloatArray, IntArray
 from adjust.observations.pair_arrays import whitening
 from adjust.observations.pairs import pair_tests
-from adjust.precision.precision import global_test
 from adjust.relay.network import MeasuredPairs
 from adjust.spatial.rigid_motions import Motions, right_jacobian_inverse
 
@@ -49,10 +47,6 @@ class AdjustedPairs:
     def sigma0(self) -> float:
         """A posteriori standard deviation of unit weight, nan without redundancy."""
         return float(np.sqrt(self.omega / self.redundancy_total)) if self.redundancy_total else float("nan")
-
-    def global_test(self, alpha: float = 0.05) -> GlobalTest | None:
-        """Two-sided chi-square test of v'Pv."""
-        return global_test(self.omega, self.redundancy_total, alpha)
 
 
 def adjusted_pairs(

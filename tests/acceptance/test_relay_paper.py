@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from adjust.model.errors import IndeterminateError
+from adjust.precision.precision import global_test
 from adjust.published.relay import paper_iteration
 from adjust.relay.conditions import MAX_HARD_LOOPS, ConditionOptions, adjust_condition_factors, adjust_conditions
 from adjust.relay.counts import count
@@ -77,7 +78,7 @@ def test_both_forms_agree_on_complete_networks(n):
         forms.append(adjust_conditions(network, ConditionOptions(loops="shortest")).pairs)
     reference = agree(network, *forms)
     assert conditions.closure < 1e-12
-    assert reference.global_test(alpha=1e-4).passed
+    assert global_test(reference.omega, reference.redundancy_total, 1e-4).passed
 
 
 @pytest.mark.parametrize("dim", [3, 6])
@@ -94,7 +95,7 @@ def test_both_forms_agree_on_the_grid_of_4900_loops():
     assert conditions.closure < 1e-12
     pairs = agree(network, conditions.pairs)
     assert pairs.redundancy.sum() == pytest.approx(3 * 4900, abs=1e-6)
-    assert pairs.global_test(alpha=1e-4).passed
+    assert global_test(pairs.omega, pairs.redundancy_total, 1e-4).passed
 
 
 def rotation(angles):

@@ -19,6 +19,7 @@ from adjust.graph.assembly import StartValues
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import Camera, FloatArray, LensParameter, PoseParameter, Station, Survey
+from adjust.precision.precision import global_test
 from adjust.relay.conditions import adjust_conditions
 from adjust.relay.eyes.drift import fit_drift, sequences
 from adjust.relay.eyes.eyes import EyeOptions, adjust_eyes
@@ -162,7 +163,7 @@ def test_independent_pairs_close_within_their_sigmas_and_agree_with_the_joint_gr
     loops = loop_misclosures(network)
     assert len(loops.test) == 1
     closed = adjust_conditions(network).pairs
-    test = closed.global_test(0.01)
+    test = global_test(closed.omega, closed.redundancy_total, 0.01)
     assert test is not None
     assert test.passed
     joint = joint_graph(result)
