@@ -95,10 +95,12 @@ def _merge_definition(merged: Merged) -> dict[str, Any]:
     origins: list[Origin] = [(old_path, i + 1) for i in range(text.count("\n"))]
     if new_path.is_file():
         added, lines = _new_sections(merged, new_path, KeyLines(text), old)
+        in_braces = any(kind in old and f"[{kind}." not in text for kind in merged.new_ids)
         text, origins = text + added, origins + lines
         merged.entries.append(DEFINITION_FILE)
         try:
-            read_tables(text)
+            if in_braces:  # or below a header of all
+                read_tables(text)
         except ValueError as error:  # of tomllib
             raise SurveyError(
                 f"{old_path}: nothing can be added below its tables ({error}); write them as [stations.ID], not as one "

@@ -68,10 +68,7 @@ def read(folder: Path, ahead: dict[Path, Begun] | None = None) -> Project:
 
 
 def with_exclusions(everything: Project, place: Path) -> tuple[Project, dict[Name, Exclusion]]:
-    """The project with the hash of ``exclusions.csv`` as it stands in the folder ``place``, and what that leaves out.
-
-    Nothing is left out yet. Raises SurveyError.
-    """
+    """With the hash of ``exclusions.csv`` in the folder ``place``, and what it would leave out; raises SurveyError."""
     rows, digest = read_exclusions(place / OBSERVATIONS_FOLDER)
     inputs = {**everything.inputs, **({f"{OBSERVATIONS_FOLDER}/{EXCLUSIONS_FILE}": digest} if digest else {})}
     return dataclasses.replace(everything, inputs=dict(sorted(inputs.items()))), in_force(rows)

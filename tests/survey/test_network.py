@@ -477,6 +477,19 @@ def test_what_is_wrong_in_what_is_added_is_named_with_its_own_line(tmp_path, cap
     assert main(["adjust", str(tmp_path / "lab"), "--quiet", "--try", "1"]) == 0
 
 
+def test_stations_in_braces_cannot_be_added_to(tmp_path):
+    """Those below one header for all of them can."""
+    texts = {"lab": "stations = { a = {}, b = {} }", "more": "[stations.c]", "rows": "[stations]\na = {}"}
+    for name, said in texts.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "survey.toml").write_text(f"format = 1\n{said}\n")
+    (tmp_path / "place").mkdir()
+    with pytest.raises(SurveyError, match=r"lab/survey\.toml: nothing can be added below its tables"):
+        merge(tmp_path / "lab", tmp_path / "more", tmp_path / "place")
+    merged = merge(tmp_path / "rows", tmp_path / "more", tmp_path / "place")
+    assert [s.station_id for s in read(merged.place).survey.stations] == ["a", "c"]
+
+
 def test_tables_with_other_columns_are_merged_under_one_header(tmp_path):
     survey, _ = _network(3, [(0, 1), (1, 2)])
     write_project(tmp_path / "lab", survey)
