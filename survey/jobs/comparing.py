@@ -52,15 +52,12 @@ class CompareOutcome:
     @cached_property
     def _dependence(self) -> tuple[str, ...]:
         """What says that the epochs are not independent; empty where they may be."""
-        shared = shared_observations(*(a.survey for a in self.adjustments))
-        if not shared:
-            return ()
-        told = ", ".join(f"{kind}: {n}" for kind, n in shared.items())
-        return (
-            f"the same values stand in both epochs ({told}): they are not independent, as the tests take them, so that "
-            "sigmas of motions are too large and what moved may stay hidden; compare epochs that were measured anew "
-            "(how far observations move a solution, 'labsurvey add' and 'labsurvey remove' say)",
-        )
+        shared = sum(shared_observations(*(a.survey for a in self.adjustments)).values())
+        return () if not shared else (
+            f"{shared} observations have the same values in both epochs, which are not independent, as the tests take "
+            "them, so that sigmas of motions are too large and what moved may stay hidden; compare epochs that were "
+            "measured anew (how far observations move a solution, 'labsurvey add' and 'labsurvey remove' say)",
+        )  # fmt: skip
 
     def summary(self) -> dict[str, object]:
         """As plain values; None where something was not measured or cannot be tested."""

@@ -106,7 +106,7 @@ def test_an_epoch_and_what_was_added_to_it_are_not_independent(epochs, tmp_path,
     write_project(tmp_path / "again", measured(chain(), np.random.default_rng(2)))
     write_project(tmp_path / "grown", replace(survey, pairs=survey.pairs[:-1]))
     found = _json(capsys, tmp_path / "first", tmp_path / "grown")
-    assert found["warnings"][0].startswith(f"the same values stand in both epochs (pairs: {len(survey.pairs) - 1})")
+    assert found["warnings"][0].startswith(f"{len(survey.pairs) - 1} observations have the same values in both")
     assert not any("independent" in w for w in _json(capsys, tmp_path / "first", tmp_path / "again")["warnings"])
 
 

@@ -141,7 +141,7 @@ def _hypothesis(survey: Survey, errors: Sequence[_Errors], size: float) -> Hypot
             without = {i: r for i, r in enumerate(survey.readings) if r.target_centring_sigma == 0.0}
             changed = with_rows(changed, "readings", {
                 i: replace(r, target_centring_sigma=size) for i, r in without.items()})  # fmt: skip
-    what, keys = (" and ".join(x) for x in ([e.what for e in errors], [e.key for e in errors]))
+    what, keys = " and ".join(e.what for e in errors), ", ".join(e.key for e in errors)
     return Hypothesis(
         "centring", f"the {what} do not stand over their points, by {1e3 * size:.2g} mm in each direction, and no "
         "sigma says so: short sights miss the most", f"give {keys} (here {1e3 * size:.2g})",

@@ -10,7 +10,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
 from survey.folder.plain import plain
 from survey.project.project import DEFINITION_FILE, IMAGES_FOLDER
-from survey.report.language import text_said
+from survey.report.language import message, text_said
 from survey.workbench.pages.capturing import FolderView
 
 
@@ -48,8 +48,10 @@ class Told:
     drawn: Drawn = Drawn()
 
     def as_dict(self) -> dict[str, object]:
-        """As plain values; the text in the language that is spoken."""
-        return {"text": text_said(self.text), "summary": self.summary, "drawn": self.drawn.as_dict()}
+        """As plain values; the text and warnings in the language that is spoken."""
+        warnings = self.summary.get("warnings")
+        said = {"warnings": [message(str(w)) for w in warnings]} if isinstance(warnings, list) else {}
+        return {"text": text_said(self.text), "summary": {**self.summary, **said}, "drawn": self.drawn.as_dict()}
 
 
 class Folder:
