@@ -134,3 +134,10 @@ class FrameTree:
         geometry = u.vectors[geometry_name]
         u.table_slots[slot] = TableSlot(slot, table.table_id, epoch_id, table.axes, angles.key, geometry)
         return slot
+
+
+def in_world(survey: Survey, name: ParameterName) -> bool:
+    """Whether a pose parameter is the pose of something in the world."""
+    if name[0] == "carrier_from_target":
+        return survey.targets_by_id[name[1]].station_id is None
+    return name[0] in ("world_from_station", "world_from_table")

@@ -15,11 +15,11 @@ import numpy as np
 from gtsam import Pose3
 from scipy import sparse
 
+from adjust.frames.tree import in_world
 from adjust.frames.unknowns import Unknown
 from adjust.graph.assembly import AdjustmentGraph, Evaluation
 from adjust.model.errors import SurveyError
-from adjust.model.result import ParameterName
-from adjust.model.survey import FloatArray, IntArray, Survey
+from adjust.model.survey import FloatArray, IntArray
 from adjust.observations.motions import MOVED, READINGS_MOVED, reading_motions, vector_motions
 from adjust.spatial.motions import motions_of, points_motions, poses_at, poses_motions
 
@@ -37,13 +37,6 @@ def gauge(graph: AdjustmentGraph, unknown: Unknown, values: gtsam.Values) -> Flo
     if unknown.name[0] in READINGS_MOVED:
         return reading_motions(graph.survey, graph.unknowns, graph.terrestrial, unknown, values)
     return motions_of(unknown, values, in_world(graph.survey, unknown.name))
-
-
-def in_world(survey: Survey, name: ParameterName) -> bool:
-    """Whether a pose parameter is the pose of something in the world."""
-    if name[0] == "carrier_from_target":
-        return survey.targets_by_id[name[1]].station_id is None
-    return name[0] in ("world_from_station", "world_from_table")
 
 
 def visible_keys(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph) -> list[int]:

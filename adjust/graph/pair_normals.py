@@ -10,17 +10,12 @@ from functools import cached_property
 
 import gtsam
 import numpy as np
-from gtsam import Pose3
-from scipy import sparse
 
 from adjust.graph.assembly import AdjustmentGraph, Evaluation
+from adjust.graph.bending import Bending, tree
 from adjust.graph.elimination import EXACT, force_on, lost, numbers, pose_cliques
-from adjust.model.survey import FloatArray, IntArray
+from adjust.model.survey import FloatArray
 from adjust.native.elimination import PoseFactor, PoseTree, pair_gradient
-from adjust.native.pairs import compose_poses
-from adjust.spatial.motions import poses_at
-from adjust.spatial.rigid import rigid
-from adjust.spatial.rigid_motions import Motions
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,47 +100,13 @@ class PairNormals:
             linear.add(factor.keys()[0], *found.jacobian(), gtsam.noiseModel.Unit.Create(6))
         return linear
 
-    def bent(self, values: gtsam.Values, delta: gtsam.VectorValues) -> gtsam.Values:
-        """Where a step leads if every pair along a tree turns and shifts by its share: ends of long corridors swing.
-
-        Moved each for itself, neighbours end up apart by the product of what both move and what they move apart.
-        """
-        keys, (order, parent) = self.keys.tolist(), self._along_tree
-        at = Motions(*poses_at(values, keys))
-        x, below = np.array([delta.at(key) for key in keys]), np.flatnonzero(parent >= 0)
-        inside = at[parent[below]].inverse() @ at[below]
-        x[below] -= (inside.inverse().adjoint() @ x[parent[below], :, None])[..., 0]
-        R, t = at.rotation.copy(), at.shifts.copy()
-        R[below], t[below] = inside.rotation, inside.shifts
-        new = Motions(R, t).retract(x)
-        R, t = (np.ascontiguousarray(a) for a in (new.rotation, new.shifts))
-        compose_poses(order, parent, R, t)
-        out = gtsam.Values()
-        for key, pose in zip(keys, rigid(R, t), strict=True):
-            out.insert(key, Pose3(pose))
-        return out
-
     @cached_property
-    def _along_tree(self) -> tuple[IntArray, IntArray]:
-        """Poses in the order, and (N,) from which each, that they are reached by few pairs from what is held.
-
-        Of those that would reach it alike the one that reaches most others: where the others hang on a spine, loops
-        close over few of its pairs.
-        """
-        from scipy.sparse.csgraph import dijkstra  # here: small surveys start without it
-
-        n, held = len(self.keys), (self.a < 0) | (self.b < 0)
+    def bending(self) -> Bending:
+        """Along a tree of pairs."""
+        held = (self.a < 0) | (self.b < 0)
         near = np.append(np.maximum(self.a, self.b)[held], [self.number[f.keys()[0]] for f in self.priors])
-        near = np.unique(near.astype(np.int64)) if len(near) else np.zeros(1, dtype=np.int64)
-        a, b = np.append(self.a[~held], near), np.append(self.b[~held], np.full(len(near), n))
-        a, b = np.append(a, b), np.append(b, a)
-        away = dijkstra(sparse.csr_array((np.ones(len(a)), (a, b)), (n + 1, n + 1)), indices=n, unweighted=True)
-        on = away[b] == away[a] + 1.0
-        a, b = a[on], b[on]
-        last = np.lexsort((np.bincount(a, minlength=n + 1)[a], b))
-        parent = np.full(n, -1)
-        parent[b[last]] = a[last]  # of several the last one
-        return np.argsort(away[:n], kind="stable"), np.where(parent == n, -1, parent)
+        found = tree(len(self.keys), self.a[~held], self.b[~held], np.unique(near.astype(np.int64)))
+        return Bending(self.keys.tolist(), *found)
 
     def solution(self, linear: PairLinear) -> tuple[gtsam.VectorValues, float] | None:
         """The solution and by how much it lowers chi-square; None where there is a pose without a pivot."""

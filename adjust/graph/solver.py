@@ -4,13 +4,15 @@ Our own loop: GTSAM's optimisers copy all values for every Python callback, stop
 nothing of the unknowns hidden in a batch.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
 
 from adjust.graph.assembly import AdjustmentGraph, Evaluation
+from adjust.graph.bending import Bending, bending_of
 from adjust.graph.cliques import SolvedTree
 from adjust.graph.datum import InnerDatum, inner_datum
 from adjust.graph.divergence import describe_divergence, stopped_at
@@ -158,19 +160,31 @@ class _Loop(System):
         """
         length = self.length
         while length >= (_SHORTEST if self.damping == 0.0 else 1.0):
-            try:
-                at = self._evaluated(self.at.values.retract(delta if length == 1.0 else delta.scale(length)))
-            except IndeterminateError:
-                new, behind = np.inf, self.behind  # a step that made a point undetermined is no step
-            else:
+            for values in self._ends(delta if length == 1.0 else delta.scale(length)):
+                try:
+                    at = self._evaluated(values)
+                except IndeterminateError:
+                    continue  # a step that made a point undetermined is no step
                 new, behind = self.graph.objective(at), self._images_behind()
-            if np.isfinite(new) and behind <= self.behind:
-                gain = (self.omega - new) / max(length * (2.0 - length) * promised, 1e-300)
-                if gain > _LEAST_GAIN or self._at_the_bottom(new, self.omega):
-                    self.length, self.behind = length, behind
-                    return at, new, gain
+                if np.isfinite(new) and behind <= self.behind:
+                    gain = (self.omega - new) / max(length * (2.0 - length) * promised, 1e-300)
+                    if gain > _LEAST_GAIN or self._at_the_bottom(new, self.omega):
+                        self.length, self.behind = length, behind
+                        return at, new, gain
             length *= 0.5
         return None
+
+    def _ends(self, delta: gtsam.VectorValues) -> Iterator[gtsam.Values]:
+        """Where a step may lead: straight on, and where that is not enough, bent along a tree."""
+        straight = self.at.values.retract(delta)
+        yield straight
+        if self.damping == 0.0 and self.bending is not None:
+            yield self.bending.bent(self.at.values, delta, straight)
+
+    @cached_property
+    def bending(self) -> Bending | None:
+        """How a step bends the survey; looked for where the first straight one fails."""
+        return bending_of(self.graph) if self.pairs is None else self.pairs.bending
 
     def _watched(self, delta: gtsam.VectorValues, promised: float) -> tuple[Evaluation, float, float] | None:
         """The whole step, whether chi-square falls or not; None where it has not fallen for too long."""
@@ -180,7 +194,7 @@ class _Loop(System):
             return None
         new = self.graph.objective(at)
         if self.pairs is not None and self.pairs.by_rows and not new < self.omega - _PROMISED * promised:
-            bent = self._evaluated(self.pairs.bent(self.at.values, delta))
+            bent = self._evaluated(self.pairs.bending.bent(self.at.values, delta, at.values))
             at, new = min((bent, self.graph.objective(bent)), (at, new), key=lambda x: x[1])
         self.waited += 1
         if not np.isfinite(new) or (self.waited >= self.options.patience and self.moved > 1e-3):

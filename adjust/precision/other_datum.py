@@ -12,10 +12,11 @@ import numpy as np
 from gtsam import Rot3
 from scipy.linalg import block_diag
 
+from adjust.frames.tree import in_world
 from adjust.frames.unknowns import Unknowns
 from adjust.graph.assembly import AdjustmentGraph, values_of
 from adjust.graph.building import GraphBuilder
-from adjust.graph.datum import InnerDatum, datum_rows, in_world, inner_datum, survey_motions
+from adjust.graph.datum import InnerDatum, datum_rows, inner_datum, survey_motions
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.rewriting import Rewriting

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from gtsam import Pose3
 
-from adjust.graph.datum import in_world
+from adjust.frames.tree import in_world
 from adjust.model.result import ParameterName
 from adjust.model.rewriting import Rewriting
 from adjust.model.survey import FloatArray, PointParameter, PoseParameter, Survey

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
-from adjust.graph.datum import in_world
+from adjust.frames.tree import in_world
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName, VarianceComponents
 from adjust.model.survey import FloatArray, IntArray

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,7 @@ def suspects(adjustment: Adjustment) -> Suspects:
 FITS, CAUTIOUS, MISFIT, UNTESTED = "fits", "cautious", "does_not_fit", "untested"
 """What ``summary.fit`` in a result file may be."""
 _MOST_PARTS = 8
+_IMPOSSIBLE = "no instrument has a sigma of"
 
 
 def fit_of(adjustment: Adjustment, tested: Consistency | None = None) -> str:
@@ -71,8 +73,9 @@ def misfits(summary: Mapping[str, Any]) -> bool:
 
 
 def warnings_with(adjustment: Adjustment, tested: Consistency | None) -> tuple[str, ...]:
-    """For people: causes that were tried first, then what tests of parts found, then the rest."""
+    """For people: causes that were tried and sigmas that cannot be, then what tests of parts found, then the rest."""
     tried = len(adjustment.diagnosis.lines) if adjustment.diagnosis is not None else 0
+    tried += len(list(takewhile(lambda w: _IMPOSSIBLE in w, adjustment.warnings[tried:])))
     found = () if tested is None else _findings(tested)
     return (*adjustment.warnings[:tried], *found, *adjustment.warnings[tried:])
 
@@ -97,6 +100,11 @@ def verdict(
             "allow. Look for blunders, wrong sigmas or a model that lacks something, starting with the groups."
         )
     if adjustment.diagnosis is not None and adjustment.diagnosis.spoils:
+        if not any(d.action == "rejected" for d in adjustment.decisions):
+            return "failed", (
+                "Everything fits, but was read in another unit than it was written in, so that the numbers below are "
+                "wrong; what it is is named first among the warnings."
+            )
         return "failed", (
             "What was left out has a cause that concerns what was kept as well, so that the numbers below are wrong; "
             "it is named first among the warnings."

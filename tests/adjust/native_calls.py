@@ -144,7 +144,7 @@ def _images() -> None:
     normals.by_rows = True
     found = normals.solution(normals.linearized(graph.prepare(graph.start, True)))
     if found is not None:
-        normals.bent(graph.start, found[0])
+        normals.bending.bent(graph.start, found[0], graph.start)
     ring = [(chr(65 + i), chr(65 + (i + step) % 12)) for step in (1, 2) for i in range(0, 12, step)]
     loop_basis(topology([(a + b, a, b) for a, b in ring]))  # triangles, then a loop through the stations of one pair
     survey, truth = head_on_table(1, n_cameras=2, n_table_epochs=3, n_free_epochs=2)

@@ -101,7 +101,7 @@ def test_a_corridor_that_bends_turns_and_shifts_every_pair_by_its_share() -> Non
     """By some thousandths of a radian each, which add up; moved each for itself, poses end up apart by far more."""
     graph, rng = of_network(7, 60, extra=0), np.random.default_rng(0)
     normals = PairNormals(graph, [])
-    keys, (order, parent) = normals.keys.tolist(), normals._along_tree
+    keys, order, parent = (tree := normals.bending).keys, tree.order, tree.parent
     before = Motions.of(np.array([graph.start.atPose3(k).matrix() for k in keys]))
     share, x, delta = rng.normal(size=(len(keys), 6)) * 3e-3, np.zeros((len(keys), 6)), gtsam.VectorValues()
     below = np.flatnonzero(parent >= 0)
@@ -111,8 +111,9 @@ def test_a_corridor_that_bends_turns_and_shifts_every_pair_by_its_share() -> Non
         x[i] = share[i] + (carried[i] @ x[parent[i]] if parent[i] >= 0 else 0.0)
         delta.insert(keys[i], x[i])
     assert np.abs(x[:, :3]).max() > 20 * 3e-3
+    aside = graph.start.retract(delta)
     bent, straight = (Motions.of(np.array([values.atPose3(k).matrix() for k in keys]))
-                      for values in (normals.bent(graph.start, delta), graph.start.retract(delta)))  # fmt: skip
+                      for values in (tree.bent(graph.start, delta, aside), aside))  # fmt: skip
     expected = (pairs @ exp(share[below])).matrices()
     np.testing.assert_allclose((bent[parent[below]].inverse() @ bent[below]).matrices(), expected, atol=1e-9)
     assert np.abs((straight[parent[below]].inverse() @ straight[below]).matrices() - expected).max() > 1e-3

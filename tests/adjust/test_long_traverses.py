@@ -70,8 +70,8 @@ def pairs_and(n: int, what: str) -> AdjustmentGraph:
     return h.build(survey, StartValues({}, poses, {}))
 
 
-def strip(n: int) -> AdjustmentGraph:
-    """Boards in a row of which every image sees two; the first one is known, and the focal length is not."""
+def strip(n: int, sigma: float = 0.01) -> AdjustmentGraph:
+    """Boards in a row of which every image sees two; the first one is known, and the focal length is not. sigma: px."""
     rng, names = np.random.default_rng(0), MODELS["brown"].names
     grid = np.array([(x, y, 0.0) for x in (0.0, 0.15, 0.3, 0.45) for y in (0.0, 0.2, 0.4)])
     lens = np.array([{"fx": 600.0, "fy": 600.0, "u0": 640.0, "v0": 512.0}.get(name, 0.0) for name in names])
@@ -82,8 +82,8 @@ def strip(n: int) -> AdjustmentGraph:
     for i, view in enumerate(views):
         for k in (i, i + 1):
             q = np.array([view.transformTo(boards[k].transformFrom(x)) for x in grid])
-            uv = 600.0 * q[:, :2] / q[:, 2:] + (640.0, 512.0) + 0.01 * rng.normal(size=(len(q), 2))
-            cov = np.tile(1e-4 * np.eye(2), (len(q), 1, 1))
+            uv = 600.0 * q[:, :2] / q[:, 2:] + (640.0, 512.0) + sigma * rng.normal(size=(len(q), 2))
+            cov = np.tile(sigma**2 * np.eye(2), (len(q), 1, 1))
             blocks.append(ImageBlock("C", f"e{i}", f"B{k}", np.arange(len(grid)), uv, cov))
     targets = tuple(Target(f"B{k}", tuple(map(str, range(len(grid)))), grid,
                            carrier_from_target=PoseParameter(b, "free" if k else "held"))
@@ -100,7 +100,7 @@ def augmented(graph: AdjustmentGraph, values: gtsam.Values, name: tuple[str, ...
 
     From ``r + A x = f, A'r = g`` (Bjoerck 1967), refined with residuals in extended precision.
     """
-    linear = graph.linearized(graph.prepare(values, True, reduced=False))
+    linear = graph.graph.linearize(values)
     stack = stacking(graph, [u.key for u in graph.unknowns.by_name.values()])
     A = sparse.csc_array(whitened_rows(linear, stack))
     (m, n), place = A.shape, stack.at[graph.unknowns.by_name[name].key]

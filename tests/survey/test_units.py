@@ -142,3 +142,69 @@ def test_distances_in_metres_among_millimetres_are_left_out_and_named(
     assert main(["adjust", str(lab), "--quiet", "--try", "1"]) == 0
     left = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8")).get("diagnosis", [])
     assert len(left) == count - 1
+
+
+def in_other_unit(**factors: float) -> Change:
+    """Sigmas of rotations in degrees and of shifts in mm, in place of all that there are, and values, times factors."""
+
+    def change(row: Row) -> None:
+        with_own_sigmas(1.0, 1.0)(row)
+        row["sigma_rotation_deg"] = repr(float(row.pop("sigma_rotation_arcsec")) / 3600.0)
+        for name, factor in factors.items():
+            row[name] = repr(float(row[name]) * factor)
+
+    return change
+
+
+PARTS = {
+    "arcsec as deg": ({"sigma_rotation_deg": 3600.0}, 0, "rotation of the pairs of group pair are about 3600 times too "
+                      "large: they are arcseconds, read as degrees"),
+    "mgon as deg": ({"sigma_rotation_deg": 1.0 / 9e-4}, 0, "1111 times too large: they are milligon, read as degrees"),
+    "um as mm": ({"sigma_translation_mm": 1e3}, 0, "1000 times too large: they are micrometres, read as millimetres"),
+    "shifts in m": (dict.fromkeys(("tx_mm", "ty_mm", "tz_mm"), 1e-3), 3, "they are metres, read as millimetres"),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PARTS)
+def test_a_part_of_pairs_in_another_unit_is_named_though_the_other_part_fits(name: str, tmp_path: Path) -> None:
+    """As one group they are only cautious."""
+    factors, code, said = PARTS[name]
+    lab = planted(tmp_path / "lab", "relay", "pairs", in_other_unit(**factors))
+    assert main(["adjust", str(lab), "--quiet"]) == code
+    solution = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))
+    assert said in solution["warnings"][0]
+    assert said in solution["diagnosis"][0]["cause"]
+
+
+def test_pairs_in_their_units_are_not_told(tmp_path: Path) -> None:
+    lab = planted(tmp_path / "lab", "relay", "pairs", in_other_unit())
+    assert main(["adjust", str(lab), "--quiet"]) == 0
+    solution = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))
+    assert "diagnosis" not in solution
+    assert solution["summary"]["fit"] == "fits"
+
+
+@pytest.mark.slow
+def test_sigmas_of_a_table_in_degrees_are_named_before_what_they_bend(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The readings win against the images: then board, lens and axes seem to have moved."""
+    lab = planted(tmp_path / "lab", "head", "table_angles", lambda row: row.update(
+        {name: repr(float(row[name]) / 3600.0) for name in ("sigma_axis1_arcsec", "sigma_axis2_arcsec")}))  # fmt: skip
+    assert main(["check", str(lab), "--json"]) == 3
+    told = [f["kind"] for f in json.loads(capsys.readouterr().out)["findings"] if f["level"] == "problem"]
+    assert told == ["suspicious sigma"]
+    assert main(["adjust", str(lab), "--quiet"]) == 3
+    solution = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))
+    assert "the angles of table turntable at" in solution["warnings"][0]
+    assert "these sigmas are degrees, read as arcseconds" in solution["warnings"][0]
+
+
+@pytest.mark.slow
+def test_what_pulls_a_survey_apart_ends_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Laser spots in micrometres: with some of them out, only rounding controls the next."""
+    lab = planted(tmp_path / "lab", "alignment", "laser_spots", lambda row: row.update(
+        {name: repr(1e3 * float(row[name])) for name in ("x_mm", "y_mm")}))  # fmt: skip
+    assert main(["adjust", str(lab), "--quiet"]) in (1, 3)
+    assert "Traceback" not in capsys.readouterr().err

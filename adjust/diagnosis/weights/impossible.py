@@ -71,7 +71,7 @@ def doubtful_sigmas(survey: Survey) -> Iterator[Hypothesis]:
 
 
 def _odd(survey: Survey) -> list[_Odd]:
-    return [*_of_values(survey), *_of_pairs(survey)]
+    return [*_of_values(survey), *_of_pairs(survey), *_of_tables(survey)]
 
 
 def _hypotheses(survey: Survey, some: Sequence[_Odd]) -> list[Hypothesis]:
@@ -84,7 +84,7 @@ def _hypotheses(survey: Survey, some: Sequence[_Odd]) -> list[Hypothesis]:
     size = f"{1e3 * largest:.2g} mm" if some[0].is_length else f"{largest / _ARCSEC:.2g} arcsec"
     named = " and ".join(f"{o.what} {listed(o.ids, 5)}" for o in some)
     place = Place("group", tuple(o.group for o in some), "sigma") if all(o.whole for o in some) else Place(
-        "pair" if some[0].part else "reading", tuple(i for o in some for i in o.ids), "sigma")  # fmt: skip
+        "pair" if some[0].field == "pairs" else "reading", tuple(i for o in some for i in o.ids), "sigma")  # fmt: skip
     out = []
     for factor, unit in units.items():
         changed = survey
@@ -130,6 +130,16 @@ def _of_pairs(survey: Survey) -> Iterator[_Odd]:
                 yield _Odd("pairs", what, group, tuple(odd), ids, size, False, part)
 
 
+def _of_tables(survey: Survey) -> Iterator[_Odd]:
+    """Of the angles that are read off a table's axes."""
+    odd = ((i, r, float(np.sqrt(np.diagonal(r.cov).max()))) for i, r in enumerate(survey.table_readings))
+    small = ((r.table_id, (i, r, sigma)) for i, r, sigma in odd if r.used and sigma < _ANGLE)
+    for table_id, found in grouped(small).items():
+        rows, ids = tuple(i for i, _, _ in found), tuple(r.epoch_id for _, r, _ in found)
+        yield _Odd("table_readings", f"the angles of table {table_id} at", found[0][1].group, rows, ids,
+                   max(sigma for _, _, sigma in found), False, "rotation")  # fmt: skip
+
+
 def _largest(cov: FloatArray) -> tuple[float, float]:
     """Of a pair's sigmas, that of its rotation (rad) and that of its shift (m)."""
     sigma = np.sqrt(np.diagonal(cov))
@@ -154,6 +164,8 @@ def _with_sigmas(survey: Survey, odd: _Odd, factor: float) -> Survey:
 
 def _edits(odd: _Odd, factor: float) -> tuple[Edit, ...]:
     """Of a whole group as one number; of others in their rows."""
+    if odd.field == "table_readings":
+        return ()  # these stand in table_angles.csv or in survey.toml
     if odd.part:
         columns = ("sigma_rotation_arcsec" if odd.part == "rotation" else "sigma_translation_mm",)
         return (ChangeColumns("pairs", columns, factor * np.eye(1), np.zeros(1), {"pair_id": odd.ids}),)

@@ -174,7 +174,11 @@ def _near(state: _State, o: int, most: int) -> _Near | None:
     N = np.concatenate([state.rows[x] for x in mine])
     of_N = np.linalg.inv(state.K[np.ix_(N, N)])  # their own R with the others out
     closeness = np.concatenate([np.full(len(state.rows[x]), links[x]) for x in mine])
-    free = _suspects(state, mine, N, of_N, (state.link[:, N] * closeness).max(axis=1))
+    try:
+        root = np.linalg.cholesky(of_N)
+    except np.linalg.LinAlgError:  # by so far out that rounding is all that tells them apart
+        return None
+    free = _suspects(state, mine, N, of_N, root, (state.link[:, N] * closeness).max(axis=1))
     if not free and len(mine) == 1:
         return None
     return _joined(state, mine, free, N, of_N)
@@ -192,11 +196,13 @@ def _rejected_near(state: _State, o: int) -> dict[int, float]:
     return {o: 1.0} | {x: link for x, link in links.items() if link > _LINKED**2 and x != o}
 
 
-def _suspects(state: _State, mine: list[int], N: IntArray, of_N: FloatArray, link: FloatArray) -> list[int]:
+def _suspects(
+    state: _State, mine: list[int], N: IntArray, of_N: FloatArray, root: FloatArray, link: FloatArray
+) -> list[int]:
     """In use and linked to one of those: half with the largest tests once all of these are in, half the closest."""
     T = np.zeros(len(link))
     B, g = state.B[:, N], state.snooping.g + state.B[:, N] @ (of_N @ state.bias[N])
-    back = B @ np.linalg.cholesky(of_N)  # R grows by back back'
+    back = B @ root  # R grows by back back'
     for members, at, R in _by_size(state.snooping, state.possible & (link > _LINKED)):
         grown = R + np.einsum("nia,nja->nij", back[at], back[at]) + CONTROLLED**2 * np.eye(R.shape[1])
         T[members] = np.einsum("ni,ni->n", g[at], np.linalg.solve(grown, g[at][..., None])[..., 0])

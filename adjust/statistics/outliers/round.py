@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from adjust.model.errors import IndeterminateError
 from adjust.model.names import numbered
 from adjust.model.result import Adjustment, Decision
 from adjust.model.survey import BoolArray, FloatArray, IntArray
@@ -138,8 +139,11 @@ class Round:
         return state, (*unwatched, *self.index[state.solution.out].tolist())
 
     def _search(self) -> Search[Snooping]:
-        def solve(used: BoolArray, before: State[Snooping] | None) -> tuple[Snooping, Verdicts]:
-            now = (self.snooping if before is None else before.solution).using(used)
+        def solve(used: BoolArray, before: State[Snooping] | None) -> tuple[Snooping, Verdicts] | None:
+            try:
+                now = (self.snooping if before is None else before.solution).using(used)
+            except IndeterminateError:
+                return None
             return now, now.tests()
 
         return Search(solve, self.options.family_alpha, best_back_first, np.inf, self.n_tests, self.factor)

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
+from adjust.model.errors import IndeterminateError
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.observations.terrestrial.statistics import influences as influences_of_readings
 from adjust.precision.precision import Precision
@@ -167,13 +168,16 @@ class Snooping:
         return new
 
     def leave_out(self, observation: int) -> None:
-        """Give the observation a bias of its own."""
+        """Give the observation a bias of its own. Raises IndeterminateError where only rounding still controls it."""
         rows = np.arange(int(self.ptr[observation]), int(self.ptr[observation + 1]))
         column = self.start_columns(rows)
         for U, _ in self.columns.values():
             column -= U @ U[rows].T
         own = column[rows]
-        L = np.linalg.cholesky(0.5 * (own + own.T))
+        try:
+            L = np.linalg.cholesky(0.5 * (own + own.T))
+        except np.linalg.LinAlgError as error:
+            raise IndeterminateError("what is left out already controls what is to go next") from error
         U = np.linalg.solve(L, column.T).T
         share = np.linalg.solve(L, self.g[rows])
         self._take(U, share, 1.0)

@@ -21,6 +21,8 @@ _LARGE = 1.15
 """sigma0 from which a mistake is looked for by trial; below, sigmas that are a little small explain as much."""
 
 
+_PART = 0.8
+"""Variance factor of a group below which a part of it may be far smaller."""
 _SEVERAL = 3
 """Observations that were left out from which on they may have one cause."""
 NOT_LOOKED_FOR = ("two mistakes at once", "bodies that bend or never rest", "refraction")
@@ -82,7 +84,8 @@ def with_probable_causes(survey: Survey, result: Adjustment, project: Project) -
     lines = tuple(f"probable cause: {c}" for c in warnings)
     if diagnosis is None and not warnings:
         diagnosis, _ = _named(_too_cautious(survey, result), project)
-        lines = tuple(f"too good: {c}" for c in diagnosis.lines) if diagnosis is not None else ()
+        head = "probable cause" if diagnosis is not None and diagnosis.spoils else "too good"
+        lines = tuple(f"{head}: {c}" for c in diagnosis.lines) if diagnosis is not None else ()
     if diagnosis is None or diagnosis.candidates[0].hypothesis.place.key not in ("sigma", "instrument_height"):
         lines += doubtful_values(survey)
     return replace(result, warnings=(*lines, *alone, *result.warnings, *note), diagnosis=diagnosis)
@@ -90,7 +93,7 @@ def with_probable_causes(survey: Survey, result: Adjustment, project: Project) -
 
 def doubtful_values(survey: Survey) -> tuple[str, ...]:
     """What cannot be right by its value alone; not heights of targets, which may be as thin as a millimetre."""
-    if not (survey.readings or survey.distances or survey.pairs):
+    if not (survey.readings or survey.distances or survey.pairs or survey.table_readings):
         return ()
     from adjust.diagnosis.units.heights import doubtful_heights  # here: as above
     from adjust.diagnosis.weights.impossible import doubtful_sigmas
@@ -116,14 +119,22 @@ def _diagnosis(
 
 
 def _too_cautious(survey: Survey, result: Adjustment) -> "Diagnosis | None":
-    """Groups whose sigmas are far too large, which no test of what contradicts shows; None where there are none."""
-    if not any(g.factor < CAUTIOUS**2 for g in result.groups):
+    """Groups whose sigmas are far too large, which no test of what contradicts shows; None where there are none.
+
+    Of pairs also the rotations or the shifts alone: where these are in another unit, the survey is so too.
+    """
+    if not any(g.factor < (_PART if survey.pairs else CAUTIOUS**2) for g in result.groups):
         return None
     from adjust.diagnosis.case import Case  # here: as above
     from adjust.diagnosis.diagnosis import diagnose
+    from adjust.diagnosis.weights.parts import UNIT_OF_SHIFTS, units_of_parts
     from adjust.diagnosis.weights.sigmas import wrong_factors
 
-    return diagnose(Case(survey, result), [wrong_factors])
+    found = diagnose(Case(survey, result), [units_of_parts])
+    if found.candidates:
+        return replace(found, spoils=found.candidates[0].hypothesis.name == UNIT_OF_SHIFTS)
+    small = any(g.factor < CAUTIOUS**2 for g in result.groups)
+    return diagnose(Case(survey, result), [wrong_factors]) if small else None
 
 
 def _left_out(survey: Survey, result: Adjustment) -> "Diagnosis | None":

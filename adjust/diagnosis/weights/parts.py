@@ -1,0 +1,102 @@
+"""Rotations or shifts of pairs in another unit than their sigmas: one part misses by the ratio of two units.
+
+Where the sigmas are too large nothing is contradicted, and the part that is right hides the other in the group's sums.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import Hypothesis, Place
+from adjust.model.names import grouped
+from adjust.model.observations import Pair
+from adjust.model.result import Adjustment
+from adjust.model.rewriting import with_rows
+from adjust.model.survey import Survey
+from adjust.precision.precision import precision_of
+
+_TURNS = {1.0 / 3600.0: "are arcseconds, read as degrees", 9e-4: "are milligon, read as degrees"}
+_SHIFTS = {1e-3: "are micrometres, read as millimetres"}
+_FAR, _NEAR = 0.3, 1.5
+"""Factor below which it is looked into, and by how much it may be below the ratio of two units.
+
+It is above that by far where the other part tells what this one, so weak, no longer does.
+"""
+_FEWEST = 8.0
+"""Redundancy of a part from which its factor says anything."""
+_SHORT = 100.0
+"""Sigmas that the shifts of a network are longer than."""
+_COARSE = 0.01
+"""m: sigma of a shift that is none of a laboratory's."""
+_EVIDENCE = 2.0
+UNIT_OF_SHIFTS = "unit of shifts"
+
+
+def units_of_parts(case: Case) -> Iterator[Hypothesis]:
+    """Of every group of pairs the part that misses by far less than its sigmas say."""
+    survey = case.survey
+    if case.result is None or not any(p.used for p in survey.pairs):
+        return
+    sums = _sums(case.result)
+    for group, rows in grouped((p.group, i) for i, p in enumerate(survey.pairs) if p.used).items():
+        for part, units in (("rotation", _TURNS), ("translation", _SHIFTS)):
+            square, redundancy = sums.get((group, part), (0.0, 0.0))
+            if redundancy < _FEWEST or square <= 0.0:
+                continue
+            factor = float(np.sqrt(square / redundancy))
+            for unit, said in units.items() if factor < _FAR else ():
+                if unit < _NEAR * factor:
+                    yield _hypothesis(survey, rows, group, part, unit, said)
+
+
+def _sums(result: Adjustment) -> dict[tuple[str, str], tuple[float, float]]:
+    """Squares over sigmas and redundancy of rotations and shifts, by group; of the pairs between fixed stations."""
+    precision = precision_of(result)
+    batch, out = precision.graph.pairs, dict[tuple[str, str], tuple[float, float]]()
+    if batch is None:
+        return out
+    found, pairs = precision.pairs, precision.graph.survey.pairs
+    for part, columns in (("rotation", slice(0, 3)), ("translation", slice(3, 6))):
+        square, redundancy = ((found.whitened[:, columns] ** 2).sum(axis=1), found.redundancy[:, columns].sum(axis=1))
+        known = [i for i, row in enumerate(batch.rows.tolist()) if pairs[row].used and np.isfinite(square[i])]
+        for group, mine in grouped((pairs[int(batch.rows[i])].group, i) for i in known).items():
+            out[group, part] = float(square[mine].sum()), float(redundancy[mine].sum())
+    return out
+
+
+def _hypothesis(survey: Survey, rows: list[int], group: str, part: str, unit: float, said: str) -> Hypothesis:
+    pairs = [survey.pairs[i] for i in rows]
+    poses = [p for p in pairs if isinstance(p.b_from_a, Pose3)] if part == "translation" else pairs
+    penalty = 6.0 * len(poses) * float(np.log(unit))
+    if part == "translation" and _short(poses):
+        moved = {i: m for i in rows if isinstance(m := survey.pairs[i].b_from_a, Pose3)}
+        new = {i: replace(survey.pairs[i], b_from_a=Pose3(m.rotation(), m.translation() / unit))
+               for i, m in moved.items()}  # fmt: skip
+        return Hypothesis(
+            UNIT_OF_SHIFTS, f"the shifts of the pairs of group {group} are hardly longer than their sigmas, and miss "
+            "by a thousandth of these: they are metres, read as millimetres",
+            "in pairs.csv multiply tx_mm, ty_mm, tz_mm by 1000", Place("group", (group,)),
+            with_rows(survey, "pairs", new), (), _EVIDENCE, 0, penalty=penalty,
+        )  # fmt: skip
+    by = np.repeat([unit, 1.0] if part == "rotation" else [1.0, unit], 3)
+    covs = {i: replace(p, cov=p.cov * np.outer(by[: len(p.cov)], by[: len(p.cov)]))
+            for i, p in zip(rows, pairs, strict=True)}  # fmt: skip
+    times = f"{1.0 / unit:.0f} times too large"
+    return Hypothesis(
+        "unit of sigmas",
+        f"the sigmas of the {part} of the pairs of group {group} are about {times}: they {said}",
+        f"multiply these sigmas by {unit:.4g}, or name their column by their unit",
+        Place("group", (group,), "sigma"), with_rows(survey, "pairs", covs), (), _EVIDENCE, 0,
+        penalty=penalty, of_variances=True,
+    )  # fmt: skip
+
+
+def _short(pairs: list[Pair]) -> bool:
+    """Whether most shifts are hardly longer than their sigmas, which are none of another unit by their size."""
+    poses = [(p.b_from_a, np.sqrt(p.cov[3, 3])) for p in pairs if isinstance(p.b_from_a, Pose3)]
+    lengths = np.array([np.linalg.norm(m.translation()) for m, _ in poses])
+    sigmas = np.array([sigma for _, sigma in poses])
+    return bool(len(poses) and np.median(lengths / sigmas) < _SHORT and np.median(sigmas) < _COARSE)
