@@ -11,18 +11,17 @@ ends the run with its report; an index outside its array ends it with a line tha
 """
 
 import argparse
+import ctypes
 import os
 import shutil
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
-
-from adjust.native import library
-from adjust.native.library import instruction_sets
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "build_tools"))
-from native import NativeBuild  # noqa: E402 - found behind the path above
+from native import NativeBuild, instruction_sets  # noqa: E402 - found behind the path above
 
 PLACE = ROOT / "build" / "checked"
 TESTS = (
@@ -43,7 +42,7 @@ def main() -> int:
     for name in ("adjust", "survey", "capture", "tests"):
         ignored = shutil.ignore_patterns("__pycache__", "*.so")
         shutil.copytree(ROOT / name, PLACE / "lib" / name, ignore=ignored, dirs_exist_ok=True)
-    _build(arguments.vectors or instruction_sets()[-1], PLACE / "lib" / "adjust" / "native")
+    _build(arguments.vectors, PLACE / "lib" / "adjust" / "native")
     shutil.copy2(ROOT / "setup.cfg", PLACE / "lib")
     if arguments.module:
         words = ["-m", arguments.module, *others]
@@ -53,13 +52,21 @@ def main() -> int:
     return subprocess.run([sys.executable, *words], cwd=PLACE / "lib", env=_environment(arguments.vectors)).returncode
 
 
-def _build(vectors: str, place: Path) -> None:
+def _build(vectors: str | None, place: Path) -> None:
     for old in place.glob("kernels_*.so"):
         old.unlink()
-    shutil.copy2(Path(library.__file__).parent / "kernels_base.so", place)
+    plain = Path(shutil.copy2(_installed(), place))
+    widest = ctypes.CDLL(str(plain)).widest_instructions()
+    name = vectors or list(instruction_sets())[widest]
     os.environ.setdefault("CXX", "g++")
     os.chdir(ROOT)
-    NativeBuild(checked=True).run({vectors: place / f"kernels_{vectors}.so"})
+    NativeBuild(checked=True).run({name: place / f"kernels_{name}.so"})
+
+
+def _installed() -> Path:
+    """The library ``base`` as it is used: in the checkout, or where the packages were installed."""
+    inside = ROOT / "adjust" / "native" / "kernels_base.so"
+    return inside if inside.exists() else Path(find_spec("adjust.native").origin).with_name(inside.name)
 
 
 def _environment(vectors: str | None) -> dict[str, str]:
