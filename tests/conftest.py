@@ -54,6 +54,15 @@ def _daily(config: pytest.Config) -> bool:
     return bool(config.option.markexpr.strip() == "not slow")
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _shared_labs(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """What one process has made serves all of them."""
+    from tests import labs
+
+    own = tmp_path_factory.getbasetemp()
+    labs.place = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "labs"
+
+
 @pytest.fixture(scope="module")
 def browser() -> Generator[Any]:
     """A browser, started once for a file."""

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from survey.cli import main
+from tests import labs
 
 COMPARE = runpy.run_path(str(Path(__file__).resolve().parents[2] / "examples" / "compare_with_truth.py"))
 
@@ -16,8 +17,7 @@ COMPARE = runpy.run_path(str(Path(__file__).resolve().parents[2] / "examples" / 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory):
     """The example with two cameras, adjusted once."""
-    folder = tmp_path_factory.mktemp("jobs") / "stereo"
-    assert main(["--quiet", "example", "stereo", str(folder)]) == 0
+    folder = labs.example("stereo", tmp_path_factory.mktemp("jobs") / "stereo")
     assert main(["--quiet", "adjust", str(folder)]) == 0
     return folder
 

@@ -43,6 +43,10 @@ class TableServer:
             time.sleep(0.002)
         return rows[-1][0]
 
+    def injected(self, words: str) -> int:
+        """The monotonic time in ns at which a SIM line, the last of its kind, arrived."""
+        return next(at for at, line in reversed(self.received()) if line == f"SIM {words}")
+
     def truth_deg(self) -> list[float]:
         """True angles of both axes, as of a moment after the call (the file is written anew every few milliseconds)."""
         asked, limit = time.monotonic_ns(), time.monotonic() + 30.0

@@ -6,7 +6,7 @@ import socket
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import numpy as np
 import pytest
@@ -34,6 +34,20 @@ def ascii_table(server, dialect="two-axis", signs=(1, 1), zeros=(0.0, 0.0), axes
         yield table
     finally:
         table.close()
+
+
+@contextmanager
+def preferred(other):
+    """This process and another, with the threads that they begin, come before all others where that is allowed."""
+    before = {pid: os.getpriority(os.PRIO_PROCESS, pid) for pid in (0, other)}
+    try:
+        with suppress(PermissionError):
+            for pid in before:
+                os.setpriority(os.PRIO_PROCESS, pid, -20)
+        yield
+    finally:
+        for pid, priority in before.items():
+            os.setpriority(os.PRIO_PROCESS, pid, priority)
 
 
 @pytest.mark.slow
@@ -91,18 +105,19 @@ def test_errors_that_must_be_asked_for(tmp_path):
 def test_stop_within_50_ms_of_a_fault(tmp_path):
     """From the moment the controller has a fault, and from that of a cut connection, to the stop that it receives.
 
-    The median of several, because other work on the machine may hold up one of them.
+    Both by the controller's own clock. The median of several, because other work on the machine may hold up one of
+    them; where that is allowed, it comes behind both processes.
     """
     delays = {"FAULT 1 over-temperature": [], "DROP": []}
-    with table_server(tmp_path, "--speed", "20") as server, ascii_table(server) as table:
+    with table_server(tmp_path, "--speed", "20") as server, preferred(server.pid), ascii_table(server) as table:
         for fault in list(delays) * 5:
             target = 50.0 if table.position[0] < 0 else -50.0
             status = table.set(np.radians([target, target]))
             time.sleep(0.05)
-            begin = server.inject(fault)
+            server.inject(fault)
             with pytest.raises(ControllerError if "FAULT" in fault else TableDisconnectedError):
-                status.result(2.0)
-            when = server.stopped()
+                status.result(30.0)
+            when, begin = server.stopped(), server.injected(fault)
             assert when > begin
             delays[fault].append((when - begin) / 1e6)
             server.inject("CLEAR")

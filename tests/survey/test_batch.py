@@ -184,6 +184,7 @@ def test_a_worker_that_is_killed_is_tried_again(nights: list[Path]) -> None:
 def test_a_worker_ends_when_its_owner_is_gone() -> None:
     worker = Worker()
     try:
+        assert worker.run({"folder": "n", "path": "/nowhere", "redetect": False}).cause == "project"  # it has started
         process = worker._running()
         assert process.stdin is not None
         process.stdin.close()

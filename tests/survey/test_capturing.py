@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from survey.examples import write_example
 from survey.project.captured import Qualities, quality_path, session_status, status_path
 from survey.workbench.pages import capturing
 from survey.workbench.pages.capturing import FolderView
 from survey.workbench.server import Server
 from survey.workbench.session import Workbench
+from tests import labs
 from tests.browsing import opened
 from tests.survey.test_workbench_server import BASE, HERE, TOKEN
 
@@ -130,7 +130,7 @@ def test_the_workbench_says_it_under_its_guard(lab, folder):
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [1280, 390])
 def test_a_session_is_watched_in_the_workbench(browser, tmp_path, width):
-    write_example("head", tmp_path / "lab")
+    labs.example("head", tmp_path / "lab")
     (tmp_path / "lab/images/X").mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(tmp_path / "lab/images/X/live1.png"), np.full((80, 100), 90, np.uint8))
     bench = Workbench(tmp_path / "lab")

@@ -13,6 +13,7 @@ from adjust.model.errors import SurveyError
 from survey.cli import main
 from survey.examples import write_example
 from survey.jobs.cross_validation import halves
+from tests import labs
 from tests.survey.camera_lab import LENSES, write_lab
 
 pytestmark = pytest.mark.usefixtures("undiagnosed")
@@ -34,7 +35,7 @@ def touched(folder: Path, camera: str, epochs: set[str], factor: float) -> None:
 
 
 def test_epochs_of_a_sort_take_turns_and_the_only_one_of_its_sort_is_in_both(tmp_path: Path) -> None:
-    write_example("head", tmp_path / "lab")
+    labs.example("head", tmp_path / "lab")
     project = survey.read(tmp_path / "lab")
     seen: dict[str, set[str]] = {}
     for block in project.survey.image_blocks:

@@ -6,9 +6,16 @@ import struct
 
 import numpy as np
 import pytest
-import trimesh
 
 from survey.interop.scene import CHI2_95, glb_bytes, ply_bytes, scene, sphere
+
+
+@pytest.fixture(scope="module")
+def trimesh():
+    """Not imported by the processes that only collect these tests."""
+    import trimesh
+
+    return trimesh
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +61,7 @@ def test_the_container_keeps_gltfs_rules(drawn):
             assert np.linalg.det(M) > 0
 
 
-def test_trimesh_opens_the_scene_and_finds_ellipsoids_of_the_right_size(drawn):
+def test_trimesh_opens_the_scene_and_finds_ellipsoids_of_the_right_size(drawn, trimesh):
     values, found = drawn
     opened = trimesh.load(io.BytesIO(glb_bytes(found)), file_type="glb")
     up = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])  # z up to y up
@@ -85,7 +92,7 @@ def test_the_cameras_of_the_scene_look_where_ours_look(drawn):
     assert np.tan(yfov / 2) == pytest.approx(480 / ((lens[0] + lens[1]) / 2))
 
 
-def test_trimesh_opens_the_ply_with_all_points_and_closed_ellipsoids(drawn):
+def test_trimesh_opens_the_ply_with_all_points_and_closed_ellipsoids(drawn, trimesh):
     values, found = drawn
     data = ply_bytes(found)
     opened = trimesh.load(io.BytesIO(data), file_type="ply", process=False)
@@ -96,7 +103,7 @@ def test_trimesh_opens_the_ply_with_all_points_and_closed_ellipsoids(drawn):
     assert f"enlarged {found.enlarged:g} times".encode() in data[:400]
 
 
-def test_the_sphere_is_closed_and_faces_outwards():
+def test_the_sphere_is_closed_and_faces_outwards(trimesh):
     mesh = trimesh.Trimesh(*sphere(16), process=False)
     assert mesh.is_watertight
     assert 0.95 * 4 / 3 * np.pi < mesh.volume < 4 / 3 * np.pi

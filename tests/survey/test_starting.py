@@ -8,9 +8,9 @@ import pytest
 
 from adjust.model.errors import SurveyError
 from survey.cli import main
-from survey.examples import write_example
 from survey.jobs.starting import start_project
 from survey.project import read
+from tests import labs
 
 pytestmark = pytest.mark.slow
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.slow
 def images(tmp_path_factory):
     """Images of a stereo head before a checkerboard of 9 x 6 inner corners."""
     place = tmp_path_factory.mktemp("images")
-    write_example("stereo", place / "lab")
+    labs.example("stereo", place / "lab")
     for path in sorted((place / "lab/images").glob("*/*")):
         if path.stem > "e03":
             path.unlink()

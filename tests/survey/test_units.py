@@ -13,6 +13,7 @@ from adjust.diagnosis.weights.impossible import doubtful_sigmas
 from survey.cli import main
 from survey.examples import write_example
 from survey.project import read
+from tests import labs
 
 Row = dict[str, str]
 Change = Callable[[Row], object]
@@ -20,7 +21,7 @@ Change = Callable[[Row], object]
 
 def planted(folder: Path, example: str, table: str, change: Change) -> Path:
     """A ready project with the rows of one table changed."""
-    write_example(example, folder)
+    labs.example(example, folder)
     path = folder / "observations" / f"{table}.csv"
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))

@@ -26,6 +26,7 @@ from survey.workbench.pictures import picture
 from survey.workbench.rows import BY_PEOPLE, IN_USE, columns, point_rows
 from survey.workbench.session import Workbench
 from survey.workbench.situation import CancelledError, ChangedError
+from tests import labs
 
 pytestmark = pytest.mark.slow
 
@@ -400,7 +401,7 @@ def mirrored(folder, camera, first, width=1280):
 @pytest.fixture
 def spoilt(tmp_path):
     """A head on a table of which some images are mirrored, and its table of image points as it is then."""
-    write_example("head", tmp_path / "lab")
+    labs.example("head", tmp_path / "lab")
     mirrored(tmp_path / "lab", "Y", "tY01")
     return tmp_path / "lab", (tmp_path / "lab/observations/image_points.csv").read_bytes()
 

@@ -14,7 +14,6 @@ import pytest
 
 import capture.web
 from adjust.model.clocks import CLOCKS
-from survey.examples import write_example
 from survey.project import write_project
 from survey.project.project import DEMANDED
 from survey.report.language import catalogue
@@ -27,6 +26,7 @@ from survey.workbench.pages.beginning import Beginning
 from survey.workbench.rows import columns
 from survey.workbench.server import WEB, Server
 from survey.workbench.session import Workbench
+from tests import labs
 from tests.browsing import CONTRAST, INKED, Page, opened
 from tests.survey.accessible import FAULTS
 
@@ -54,7 +54,7 @@ ROWS = "Number(document.querySelector('#tables [role=grid]').getAttribute('aria-
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A project with one image point that is wrong by 4 px, and a title that a careless page would run."""
     out = tmp_path_factory.mktemp("workbench") / "lab"
-    write_example("head", out)
+    labs.example("head", out)
     path = out / "observations" / "image_points.csv"
     with path.open(newline="") as stream:
         rows = list(csv.reader(stream))
@@ -381,7 +381,7 @@ def test_what_others_write_is_told_and_loaded(page: Page, folder: Path) -> None:
 
 def test_a_folder_of_images_becomes_a_project_on_the_page(browser: Any, tmp_path: Path) -> None:
     """Its survey.toml is gone; the images lie where those of a project do, and stay."""
-    write_example("one-camera", tmp_path / "lab")
+    labs.example("one-camera", tmp_path / "lab")
     for name in sorted((tmp_path / "lab/images").glob("*/*"))[3:]:
         name.unlink()
     (tmp_path / "lab/survey.toml").unlink()
@@ -399,7 +399,7 @@ def test_a_folder_of_images_becomes_a_project_on_the_page(browser: Any, tmp_path
 
 
 def test_before_anything_is_observed_every_view_says_what_it_waits_for(browser: Any, tmp_path: Path) -> None:
-    write_example("one-camera", tmp_path / "lab")
+    labs.example("one-camera", tmp_path / "lab")
     with opened(browser, Workbench(tmp_path / "lab")) as page:
         p, waiting = page.page, set()
         for view in (*VIEWS, "halves"):
@@ -431,7 +431,7 @@ def test_ellipsoids_are_in_sight_when_a_scene_is_opened(desk: Page, mode: str) -
 
 def test_images_are_detected_and_shown_as_they_come(browser: Any, tmp_path: Path) -> None:
     """From a folder of images in which nothing was looked for to an adjusted project, in the page alone."""
-    write_example("one-camera", tmp_path / "lab")
+    labs.example("one-camera", tmp_path / "lab")
     names = sorted((tmp_path / "lab/images").glob("*/*"))
     for name in names[6:]:
         name.unlink()

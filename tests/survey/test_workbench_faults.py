@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from survey.examples import write_example
 from survey.notebook.steps import detect
 from survey.project.exclusions import read_exclusions
 from survey.workbench.session import Workbench
+from tests import labs
 from tests.browsing import Page, opened
 
 pytestmark = [pytest.mark.slow, pytest.mark.browser]
@@ -48,14 +48,14 @@ def _misread(row: dict[str, str]) -> dict[str, str]:
 
 def write_spoilt(folder: Path) -> None:
     """A head on a table with three mistakes."""
-    write_example("head", folder)
+    labs.example("head", folder)
     _rows(folder / "observations/image_points.csv", _spoilt)
     _rows(folder / "observations/table_angles.csv", _misread)
 
 
 def write_reflection(folder: Path) -> None:
     """Two cameras and a board with a lamp mirrored in it, beside a corner; another program took that for the corner."""
-    write_example("stereo", folder)
+    labs.example("stereo", folder, detected=True)
     path = folder / "images/left/e05.png"
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     assert image is not None

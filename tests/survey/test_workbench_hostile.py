@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from survey.cli import main
-from survey.examples import write_example
 from survey.folder.locking import LOCK, FileLock
 from survey.workbench.addresses import WAYS
 from survey.workbench.session import Workbench
+from tests import labs
 from tests.browsing import opened
 from tests.survey.test_workbench import exclusions
 from tests.survey.test_workbench_browser import VIEWS
@@ -189,7 +189,7 @@ def test_a_command_that_writes_at_the_same_time_loses_nothing(mine):
 
 def harmful(folder: Path) -> None:
     """A project with markup in everything that people write: title, comments, reasons, names of what is left out."""
-    write_example("head", folder)
+    labs.example("head", folder)
     toml = folder / "survey.toml"
     text = toml.read_text().replace('title = "', f'title = \'{ODD}\' # {ODD}\n# "', 1)
     toml.write_text(f"# {ODD}\n{text}\n[identification]\nsurveyor = '{ODD}'\nnotes = '{ODD}'\n")

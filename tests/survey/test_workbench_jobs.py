@@ -13,6 +13,7 @@ from survey.project import read, write_project
 from survey.report.language import speaking
 from survey.simulate import Scene, beacons
 from survey.workbench.session import Workbench
+from tests import labs
 from tests.survey.planning_lab import write_lab
 
 pytestmark = pytest.mark.slow
@@ -22,7 +23,7 @@ pytestmark = pytest.mark.slow
 def pictures(tmp_path_factory):
     """A project of images in which nothing was looked for yet."""
     folder = tmp_path_factory.mktemp("camera") / "lab"
-    write_example("one-camera", folder)
+    labs.example("one-camera", folder)
     for name in sorted((folder / "images").glob("*/*"))[6:]:
         name.unlink()
     return folder

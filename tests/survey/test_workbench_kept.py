@@ -7,9 +7,9 @@ import sys
 import numpy as np
 import pytest
 
-from survey.examples import write_example
 from survey.jobs.adjusting.job import adjust_job
 from survey.workbench.session import Workbench
+from tests import labs
 
 pytestmark = pytest.mark.slow
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def adjusted(tmp_path_factory):
     folder = tmp_path_factory.mktemp("kept") / "lab"
-    write_example("head", folder)
+    labs.example("head", folder)
     adjust_job(folder, progress=False)
     return folder
 
