@@ -1,6 +1,6 @@
 """Tests and reliability of all image points in the core, in threads: every point by itself (``point_tests.h``).
 
-And of what may have changed from one epoch on (``changes.h``).
+And of what may have changed from one epoch on (``changes.h``), and what errs alike (``parallels.h``).
 """
 
 from typing import NamedTuple
@@ -27,6 +27,9 @@ _change_squares = Function(
     "first[J+1] rows[k] B[k,w] A_ptr[m+1] A_column[a] A_entry[a] e[m] own_ptr[n+1] own_column[o] own_entry[o] U[n,c] "
     "x[n,w] s[n,w] mark[n] touched[n] left[w,w] shared[w,c] columns[2,w] squares[J,w] M[J,w,w] g[J,w]",
 )
+_parallel_pairs = Function("parallel_pairs", "first last end u[N,d] head[h,N+31] rest[N+31] least found[m,3]")
+_HEAD, _BEHIND = 16, 31
+"""Components by which vectors are compared first; numbers behind the last of them, for whole vectors."""
 
 
 class AdjustedPoints(NamedTuple):
@@ -102,3 +105,24 @@ def change_squares(
     out = np.empty((J, w)), np.empty((J, w, w)), np.empty((J, w))
     _change_squares(first, rows, padded, *A, e, *own, U, *later, *sums, *out)
     return out[0][:, :q], out[1][:, :q, :q], out[2][:, :q]
+
+
+class UnitVectors:
+    """Unit vectors (n, d) of single numbers, in axes along which most of them are long."""
+
+    def __init__(self, u: FloatArray) -> None:
+        self.u = u.astype(np.float32)
+        axes = np.linalg.eigh(u.T @ u)[1][:, : -_HEAD - 1 : -1]
+        head = u @ axes
+        rest = np.sqrt(np.maximum(1.0 - np.einsum("nh,nh->n", head, head), 0.0))
+        self._head, self._rest = (np.concatenate([x, np.zeros((_BEHIND, *x.shape[1:]))]).T.astype(np.float32, order="C")
+                                  for x in (head, rest))  # fmt: skip
+
+    def parallel(self, first: int, last: int, end: int, least: float) -> FloatArray:
+        """Rows (k, 3): i < end, j < i from first to last, and the size of their product, where that is not less."""
+        found = np.empty((4 * (last - first), 3))
+        while True:
+            n = _parallel_pairs(first, last, end, self.u, self._head, self._rest, least, found)
+            if n <= len(found):
+                return found[:n]
+            found = np.empty((n, 3))

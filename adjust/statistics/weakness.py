@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy import sparse
@@ -9,6 +10,7 @@ from scipy import sparse
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import side_by_side
+from adjust.native.point_tests import UnitVectors
 from adjust.precision.stacked import AT_ONCE
 from adjust.statistics.normal import DENSE, FEW, PLAIN, Inverse
 from adjust.statistics.result import Correlation, WeakDirection, WeakPart
@@ -23,6 +25,8 @@ _WORK, _SOLVED = 1_000_000_000, 5_000_000
 """Correlations that are looked at in drawn solutions, and those in columns of the covariance matrix."""
 _DRAWS, _SURE = 64, 7.0
 """Drawn solutions, and by how many sigmas what they tell may be wrong."""
+_SIZES = (0.99, 0.96, 0.9)
+"""Correlations in drawn solutions that are looked for first: mostly there are enough of them."""
 _COMPARED, _TOGETHER = 256, 8
 """Components that are compared with all others in one go, and how often that is done side by side."""
 _BLOCK, _STEPS, _EXACT = 8, 40, 1e-10
@@ -70,7 +74,7 @@ def correlations(
     if n <= PLAIN or (n <= DENSE and system.structured is not None):
         sigma = np.sqrt(np.maximum(np.diag(system.covariance), 1e-300))
         C = system.covariance / sigma / sigma[:, None]
-        pairs = _largest(lambda rows, part: np.abs(C[rows, part]), n, n, limit)
+        pairs = _largest(partial(_larger, C), n, n, limit)
         return _named(system, _above(pairs, C[pairs[:, 0], pairs[:, 1]], limit))
     pairs = _likely(system, index, limit)
     columns = np.array(list(dict.fromkeys(pairs[:, 1].tolist()))[: max(_SOLVED // n, AT_ONCE)], dtype=np.int64)
@@ -92,6 +96,14 @@ def _above(pairs: IntArray, C: FloatArray, limit: float) -> _Found:
     return list(zip(*np.sort(pairs[high], axis=1).T.tolist(), C[high].tolist(), strict=True))
 
 
+def _larger(C: FloatArray, first: int, last: int, end: int, least: float) -> FloatArray:
+    """Of columns of a matrix what is below its diagonal, to row ``end``, and so large: as ``_largest`` asks for it."""
+    size = np.abs(np.tril(C[first:end, first:last], -1))
+    at = np.flatnonzero(size >= least)
+    i, j = np.divmod(at, last - first)
+    return np.stack([first + i, first + j, size.ravel()[at]], axis=1)
+
+
 def _likely(system: LinearSystem, index: IntArray, limit: float) -> IntArray:
     """Pairs (k, 2) that may correlate so, the likeliest first, by errors of drawn solutions.
 
@@ -100,43 +112,27 @@ def _likely(system: LinearSystem, index: IntArray, limit: float) -> IntArray:
     drawn = system.drawn(_DRAWS)
     drawn /= np.maximum(np.linalg.norm(drawn, axis=1), 1e-150)[:, None]
     order = np.concatenate([index, np.delete(np.arange(len(drawn)), index)])
-    u, z = drawn[order].astype(np.float32), np.arctanh(limit) - _SURE / np.sqrt(_DRAWS - 2.0)
-
-    def size(rows: slice, part: slice) -> FloatArray:
-        x: FloatArray = u[rows] @ u[part].T
-        return np.abs(x, out=x)
-
-    pairs = order[_largest(size, len(u), len(index), float(np.tanh(max(z, 1e-9))))]
-    often = np.bincount(pairs.ravel(), minlength=len(u))[pairs]
+    u, z = UnitVectors(drawn[order]), np.arctanh(limit) - _SURE / np.sqrt(_DRAWS - 2.0)
+    for size in (*_SIZES, 0.0):  # seldom down to the last
+        found = _largest(u.parallel, len(order), len(index), max(size, float(np.tanh(max(z, 1e-9)))))
+        if len(found) == _KEPT:
+            break
+    pairs = order[found]
+    often = np.bincount(pairs.ravel(), minlength=len(order))[pairs]
     return np.where(often[:, :1] > often[:, 1:], pairs[:, ::-1], pairs)
 
 
-def _largest(size: Callable[[slice, slice], FloatArray], total: int, n: int, least: float) -> IntArray:
+def _largest(above: Callable[[int, int, int, float], FloatArray], total: int, n: int, least: float) -> IntArray:
     """Pairs (k, 2) of n columns with each other and with all others, those at least of a size, the largest first.
 
-    size: of some rows and columns. total: rows. Small blocks: what is not so large is never written to memory, and
-    what is smaller than enough others, of neighbours first, is not so large.
+    above: of columns from .. to with the rows behind each, to a last one, of at least a size: row, column, size (k, 3).
+    total: rows. What is smaller than enough others is not looked for.
     """
-    parts = [slice(first, min(first + _COMPARED, n)) for first in range(0, n, _COMPARED)]
-
-    def above(part: slice) -> FloatArray:
-        found = [np.zeros((0, 3))]
-        for row in range(part.start, total, 4 * _COMPARED):
-            x = size(slice(row, row + 4 * _COMPARED), part)
-            if row == part.start:
-                x[: x.shape[1]] = np.tril(x[: x.shape[1]], -1)  # each pair once, nothing with itself
-            if x.max() >= least:
-                at = np.flatnonzero(x >= least)
-                i, j = np.divmod(at, x.shape[1])
-                found.append(np.stack([row + i, part.start + j, x.ravel()[at]], axis=1))
-        return _first(np.concatenate(found))
-
-    near = np.concatenate([x[x >= least] for x in (np.tril(size(part, part), -1) for part in parts)]) if parts else ()
-    if len(near) > _KEPT:
-        least = float(np.partition(near, -_KEPT)[-_KEPT])
+    parts = [(first, min(first + _COMPARED, n)) for first in range(0, n, _COMPARED)]
     out = np.zeros((0, 3))
     for k in range(0, len(parts), _TOGETHER):
-        out = _first(np.concatenate([out, *side_by_side(above, parts[k : k + _TOGETHER])]))
+        some = [(*part, total, least) for part in parts[k : k + _TOGETHER]]
+        out = _first(np.concatenate([out, *side_by_side(lambda part: _first(above(*part)), some)]))
         least = max(least, float(out[-1, 2])) if len(out) == _KEPT else least
     return out[:, :2].astype(np.int64)
 

@@ -180,10 +180,10 @@ def neighbours(adjustment: Adjustment, scale: Scale) -> tuple[RelativePrecision,
     if len(names) < 2:
         return ()
     x, found = np.array(places), dict[tuple[int, int], None]()
-    free = [bool(_unknown_components(adjustment.estimates[name])) for name in names]
     for i in range(len(x)):
         near = _nearest(x, i, min(3, len(x)))
-        found |= {(min(i, k), max(i, k)): None for k in near[1:] if free[i] or free[k]}
+        free = [bool(_unknown_components(adjustment.estimates[names[k]])) for k in near]
+        found |= {(min(i, k), max(i, k)): None for k, known in zip(near[1:], free[1:], strict=True) if free[0] or known}
         if len(found) >= MOST_NEIGHBOURS:
             break
     pairs = [(names[i], names[k]) for i, k in islice(found, MOST_NEIGHBOURS)]

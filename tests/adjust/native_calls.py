@@ -124,6 +124,7 @@ def _images() -> None:
     point_tests.point_tests(points, lambda0, tuple(np.zeros((n,) if i < 5 else (n, 2)) for i in range(9)))
     eye, ones = point_tests.SparseRows(np.arange(4), np.arange(3), np.ones(3)), np.ones((3, 2))
     point_tests.change_squares(np.array([0, 1, 3]), np.arange(3), ones, eye, ones[:, 0].copy(), eye, ones)
+    point_tests.UnitVectors(np.eye(20, 64)[[0, 1, 1, 5, 19]]).parallel(0, 5, 5, 0.9)
     words = text.Words.of(["a", "bc", ""])
     text.number_rows(words, np.array([0, 1, 2]), words, np.array([1, 1, 0]), points.v[:3], [3, 0])
     parts = [(text.WORD, 0), (text.NUMBERS, 2), (text.TEXT, 1)]

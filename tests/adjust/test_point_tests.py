@@ -3,11 +3,13 @@
 from itertools import pairwise
 
 import numpy as np
+import pytest
 from scipy import sparse
 
 from adjust.native.point_tests import (
     AdjustedPoints,
     SparseRows,
+    UnitVectors,
     change_squares,
     controlled_directions,
     farthest_points,
@@ -144,3 +146,23 @@ def test_changes_from_every_run_on_are_those_of_the_dense_matrices() -> None:
             np.testing.assert_allclose(M[j], expected, rtol=0.0, atol=1e-12 * np.abs(expected).max(initial=1.0))
             np.testing.assert_allclose(squares[j], (C**2).sum(axis=0))
             np.testing.assert_allclose(g[j], C.T @ e[rows[start:]])
+
+
+@pytest.mark.parametrize("least", [0.3, 0.7, 0.99])
+@pytest.mark.parametrize("smooth", [0.0, 1.5])
+def test_nearly_parallel_vectors(least: float, smooth: float) -> None:
+    """Of all products those that are as large, whether few axes hold most of the vectors or none do."""
+    rng = np.random.default_rng(4)
+    u = rng.normal(size=(333, 64)) * np.arange(1, 65) ** -smooth @ np.linalg.qr(rng.normal(size=(64, 64)))[0]
+    u[200:260] = rng.choice([-1.0, 1.0], 60)[:, None] * u[:60] + 0.1 * rng.normal(size=(60, 64)) * np.abs(u[:60]).mean()
+    u[300] = u[7]
+    u /= np.linalg.norm(u, axis=1)[:, None]
+    for first, last, end in ((0, 333, 333), (5, 6, 333), (64, 97, 97), (10, 250, 301)):
+        found = UnitVectors(u).parallel(first, last, end, least)
+        size = np.abs(np.tril(u @ u.T, -1))
+        mine = np.zeros_like(size)
+        mine[tuple(found[:, :2].astype(np.int64).T)] = found[:, 2]
+        size[:, :first] = size[:, last:] = size[end:] = 0.0
+        sure = np.abs(size - least) > 1e-6  # single numbers
+        np.testing.assert_allclose(mine[sure], np.where(size >= least, size, 0.0)[sure], atol=1e-6)
+    assert (size >= least).any()
