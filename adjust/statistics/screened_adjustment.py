@@ -134,6 +134,8 @@ def _blamed_on_rays(survey: Survey, found: Adjustment) -> bool:
     names = [p.point_id for p in found.survey.points]
     paired = {r.frame_id for p in survey.pairs if p.used for r in (p.a, p.b) if r.kind == "station"}
     carrying = {c.camera_id for c in survey.cameras if c.station_id in paired}
+    if not touched and not carrying:
+        return False
     kept = {(b.camera_id, b.epoch_id) for b in found.survey.image_blocks if b.n_used}
     lost = {b.camera_id for b in survey.image_blocks if (b.camera_id, b.epoch_id) not in kept and b.n_used}
     return bool(lost & carrying) or any(
