@@ -55,7 +55,7 @@ def write_spoilt(folder: Path) -> None:
 
 def write_reflection(folder: Path) -> None:
     """Two cameras and a board with a lamp mirrored in it, beside a corner; another program took that for the corner."""
-    labs.example("stereo", folder, detected=True)
+    labs.example("stereo", folder)
     path = folder / "images/left/e05.png"
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     assert image is not None
