@@ -119,7 +119,8 @@ def _evidence(survey: Survey, before: Screen | None, values: FloatArray, ways: S
     if before is not None:
         misread = [i for i, w in enumerate(whole) if w and not _fits_as_it_is(before, ways[i][0].rows)]
         anew, there = (misread, []) if n <= _LARGE_START else ([], misread)
-        there += [i for i, w in enumerate(whole) if not w]
+        # where all others fit, the start is not spoilt, and of a few readings it says more than a new one of all
+        there += [i for i, w in enumerate(whole) if not w or (i in anew and _others_fit(before, ways[i][0].rows))]
     surveys, out = [mended(survey, ways[i][0].rows, ways[i][1]) for i in anew], [0.0] * len(ways)
     for i, after in zip(anew, before.afresh(surveys) if before else map(screen, surveys), strict=True):
         if after is not None:
@@ -127,7 +128,7 @@ def _evidence(survey: Survey, before: Screen | None, values: FloatArray, ways: S
             old = CAP * n if before is None else before.misfit(scale)
             out[i] = improvement(old, after.misfit(scale), n)
     for i, gain in () if before is None else _in_place(before, values, ways, there):
-        out[i] = gain
+        out[i] = max(out[i], gain)
     return out
 
 
@@ -165,6 +166,13 @@ def _fits_as_it_is(before: Screen, rows: IntArray) -> bool:
     """Whether so few readings miss, of these and of all, that these cannot be misread throughout."""
     bad = before.missed
     return bool(before.scale < _ROUGH and bad.mean() < _FEW and bad[rows].mean() < 0.5)
+
+
+def _others_fit(before: Screen, rows: IntArray) -> bool:
+    """Whether few of the other readings miss."""
+    others = np.ones(len(before.missed), dtype=np.bool_)
+    others[rows] = False
+    return bool(others.any() and before.scale < _ROUGH and before.missed[others].mean() < _FEW)
 
 
 def _hypothesis(survey: Survey, scope: Scope, misreading: Misreading, evidence: float, looked_at: int) -> Hypothesis:
