@@ -90,7 +90,7 @@ def begin_adjusting() -> None:
     if sys.platform == "linux" and (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:  # of glibc
         for option, value in _MALLOC.items():
             mallopt(option, value)
-    for name in ("numpy.f2py", "numpy.ma", "numpy.testing"):
+    for name in ("numpy.f2py", "numpy.testing"):  # not numpy.ma: two threads that are first to use a lazy module fail
         spec = None if name in sys.modules else importlib.util.find_spec(name)
         if spec is not None and spec.loader is not None:
             spec.loader = importlib.util.LazyLoader(spec.loader)
