@@ -112,6 +112,7 @@ Solver = tuple[Callable[[FloatArray], FloatArray], Callable[[], FloatArray] | No
 
 
 def _solver(scaled: sparse.csc_matrix) -> Solver:
+    """Raises LinAlgError where the matrix is singular."""
     n = scaled.shape[0]
     if n <= FEW:  # its inverse: SciPy's linear algebra takes longer to load
         inverse = np.linalg.inv(scaled.toarray())
@@ -121,7 +122,10 @@ def _solver(scaled: sparse.csc_matrix) -> Solver:
         return lambda b: np.asarray(scipy.linalg.cho_solve(factor, b)), lambda: inverse_of_factor(*factor)
     from scipy.sparse.linalg import splu  # here: as above
 
-    lu = splu(scaled, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+    try:
+        lu = splu(scaled, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+    except RuntimeError as error:
+        raise np.linalg.LinAlgError(str(error)) from error
     return lu.solve, None
 
 

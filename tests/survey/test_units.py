@@ -221,3 +221,23 @@ def test_few_height_differences_of_the_other_sign_are_named_and_mended(tmp_path:
     assert solution["diagnosis"][0]["name"] == "sign of height differences"
     assert solution["warnings"][0].startswith("probable cause: all readings of kind height_difference")
     assert main(["adjust", str(lab), "--quiet", "--try", "1"]) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("factor", "said"), [
+    (1e3, "are millimetres, read as metres"), (1e-3, "are metres, read as millimetres"),
+    (1.0 / 25.4, "are inches, read as millimetres"),
+])  # fmt: skip
+def test_all_distances_in_another_unit_have_one_cause(
+    factor: float, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Micrometres took a minute and a half, and were told as sigmas that no instrument has."""
+    lab = planted(tmp_path / "lab", "total-station", "distances", scaled("value_mm", factor))
+    assert main(["adjust", str(lab), "--quiet"]) == 0
+    shown = capsys.readouterr().out
+    assert "NEEDS A LOOK" in shown
+    assert f"probable cause: all distances: their values {said}" in shown
+    assert "no instrument has" not in shown
+    assert main(["adjust", str(lab), "--quiet", "--try", "1"]) == 0
+    solution = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))
+    assert (solution["summary"]["fit"], solution["warnings"]) == ("fits", [])

@@ -73,6 +73,7 @@ def _scaled(name: str, kinds: tuple[ReadingKind, ...], ratios: dict[str, float])
     return [Misreading(name, said, ratio, 0.0, kinds) for said, ratio in ratios.items()]
 
 
+UNIT_OF_LENGTHS = "unit of lengths"
 LENGTH_RATIOS = {
     "are metres, read as millimetres": 1000.0,
     "are millimetres, read as metres": 0.001,
@@ -95,7 +96,7 @@ ANGLE_RATIOS = {
     "are degrees, read as arcseconds": 3600.0,
 }
 MISREADINGS: tuple[Misreading, ...] = (
-    *_scaled("unit of lengths", LENGTHS, LENGTH_RATIOS),
+    *_scaled(UNIT_OF_LENGTHS, LENGTHS, LENGTH_RATIOS),
     *_scaled("unit of angles", ANGLES, ANGLE_RATIOS),
     Misreading("sense of rotation", "count the other way round", -1.0, 0.0, TURNS),
     Misreading("angles from another zero", "are elevations, read as zenith angles", -1.0, np.pi / 2.0, ("zenith",)),

@@ -3,14 +3,14 @@
 The rest of the survey predicts them, with the sigma of that; nothing is adjusted.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from adjust.diagnosis.diagnosis import Candidate
 from adjust.diagnosis.hypothesis import ChangeReadings, Edit, Hypothesis, Place
-from adjust.diagnosis.units.conventions import MISREADINGS, Misreading, slips
+from adjust.diagnosis.units.conventions import MISREADINGS, UNIT_OF_LENGTHS, Misreading, slips
 from adjust.diagnosis.units.motions import CONVENTIONS, edits_of, mended, miss
 from adjust.model.observations import Distance, Reading
 from adjust.model.result import Adjustment, ObservationResidual
@@ -39,7 +39,29 @@ def misread_singles(survey: Survey, result: Adjustment) -> tuple[Candidate, ...]
         row = given.get((o.kind, o.ids[0])) if o.ids and not o.used else None
         if row is not None:
             found += _best(survey, result, o, row)
-    return tuple(sorted(found, key=lambda c: -c.statistic)[:_MOST])
+    common = _of_all_distances(survey, found)
+    return common or tuple(sorted(found, key=lambda c: -c.statistic)[:_MOST])
+
+
+def _of_all_distances(survey: Survey, found: Sequence[Candidate]) -> tuple[Candidate, ...]:
+    """One candidate where each distance of the survey fits in the same other unit; else none."""
+    used = {d.distance_id: i for i, d in enumerate(survey.distances) if d.used}
+    edits = {i: (e.factor, c) for c in found for e in c.hypothesis.edits
+             if isinstance(e, ChangeReadings) and e.table == "distances" for i in e.ids}  # fmt: skip
+    factors = {factor for factor, _ in edits.values()}
+    ways = [m for m in MISREADINGS if m.name == UNIT_OF_LENGTHS and factors == {m.factor}]
+    if not ways or len(used) < 2 or edits.keys() != used.keys():
+        return ()
+    way, every, first = ways[0], survey.distances, next(c for _, c in edits.values())
+    changed = with_rows(survey, "distances", {
+        i: replace(every[i], value=way.factor * every[i].value) for i in used.values()})  # fmt: skip
+    h = Hypothesis(
+        way.name, f"all distances: {way.text('their')}", f"in distances.csv multiply them by {way.factor:.10g}, or "
+        "name the column by their unit", Place("reading", tuple(used), "value"), changed,
+        (ChangeReadings(tuple(used), way.factor, table="distances"),),
+    )  # fmt: skip
+    share = min(c.explained for _, c in edits.values())
+    return (replace(first, hypothesis=h, explained=share, statistic=sum(c.statistic for _, c in edits.values())),)
 
 
 def _best(survey: Survey, result: Adjustment, o: ObservationResidual, row: int) -> list[Candidate]:

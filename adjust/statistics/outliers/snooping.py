@@ -251,8 +251,11 @@ class Snooping:
                 new[mine] = new[mine].min()
             if np.abs(new - weights).max(initial=0.0) < 1e-2:
                 break
+            try:
+                e = self._reweighted(new, factor)
+            except np.linalg.LinAlgError:
+                break  # what is so far off that its weight is nothing is all that determines something: it stands out
             weights = new
-            e = self._reweighted(weights, factor)
         return squares
 
     def _linearised(self) -> FloatArray:

@@ -15,7 +15,9 @@ _BY_FAR = 1e4
 
 
 def distances_that_stand_out(survey: Survey) -> tuple[BoolArray, Start] | None:
-    """Which (n,) of the distances do, fewer than half of them, and the start values; None where none does.
+    """Which (n,) of the distances do, fewer than half of them or all, and the start values; None where none does.
+
+    All of them only among as many others, which hold the survey together without.
 
     Raises SurveyError where there are no start values.
     """
@@ -23,10 +25,11 @@ def distances_that_stand_out(survey: Survey) -> tuple[BoolArray, Start] | None:
     graph = GraphBuilder(survey, start.lenses).build(start)
     every = misfits(graph, graph.start)
     mine = {m.owner.removeprefix("distance "): m.square for m in every if m.owner.startswith("distance ")}
-    rest = max((m.square for m in every if not m.owner.startswith("distance ")), default=0.0)
+    others = [m.square for m in every if not m.owner.startswith("distance ")]
+    rest = max(others, default=0.0)
     square = np.array([mine.get(d.distance_id, 0.0) for d in survey.distances])
     worst = np.argsort(-square, kind="stable")
-    for k in range(1, (len(square) + 1) // 2):
-        if square[worst[k - 1]] > _BY_FAR * max(rest, square[worst[k]], 1.0):
+    for k in (*range(1, (len(square) + 1) // 2), *[len(square)][: len(others) >= len(square)]):
+        if square[worst[k - 1]] > _BY_FAR * max([rest, 1.0, *square[worst[k : k + 1]]]):
             return np.isin(np.arange(len(square)), worst[:k]), start
     return None
