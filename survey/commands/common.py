@@ -87,6 +87,7 @@ def begin_adjusting() -> None:
     import ctypes  # here: --help starts without it
 
     os.environ.setdefault("NUMPY_MADVISE_HUGEPAGE", "0")  # pages of 2 MB are sought, and cleared whole, at every array
+    os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")  # one place for memory, not one more of Arrow's own
     if sys.platform == "linux" and (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:  # of glibc
         for option, value in _MALLOC.items():
             mallopt(option, value)
