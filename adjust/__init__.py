@@ -7,8 +7,9 @@
 The names in ``__all__`` stay; everything is loaded when it is first used.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from adjust.model.loading import lazily
 
 if TYPE_CHECKING:
     from adjust.adjustment import AdjustOptions
@@ -22,19 +23,19 @@ if TYPE_CHECKING:
     from adjust.relay.session import NetworkSession
 
 _PLACES = {
-    "AdjustOptions": ("adjust.adjustment", "AdjustOptions"),
-    "Adjustment": ("adjust.model.result", "Adjustment"),
-    "Datum": ("adjust.model.survey", "Datum"),
-    "Estimate": ("adjust.model.result", "Estimate"),
-    "IndeterminateError": ("adjust.model.errors", "IndeterminateError"),
-    "NotConvergedError": ("adjust.model.errors", "NotConvergedError"),
-    "NetworkSession": ("adjust.relay.session", "NetworkSession"),
-    "Survey": ("adjust.model.survey", "Survey"),
-    "SurveyError": ("adjust.model.errors", "SurveyError"),
-    "in_datum": ("adjust.precision.other_datum", "in_datum"),
-    "joint_congruence": ("adjust.epochs.congruence", "joint_congruence"),
-    "joint_survey": ("adjust.epochs.joint", "joint_survey"),
-    "solve": ("adjust.adjustment", "adjust"),
+    "AdjustOptions": "adjust.adjustment",
+    "Adjustment": "adjust.model.result",
+    "Datum": "adjust.model.survey",
+    "Estimate": "adjust.model.result",
+    "IndeterminateError": "adjust.model.errors",
+    "NotConvergedError": "adjust.model.errors",
+    "NetworkSession": "adjust.relay.session",
+    "Survey": "adjust.model.survey",
+    "SurveyError": "adjust.model.errors",
+    "in_datum": "adjust.precision.other_datum",
+    "joint_congruence": "adjust.epochs.congruence",
+    "joint_survey": "adjust.epochs.joint",
+    "solve": "adjust.adjustment:adjust",
 }
 
 __all__ = [
@@ -53,15 +54,7 @@ __all__ = [
     "solve",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    """A public name, loaded now."""
-    if name not in _PLACES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module, attribute = _PLACES[name]
-    value = getattr(import_module(module), attribute)
-    globals()[name] = value
-    return value
+__getattr__ = lazily(globals(), _PLACES)
 
 
 def __dir__() -> list[str]:

@@ -12,8 +12,9 @@ See docs/python.md. The names in ``__all__`` stay; everything is loaded when it 
 package costs nothing.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from adjust.model.loading import lazily
 
 if TYPE_CHECKING:
     from adjust.model.errors import SurveyError
@@ -78,14 +79,7 @@ __all__ = [
     "write_project",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    """A public name, loaded now."""
-    if name not in _PLACES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(_PLACES[name]), name)
-    globals()[name] = value
-    return value
+__getattr__ = lazily(globals(), _PLACES)
 
 
 def __dir__() -> list[str]:

@@ -3,8 +3,9 @@
 Every name is loaded when it is first used: large tables are read while all that their project needs is still loaded.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from adjust.model.loading import lazily
 
 if TYPE_CHECKING:
     from survey.folder.text import atomic_write
@@ -25,17 +26,11 @@ __all__ = [
     "write_project",
 ]
 _PLACES = {
+    **dict.fromkeys(__all__, "survey.project.project"),
     "atomic_write": "survey.folder.text",
     "read": "survey.project.reading",
     "read_definition": "survey.project.reading",
     "write_project": "survey.project.writing",
 }
 
-
-def __getattr__(name: str) -> Any:
-    """A public name, loaded now."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(_PLACES.get(name, "survey.project.project")), name)
-    globals()[name] = value
-    return value
+__getattr__ = lazily(globals(), _PLACES)
