@@ -147,9 +147,14 @@ class LinearScores:
         return self._summed(parts, drift_times(len(parts)))
 
     def apart(self, parts: Sequence[Part]) -> tuple[FloatArray, FloatArray]:
-        """Of p changes by one number each: B'e (p,) and M (p, p), what the unknowns leave of B'B."""
-        g, BB, taken = self._normals(parts, np.arange(len(parts)))
-        return g[:, 0], np.diag(BB[:, 0, 0]) - taken[0][:, 0, :, 0]
+        """Of p changes by one number each: B'e (p,) and M (p, p), what the unknowns leave of B'B.
+
+        They may have rows in common.
+        """
+        g, _, taken = self._normals(parts, np.arange(len(parts)))
+        rows, B = (np.concatenate(x) for x in zip(*((r, J[:, 0]) for r, J in parts), strict=True))
+        columns = sparse.csc_matrix((B, rows, np.cumsum([0, *(len(r) for r, _ in parts)])), (len(self.e), len(parts)))
+        return g[:, 0], (columns.T @ columns).toarray() - taken[0][:, 0, :, 0]
 
     def steps(self, courses: Sequence[Sequence[Part]]) -> list[dict[int, Score]]:
         """Of each course a change from part t on: the scores of t, at most ``_CUTS`` of them.

@@ -8,17 +8,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import sparse
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.model.names import grouped
 from adjust.model.result import Adjustment
 from adjust.model.rewriting import with_rows
-from adjust.model.survey import FloatArray, Survey
+from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.observations.terrestrial import equations as k
 from adjust.observations.terrestrial.batch import TerrestrialBatch
-from adjust.statistics.score import LinearScores, Part
 from adjust.testing.distributions import chi2
 
 _MOST = 1_500
@@ -35,17 +33,17 @@ _LAST = 1.5
 
 
 @dataclass(frozen=True, eq=False)
-class _Errors:
-    """Of targets, or of instruments. what: which, for people. key: of ``survey.toml``. setups: whose instruments.
+class _Error:
+    """Of a target in one reading, or of the instrument of a set-up: rows (r,) and their whitened derivatives (r, c)."""
 
-    parts: of each number of an error its rows and whitened derivatives. squares: of each error eigenvalues of B'B.
-    """
+    rows: IntArray
+    B: FloatArray
+    setup_id: str = ""
 
-    what: str
-    key: str
-    setups: frozenset[str]
-    parts: tuple[Part, ...]
-    squares: FloatArray
+    @property
+    def squares(self) -> FloatArray:
+        """Eigenvalues (c,) of B'B."""
+        return np.asarray(np.linalg.eigvalsh(self.B.T @ self.B), dtype=np.float64)
 
 
 def missing_centring(case: Case) -> Iterator[Hypothesis]:
@@ -59,56 +57,54 @@ def missing_centring(case: Case) -> Iterator[Hypothesis]:
     if batch is None:
         return
     batch.evaluate(linear.system.precision.solved.values)
-    some = [e for e in (_of_targets(survey, linear, batch), _of_instruments(survey, linear, batch)) if e.parts]
-    every = [(errors, *_likeliest(linear, errors)) for errors in (some[:1], some[1:], some)[: 2 * len(some) - 1]]
+    first = int(linear.system.ptr[-1 - n])  # of the readings, one row each, the last ones
+    errors = [*_of_targets(batch, first), *_of_instruments(survey, batch, first)]
+    if not errors:
+        return
+    b, M = linear.apart([(e.rows, column[:, None]) for e in errors for column in e.B.T])
+    at = np.split(np.arange(len(b)), np.cumsum([e.B.shape[1] for e in errors])[:-1])
+    shown = [(e, own) for e, own in zip(errors, at, strict=True) if _shows(e, M[own, own])]
+    targets, instruments = ([one for one in shown if bool(one[0].setup_id) == of] for of in (False, True))
+    sets = [one for one in (targets, instruments) if one]
+    every = [(some, *_likeliest(b, M, np.concatenate([own for _, own in some])))
+             for some in (*sets, *([shown] if len(sets) > 1 else []))]  # fmt: skip
     least = min((cost for *_, cost in every), default=0.0)
     most = min(-float(chi2.isf(_ALPHA, 1)), least + _LESS_LIKELY, _with_factors(linear.result))
-    for errors, size, cost in every:
+    for some, size, cost in every:
         if cost < most and size < _SIZES[-1]:
-            yield _hypothesis(survey, errors, size)
+            yield _hypothesis(survey, [e for e, _ in some], size)
 
 
-def _of_targets(survey: Survey, linear: LinearScores, batch: TerrestrialBatch) -> _Errors:
-    """Where no sigma is given: in the one direction in which it changes the reading."""
-    at, a = _first_row(survey, linear), batch.layout.arrays
+def _of_targets(batch: TerrestrialBatch, first: int) -> Iterator[_Error]:
+    """Where no sigma is given: in the one direction in which it changes the reading. first: row of all readings."""
+    a = batch.layout.arrays
     by = np.linalg.norm(np.hstack([batch.by_horizontal(k.TO, a.to), batch.by_horizontal(k.SECOND, a.second)]), axis=1)
-    rows = np.flatnonzero(batch.used & (a.target_centring == 0.0) & (a.kind != k.HEIGHT))
-    B = by[rows] / batch.sigma[rows]
-    parts = [(np.array([at + i]), np.full((1, 1), b)) for i, b in zip(rows.tolist(), B.tolist(), strict=True)]
-    return _Errors("targets", "sigma_target_centring_mm", frozenset(), tuple(parts), B**2)
+    for i in np.flatnonzero(batch.used & (a.target_centring == 0.0) & (a.kind != k.HEIGHT)).tolist():
+        yield _Error(np.array([first + i]), np.full((1, 1), by[i] / batch.sigma[i]))
 
 
-def _of_instruments(survey: Survey, linear: LinearScores, batch: TerrestrialBatch) -> _Errors:
-    """Of set-ups without a sigma whose point does not simply move with the instrument."""
+def _of_instruments(survey: Survey, batch: TerrestrialBatch, first: int) -> Iterator[_Error]:
+    """Of set-ups without a sigma, in both directions."""
     by = batch.by_horizontal(k.AT, batch.layout.arrays.at) / batch.sigma[:, None]
     without = {s.setup_id for s in survey.setups if s.centring_sigma == 0.0}
     mine = ((r.setup_id, i) for i, r in enumerate(survey.readings) if r.setup_id in without and batch.used[i])
-    seen, parts, squares = list[str](), list[Part](), list[FloatArray]()
     for setup_id, rows in grouped(mine).items():
-        own = [(_first_row(survey, linear) + np.array(rows), by[rows, axis, None]) for axis in (0, 1)]
-        BB = by[rows].T @ by[rows]
-        if np.trace(linear.apart(own)[1]) > _SEEN * np.trace(BB):
-            seen.append(setup_id)
-            parts += own
-            squares.append(np.asarray(np.linalg.eigvalsh(BB), dtype=np.float64))
-    return _Errors("instruments", "sigma_centring_mm", frozenset(seen), tuple(parts), np.concatenate([*squares, []]))
+        yield _Error(first + np.array(rows), by[rows], setup_id)
 
 
-def _first_row(survey: Survey, linear: LinearScores) -> int:
-    """Of the readings, one row each, the last ones of a linear system."""
-    return int(linear.system.ptr[-1 - len(survey.readings)])
+def _shows(error: _Error, left: FloatArray) -> bool:
+    """Whether its point does not simply move with an instrument. left: what the unknowns leave of its squares (c,)."""
+    return not error.setup_id or bool(left.sum() > _SEEN * (error.B**2).sum())
 
 
-def _likeliest(linear: LinearScores, errors: Sequence[_Errors]) -> tuple[float, float]:
+def _likeliest(b: FloatArray, M: FloatArray, at: IntArray) -> tuple[float, float]:
     """That of ``_SIZES``, and minus twice the logarithm of its restricted likelihood over that of none.
 
     With ``b = B'e`` and M, what the unknowns leave of B'B, v'Pv falls by ``b' inv(M + I / s^2) b`` where the errors
-    have variances s^2; ``log det (I + s^2 M)`` counts against it.
+    ``at`` have variances s^2; ``log det (I + s^2 M)`` counts against it.
     """
-    parts = [part for e in errors for part in e.parts]
-    b, M = linear.apart(parts)
-    values, axes = np.linalg.eigh(M + _in_common(parts))
-    along, left = (axes.T @ b) ** 2, _SIZES[:, None] ** 2 * np.maximum(values, 0.0)
+    values, axes = np.linalg.eigh(M[np.ix_(at, at)])
+    along, left = (axes.T @ b[at]) ** 2, _SIZES[:, None] ** 2 * np.maximum(values, 0.0)
     costs = (np.log1p(left) - _SIZES[:, None] ** 2 * along / (1.0 + left)).sum(axis=1)
     best = int(np.argmin(costs))
     return float(_SIZES[best]), float(costs[best])
@@ -121,30 +117,20 @@ def _with_factors(result: Adjustment) -> float:
     return sum(g.redundancy * float(np.log(g.omega / g.redundancy) + 1.0) - g.omega for g in tested)
 
 
-def _in_common(parts: Sequence[Part]) -> FloatArray:
-    """B'B (p, p) of parts that have rows in common, zero of each with itself."""
-    rows, B = (np.concatenate(x) for x in zip(*((r, J[:, 0]) for r, J in parts), strict=True))
-    columns = sparse.csc_matrix((B, rows, np.cumsum([0, *(len(r) for r, _ in parts)])))
-    BB: FloatArray = (columns.T @ columns).toarray()
-    np.fill_diagonal(BB, 0.0)
-    return BB
-
-
-def _hypothesis(survey: Survey, errors: Sequence[_Errors], size: float) -> Hypothesis:
-    changed, penalty = survey, 0.0
-    for e in errors:
-        penalty += float(np.log1p(size**2 * e.squares).sum())
-        if e.setups:
-            setups = (replace(s, centring_sigma=size) if s.setup_id in e.setups else s for s in survey.setups)
-            changed = replace(changed, setups=tuple(setups))
-        else:
-            without = {i: r for i, r in enumerate(survey.readings) if r.target_centring_sigma == 0.0}
-            changed = with_rows(changed, "readings", {
-                i: replace(r, target_centring_sigma=size) for i, r in without.items()})  # fmt: skip
-    what, keys = " and ".join(e.what for e in errors), ", ".join(e.key for e in errors)
+def _hypothesis(survey: Survey, errors: Sequence[_Error], size: float) -> Hypothesis:
+    setups, changed, names = {e.setup_id for e in errors} - {""}, survey, list[tuple[str, str]]()
+    if any(not e.setup_id for e in errors):
+        names.append(("targets", "sigma_target_centring_mm"))
+        changed = with_rows(changed, "readings", {i: replace(r, target_centring_sigma=size)
+                            for i, r in enumerate(survey.readings) if r.target_centring_sigma == 0.0})  # fmt: skip
+    if setups:
+        names.append(("instruments", "sigma_centring_mm"))
+        moved = (replace(s, centring_sigma=size) if s.setup_id in setups else s for s in survey.setups)
+        changed = replace(changed, setups=tuple(moved))
+    what, keys = " and ".join(w for w, _ in names), ", ".join(key for _, key in names)
     return Hypothesis(
         "centring", f"the {what} do not stand over their points, by {1e3 * size:.2g} mm in each direction, and no "
         "sigma says so: short sights miss the most", f"give {keys} (here {1e3 * size:.2g})",
-        Place("reading", tuple(dict.fromkeys(r.kind for r in survey.readings)), "sigma"), changed, (), _LAST,
-        1, len(_SIZES), penalty=penalty, of_variances=True,
+        Place("reading", tuple(dict.fromkeys(r.kind for r in survey.readings)), "sigma"), changed, (), _LAST, 1,
+        len(_SIZES), penalty=sum(float(np.log1p(size**2 * e.squares).sum()) for e in errors), of_variances=True,
     )  # fmt: skip
