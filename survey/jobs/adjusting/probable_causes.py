@@ -87,8 +87,8 @@ def with_probable_causes(survey: Survey, result: Adjustment, project: Project) -
         head = "probable cause" if diagnosis is not None and diagnosis.spoils else "too good"
         lines = tuple(f"{head}: {c}" for c in diagnosis.lines) if diagnosis is not None else ()
     if diagnosis is None or diagnosis.candidates[0].hypothesis.place.key not in ("sigma", "instrument_height"):
-        meant = None if diagnosis is None else diagnosis.candidates[0].hypothesis.changed()
-        lines += doubtful_values(meant or survey)
+        meant = survey if diagnosis is None else diagnosis.candidates[0].hypothesis.survey
+        lines += doubtful_values(survey if callable(meant) else meant)  # a size is not looked for again
     return replace(result, warnings=(*lines, *alone, *result.warnings, *note), diagnosis=diagnosis)
 
 
