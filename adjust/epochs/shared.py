@@ -5,6 +5,7 @@ from collections.abc import Hashable, Iterable
 from adjust.model.observations import CoordinateDifferences, Distance, ImageBlock, Pair, Reading
 from adjust.model.survey import Survey
 
+_Observed = ImageBlock | Pair | CoordinateDifferences | Distance | Reading
 _SCALARS = ("distances", "readings")
 _MOST, _FEWEST = 0.5, 3
 """Single numbers that were read twice may be the same to the last digit written: only more than this share, of at least
@@ -24,13 +25,13 @@ def shared_observations(first: Survey, second: Survey) -> dict[str, int]:
 
 def _values(survey: Survey) -> dict[str, dict[Hashable, int]]:
     """Ids and values of the observations of each kind that are used, and how many each stands for."""
-    kinds: tuple[tuple[str, Iterable[ImageBlock | Pair | CoordinateDifferences | Distance | Reading]], ...] = (
+    kinds: tuple[tuple[str, Iterable[_Observed]], ...] = (
         ("image_points", survey.image_blocks), ("pairs", survey.pairs), ("distances", survey.distances),
         ("readings", survey.readings), ("coordinate_differences", survey.coordinate_differences))  # fmt: skip
     return {kind: {_value(o): _size(o) for o in found if isinstance(o, ImageBlock) or o.used} for kind, found in kinds}
 
 
-def _value(o: ImageBlock | Pair | CoordinateDifferences | Distance | Reading) -> Hashable:
+def _value(o: _Observed) -> Hashable:
     match o:
         case ImageBlock():
             return *o.place, o.uv.tobytes()
@@ -44,5 +45,5 @@ def _value(o: ImageBlock | Pair | CoordinateDifferences | Distance | Reading) ->
             return o.reading_id, o.at, o.to, o.value
 
 
-def _size(o: ImageBlock | Pair | CoordinateDifferences | Distance | Reading) -> int:
+def _size(o: _Observed) -> int:
     return len(o.uv) if isinstance(o, ImageBlock) else len(o.to) if isinstance(o, CoordinateDifferences) else 1

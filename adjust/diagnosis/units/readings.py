@@ -178,13 +178,14 @@ def _others_fit(before: Screen, rows: IntArray) -> bool:
 def _hypothesis(survey: Survey, scope: Scope, misreading: Misreading, evidence: float, looked_at: int) -> Hypothesis:
     ids = tuple(survey.readings[i].reading_id for i in scope.rows)
     return Hypothesis(
-        misreading.name, f"{scope.text}: {misreading.text('their')}", _remedy(misreading), scope.place,
+        misreading.name, f"{scope.text}: {misreading.text('their')}", remedy(misreading), scope.place,
         mended(survey, scope.rows, misreading), (ChangeReadings(ids, misreading.factor, misreading.offset),), evidence,
         1, max(looked_at, 1), penalty=shrinking(misreading.factor, len(scope.rows)),
     )  # fmt: skip
 
 
-def _remedy(misreading: Misreading) -> str:
+def remedy(misreading: Misreading, table: str = "terrestrial") -> str:
+    """What to do with all values of a table that were read so."""
     if misreading.offset:
         return "in terrestrial.csv give them as zenith angles"
-    return f"in terrestrial.csv multiply them by {misreading.factor:.10g}, or name the column by their unit"
+    return f"in {table}.csv multiply them by {misreading.factor:.10g}, or name the column by their unit"

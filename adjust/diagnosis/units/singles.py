@@ -12,6 +12,7 @@ from adjust.diagnosis.diagnosis import Candidate
 from adjust.diagnosis.hypothesis import ChangeReadings, Edit, Hypothesis, Place
 from adjust.diagnosis.units.conventions import MISREADINGS, UNIT_OF_LENGTHS, Misreading, slips
 from adjust.diagnosis.units.motions import CONVENTIONS, edits_of, mended, miss
+from adjust.diagnosis.units.readings import remedy
 from adjust.model.observations import Distance, Reading
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.rewriting import with_rows
@@ -56,9 +57,8 @@ def _of_all_distances(survey: Survey, found: Sequence[Candidate]) -> tuple[Candi
     changed = with_rows(survey, "distances", {
         i: replace(every[i], value=way.factor * every[i].value) for i in used.values()})  # fmt: skip
     h = Hypothesis(
-        way.name, f"all distances: {way.text('their')}", f"in distances.csv multiply them by {way.factor:.10g}, or "
-        "name the column by their unit", Place("reading", tuple(used), "value"), changed,
-        (ChangeReadings(tuple(used), way.factor, table="distances"),),
+        way.name, f"all distances: {way.text('their')}", remedy(way, "distances"),
+        Place("reading", tuple(used), "value"), changed, (ChangeReadings(tuple(used), way.factor, table="distances"),),
     )  # fmt: skip
     share = min(c.explained for _, c in edits.values())
     return (replace(first, hypothesis=h, explained=share, statistic=sum(c.statistic for _, c in edits.values())),)

@@ -4,7 +4,7 @@ No theodolite is known to a hundredth of an arcsecond, and no length in air to a
 refractive index is not.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -156,10 +156,15 @@ def _with_sigmas(survey: Survey, odd: _Odd, factor: float) -> Survey:
     every = getattr(survey, odd.field)
     if not odd.part:
         return with_rows(survey, odd.field, {i: replace(every[i], sigma=factor * every[i].sigma) for i in odd.rows})
-    by = np.repeat([factor, 1.0] if odd.part == "rotation" else [1.0, factor], 3)
+    return with_part(survey, odd.field, odd.rows, odd.part, factor)
+
+
+def with_part(survey: Survey, field: str, rows: Iterable[int], part: str, factor: float) -> Survey:
+    """The survey with the sigmas of the rotations, or of the shifts, of some pairs or table readings times a factor."""
+    by, every = np.repeat([factor, 1.0] if part == "rotation" else [1.0, factor], 3), getattr(survey, field)
     new = {i: replace(p, cov=p.cov * np.outer(by[: len(p.cov)], by[: len(p.cov)]))
-           for i in odd.rows for p in (every[i],)}  # fmt: skip
-    return with_rows(survey, odd.field, new)
+           for i in rows for p in (every[i],)}  # fmt: skip
+    return with_rows(survey, field, new)
 
 
 def _edits(odd: _Odd, factor: float) -> tuple[Edit, ...]:

@@ -11,6 +11,7 @@ from gtsam import Pose3
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
+from adjust.diagnosis.weights.impossible import with_part
 from adjust.model.names import grouped
 from adjust.model.observations import Pair
 from adjust.model.result import Adjustment
@@ -81,15 +82,12 @@ def _hypothesis(survey: Survey, rows: list[int], group: str, part: str, unit: fl
             "in pairs.csv multiply tx_mm, ty_mm, tz_mm by 1000", Place("group", (group,)),
             with_rows(survey, "pairs", new), (), _EVIDENCE, 0, penalty=penalty,
         )  # fmt: skip
-    by = np.repeat([unit, 1.0] if part == "rotation" else [1.0, unit], 3)
-    covs = {i: replace(p, cov=p.cov * np.outer(by[: len(p.cov)], by[: len(p.cov)]))
-            for i, p in zip(rows, pairs, strict=True)}  # fmt: skip
     times = f"{1.0 / unit:.0f} times too large"
     return Hypothesis(
         "unit of sigmas",
         f"the sigmas of the {part} of the pairs of group {group} are about {times}: they {said}",
         f"multiply these sigmas by {unit:.4g}, or name their column by their unit",
-        Place("group", (group,), "sigma"), with_rows(survey, "pairs", covs), (), _EVIDENCE, 0,
+        Place("group", (group,), "sigma"), with_part(survey, "pairs", rows, part, unit), (), _EVIDENCE, 0,
         penalty=penalty, of_variances=True,
     )  # fmt: skip
 

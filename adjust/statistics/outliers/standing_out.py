@@ -29,7 +29,8 @@ def distances_that_stand_out(survey: Survey) -> tuple[BoolArray, Start] | None:
     rest = max(others, default=0.0)
     square = np.array([mine.get(d.distance_id, 0.0) for d in survey.distances])
     worst = np.argsort(-square, kind="stable")
-    for k in (*range(1, (len(square) + 1) // 2), *[len(square)][: len(others) >= len(square)]):
+    all_of_them = [len(square)] if len(others) >= len(square) else []
+    for k in (*range(1, (len(square) + 1) // 2), *all_of_them):
         if square[worst[k - 1]] > _BY_FAR * max([rest, 1.0, *square[worst[k : k + 1]]]):
             return np.isin(np.arange(len(square)), worst[:k]), start
     return None
