@@ -10,6 +10,7 @@ from adjust.adjustment import AdjustOptions
 from adjust.diagnosis.alone import completed, own_lenses, single_views
 from adjust.diagnosis.budget import REST, SCORES, START, STEP, Budget
 from adjust.diagnosis.prediction import Altered, Linear, adjusted_values, started_values
+from adjust.diagnosis.units.conventions import UNKNOWN, Written
 from adjust.graph.assembly import StartValues, values_of
 from adjust.graph.solver import SolveOptions
 from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
@@ -34,7 +35,10 @@ _LOST = 1e4
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A survey, and what became of it: its adjustment, or the error instead; what its diagnosis may still adjust."""
+    """A survey, and what became of it: its adjustment, or the error instead; what its diagnosis may still adjust.
+
+    written: how its project writes it.
+    """
 
     survey: Survey
     result: Adjustment | None = None
@@ -42,6 +46,7 @@ class Case:
     budget: Budget = field(default_factory=Budget)
     passed_over: list[str] = field(default_factory=list)
     """Kinds of causes that are not looked for in a survey of this size; families add theirs."""
+    written: Written = UNKNOWN
 
     def few(self, name: str, number: int, most: int) -> bool:
         """Whether a kind of cause is looked for, whose cost grows with a number faster than that of adjusting."""

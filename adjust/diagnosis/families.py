@@ -25,6 +25,7 @@ from adjust.diagnosis.weights.centring import missing_centring
 from adjust.diagnosis.weights.correlated import correlated_readings
 from adjust.diagnosis.weights.impossible import impossible_sigmas
 from adjust.diagnosis.weights.sigmas import odd_sigmas, wrong_factors
+from adjust.diagnosis.weights.small import small_sigmas
 
 Family = Callable[[Case], Iterable[Hypothesis]]
 SCORES: tuple[Family, ...] = (effects.hypotheses,)
@@ -36,10 +37,10 @@ NAMES: tuple[Family, ...] = (
 VALUES: tuple[Family, ...] = (misread_heights, impossible_sigmas)
 """Told by the values alone: the first ones that are tried."""
 UNITS: tuple[Family, ...] = (misread_readings, wrong_heights, misread_pairs)
-IN_COMMON = (*VALUES, *UNITS)
+IN_COMMON = (*VALUES, *UNITS, small_sigmas)
 """What several observations that were left out, with all others fitting, may have in common."""
 TIME: tuple[Family, ...] = (forgotten_motion, unsynchronised)
-WEIGHTS: tuple[Family, ...] = (odd_sigmas, wrong_factors, correlated_readings, missing_centring)
+WEIGHTS: tuple[Family, ...] = (odd_sigmas, wrong_factors, small_sigmas, correlated_readings, missing_centring)
 CHEAP = (*VALUES, *IMAGES, *NAMES, *UNITS, *TIME, *WEIGHTS, lost_cameras)
 LATER: tuple[tuple[Family, ...], ...] = ((wrong_sizes,), (changed_bodies,))
 """These adjust to find theirs: they are asked where what the first ones found does not explain everything."""

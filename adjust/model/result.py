@@ -377,7 +377,8 @@ class Adjustment:
     """A solved survey with its precision.
 
     sigma0: a posteriori standard deviation of unit weight (a priori is 1). omega: v'Pv. iterations: steps taken.
-    max_step: the last step in sigmas of the unknowns. warnings: for people, worst first.
+    max_step: the last step in sigmas of the unknowns. warnings: for people, worst first. doubtful: those of them that
+    say of a value that it cannot be right, whatever the residuals say.
     other_residuals: of all that are not image points, the readings last, also as arrays in ``reading_residuals``.
     precision: gives joint covariances, ``precision.joint([name, ...])``.
     variance_components: where they were estimated. decisions: the log of the search for gross errors. n_screened: image
@@ -407,6 +408,7 @@ class Adjustment:
     decisions: tuple[Decision, ...] = ()
     n_screened: int = 0
     diagnosis: Explanation | None = None
+    doubtful: tuple[str, ...] = ()
 
     @cached_property
     def single_residuals(self) -> Sequence[ObservationResidual]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -47,7 +46,6 @@ def suspects(adjustment: Adjustment) -> Suspects:
 FITS, CAUTIOUS, MISFIT, UNTESTED = "fits", "cautious", "does_not_fit", "untested"
 """What ``summary.fit`` in a result file may be."""
 _MOST_PARTS = 8
-_IMPOSSIBLE = "no instrument has a sigma of"
 
 
 def fit_of(adjustment: Adjustment, tested: Consistency | None = None) -> str:
@@ -73,11 +71,11 @@ def misfits(summary: Mapping[str, Any]) -> bool:
 
 
 def warnings_with(adjustment: Adjustment, tested: Consistency | None) -> tuple[str, ...]:
-    """For people: causes that were tried and sigmas that cannot be, then what tests of parts found, then the rest."""
+    """For people: causes that were tried and values that cannot be, then what tests of parts found, then the rest."""
     tried = len(adjustment.diagnosis.lines) if adjustment.diagnosis is not None else 0
-    tried += len(list(takewhile(lambda w: _IMPOSSIBLE in w, adjustment.warnings[tried:])))
+    first = (*adjustment.warnings[:tried], *adjustment.doubtful)
     found = () if tested is None else _findings(tested)
-    return (*adjustment.warnings[:tried], *found, *adjustment.warnings[tried:])
+    return (*first, *found, *(w for w in adjustment.warnings[tried:] if w not in adjustment.doubtful))
 
 
 def _findings(tested: Consistency) -> tuple[str, ...]:

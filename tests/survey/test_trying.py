@@ -31,12 +31,14 @@ from adjust.diagnosis.units.readings import misread_readings
 from adjust.model.errors import SurveyError
 from adjust.model.survey import Survey
 from survey.jobs.adjusting.edits import file_of, kept_name
-from survey.jobs.adjusting.places import _Files
+from survey.jobs.adjusting.places import ProjectFiles
 from survey.jobs.adjusting.trying import carried_out
+from survey.jobs.adjusting.written import written_of
 from survey.jobs.excluding import include_job
 from survey.project import read
 from survey.project.writing import write_project
 from tests.acceptance.planted_mistakes import MISTAKES, survey_of
+from tests.labs import with_euler_angles
 
 FORMED = {  # the family that forms the hypothesis, for a mistake in a kind of survey
     ("pairs inverted", "hand"): misread_pairs,
@@ -114,12 +116,15 @@ def test_conventions_of_pairs_as_columns(convention, tmp_path: Path) -> None:
     survey, _ = survey_of("poses", 3)
     lab = tmp_path / "lab"
     write_project(lab, survey)
-    given = read(lab).survey
+    if convention.angles:
+        with_euler_angles(lab / "observations" / "pairs.csv")
+    project = read(lab)
+    given, written = project.survey, written_of(project)
     rows = np.array([0, 3, 7])
     edits = edits_of(given, rows, convention)
     assert edits
     carried_out(lab, hypothesis(edits))
-    assert_same(read(lab).survey, mended(given, rows, convention))
+    assert_same(read(lab).survey, mended(given, rows, convention, written))
 
 
 def hypothesis(edits: tuple[Edit, ...], place: Place | None = None) -> Hypothesis:
@@ -244,7 +249,7 @@ def test_the_line_to_edit(tmp_path: Path) -> None:
         ((), Place("pair", ("all",)), f"{pairs_csv}:2 and {len(pairs) - 1} more rows"),
         ((), Place("pair", (pairs[1],)), f"{pairs_csv}:3"),
     ):
-        assert _Files(robot).of(hypothesis(made, place)) == wanted
+        assert ProjectFiles(robot).of(hypothesis(made, place)) == wanted
 
 
 def test_the_line_of_a_reading(tmp_path: Path) -> None:
@@ -265,12 +270,12 @@ def test_the_line_of_a_reading(tmp_path: Path) -> None:
         ((), Place("reading", ("lengths",), "value"), f"{where}:2 and {len(ids) - 1} more rows"),
         ((), Place("point", (held,), "x"), f"survey.toml:{line_of(hall, 'survey.toml', f'{held} = ')}"),
     ):
-        assert _Files(hall).of(hypothesis(made, place)).startswith(wanted)
+        assert ProjectFiles(hall).of(hypothesis(made, place)).startswith(wanted)
     rows = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
     column = rows[0].index("reading_id")
     path.write_text("\n".join(",".join(c for i, c in enumerate(r) if i != column) for r in rows) + "\n",
                     encoding="utf-8")  # fmt: skip
-    assert _Files(hall).of(hypothesis((ChangeReadings(("r12", "r7"), -1.0),))) == f"{where}:8 and 1 more rows"
+    assert ProjectFiles(hall).of(hypothesis((ChangeReadings(("r12", "r7"), -1.0),))) == f"{where}:8 and 1 more rows"
     before = {r.reading_id: r.value for r in read(hall).survey.readings}
     carried_out(hall, hypothesis((ChangeReadings(("r7",), 1.0, 0.25),)))
     after = {r.reading_id: r.value for r in read(hall).survey.readings}

@@ -1,18 +1,20 @@
 """Values in another unit, and table readings under another epoch: told by `check`, named and mended by `adjust`."""
 
-import csv
 import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from adjust.adjustment import adjust
 from adjust.diagnosis.units.heights import doubtful_heights
 from adjust.diagnosis.weights.impossible import doubtful_sigmas
-from survey.cli import main
+from survey.cli import FAILED, main
 from survey.examples import write_example
 from survey.project import read
+from survey.solution.verdict import warnings_with
 from tests import labs
 
 Row = dict[str, str]
@@ -22,15 +24,7 @@ Change = Callable[[Row], object]
 def planted(folder: Path, example: str, table: str, change: Change) -> Path:
     """A ready project with the rows of one table changed."""
     labs.example(example, folder)
-    path = folder / "observations" / f"{table}.csv"
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    for row in rows:
-        change(row)
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, list(dict.fromkeys(name for row in rows for name in row)), restval="")
-        writer.writeheader()
-        writer.writerows(rows)
+    labs.with_rows(folder / "observations" / f"{table}.csv", lambda _, row: change(row))
     return folder
 
 
@@ -53,6 +47,21 @@ def with_own_sigmas(rotation: float, shift: float) -> Change:
         row.update(sigma_rotation_arcsec=f"{turn * rotation:.9g}", sigma_translation_mm=f"{length * shift:.9g}")
 
     return change
+
+
+def of_turns(column: str, unit: float) -> Change:
+    """The arcseconds that there are, in another unit and column."""
+
+    def change(row: Row) -> None:
+        arcsec = row.pop("sigma_rotation_arcsec")
+        row[column] = repr(unit * float(arcsec)) if arcsec else ""
+
+    return change
+
+
+def of_angles(column: str, unit: float) -> Change:
+    """Two arcseconds for all angles, in another unit and column."""
+    return lambda row: row.update({column: repr(2.0 * unit) if row["value_gon"] else ""})
 
 
 CASES: dict[str, tuple[str, str, Change, str, str]] = {
@@ -83,6 +92,82 @@ def test_another_unit_is_told_named_and_mended(
     assert main(["check", str(lab), "--quiet"]) == 0
 
 
+EULER = {
+    "gon": (10.0 / 9.0, 59, "have Euler angles in gon, read as degrees", "by 0.9"),
+    "radians": (math.pi / 180.0, 59, "have Euler angles in radians, read as degrees", "by 57.2957795"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("chosen", [lambda _: True, lambda i: i % 3 == 0, lambda i: i < 4],
+                         ids=["all", "third", "four"])  # fmt: skip
+@pytest.mark.parametrize("unit", EULER)
+def test_euler_angles_of_pairs_in_another_unit(unit: str, chosen: Callable[[int], bool], tmp_path: Path) -> None:
+    """Beyond half a turn of gon the rotation as it was read no longer says which angles stand there."""
+    factor, n, said, by = EULER[unit]
+    lab = labs.example("relay", tmp_path / "lab")
+    labs.with_euler_angles(lab / "observations" / "pairs.csv", factor, chosen)
+    assert main(["adjust", str(lab), "--quiet"]) in (FAILED, 3)
+    names = ("solution.json", "unsolved.json")
+    (first, *_) = next(json.loads(p.read_text(encoding="utf-8"))["diagnosis"] for name in names
+                       if (p := lab / "results" / name).exists())  # fmt: skip
+    assert (first["name"], said in first["cause"], by in first["change"]) == ("unit of Euler angles", True, True)
+    wrong = sum(chosen(i) for i in range(n))
+    assert first["where"] == f"observations/pairs.csv:2 and {wrong - 1} more rows"
+    assert main(["adjust", str(lab), "--quiet", "--try", "1"]) == 0
+
+
+SIGMAS = {
+    "radians as degrees, of turns": ("relay", "pairs", of_turns("sigma_rotation_deg", math.pi / 648000.0),
+                                     "radians, read as degrees", "by 57.2958"),
+    "radians as arcseconds, of turns": ("relay", "pairs", of_turns("sigma_rotation_arcsec", math.pi / 648000.0),
+                                        "radians, read as arcseconds", "by 206265"),
+    "radians as milligon": ("total-station", "terrestrial", of_angles("sigma_mgon", math.pi / 648000.0),
+                            "radians, read as milligon", "by 63662"),
+    "radians as cc": ("total-station", "terrestrial", of_angles("sigma_cc", math.pi / 648000.0),
+                      "radians, read as cc", "by 636620"),
+    "gon as milligon": ("total-station", "terrestrial", of_angles("sigma_mgon", 1.0 / 3240.0),
+                        "gon, read as milligon", "by 1000"),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SIGMAS)
+def test_sigmas_are_named_in_the_unit_of_their_column(name: str, tmp_path: Path) -> None:
+    example, table, change, said, by = SIGMAS[name]
+    lab = planted(tmp_path / "lab", example, table, change)
+    assert main(["adjust", str(lab), "--quiet"]) == 3
+    (first, *_) = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))["diagnosis"]
+    assert (first["name"], said in first["cause"], by in first["change"]) == ("unit of sigmas", True, True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("setup_id", ["", "S1a"])
+@pytest.mark.parametrize(("factor", "unit"), [(1e3, "millimetres"), (1e6, "micrometres")])
+def test_lengths_in_a_column_of_metres(factor: float, unit: str, setup_id: str, tmp_path: Path) -> None:
+    """Those of the set-up that the start begins with give all others their scale."""
+    lab = planted(tmp_path / "lab", "total-station", "terrestrial", scaled(
+        "value_m", factor, lambda row: setup_id in ("", row["setup_id"])))  # fmt: skip
+    assert main(["adjust", str(lab), "--quiet"]) == FAILED
+    (first, *_) = json.loads((lab / "results" / "unsolved.json").read_text(encoding="utf-8"))["diagnosis"]
+    assert (first["name"], setup_id in first["cause"]) == ("unit of lengths", True)
+    assert f"are {unit}, read as metres" in first["cause"]
+    assert f"multiply them by {1.0 / factor:g}" in first["change"]
+
+
+def test_height_differences_of_the_other_sign_are_named_without_a_search(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Among what they contradict nothing can be left out: each try takes the more steps the less it explains."""
+    lab = planted(tmp_path / "lab", "total-station", "terrestrial", scaled(
+        "value_m", -1.0, lambda row: row["kind"] == "height_difference"))  # fmt: skip
+    monkeypatch.delattr("adjust.statistics.screened_adjustment.search_outliers")
+    assert main(["adjust", str(lab), "--quiet"]) == 3
+    (first, *more) = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))["diagnosis"]
+    assert (first["name"], first["probability"] > 0.99, more) == ("sign of height differences", True, [])
+    assert first["change"] == "in terrestrial.csv give them the other sign, or exchange from_id and to_id"
+
+
 def test_a_sigma_that_cannot_be_is_told_where_everything_fits(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -92,6 +177,14 @@ def test_a_sigma_that_cannot_be_is_told_where_everything_fits(
     shown = capsys.readouterr().out
     assert "NEEDS A LOOK" in shown
     assert "no instrument has a sigma of 5e-05 mm: these sigmas are metres, read as millimetres" in shown
+
+
+def test_doubtful_values_stand_first_whatever_their_words(tmp_path: Path) -> None:
+    lab = labs.example("total-station", tmp_path / "lab")
+    found = replace(adjust(read(lab).survey), warnings=("left out", "a height of 2 mm", "cautious"))
+    assert warnings_with(found, None) == found.warnings
+    doubtful = replace(found, doubtful=("a height of 2 mm",))
+    assert warnings_with(doubtful, None) == ("a height of 2 mm", "left out", "cautious")
 
 
 def test_what_a_survey_may_have_is_not_told(tmp_path: Path) -> None:

@@ -3,7 +3,8 @@
 Ratios of units and conventions of angles are exact; a ratio that observations show is compared with them.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -14,7 +15,35 @@ from adjust.model.survey import FloatArray, IntArray
 ANGLES: tuple[ReadingKind, ...] = ("direction", "angle", "azimuth", "zenith")
 TURNS: tuple[ReadingKind, ...] = ("direction", "angle", "azimuth")
 _SMALLER = 0.1
+UNITS = {"m": "metres", "mm": "millimetres", "deg": "degrees", "gon": "gon", "mgon": "milligon", "arcsec": "arcseconds",
+          "cc": "cc"}  # fmt: skip
+"""Words for the units in which tables can be written."""
 LENGTHS: tuple[ReadingKind, ...] = ("slope_distance", "horizontal_distance", "height_difference")
+
+
+@dataclass(frozen=True, eq=False)
+class Written:
+    """How the tables of a project write what was observed, as far as that is known.
+
+    units: in which the numbers of a quantity stand ("mm", "gon"), by table and quantity: ``terrestrial.value``,
+    ``pairs.sigma``. euler: (3,) rad about x, y, z of the pairs whose rotation is given by these, by id, as they stand:
+    a rotation does not say beyond which turn they were.
+    """
+
+    units: Mapping[str, frozenset[str]] = field(default_factory=dict)
+    euler: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    def words(self, quantity: str) -> frozenset[str]:
+        """The units of a quantity in words; none where they are not known."""
+        return frozenset(UNITS[u] for u in self.units.get(quantity, ()))
+
+    def can_be(self, said: str, quantity: str) -> bool:
+        """Whether "are gon, read as degrees" can be: what a table can be written in is read in its own unit."""
+        known, read = self.words(quantity), said.split()[-1]
+        return not known or read in known or read not in UNITS.values()
+
+
+UNKNOWN = Written()
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +113,8 @@ LENGTH_RATIOS = {
     "are centimetres, read as millimetres": 10.0,
     "are centimetres, read as metres": 0.01,
     "are inches, read as metres": 0.0254,
+    "are micrometres, read as metres": 1e-6,
+    "are micrometres, read as millimetres": 1e-3,
 }
 ANGLE_RATIOS = {
     "are gon, read as degrees": 0.9,
@@ -105,6 +136,12 @@ MISREADINGS: tuple[Misreading, ...] = (
     Misreading("sign of height differences", "have the other sign", -1.0, 0.0, ("height_difference",)),
 )
 SLIPS = (10.0, 0.1, 100.0, 0.01)
+
+
+def misreadings(written: Written, table: str) -> list[Misreading]:
+    """The ways in which the values of a table can be misread, of those that say the same the first."""
+    every = [m for m in MISREADINGS if written.can_be(m.said, f"{table}.value")]
+    return list({(m.kinds, m.factor, m.offset): m for m in reversed(every)}.values())[::-1]
 
 
 def slips(kind: ReadingKind, value: float) -> list[Misreading]:

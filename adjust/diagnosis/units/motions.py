@@ -7,14 +7,16 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.diagnosis.hypothesis import ChangeColumns, Edit, ExchangeColumns
-from adjust.diagnosis.units.conventions import LENGTH_RATIOS
+from adjust.diagnosis.units.conventions import ANGLE_RATIOS, LENGTH_RATIOS, UNKNOWN, Written
 from adjust.model.errors import SurveyError
+from adjust.model.observations import Pair
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.spatial.rotation_forms import euler_from_matrix, matrix_from_euler, quaternion_wxyz
 
 Motion = Pose3 | Rot3
 _QUATERNION, _SHIFT = ("qw", "qx", "qy", "qz"), ("tx_mm", "ty_mm", "tz_mm")
+_EULER = ("euler_x_deg", "euler_y_deg", "euler_z_deg")
 
 
 @dataclass(frozen=True)
@@ -22,7 +24,7 @@ class Convention:
     """name: of the kind of mistake. said: what is wrong. remedy: in pairs.csv. mend: the motion as it was meant.
 
     columns: the numbers of pairs.csv that change, and by which matrix, where that mends it. shifts: what the lengths of
-    shifts are multiplied by.
+    shifts are multiplied by. angles: what Euler angles are, as they stand there; 0 where nothing is done to them.
     """
 
     name: str
@@ -31,6 +33,17 @@ class Convention:
     mend: Callable[[Motion], Motion | None]
     columns: tuple[tuple[str, ...], FloatArray] | None = None
     shifts: float = 1.0
+    angles: float = 0.0
+
+    def meant(self, pair: Pair, written: Written) -> Motion | None:
+        """The motion of a pair as it was meant; None where it cannot have been misread so."""
+        if not self.angles:
+            return self.mend(pair.b_from_a)
+        read = written.euler.get(pair.pair_id)
+        if read is None:
+            return None
+        R = Rot3.RzRyRx(*(self.angles * read).tolist())
+        return Pose3(R, pair.b_from_a.translation()) if isinstance(pair.b_from_a, Pose3) else R
 
 
 def rotation_of(m: Motion) -> FloatArray:
@@ -63,6 +76,12 @@ def _of_shifts(said: str, columns: tuple[str, ...] = _SHIFT) -> Convention:
     else:
         told = f"have {columns[0]} in {said}", f"multiply {columns[0]} by {factor:g}"
     return _numbers("unit of shifts", *told, columns, factor * np.eye(len(columns)), factor)
+
+
+def _of_angles(said: str) -> Convention:
+    factor, columns = ANGLE_RATIOS[f"are {said}"], ", ".join(_EULER)
+    return Convention("unit of Euler angles", f"have Euler angles in {said}", f"multiply {columns} by {factor:.9g}",
+                      lambda m: m, (_EULER, factor * np.eye(3)), angles=factor)  # fmt: skip
 
 
 def _inverted(m: Motion) -> Motion:
@@ -107,16 +126,20 @@ CONVENTIONS: tuple[Convention, ...] = (
                "name the columns by that order", _by_euler(lambda a: matrix_from_euler(a, "213"))),
     _numbers("left-handed frames", "are of frames whose z axis points the other way (left-handed)",
              "negate qx, qy and tz", ("qx", "qy", "tz_mm"), -np.eye(3)),
+    _of_angles("gon, read as degrees"),
+    _of_angles("radians, read as degrees"),
 )  # fmt: skip
 
 
-def mended(survey: Survey, rows: IntArray, convention: Convention) -> Survey | None:
+def mended(
+    survey: Survey, rows: IntArray, convention: Convention, written: Written = UNKNOWN
+) -> Survey | None:
     """The survey with these pairs as they were meant; None where they cannot have been misread so.
 
     The covariance is in the tangent of the motion as it is written; rotation and shift keep their sigmas.
     """
     pairs = {i: survey.pairs[i] for i in rows.tolist()}
-    new = {i: replace(p, b_from_a=m) for i, p in pairs.items() if (m := convention.mend(p.b_from_a)) is not None}
+    new = {i: replace(p, b_from_a=m) for i, p in pairs.items() if (m := convention.meant(p, written)) is not None}
     return with_rows(survey, "pairs", new) if len(new) == len(pairs) else None
 
 

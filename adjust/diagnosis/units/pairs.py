@@ -7,16 +7,18 @@ and shifts of both sides must be those of one rigid body. Inverting both sides o
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
 
 import numpy as np
 from gtsam import Pose3
 
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
-from adjust.diagnosis.screen import Screen, at_best, screen
+from adjust.diagnosis.screen import Screen, at_best, improvement, screen
 from adjust.diagnosis.sequences import Link, fitted, hand, links, typical
 from adjust.diagnosis.units.conventions import Scope, shrinking
 from adjust.diagnosis.units.motions import CONVENTIONS, Convention, Motion, edits_of, mended, miss, rotation_of
+from adjust.model.errors import listed
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.spatial.rigid_motions import Motions
@@ -27,8 +29,12 @@ _SURE = 20.0
 _MOST, _SINGLE = 5, 8
 _MISSED = 25.0
 """Mean square over sigmas at the start that the typical one of several pairs that are misread has at least."""
+_ROUNDS = 5
+"""Turns in which those of the pairs are found that are misread."""
 _LARGE = 500
 """Pairs up to which start values are found anew for every convention."""
+
+_Found = tuple[float, Scope, Convention]
 
 
 def misread_pairs(case: Case) -> Iterator[Hypothesis]:
@@ -40,27 +46,39 @@ def misread_pairs(case: Case) -> Iterator[Hypothesis]:
     judge = _by_hands(survey, hands) if hands else _by_start(case)
     if judge is None:
         return
-    found, looked_at = list[tuple[float, Scope, Convention]](), 0
-    meant = [(c, {i: m for i, p in enumerate(survey.pairs) if (m := c.mend(p.b_from_a)) is not None})
+    found, looked_at = list[_Found](), 0
+    meant = [(c, {i: m for i, p in enumerate(survey.pairs) if (m := c.meant(p, case.written)) is not None})
              for c in CONVENTIONS]  # fmt: skip
     last = ""
     for scope in _scopes(survey, judge.worst):
-        if scope.place.kind != last and any(e > _SURE and c.shifts >= 1.0 for e, _, c in found):
-            break  # what is wrong with many is not looked for in a few; what makes all smaller than its sigmas fits any
+        if scope.place.kind != last and any(_sure(f) for f in found):
+            break  # what is wrong with many is not looked for in a few
         last = scope.place.kind
         rows = scope.rows.tolist()
         ways = [(c, {i: motions[i] for i in rows}) for c, motions in meant if all(i in motions for i in rows)]
         looked_at += len(ways)
         judged = judge.evidence([new for _, new in ways]) if ways else []
         found += [(e, scope, c) for e, (c, _) in zip(judged, ways, strict=True)]
-    found.sort(key=lambda f: (-f[0], -len(f[1].rows)))
+    if not hands and not any(_sure(f) for f in found):
+        parts = [_part(case, c, motions) for c, motions in meant if c.angles and motions]
+        looked_at += len(parts)
+        found += [part for part in parts if len(part[1].rows) > 1]
+    found.sort(key=lambda f: (not _sure(f), -f[0], -len(f[1].rows)))
     for evidence, scope, convention in found[:_MOST]:
-        changed = mended(survey, scope.rows, convention) if evidence > _CLEARLY else None
+        changed = mended(survey, scope.rows, convention, case.written) if evidence > _CLEARLY else None
         if changed is not None:
             cause = f"{scope.text} {convention.said}{_lengths(changed, hands)}"
             yield Hypothesis(convention.name, cause, f"in pairs.csv {convention.remedy}", scope.place, changed,
                              edits_of(survey, scope.rows, convention), evidence, 1, looked_at,
                              penalty=shrinking(convention.shifts, 3 * len(scope.rows)))  # fmt: skip
+
+
+def _sure(found: _Found) -> bool:
+    """Whether several fit so: that of single pairs is of each alone, which many misread ones have as well.
+
+    What makes all of them smaller than their sigmas fits any.
+    """
+    return found[0] > _SURE and len(found[1].rows) > 1 and found[2].shifts >= 1.0
 
 
 def _lengths(survey: Survey, hands: list[Link]) -> str:
@@ -95,6 +113,44 @@ def _scopes(survey: Survey, worst: IntArray) -> Iterator[Scope]:
     for i in worst[:_SINGLE].tolist():
         pair = survey.pairs[i]
         yield Scope(np.array([i]), f"pair {pair.pair_id}: its values", Place("pair", (pair.pair_id,)))
+
+
+def _part(case: Case, convention: Convention, meant: Mapping[int, Motion]) -> _Found:
+    """Those pairs that fit better as they were perhaps meant; found in turn with where that puts all stations."""
+    now, survey, rows = at_best(case), case.survey, frozenset[int]()
+    read = {i: survey.pairs[i].b_from_a for i in meant}
+    for _ in range(_ROUNDS):
+        if now is None:
+            break
+        better = frozenset(np.array(list(meant))[_read_as(now, meant) < _read_as(now, read)].tolist())
+        if better == rows:
+            break
+        rows, now = better, screen(_with(survey, {i: meant[i] for i in better}))
+    evidence, rows = _by_loops(survey, meant, rows)
+    ids = tuple(survey.pairs[i].pair_id for i in sorted(rows))
+    where = Scope(np.array(sorted(rows), dtype=np.int64), f"pairs {listed(ids, 6)}", Place("pair", ids))
+    return evidence, where, convention
+
+
+def _by_loops(survey: Survey, meant: Mapping[int, Motion], rows: frozenset[int]) -> tuple[float, frozenset[int]]:
+    """With one or two pairs of a station after the others in their other way, as long as that closes loops.
+
+    How many times less loops then miss.
+    """
+    loops, ends = _loop_tests(survey), [{p.a.frame_id, p.b.frame_id} for p in survey.pairs]
+    turns = [frozenset({i, j}) for i, j in combinations_with_replacement(meant, 2) if ends[i] & ends[j]]
+
+    def misses(sets: Sequence[frozenset[int]]) -> FloatArray:
+        each = loops([{i: meant[i] for i in some} for some in sets])
+        return np.asarray(np.minimum(each, CAP).sum(axis=1))
+
+    first, now = misses([frozenset(), rows]).tolist()
+    while True:
+        left = misses([rows ^ turn for turn in turns])
+        best = int(np.argmin(left))
+        if left[best] > now - 0.5 * CAP:
+            return improvement(first, now, len(survey.pairs)), rows
+        rows, now = rows ^ turns[best], float(left[best])
 
 
 @dataclass(frozen=True, eq=False)

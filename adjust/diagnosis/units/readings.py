@@ -16,10 +16,11 @@ from adjust.diagnosis.screen import Screen, at_best, improvement, screen
 from adjust.diagnosis.units.conventions import (
     ANGLES,
     LENGTHS,
-    MISREADINGS,
     TURNS,
+    UNIT_OF_LENGTHS,
     Misreading,
     Scope,
+    misreadings,
     shrinking,
     slips,
 )
@@ -32,6 +33,8 @@ _MOST, _SINGLE = 6, 8
 _FAR = 1000.0
 """Square over sigma of a single reading from which it is no matter how much larger it is."""
 _FEW, _ROUGH = 0.1, 4.0
+_SPOILT = 1e6
+"""Variance factor of a start at which even the typical observation misses by a thousand sigmas."""
 _LARGE_START = 2500
 """Readings up to which start values are found anew for every hypothesis that concerns all of a kind."""
 _Way = tuple[Scope, Misreading]
@@ -44,7 +47,8 @@ def misread_readings(case: Case) -> Iterator[Hypothesis]:
     if not survey.readings:
         return
     before, values = at_best(case), np.array([r.value for r in survey.readings])
-    ways = [(scope, m) for scope in scopes(survey) for m in _possible(survey, scope, values)]
+    known = misreadings(case.written, "terrestrial")
+    ways = [(scope, m) for scope in scopes(survey) for m in _possible(survey, scope, values, known)]
     looked_at = len(ways)
     gains = _evidence(survey, before, values, ways)
     if before is not None and max(gains, default=0.0) < _CLEARLY:
@@ -89,17 +93,20 @@ def scopes(survey: Survey) -> Iterator[Scope]:
     every = list(dict.fromkeys(s for s in setups.tolist() if s))
     for setup_id in every if len(every) > 1 else []:
         place = Place("setup", (setup_id,), "value")
-        for kind in dict.fromkeys(kinds[setups == setup_id].tolist()):
+        here = kinds[setups == setup_id].tolist()
+        for kind in dict.fromkeys(k for k in here if here.count(k) < np.count_nonzero(kinds == k)):
             yield Scope(of([kind], setup_id), f"the readings of kind {kind} of set-up {setup_id}", place)
         if len(set(kinds[rows := of(ANGLES, setup_id)].tolist())) > 1:
             yield Scope(rows, f"the angles of set-up {setup_id}", place)
 
 
-def _possible(survey: Survey, scope: Scope, values: FloatArray) -> Iterator[Misreading]:
+def _possible(
+    survey: Survey, scope: Scope, values: FloatArray, known: Sequence[Misreading]
+) -> Iterator[Misreading]:
     """A scope of several kinds is misread as a whole, in a way that all of them can be."""
     kinds = {survey.readings[i].kind for i in scope.rows}
     widest = float(np.abs(values[scope.rows]).max())
-    yield from (m for m in MISREADINGS if kinds <= set(m.kinds) and m.may_be(widest))
+    yield from (m for m in known if kinds <= set(m.kinds) and m.may_be(widest))
 
 
 def mended(survey: Survey, rows: IntArray, misreading: Misreading) -> Survey:
@@ -117,6 +124,9 @@ def _evidence(survey: Survey, before: Screen | None, values: FloatArray, ways: S
     ]  # of all readings of its kinds
     anew, there = list(range(len(ways))), list[int]()
     if before is not None:
+        # the lengths of one set-up may have given the start its scale, of which nothing else is left then
+        whole = [w or (before.scale > _SPOILT and way[1].name == UNIT_OF_LENGTHS)
+                 for w, way in zip(whole, ways, strict=True)]  # fmt: skip
         misread = [i for i, w in enumerate(whole) if w and not _fits_as_it_is(before, ways[i][0].rows)]
         anew, there = (misread, []) if n <= _LARGE_START else ([], misread)
         # where all others fit, the start is not spoilt, and of a few readings it says more than a new one of all
@@ -188,4 +198,9 @@ def remedy(misreading: Misreading, table: str = "terrestrial") -> str:
     """What to do with all values of a table that were read so."""
     if misreading.offset:
         return "in terrestrial.csv give them as zenith angles"
+    if misreading.factor == -1.0:
+        heights = misreading.kinds == ("height_difference",)
+        other = "exchange from_id and to_id" if heights else \
+            "change clockwise below [bearings] in survey.toml where all count so"  # fmt: skip
+        return f"in {table}.csv give them the other sign, or {other}"
     return f"in {table}.csv multiply them by {misreading.factor:.10g}, or name the column by their unit"

@@ -10,7 +10,7 @@ import numpy as np
 
 from adjust.diagnosis.diagnosis import Candidate
 from adjust.diagnosis.hypothesis import ChangeReadings, Edit, Hypothesis, Place
-from adjust.diagnosis.units.conventions import MISREADINGS, UNIT_OF_LENGTHS, Misreading, slips
+from adjust.diagnosis.units.conventions import MISREADINGS, UNIT_OF_LENGTHS, Misreading, Written, misreadings, slips
 from adjust.diagnosis.units.motions import CONVENTIONS, edits_of, mended, miss
 from adjust.diagnosis.units.readings import remedy
 from adjust.model.observations import Distance, Reading
@@ -27,10 +27,10 @@ _ALPHA, _FITS = 1e-4, 1e-3
 _MOST = 3
 
 
-def misread_singles(survey: Survey, result: Adjustment) -> tuple[Candidate, ...]:
+def misread_singles(survey: Survey, result: Adjustment, written: Written) -> tuple[Candidate, ...]:
     """Of each observation in use that the adjustment left out, the way to read it in which it fits, if there is one.
 
-    survey: as it was given. The one that is farthest off as it stands comes first.
+    survey: as it was given. written: how its project writes it. The one that is farthest off as it stands comes first.
     """
     given = {("pair", p.pair_id): i for i, p in enumerate(survey.pairs) if p.used}
     given |= {("distance", d.distance_id): i for i, d in enumerate(survey.distances) if d.used}
@@ -39,7 +39,7 @@ def misread_singles(survey: Survey, result: Adjustment) -> tuple[Candidate, ...]
     for o in result.other_residuals:
         row = given.get((o.kind, o.ids[0])) if o.ids and not o.used else None
         if row is not None:
-            found += _best(survey, result, o, row)
+            found += _best(survey, result, o, row, written)
     common = _of_all_distances(survey, found)
     return common or tuple(sorted(found, key=lambda c: -c.statistic)[:_MOST])
 
@@ -64,11 +64,13 @@ def _of_all_distances(survey: Survey, found: Sequence[Candidate]) -> tuple[Candi
     return (replace(first, hypothesis=h, explained=share, statistic=sum(c.statistic for _, c in edits.values())),)
 
 
-def _best(survey: Survey, result: Adjustment, o: ObservationResidual, row: int) -> list[Candidate]:
+def _best(
+    survey: Survey, result: Adjustment, o: ObservationResidual, row: int, written: Written
+) -> list[Candidate]:
     own = np.abs(o.residual / o.standardized)
     if not np.isfinite(own).all() or not (own > 0.0).all():
         return []
-    ways = list(_of_pair(survey, o, row) if o.kind == "pair" else _of_value(survey, o, row))
+    ways = list((_of_pair if o.kind == "pair" else _of_value)(survey, o, row, written))
     before = float(np.sum((o.residual / own) ** 2))
     limit, fits = (float(chi2.isf(p, len(own))) for p in (sidak(_ALPHA, len(ways)), _FITS))
     scale = max(1.0, result.sigma0) ** 2 if np.isfinite(result.sigma0) else 1.0
@@ -80,11 +82,13 @@ def _best(survey: Survey, result: Adjustment, o: ObservationResidual, row: int) 
     return [Candidate(ways[least][1], share, (before - after[least]) / scale, limit, 1.0, result.sigma0)]
 
 
-def _of_pair(survey: Survey, o: ObservationResidual, row: int) -> Iterator[tuple[FloatArray, Hypothesis]]:
+def _of_pair(
+    survey: Survey, o: ObservationResidual, row: int, written: Written
+) -> Iterator[tuple[FloatArray, Hypothesis]]:
     """What it misses by (k,) in the conventions in which its motion may have been written."""
     rows = np.array([row])
     for convention in CONVENTIONS:
-        changed = mended(survey, rows, convention)
+        changed = mended(survey, rows, convention, written)
         if changed is not None:
             pair = changed.pairs[row]
             yield miss(pair.b_from_a, o.adjusted), Hypothesis(
@@ -93,12 +97,15 @@ def _of_pair(survey: Survey, o: ObservationResidual, row: int) -> Iterator[tuple
             )  # fmt: skip
 
 
-def _of_value(survey: Survey, o: ObservationResidual, row: int) -> Iterator[tuple[FloatArray, Hypothesis]]:
+def _of_value(
+    survey: Survey, o: ObservationResidual, row: int, written: Written
+) -> Iterator[tuple[FloatArray, Hypothesis]]:
     """The same (1,) of a reading or distance: decimal point moved, in another unit, sense or from another zero."""
     of: Distance | Reading = survey.distances[row] if o.kind == "distance" else survey.readings[row]
     kind = of.kind if isinstance(of, Reading) else "slope_distance"
     ways = slips(kind, of.value)
-    ways += [m for m in MISREADINGS if kind in m.kinds and m.factor not in [slip.factor for slip in ways]]
+    known = misreadings(written, "terrestrial" if isinstance(of, Reading) else "distances")
+    ways += [m for m in known if kind in m.kinds and m.factor not in [slip.factor for slip in ways]]
     for way in ways:
         value = way.mend(np.array([of.value]))
         other = replace(of, value=float(value[0]))

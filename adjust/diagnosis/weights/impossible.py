@@ -12,7 +12,7 @@ from gtsam import Pose3
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import ChangeColumns, ChangeReadings, Edit, Hypothesis, Place, ScaleKey
-from adjust.diagnosis.units.conventions import ANGLES
+from adjust.diagnosis.units.conventions import ANGLES, UNKNOWN, Written
 from adjust.diagnosis.weights.sigmas import id_of, kind_of
 from adjust.model.errors import listed
 from adjust.model.names import grouped
@@ -28,15 +28,20 @@ _ANGLE, _LENGTH, _PART = 0.01 * _ARCSEC, 1e-7, 1e-7
 _SETUP = 1e-6
 """m: the same of a length that a total station or a level reads."""
 _USUAL = 0.05 * _ARCSEC, 120.0 * _ARCSEC
-_OF_ANGLES = {
-    3600.0: "are degrees, read as arcseconds", 1000.0: "are gon, read as milligon", 10000.0: "are gon, read as cc",
-}  # fmt: skip
+_SIZES = {"degrees": np.pi / 180.0, "gon": np.pi / 200.0, "radians": 1.0, "arcseconds": _ARCSEC,
+          "milligon": np.pi / 2e5, "cc": np.pi / 2e6}  # fmt: skip
+"""rad: of the units in which sigmas of angles are meant, the first three, and read."""
+_TYPICAL = (("degrees", "arcseconds"), ("gon", "milligon"), ("gon", "cc"), ("radians", "arcseconds"))
+"""What is meant and read where nobody knows how it is written."""
+_ALIKE = 1.2
+"""Ratio below which two units are not told from each other by what sigmas they make."""
 _OF_LENGTHS = {1000.0: "are metres, read as millimetres"}
+_TABLES = {"readings": "terrestrial", "distances": "distances", "pairs": "pairs"}
 
 
 @dataclass(frozen=True, eq=False)
-class _Odd:
-    """Sigmas of observations of one kind and group that are too small.
+class Sigmas:
+    """Sigmas of observations of one kind and group.
 
     rows: in the list ``field`` of a survey. part: of a pair's motion, "rotation" or "translation". whole: whether that
     is all of the group. largest: of these sigmas (rad or m).
@@ -52,6 +57,11 @@ class _Odd:
     part: str = ""
 
     @property
+    def count(self) -> int:
+        """Of observed components."""
+        return len(self.rows) * {"pairs": 3, "table_readings": 2}.get(self.field, 1)
+
+    @property
     def is_length(self) -> bool:
         """Else they are angles."""
         return self.part != "rotation" and self.what not in ANGLES
@@ -61,45 +71,67 @@ def impossible_sigmas(case: Case) -> Iterator[Hypothesis]:
     """All angles that cannot be right in the units that were probably meant, and all lengths."""
     odd = _odd(case.survey)
     for some in ([o for o in odd if o.is_length], [o for o in odd if not o.is_length]):
-        yield from _hypotheses(case.survey, some)
+        yield from _hypotheses(case.survey, some, case.written)
 
 
-def doubtful_sigmas(survey: Survey) -> Iterator[Hypothesis]:
+def doubtful_sigmas(survey: Survey, written: Written = UNKNOWN) -> Iterator[Hypothesis]:
     """The same kind by kind, each only in the likeliest unit."""
     for odd in _odd(survey):
-        yield from _hypotheses(survey, [odd])[:1]
+        yield from _hypotheses(survey, [odd], written)[:1]
 
 
-def _odd(survey: Survey) -> list[_Odd]:
+def _odd(survey: Survey) -> list[Sigmas]:
     return [*_of_values(survey), *_of_pairs(survey), *_of_tables(survey)]
 
 
-def _hypotheses(survey: Survey, some: Sequence[_Odd]) -> list[Hypothesis]:
+def _hypotheses(survey: Survey, some: Sequence[Sigmas], written: Written) -> list[Hypothesis]:
     """By unit. What larger variances take of the misfit is paid for only among these: smaller ones are impossible."""
     if not some:
         return []
-    largest, number = max(o.largest for o in some), sum(len(o.rows) for o in some)
-    units = _OF_LENGTHS if some[0].is_length else {
-        f: unit for f, unit in _OF_ANGLES.items() if _USUAL[0] <= f * largest <= _USUAL[1]} or _OF_ANGLES  # fmt: skip
+    largest = max(o.largest for o in some)
+    units = _OF_LENGTHS if some[0].is_length else units_of_angles(some, written)
     size = f"{1e3 * largest:.2g} mm" if some[0].is_length else f"{largest / _ARCSEC:.2g} arcsec"
-    named = " and ".join(f"{o.what} {listed(o.ids, 5)}" for o in some)
-    place = Place("group", tuple(o.group for o in some), "sigma") if all(o.whole for o in some) else Place(
-        "pair" if some[0].field == "pairs" else "reading", tuple(i for o in some for i in o.ids), "sigma")  # fmt: skip
-    out = []
-    for factor, unit in units.items():
-        changed = survey
-        for odd in some:
-            changed = _with_sigmas(changed, odd, factor)
-        out.append(Hypothesis(
-            "unit of sigmas", f"{named}: no instrument has a sigma of {size}: these sigmas {unit}",
-            f"multiply these sigmas by {factor:g}, or name their column or key by their unit", place, changed,
-            tuple(e for odd in some for e in _edits(odd, factor)), SURE, 0, len(units),
-            penalty=2.0 * number * float(np.log(factor / min(units))), of_variances=True,
-        ))  # fmt: skip
+    return [replace(with_sigmas(survey, some, factor, f"no instrument has a sigma of {size}: these sigmas {unit}",
+                                factor / min(units)), evidence=SURE, looked_at=len(units))
+            for factor, unit in units.items()]  # fmt: skip
+
+
+def units_of_angles(some: Sequence[Sigmas], written: Written) -> dict[float, str]:
+    """By factor how sigmas were written and read, so that they become usual ones; all where none is."""
+    tables = {_TABLES.get(o.field, "") for o in some}
+    read = frozenset[str]().union(*(written.words(f"{t}.sigma") for t in tables))
+    values = frozenset[str]().union(*(written.words(f"{t}.value") for t in tables))
+    meant = sorted(("degrees", "gon", "radians"), key=lambda unit: unit not in values)
+    ways = [(m, r) for m in meant for r in _SIZES if (r in read if read else (m, r) in _TYPICAL)]
+    by = {(m, r): _SIZES[m] / _SIZES[r] for m, r in ways if _SIZES[m] > _ALIKE * _SIZES[r]}
+    largest = max(o.largest for o in some)
+    usual = {w: f for w, f in by.items() if _USUAL[0] <= f * largest <= _USUAL[1]} or by
+    out = dict[float, str]()
+    for (m, r), factor in usual.items():
+        near = next((f for f in out if 1.0 / _ALIKE < f / factor < _ALIKE), None)
+        if near is None:
+            out[factor] = f"are {m}, read as {r}"
+        elif read and out[near].endswith(r):
+            out[near] += f" (or {m}, which is nearly the same)"
     return out
 
 
-def _of_values(survey: Survey) -> Iterator[_Odd]:
+def with_sigmas(survey: Survey, some: Sequence[Sigmas], factor: float, said: str, dearer: float) -> Hypothesis:
+    """These sigmas in another unit. dearer: by what factor they are larger than those they are compared with."""
+    named = " and ".join(f"{o.what} {listed(o.ids, 5)}" for o in some)
+    place = Place("group", tuple(o.group for o in some), "sigma") if all(o.whole for o in some) else Place(
+        "pair" if some[0].field == "pairs" else "reading", tuple(i for o in some for i in o.ids), "sigma")  # fmt: skip
+    changed = survey
+    for one in some:
+        changed = _with_sigmas(changed, one, factor)
+    return Hypothesis(
+        "unit of sigmas", f"{named}: {said}", f"multiply these sigmas by {factor:.6g}, or name their column or key by "
+        "their unit", place, changed, tuple(e for one in some for e in _edits(one, factor)), parameters=0,
+        penalty=2.0 * sum(o.count for o in some) * float(np.log(dearer)), of_variances=True,
+    )  # fmt: skip
+
+
+def _of_values(survey: Survey) -> Iterator[Sigmas]:
     """Of readings by kind, and of distances."""
     every: tuple[tuple[str, tuple[Reading | Distance, ...]], ...] = (
         ("readings", survey.readings), ("distances", survey.distances))  # fmt: skip
@@ -109,10 +141,10 @@ def _of_values(survey: Survey) -> Iterator[_Odd]:
         for (kind, group), rows in odd.items():
             ids = tuple(id_of(observed[i]) for i in rows)
             largest = max(observed[i].sigma for i in rows)
-            yield _Odd(field, kind, group, tuple(rows), ids, largest, len(rows) == len(number[group]))
+            yield Sigmas(field, kind, group, tuple(rows), ids, largest, len(rows) == len(number[group]))
 
 
-def _of_pairs(survey: Survey) -> Iterator[_Odd]:
+def _of_pairs(survey: Survey) -> Iterator[Sigmas]:
     """Of the rotations and of the shifts of pairs, where all sigmas of one are too small."""
     used = [i for i, p in enumerate(survey.pairs) if p.used]
     for group, rows in grouped((survey.pairs[i].group, i) for i in used).items():
@@ -127,16 +159,16 @@ def _of_pairs(survey: Survey) -> Iterator[_Odd]:
             if odd:
                 ids = tuple(survey.pairs[i].pair_id for i in odd)
                 size = max(largest[i][part == "translation"] for i in odd)
-                yield _Odd("pairs", what, group, tuple(odd), ids, size, False, part)
+                yield Sigmas("pairs", what, group, tuple(odd), ids, size, False, part)
 
 
-def _of_tables(survey: Survey) -> Iterator[_Odd]:
+def _of_tables(survey: Survey) -> Iterator[Sigmas]:
     """Of the angles that are read off a table's axes."""
     odd = ((i, r, float(np.sqrt(np.diagonal(r.cov).max()))) for i, r in enumerate(survey.table_readings))
     small = ((r.table_id, (i, r, sigma)) for i, r, sigma in odd if r.used and sigma < _ANGLE)
     for table_id, found in grouped(small).items():
         rows, ids = tuple(i for i, _, _ in found), tuple(r.epoch_id for _, r, _ in found)
-        yield _Odd("table_readings", f"the angles of table {table_id} at", found[0][1].group, rows, ids,
+        yield Sigmas("table_readings", f"the angles of table {table_id} at", found[0][1].group, rows, ids,
                    max(sigma for _, _, sigma in found), False, "rotation")  # fmt: skip
 
 
@@ -152,7 +184,7 @@ def _least(o: Reading | Distance) -> float:
     return _ANGLE if o.kind in ANGLES else _SETUP
 
 
-def _with_sigmas(survey: Survey, odd: _Odd, factor: float) -> Survey:
+def _with_sigmas(survey: Survey, odd: Sigmas, factor: float) -> Survey:
     every = getattr(survey, odd.field)
     if not odd.part:
         return with_rows(survey, odd.field, {i: replace(every[i], sigma=factor * every[i].sigma) for i in odd.rows})
@@ -167,7 +199,7 @@ def with_part(survey: Survey, field: str, rows: Iterable[int], part: str, factor
     return with_rows(survey, field, new)
 
 
-def _edits(odd: _Odd, factor: float) -> tuple[Edit, ...]:
+def _edits(odd: Sigmas, factor: float) -> tuple[Edit, ...]:
     """Of a whole group as one number; of others in their rows."""
     if odd.field == "table_readings":
         return ()  # these stand in table_angles.csv or in survey.toml

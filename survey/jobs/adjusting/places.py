@@ -37,12 +37,12 @@ _WHOLE = {"reading": "terrestrial", "pair": "pairs", "setup": "terrestrial"}
 
 def located(found: Diagnosis, project: Project) -> Diagnosis:
     """The diagnosis with the place in the project's files beside every candidate."""
-    files = _Files(project.files or project.folder, project.origins)
+    files = ProjectFiles(project.files or project.folder, project.origins)
     candidates = tuple(replace(c, where=files.of(c.hypothesis)) for c in found.candidates)
     return replace(found, candidates=candidates)
 
 
-class _Files:
+class ProjectFiles:
     """The files of a project, each read when it is first asked for."""
 
     def __init__(self, folder: Path, origins: Mapping[str, Sequence[tuple[Path, int]]] = MappingProxyType({})) -> None:

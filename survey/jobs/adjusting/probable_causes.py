@@ -44,7 +44,7 @@ def explaining(survey: Survey, project: Project) -> Iterator[None]:
 def explained(survey: Survey, error: SurveyError, project: Project) -> SurveyError:
     """What an adjustment of the ``survey`` of a project raised, with the probable causes in front, if any."""
     apart, contradictions = separate_epochs(survey), _probable_causes(survey)
-    diagnosis, note = _named(_diagnosis(survey, None, error, contradictions), project)
+    diagnosis, note = _named(_diagnosis(survey, None, error, contradictions, project), project)
     if isinstance(error, IndeterminateError):
         note = ()  # what is not observed contradicts nothing
     if diagnosis is not None and project.origins:  # of a project that has not grown there is nothing to try
@@ -65,6 +65,7 @@ def with_probable_causes(survey: Survey, result: Adjustment, project: Project) -
     warnings: tuple[str, ...] = ()
     note: tuple[str, ...] = ()
     alone: tuple[str, ...] = ()
+    doubtful: tuple[str, ...] = ()
     diagnosis: Diagnosis | None = None
     if survey.tables:
         from adjust.diagnosis.table import sign_warnings, unseen_readings  # here: most surveys start without a table
@@ -75,11 +76,11 @@ def with_probable_causes(survey: Survey, result: Adjustment, project: Project) -
         # what does not fit may have spoilt the lenses too: then those that the images alone give
         causes = _probable_causes(survey, result) or _probable_causes(survey)
         if not warnings:
-            diagnosis, note = _named(_diagnosis(survey, result, None, causes), project)
+            diagnosis, note = _named(_diagnosis(survey, result, None, causes, project), project)
             warnings = diagnosis.lines if diagnosis is not None else ()
         warnings += tuple(c for c in causes if c not in warnings)
     if diagnosis is None and not warnings:
-        diagnosis, _ = _named(_left_out(survey, result), project)
+        diagnosis, _ = _named(_left_out(survey, result, project), project)
         warnings = diagnosis.lines if diagnosis is not None else ()
     lines = tuple(f"probable cause: {c}" for c in warnings)
     if diagnosis is None and not warnings:
@@ -88,23 +89,29 @@ def with_probable_causes(survey: Survey, result: Adjustment, project: Project) -
         lines = tuple(f"{head}: {c}" for c in diagnosis.lines) if diagnosis is not None else ()
     if diagnosis is None or diagnosis.candidates[0].hypothesis.place.key not in ("sigma", "instrument_height"):
         meant = survey if diagnosis is None else diagnosis.candidates[0].hypothesis.survey
-        lines += doubtful_values(survey if callable(meant) else meant)  # a size is not looked for again
-    return replace(result, warnings=(*lines, *alone, *result.warnings, *note), diagnosis=diagnosis)
+        doubtful = doubtful_values(survey if callable(meant) else meant, project)  # a size is not looked for again
+    warnings = (*lines, *doubtful, *alone, *result.warnings, *note)
+    return replace(result, warnings=warnings, diagnosis=diagnosis, doubtful=doubtful)
 
 
-def doubtful_values(survey: Survey) -> tuple[str, ...]:
+def doubtful_values(survey: Survey, project: Project) -> tuple[str, ...]:
     """What cannot be right by its value alone; not heights of targets, which may be as thin as a millimetre."""
     if not (survey.readings or survey.distances or survey.pairs or survey.table_readings):
         return ()
     from adjust.diagnosis.units.heights import doubtful_heights  # here: as above
     from adjust.diagnosis.weights.impossible import doubtful_sigmas
 
-    found = (*doubtful_heights(survey), *doubtful_sigmas(survey))
+    sigmas = tuple(doubtful_sigmas(survey))
+    if sigmas:
+        from survey.jobs.adjusting.written import written_of
+
+        sigmas = tuple(doubtful_sigmas(survey, written_of(project)))
+    found = (*doubtful_heights(survey), *sigmas)
     return tuple(f"{h.cause}; {h.change}" for h in found if h.place.kind != "point")
 
 
 def _diagnosis(
-    survey: Survey, result: Adjustment | None, error: SurveyError | None, causes: Sequence[str]
+    survey: Survey, result: Adjustment | None, error: SurveyError | None, causes: Sequence[str], project: Project
 ) -> "Diagnosis | None":
     """What explains the misfit by trial, where closed forms have not named it; None where none of that is asked."""
     from adjust.diagnosis.table import only_symptoms  # here: a survey that fits starts without them
@@ -115,8 +122,9 @@ def _diagnosis(
         return None
     from adjust.diagnosis.case import Case
     from adjust.diagnosis.diagnosis import diagnose
+    from survey.jobs.adjusting.written import written_of
 
-    return diagnose(Case(survey, result, error))
+    return diagnose(Case(survey, result, error, written=written_of(project)))
 
 
 def _too_cautious(survey: Survey, result: Adjustment) -> "Diagnosis | None":
@@ -138,7 +146,7 @@ def _too_cautious(survey: Survey, result: Adjustment) -> "Diagnosis | None":
     return diagnose(Case(survey, result), [wrong_factors]) if small else None
 
 
-def _left_out(survey: Survey, result: Adjustment) -> "Diagnosis | None":
+def _left_out(survey: Survey, result: Adjustment, project: Project) -> "Diagnosis | None":
     """What was left out by the search for gross errors, and fits as it was meant; None where nothing does.
 
     Of several first what they may have in common.
@@ -149,15 +157,17 @@ def _left_out(survey: Survey, result: Adjustment) -> "Diagnosis | None":
     from adjust.diagnosis.diagnosis import Diagnosis, diagnose  # here: as above
     from adjust.diagnosis.trial import misfit_of
     from adjust.diagnosis.units.singles import misread_singles
+    from survey.jobs.adjusting.written import written_of
 
+    written = written_of(project)
     if left_out >= _SEVERAL:
         from adjust.diagnosis.case import Case
         from adjust.diagnosis.families import IN_COMMON
 
-        common = diagnose(Case(survey, result), IN_COMMON)
+        common = diagnose(Case(survey, result, written=written), IN_COMMON)
         if common.candidates:
             return replace(common, spoils=True)
-    found = misread_singles(survey, result)
+    found = misread_singles(survey, result, written)
     names = tuple(dict.fromkeys(c.hypothesis.name for c in found))
     return Diagnosis(found, names, misfit_of(result, survey)) if found else None
 

@@ -15,7 +15,8 @@ from adjust.model.result import Adjustment, ParameterName
 from adjust.model.subsets import with_points
 from adjust.model.survey import Survey
 from adjust.statistics.outliers.supported import lost_notes, supported, without_lost_points
-from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
+from adjust.statistics.screened_adjustment import CleanOptions
+from survey.jobs.adjusting.astray import cleaned
 from survey.jobs.adjusting.probable_causes import explaining, with_probable_causes
 from survey.jobs.adjusting.symmetric_boards import consistent_turns
 from survey.jobs.detecting.image_defects import blurred, defect_warnings
@@ -116,9 +117,7 @@ def _adjusted(work: Work) -> Work:
     """Least squares without gross errors, with variance components where they are asked for."""
     how = _options(work.project)
     with explaining(work.survey, work.project):
-        result = without_lost_points(
-            work.survey, lambda part: adjust_cleaned(part, how, work.progress, work.begin(part))
-        )
+        result = without_lost_points(work.survey, lambda part: cleaned(part, how, work.progress, work.begin(part)))
     return replace(work, adjustment=result)
 
 
