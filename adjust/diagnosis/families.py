@@ -14,6 +14,7 @@ from adjust.diagnosis.names.points import exchanged_points
 from adjust.diagnosis.names.rays import exchanged_in_images
 from adjust.diagnosis.names.setups import rows_of_another_setup
 from adjust.diagnosis.names.stations import exchanged_stations
+from adjust.diagnosis.table.misread import misread_tables
 from adjust.diagnosis.targets.layout import other_layouts
 from adjust.diagnosis.targets.size import wrong_sizes
 from adjust.diagnosis.time.forgotten_motion import forgotten_motion
@@ -41,7 +42,7 @@ IN_COMMON = (*VALUES, *UNITS, small_sigmas)
 """What several observations that were left out, with all others fitting, may have in common."""
 TIME: tuple[Family, ...] = (forgotten_motion, unsynchronised)
 WEIGHTS: tuple[Family, ...] = (odd_sigmas, wrong_factors, small_sigmas, correlated_readings, missing_centring)
-CHEAP = (*VALUES, *IMAGES, *NAMES, *UNITS, *TIME, *WEIGHTS, lost_cameras)
+CHEAP = (*VALUES, misread_tables, *IMAGES, *NAMES, *UNITS, *TIME, *WEIGHTS, lost_cameras)
 LATER: tuple[tuple[Family, ...], ...] = ((wrong_sizes,), (changed_bodies,))
 """These adjust to find theirs: they are asked where what the first ones found does not explain everything."""
 

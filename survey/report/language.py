@@ -85,13 +85,21 @@ def catalogue(language: str) -> Catalogue:
                      found["texts"] | found["cells"])  # fmt: skip
 
 
+_AROUND = "(.+); (.+) "
+"""What the pattern of a cause that was tried begins with."""
+
+
 @cache
 def _phrases(language: str) -> tuple[tuple[str, str, str], ...]:
-    """Every message with the longest words of its own, which are looked for before its pattern is."""
+    """Every message with the longest words of its own, which are looked for before its pattern is.
+
+    First what stands around a cause and its change: either may be any other message.
+    """
     known = catalogue(language)
     words = [max(_PLACE.split(sentence), key=len) for sentence in known.sentences]
     words += [""] * (len(known.messages) - len(words))
-    return tuple((w, *one) for w, one in zip(words, known.messages, strict=True))
+    every = ((w, *one) for w, one in zip(words, known.messages, strict=True))
+    return tuple(sorted(every, key=lambda one: not one[1].startswith(_AROUND)))
 
 
 @cache  # not re's own, which holds fewer

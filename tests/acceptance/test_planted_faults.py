@@ -129,8 +129,9 @@ def test_board_moved_between_images(good, tmp_path, capsys):
     survey, truth = good
     late = [r.epoch_id for r in survey.table_readings][14:]
     text = said(tmp_path, displaced(survey, truth, late), capsys)
-    line = next(row for row in text.splitlines() if "target board was moved between images" in row)
-    assert ", ".join(late) in line
+    line = next(row for row in text.splitlines() if "target board, which stands for the world, was moved" in row)
+    assert f"was moved before epoch {late[0]} by" in line
+    assert f"leave out what was observed from {late[0]} on, or give it a name of its own there" in line
     shift = np.array([float(v) for v in line.split("by (")[1].split(")")[0].split(",")])
     np.testing.assert_allclose(shift, SHIFT_MM, atol=0.5)
     assert abs(float(line.split("mm and ")[1].split()[0]) - TURN_DEG) < 0.1
@@ -172,6 +173,28 @@ def test_board_one_column_off(good, tmp_path, capsys):
     text = said(tmp_path, replace(survey, image_blocks=tuple(blocks)), capsys)
     assert "epoch t08, target board is mis-detected: its points are numbered one or more rows or columns off" in text
     assert "20.0 mm" in text
+
+
+MENDED = {
+    "axes exchanged": lambda s: with_angles(s, SHARED["axes exchanged"][0]),
+    "gon of one axis": lambda s: with_angles(s, SHARED["gon of one axis"][0]),
+    "mistyped": lambda s: with_angles(s, mistyped),
+    "exchanged": lambda s: with_angles(s, exchanged),
+    "wrong corner": lambda s: renumbered(s, "t08", lambda i: 87 - i),
+    "wrong corner, and mistyped": lambda s: renumbered(with_angles(s, mistyped), "t08", lambda i: 87 - i),
+}
+
+
+@pytest.mark.parametrize("fault", MENDED)
+def test_mistake_is_mended_in_its_table(fault, good, tmp_path, capsys):
+    adjusted(tmp_path, MENDED[fault](good[0]), capsys)
+    assert main(["adjust", str(tmp_path), "--quiet", "--json", "--try", "1"]) == 0
+    assert json.loads(capsys.readouterr().out)["warnings"] == []
+
+
+def test_readings_in_no_order_at_all(good, tmp_path, capsys):
+    text = said(tmp_path, with_angles(good[0], lambda a: a[np.random.default_rng(1).permutation(len(a))]), capsys)
+    assert "no exchange of the axes, unit or shift by one epoch explains it; compare the epochs of table_angles" in text
 
 
 def test_without_caliper_the_direction_is_named(tmp_path, capsys):

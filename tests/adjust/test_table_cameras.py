@@ -5,9 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adjust.diagnosis.table import probable_causes
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.diagnosis import diagnose
+from adjust.diagnosis.table.misread import misread_tables
 from adjust.model.survey import Survey
 from survey.simulate import head_on_table
+from tests.adjust.planted import case_of
 
 pytestmark = pytest.mark.slow
 
@@ -24,8 +27,7 @@ def mirrored(survey: Survey, camera_id: str) -> Survey:
 
 def test_a_mirrored_camera_is_named() -> None:
     survey, _ = head_on_table(2, n_cameras=3, n_table_epochs=8, n_free_epochs=2)
-    assert probable_causes(survey) == ()
+    assert list(misread_tables(Case(survey))) == []
     wrong = survey.cameras[1].camera_id
-    causes = probable_causes(mirrored(survey, wrong))
-    assert len(causes) == 1
-    assert causes[0].startswith(f"camera {wrong}: its images contradict those of all others")
+    first = diagnose(case_of(mirrored(survey, wrong))).candidates[0].hypothesis
+    assert (first.name, first.place.ids) == ("images mirrored", (wrong,))

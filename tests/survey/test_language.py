@@ -46,10 +46,8 @@ motion forgotten|odd sigma|order of Euler angles|order of quaternions|pairs inve
 points exchanged|prism constant|rolling shutter|rotations inverted|rows and columns|rows of another set-up
 sense of rotation|set-up turned|shift in other axes|sigmas of a group|sign of height differences|slipped decimal
 station moved|stations exchanged|table moved|targets exchanged|the same twice|unit of angles|body of 7
-unit of Euler angles
-unit of heights|unit of lengths|unit of shifts|unit of sigmas|its images contradict those of all others
-no exchange of the axes, unit or shift by one epoch explains it
-which no reading of table"""
+unit of Euler angles|table misread|sign of an axis|reading mistyped|readings exchanged|points misnumbered
+unit of heights|unit of lengths|unit of shifts|unit of sigmas"""
 """Kinds of causes and marks of lines, by which programs tell them apart: shown to nobody."""
 OTHERS = [language for language in LANGUAGES if language != "en"]
 

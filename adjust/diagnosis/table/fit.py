@@ -3,9 +3,7 @@
 Every view says ``inner_from_outer = inner_from_mount * mount_from_table(angles) * table_from_outer``.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar, cast
 
 import numpy as np
 
@@ -19,9 +17,7 @@ from adjust.start.closed_forms.hand_eye import relative_motions, solve_ax_xb, so
 _MEDIAN_6 = 5.348  # of chi-square with six degrees of freedom
 _BOUND = 30.0  # weights fall beyond this many times the median
 _LEVER_M = 1.0
-Known = dict[tuple[object, ...], object]
-"""Poses that fits began with, by the function and the numbers that they follow from."""
-_Found = TypeVar("_Found")
+_STEPS = 12
 _GEOMETRY_SIGMAS = np.array([np.radians(1.0), 0.02])  # weak: only so that no direction is wholly open
 
 
@@ -42,39 +38,36 @@ class TableFit:
 
 
 def residuals(
-    views: TableViews, motions: FloatArray, X: FloatArray, Z: FloatArray, place: IntArray
+    views: TableViews, motions: FloatArray, X: FloatArray, Z: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Residuals (n, 6) rad and m in the mount, their information (n, 6, 6), and mount_from_table (n, 4, 4)."""
     mount_from_table = inverse(motions)[views.epoch]
     seen = X[views.inner] @ views.poses
-    error = seen @ inverse(mount_from_table @ Z[place])
+    error = seen @ inverse(mount_from_table @ Z[views.outer])
     A = adjoint(X[views.inner])
     r = np.concatenate([rotation_log(error[:, :3, :3]), error[:, :3, 3]], axis=1)
     return r, _inverse(A @ views.cov @ A.swapaxes(1, 2)), mount_from_table
 
 
-def fit_table(
-    views: TableViews, place: IntArray, iterations: int = 12, known: Known | None = None
-) -> TableFit | None:
-    """Robust least squares; ``place`` (n,): which place of an outer thing each view shows. None where nothing starts.
+def fit_table(views: TableViews) -> TableFit | None:
+    """Robust least squares. None where nothing starts.
 
-    Gauss-Newton with Geman-McClure weights whose scale follows the median. known: poses that fits of the same views
-    began with, to which those of this one are added: most trials differ in few of them.
+    Gauss-Newton with Geman-McClure weights whose scale follows the median.
     """
     geometry = given_geometry(views.table)
-    begun = _start(views, views.motions(geometry=geometry), place, {} if known is None else known)
+    begun = _start(views, views.motions(geometry=geometry))
     if begun is None:
         return None
     X, Z = begun
-    groups = _groups(views, place, len(X), len(Z))
+    groups = _groups(views, len(X), len(Z))
     by_geometry = (views.by_geometry() * _free_geometry(views))[views.epoch]
-    for step in range(iterations + 1):
-        r, info, mount_from_table = residuals(views, views.motions(geometry=geometry), X, Z, place)
+    for step in range(_STEPS + 1):
+        r, info, mount_from_table = residuals(views, views.motions(geometry=geometry), X, Z)
         if not np.isfinite(r).all():
             return None
         chi2 = np.einsum("ni,nij,nj->n", r, info, r)
         scale = max(1.0, float(np.median(chi2)) / _MEDIAN_6)
-        if step < iterations:
+        if step < _STEPS:
             weights = (1.0 / (1.0 + chi2 / (_BOUND * _MEDIAN_6 * scale))) ** 2
             own = np.broadcast_to(np.eye(6), info.shape)
             J = np.concatenate([own, -adjoint(mount_from_table), by_geometry], axis=2)
@@ -82,9 +75,9 @@ def fit_table(
     return TableFit(X, Z, geometry, chi2, scale)
 
 
-def _groups(views: TableViews, place: IntArray, n_inner: int, n_places: int) -> list[tuple[IntArray, IntArray]]:
+def _groups(views: TableViews, n_inner: int, n_places: int) -> list[tuple[IntArray, IntArray]]:
     """Views (m,) of one inner thing and one place each, and the unknowns (14,) of the two and of the geometry."""
-    pair = views.inner * n_places + place
+    pair = views.inner * n_places + views.outer
     out, step, n = [], np.arange(6), 6 * (n_inner + n_places)
     for one in np.unique(pair).tolist():
         inner, outer = divmod(one, n_places)
@@ -127,18 +120,16 @@ def _free_geometry(views: TableViews) -> FloatArray:
     return np.array([float("non_orthogonality" in free), float("axis_offset" in free)])
 
 
-def _start(
-    views: TableViews, motions: FloatArray, place: IntArray, known: Known
-) -> tuple[FloatArray, FloatArray] | None:
+def _start(views: TableViews, motions: FloatArray) -> tuple[FloatArray, FloatArray] | None:
     """Closed form for the group of views with most turns, then one constant pose after the other."""
-    n_places = int(place.max()) + 1
+    n_places = len(views.outer_ids)
     X: dict[int, FloatArray] = {}
     Z: dict[int, FloatArray] = {}
-    groups = sorted(set(zip(views.inner.tolist(), place.tolist(), strict=True)))
-    rows = {g: np.flatnonzero((views.inner == g[0]) & (place == g[1])) for g in groups}
+    groups = sorted(set(zip(views.inner.tolist(), views.outer.tolist(), strict=True)))
+    rows = {g: np.flatnonzero((views.inner == g[0]) & (views.outer == g[1])) for g in groups}
     M = motions[views.epoch]
     for g in sorted(groups, key=lambda g: -len(rows[g])):
-        found = _once(known, _closed_form, M[rows[g]], views.poses[rows[g]])
+        found = _closed_form(M[rows[g]], views.poses[rows[g]])
         if found is not None:
             X[g[0]], Z[g[1]] = found
             break
@@ -151,19 +142,12 @@ def _start(
         i, p = max(open_ones, key=lambda g: len(rows[g]))
         use = rows[i, p]
         if i in X:
-            Z[p] = _once(known, _mean, M[use] @ X[i] @ views.poses[use])
+            Z[p] = _mean(M[use] @ X[i] @ views.poses[use])
         else:
-            X[i] = _once(known, _mean, inverse(M[use]) @ Z[p] @ inverse(views.poses[use]))
+            X[i] = _mean(inverse(M[use]) @ Z[p] @ inverse(views.poses[use]))
     if len(X) < len(views.inner_ids) or len(Z) < n_places:
         return None
     return np.array([X[i] for i in range(len(X))]), np.array([Z[p] for p in range(n_places)])
-
-
-def _once(known: Known, function: Callable[..., _Found], *given: FloatArray) -> _Found:
-    key = (function, *(g.tobytes() for g in given))
-    if key not in known:
-        known[key] = function(*given)
-    return cast(_Found, known[key])
 
 
 def _mean(offers: FloatArray) -> FloatArray:

@@ -1,14 +1,16 @@
 """Mistakes that all readings of a table share: axes exchanged, wrong units, epochs out of step."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
+from adjust.diagnosis.hypothesis import ChangeColumns, Hypothesis, Place
 from adjust.diagnosis.table.views import TableViews
 from adjust.model.errors import SurveyError
-from adjust.model.survey import FloatArray, IntArray
+from adjust.model.rewriting import with_rows
+from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.spatial.rigid import inverse, rotation_log
 from adjust.start.closed_forms.hand_eye import solve_ax_zb
 
@@ -32,17 +34,24 @@ _UNITS = (  # factor from what stands there to what is meant, and how that comes
 class Misread:
     """What may have happened to the readings (e, k) rad: of which axes and of which epochs they are, and what factors.
 
-    axes: (k,) positions of the columns meant. epochs: rearranges the rows.
+    axes: (k,) positions of the columns meant. epochs: rearranges the rows. lost: epochs that then have no reading.
     """
 
     text: str
     factors: FloatArray
     axes: tuple[int, ...]
-    epochs: Callable[[FloatArray], FloatArray] = lambda a: a
+    epochs: Callable[[FloatArray], FloatArray] | None = None
+    lost: tuple[int, ...] = ()
 
     def meant(self, angles: FloatArray) -> FloatArray:
         """Those meant, of those that stand there."""
-        return self.epochs(angles[:, self.axes]) * self.factors
+        columns = angles[:, self.axes]
+        return (columns if self.epochs is None else self.epochs(columns)) * self.factors
+
+    @property
+    def edits(self) -> FloatArray | None:
+        """(k, k) of the columns of the table; None where its rows change places."""
+        return None if self.epochs is not None else np.diag(self.factors) @ np.eye(len(self.axes))[list(self.axes)]
 
 
 @dataclass(frozen=True)
@@ -54,6 +63,37 @@ class Verdict:
     corrected: float
 
 
+def misread_throughout(survey: Survey, views: TableViews, verdict: Verdict) -> Hypothesis:
+    """The survey with all readings as they were meant."""
+    table_id, h = views.table.table_id, verdict.hypothesis
+    lost = {views.epoch_ids[i] for i in h.lost}
+    angles = dict(zip(views.epoch_ids, h.meant(views.angles), strict=True))
+    meant = with_angles(survey, table_id, angles)
+    meant = replace(meant, table_readings=tuple(
+        r for r in meant.table_readings if (r.table_id, r.epoch_id) not in {(table_id, e) for e in lost}))  # fmt: skip
+    edits = () if h.edits is None else (column_edit(table_id, h.edits, np.zeros(len(h.axes))),)
+    return Hypothesis(
+        "table misread", f"table {table_id}: probably {h.text}: so read, the turns between images and between readings "
+        f"agree to {np.degrees(verdict.corrected):.2f} deg instead of {np.degrees(verdict.as_given):.2f} deg (median)",
+        "correct table_angles.csv", Place("table", (table_id,), "axis1_deg"), meant, edits,
+        verdict.as_given / (verdict.corrected + np.radians(_CLEAR_DEG)), 1, len(hypotheses(len(h.axes))),
+    )  # fmt: skip
+
+
+def with_angles(survey: Survey, table_id: str, angles: Mapping[str, FloatArray]) -> Survey:
+    """The survey with other readings (k,) rad of a table at these epochs."""
+    new = {i: replace(r, angles=angles[r.epoch_id]) for i, r in enumerate(survey.table_readings)
+           if r.table_id == table_id and r.epoch_id in angles}  # fmt: skip
+    return with_rows(survey, "table_readings", new)
+
+
+def column_edit(table_id: str, matrix: FloatArray, offset: FloatArray, epochs: tuple[str, ...] = ()) -> ChangeColumns:
+    """In ``table_angles.csv`` at some epochs or all: matrix (k, k) times the readings of a table plus (k,) deg."""
+    columns = tuple(f"axis{i + 1}_deg" for i in range(len(matrix)))
+    where = {"table_id": (table_id,), **({"epoch_id": epochs} if epochs else {})}
+    return ChangeColumns("table_angles", columns, matrix, offset, where)
+
+
 def hypotheses(n_axes: int) -> list[Misread]:
     """All mistakes, the simplest first."""
     names, one, own = [f"axis{i + 1}" for i in range(n_axes)], np.ones(n_axes), tuple(range(n_axes))
@@ -62,8 +102,8 @@ def hypotheses(n_axes: int) -> list[Misread]:
     out += [Misread(f"the readings of {' and '.join(names)} {what}", factor * one, own) for factor, what in _UNITS]
     out += [Misread(f"the readings of {name} {what}", np.where(np.arange(2) == i, factor, 1.0), own)
             for i, name in enumerate(names if two else ()) for factor, what in _UNITS]  # fmt: skip
-    out += [Misread(f"every epoch has the reading of the {which} one", one, own, partial(np.roll, shift=by, axis=0))
-            for by, which in ((1, "following"), (-1, "preceding"))]  # fmt: skip
+    out += [Misread(f"every epoch has the reading of the {which} one", one, own, partial(np.roll, shift=by, axis=0),
+                    (0 if by > 0 else -1,)) for by, which in ((1, "following"), (-1, "preceding"))]  # fmt: skip
     out.append(Misread("the readings are in the opposite order of the epochs", one, own, np.flipud))
     both = [Misread(f"axis1 and axis2 are exchanged, and the readings {what}", factor * one, other)
             for factor, what in _UNITS]  # fmt: skip

@@ -4,12 +4,14 @@ A table whose inner axis is read with the wrong sign moves like one whose base a
 the outer axis: ``R1(a1) R2(-a2) = S R1(a1) R2(a2) S`` with S half a turn about axis 1.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.model.result import ParameterName
+from adjust.diagnosis.hypothesis import Hypothesis, Place
+from adjust.diagnosis.table.readings import column_edit, with_angles
+from adjust.model.result import Adjustment, ParameterName, adjusted_pose
 from adjust.model.survey import FloatArray, PoseParameter, Survey, Table
 from adjust.spatial.rigid import inverse, rigid, rotation_exp, rotation_log
 from adjust.start.network import given_pose
@@ -58,6 +60,35 @@ def constants(
         elif not station and base is not None and own is not None:
             outer[name] = inverse(base) @ own
     return inner, outer
+
+
+def wrong_signs(survey: Survey, result: Adjustment) -> Iterator[Hypothesis]:
+    """Axes whose sign contradicts poses that are given as starts: images alone do not see it, whatever fits."""
+
+    def pose(name: ParameterName, given: PoseParameter) -> FloatArray | None:
+        found = adjusted_pose(result.estimates, name, given)
+        return None if found is None else found.matrix()
+
+    for table in survey.tables:
+        verdict = sign_mistake(table, constants(survey, table, pose), given_constants(survey, table))
+        if verdict is not None:
+            yield sign_of(survey, table, verdict)
+
+
+def sign_of(survey: Survey, table: Table, verdict: SignVerdict) -> Hypothesis:
+    """The survey with these axes negated."""
+    axes, many = " and ".join(verdict.axes), len(verdict.axes) > 1
+    signs = np.array([-1.0 if f"axis{i + 1}" in verdict.axes else 1.0 for i in range(len(table.axes))])
+    readings = {r.epoch_id: signs * r.angles for r in survey.table_readings if r.table_id == table.table_id}
+    return Hypothesis(
+        "sign of an axis",
+        f"table {table.table_id}: the sign{'s' if many else ''} of {axes} {'are' if many else 'is'} probably wrong: "
+        f"{verdict.shown_by} comes out {np.degrees(verdict.as_given):.1f} deg from the pose given, with {axes} negated "
+        f"{np.degrees(verdict.corrected):.1f} deg", "correct the sign in table_angles.csv, or the pose given",
+        Place("table", (table.table_id,), "axis1_deg"), with_angles(survey, table.table_id, readings),
+        (column_edit(table.table_id, np.diag(signs), np.zeros(len(signs))),),
+        verdict.as_given / max(verdict.corrected, _WRONG_RAD / 10.0), 1, 3,
+    )  # fmt: skip
 
 
 def sign_mistake(table: Table, found: Constants, given: Constants) -> SignVerdict | None:

@@ -2,17 +2,15 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
-from adjust.adjustment import adjust
-from adjust.diagnosis.alone import own_lens, single_camera_survey, single_views, view_covariance
+from adjust.diagnosis.alone import single_views, view_covariance
+from adjust.diagnosis.case import Case
 from adjust.frames.tables import table_motions
-from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
-from adjust.model.result import Estimate, ParameterName
-from adjust.model.rewriting import with_rows
-from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey, Table, Target
+from adjust.model.survey import FloatArray, IntArray, Survey, Table, Target
 from adjust.spatial.rigid import adjoint, inverse, rigid, rotation_exp
 from adjust.start.views import View, untrustworthy
 
@@ -67,19 +65,6 @@ class TableViews:
             cov=self.cov[rows],
         )  # fmt: skip
 
-    def shows(self, kind: str, thing_id: str) -> BoolArray:
-        """Which views (n,) are those of one thing, a camera or a target."""
-        inner = np.array([name == (kind, thing_id) for name in self.inner_ids])
-        outer = np.array([name == (kind, thing_id) for name in self.outer_ids])
-        return np.asarray(inner[self.inner] | outer[self.outer])
-
-    def without(self, kind: str, thing_id: str) -> "TableViews":
-        """The same without the views of one thing, and without what only these show."""
-        rest = self.only(np.flatnonzero(~self.shows(kind, thing_id)))
-        (left, inner), (right, outer) = (np.unique(x, return_inverse=True) for x in (rest.inner, rest.outer))
-        shown = tuple(self.inner_ids[i] for i in left), tuple(self.outer_ids[i] for i in right)
-        return replace(rest, inner=inner, outer=outer, inner_ids=shown[0], outer_ids=shown[1])
-
 
 def given_geometry(table: Table) -> FloatArray:
     """Non-orthogonality (rad) and axis offset (m) as they are given, (2,)."""
@@ -87,11 +72,13 @@ def given_geometry(table: Table) -> FloatArray:
     return np.array([given.get("non_orthogonality", 0.0), given.get("axis_offset", 0.0)])
 
 
-def table_views(survey: Survey) -> tuple[TableViews, ...]:
+@lru_cache(maxsize=2)
+def table_views(case: Case) -> tuple[TableViews, ...]:
     """The views of every table that carries cameras before fixed targets, or targets before fixed cameras.
 
-    The cameras' lenses are those given, or found from the images. Raises SurveyError where there are none.
+    With the lenses that each camera's own images give: tables and other cameras have no say.
     """
+    survey = case.survey
     carried = {s.station_id: s.table_id for s in survey.stations if s.motion == "table"}
     readings = {(r.table_id, r.epoch_id) for r in survey.table_readings}
     blocks = [b for b in survey.image_blocks if b.target_id is not None]
@@ -110,7 +97,7 @@ def table_views(survey: Survey) -> tuple[TableViews, ...]:
         sides.append((str(table_id), by_target is not None) if usable else None)
     if not any(sides):
         return ()
-    views = poses_of_views(_calibrated(replace(survey, image_blocks=tuple(blocks))))
+    views = _poses(case, replace(survey, image_blocks=tuple(blocks)))
     out = []
     for table in survey.tables:
         mine = {i: s[1] for i, s in enumerate(sides) if s is not None and s[0] == table.table_id and i in views}
@@ -120,34 +107,9 @@ def table_views(survey: Survey) -> tuple[TableViews, ...]:
     return tuple(out)
 
 
-def _calibrated(survey: Survey) -> Survey:
-    """With the lens of each camera from its own images alone: tables and other cameras have no say."""
-    found = dict[ParameterName, Estimate]()
-    for camera in (c for c in survey.cameras if c.lens.free):
-        alone = single_camera_survey(survey, camera.camera_id)
-        try:
-            found |= adjust(alone).estimates if alone.image_blocks else {}
-        except SurveyError:  # too few images: the lens that the search for start values finds will do
-            continue
-    return with_lenses(survey, found)
-
-
-def with_lenses(survey: Survey, estimates: Mapping[ParameterName, Estimate]) -> Survey:
-    """The survey whose lenses start from those of adjustments, as far as there are any."""
-    known = {i: c for i, c in enumerate(survey.cameras) if ("lens", c.camera_id) in estimates}
-    values = {i: np.asarray(estimates["lens", c.camera_id].value) for i, c in known.items()}
-    new = {i: replace(c, lens=replace(c.lens, values=values[i])) for i, c in known.items()}
-    return with_rows(survey, "cameras", new)
-
-
-def poses_of_views(survey: Survey) -> dict[int, View]:
-    """Every block of a target that a pose explains, as rays and poses, each from its own image alone.
-
-    Raises SurveyError where a camera has no lens and its images give none.
-    """
-    seen = dict.fromkeys(b.camera_id for b in survey.image_blocks)
-    # those without a pose are named by the search for start values
-    found = single_views(survey, {camera_id: own_lens(survey, survey.cameras_by_id[camera_id]) for camera_id in seen})
+def _poses(case: Case, survey: Survey) -> dict[int, View]:
+    """Every block of a target that a pose explains, as rays and poses, each from its own image alone."""
+    found = single_views(survey, case.lenses)
     reasons, _ = untrustworthy(found, survey)
     return {view.block_idx: view for view in found if view.block_idx not in reasons}
 

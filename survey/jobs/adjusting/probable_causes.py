@@ -1,7 +1,7 @@
 """Why an adjustment failed, or what contradicts in it, where the images can tell. Nothing is repaired."""
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import replace
@@ -43,20 +43,20 @@ def explaining(survey: Survey, project: Project) -> Iterator[None]:
 
 def explained(survey: Survey, error: SurveyError, project: Project) -> SurveyError:
     """What an adjustment of the ``survey`` of a project raised, with the probable causes in front, if any."""
-    apart, contradictions = separate_epochs(survey), _probable_causes(survey)
-    diagnosis, note = _named(_diagnosis(survey, None, error, contradictions, project), project)
+    apart = separate_epochs(survey)
+    diagnosis, note = _named(_diagnosis(survey, None, error, project), project)
     if isinstance(error, IndeterminateError):
         note = ()  # what is not observed contradicts nothing
     if diagnosis is not None and project.origins:  # of a project that has not grown there is nothing to try
         done = (replace(c, hypothesis=replace(c.hypothesis, edits=())) for c in diagnosis.candidates)
         diagnosis = replace(diagnosis, candidates=tuple(done))
-    tried = diagnosis.lines if diagnosis is not None else ()
-    if not apart and not contradictions and not tried:
+    tried = diagnosis.lines if diagnosis is not None else _disagreeing_tables(survey)
+    if not apart and not tried:
         said = copy(error)
         said.args = ("\n  - ".join([str(error), *note]),)
         return said if note else error
-    lines = "\n  - ".join(["probable cause:", *apart, *tried, *contradictions, *note])
-    message = f"{lines}\n{_consequence(error) if contradictions or tried else f'without that: {error}'}"
+    lines = "\n  - ".join(["probable cause:", *apart, *tried, *note])
+    message = f"{lines}\n{_consequence(error) if tried else f'without that: {error}'}"
     return SurveyError(message) if diagnosis is None else DiagnosedError(message, diagnosis)
 
 
@@ -68,17 +68,14 @@ def with_probable_causes(survey: Survey, result: Adjustment, project: Project) -
     doubtful: tuple[str, ...] = ()
     diagnosis: Diagnosis | None = None
     if survey.tables:
-        from adjust.diagnosis.table import sign_warnings, unseen_readings  # here: most surveys start without a table
+        from adjust.diagnosis.table.signs import wrong_signs  # here: most surveys start without a table
+        from adjust.diagnosis.table.unseen import unseen_readings
 
-        warnings = sign_warnings(survey, result)
+        warnings = tuple(f"{h.cause}; {h.change}" for h in wrong_signs(survey, result))
         alone = tuple(f"{f.found}; {f.remedy}" for f in unseen_readings(survey, misspelt=True))
-    if _contradicted(survey, result):
-        # what does not fit may have spoilt the lenses too: then those that the images alone give
-        causes = _probable_causes(survey, result) or _probable_causes(survey)
-        if not warnings:
-            diagnosis, note = _named(_diagnosis(survey, result, None, causes, project), project)
-            warnings = diagnosis.lines if diagnosis is not None else ()
-        warnings += tuple(c for c in causes if c not in warnings)
+    if _contradicted(survey, result) and not warnings:
+        diagnosis, note = _named(_diagnosis(survey, result, None, project), project)
+        warnings = diagnosis.lines if diagnosis is not None else _disagreeing_tables(survey)
     if diagnosis is None and not warnings:
         diagnosis, _ = _named(_left_out(survey, result, project), project)
         warnings = diagnosis.lines if diagnosis is not None else ()
@@ -111,20 +108,23 @@ def doubtful_values(survey: Survey, project: Project) -> tuple[str, ...]:
 
 
 def _diagnosis(
-    survey: Survey, result: Adjustment | None, error: SurveyError | None, causes: Sequence[str], project: Project
+    survey: Survey, result: Adjustment | None, error: SurveyError | None, project: Project
 ) -> "Diagnosis | None":
-    """What explains the misfit by trial, where closed forms have not named it; None where none of that is asked."""
-    from adjust.diagnosis.table import only_symptoms  # here: a survey that fits starts without them
+    """What explains the misfit by trial; None where none of that is asked.
 
+    Of what stops an adjustment otherwise, as a lack of start values, tables alone.
+    """
     refused = error is not None and not isinstance(error, IndeterminateError | NotConvergedError)
     fits = result is not None and result.sigma0 < _LARGE and not _images_refused(survey, result)
-    if refused or fits or not only_symptoms(causes):
+    if fits or (refused and not survey.tables):
         return None
-    from adjust.diagnosis.case import Case
+    from adjust.diagnosis.case import Case  # here: a survey that fits starts without them
     from adjust.diagnosis.diagnosis import diagnose
+    from adjust.diagnosis.table.misread import misread_tables
     from survey.jobs.adjusting.written import written_of
 
-    return diagnose(Case(survey, result, error, written=written_of(project)))
+    case = Case(survey, result, error, written=written_of(project))
+    return diagnose(case, [misread_tables] if refused else None)
 
 
 def _too_cautious(survey: Survey, result: Adjustment) -> "Diagnosis | None":
@@ -191,12 +191,12 @@ def _consequence(error: SurveyError) -> str:
     return f"without that: {error}"
 
 
-def _probable_causes(survey: Survey, result: Adjustment | None = None) -> tuple[str, ...]:
+def _disagreeing_tables(survey: Survey) -> tuple[str, ...]:
     if not survey.tables:
         return ()
-    from adjust.diagnosis.table import probable_causes  # here: as above
+    from adjust.diagnosis.table.misread import disagreeing_tables  # here: as above
 
-    return probable_causes(survey, result)
+    return tuple(f"{f.found}; {f.remedy}" for f in disagreeing_tables(survey))
 
 
 def _contradicted(survey: Survey, result: Adjustment) -> bool:
