@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -92,6 +93,13 @@ def test_another_unit_is_told_named_and_mended(
     assert main(["check", str(lab), "--quiet"]) == 0
 
 
+def diagnosis_of(lab: Path) -> list[dict[str, Any]]:
+    """Of its solution, or of its adjustment that failed."""
+    found = (lab / "results" / name for name in ("solution.json", "unsolved.json"))
+    told = next(json.loads(path.read_text(encoding="utf-8"))["diagnosis"] for path in found if path.exists())
+    return list(told)
+
+
 EULER = {
     "gon": (10.0 / 9.0, 59, "have Euler angles in gon, read as degrees", "by 0.9"),
     "radians": (math.pi / 180.0, 59, "have Euler angles in radians, read as degrees", "by 57.2957795"),
@@ -108,9 +116,7 @@ def test_euler_angles_of_pairs_in_another_unit(unit: str, chosen: Callable[[int]
     lab = labs.example("relay", tmp_path / "lab")
     labs.with_euler_angles(lab / "observations" / "pairs.csv", factor, chosen)
     assert main(["adjust", str(lab), "--quiet"]) in (FAILED, 3)
-    names = ("solution.json", "unsolved.json")
-    (first, *_) = next(json.loads(p.read_text(encoding="utf-8"))["diagnosis"] for name in names
-                       if (p := lab / "results" / name).exists())  # fmt: skip
+    (first, *_) = diagnosis_of(lab)
     assert (first["name"], said in first["cause"], by in first["change"]) == ("unit of Euler angles", True, True)
     wrong = sum(chosen(i) for i in range(n))
     assert first["where"] == f"observations/pairs.csv:2 and {wrong - 1} more rows"
@@ -153,6 +159,36 @@ def test_lengths_in_a_column_of_metres(factor: float, unit: str, setup_id: str, 
     assert (first["name"], setup_id in first["cause"]) == ("unit of lengths", True)
     assert f"are {unit}, read as metres" in first["cause"]
     assert f"multiply them by {1.0 / factor:g}" in first["change"]
+
+
+ROWS = {
+    "pairs inverted": ("relay", "pairs", lambda i, row: i % 3 == 0 and row.update(a_id=row["b_id"], b_id=row["a_id"]),
+                       "are a_from_b, read as b_from_a", "exchange a_id and b_id"),
+    "directions of the second face": ("total-station", "terrestrial", lambda i, row: i % 2 and row["setup_id"] == "S2a"
+                                      and row["kind"] == "direction" and row.update(
+                                          value_gon=f"{(float(row['value_gon']) + 200.0) % 400.0:.5f}"),
+                                      "set-up S2a: directions r46, r52", "turn them by 200 gon"),
+    "angles from another zero": ("total-station", "terrestrial", lambda i, row: row["kind"] == "zenith"
+                                 and row["setup_id"] == "S3a" and row.update(
+                                     value_gon=f"{200.0 - float(row['value_gon']):.5f}"),
+                                 "of set-up S3a: their values are nadir angles", "give them as zenith angles"),
+    "kind of distances": ("total-station", "terrestrial", lambda i, row: row["kind"] == "slope_distance"
+                          and row.update(kind="horizontal_distance"),
+                          "the horizontal distances are slope distances", "call them slope_distance"),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ROWS)
+def test_rows_that_are_written_as_others_are_read(name: str, tmp_path: Path) -> None:
+    example, table, change, said, remedy = ROWS[name]
+    lab = labs.example(example, tmp_path / "lab")
+    labs.with_rows(lab / "observations" / f"{table}.csv", change)
+    assert main(["adjust", str(lab), "--quiet"]) in (FAILED, 3)
+    (first, *_) = diagnosis_of(lab)
+    assert (first["name"], said in first["cause"], remedy in first["change"]) == (name, True, True)
+    assert first["explained"] > 0.95
+    assert main(["adjust", str(lab), "--quiet", "--try", "1"]) == 0
 
 
 def test_height_differences_of_the_other_sign_are_named_without_a_search(

@@ -25,6 +25,8 @@ from adjust.model.survey import PoseParameter, Survey
 
 _MOST = 0.25
 """Share of the epochs up to which it is single ones that disagree."""
+_SEVERAL = 10.0
+"""Evidence of more than one, over their number: the rather something else has changed between some of them."""
 _EXACT = 5.0  # sigmas
 _ALIKE = 10.0, np.radians(0.02)
 """Sigmas, and rad beside them, by which readings that were exchanged are each other's at most."""
@@ -55,11 +57,12 @@ def misread_epochs(survey: Survey, views: TableViews, fit: TableFit) -> Iterator
     changed = survey
     for wrong in found:
         changed = wrong.mend(changed)
+    evidence = float(fit.chi2[rows].max() / fit.scale) if len(found) == 1 else _SEVERAL / len(found)
     table_id, at = views.table.table_id, tuple(e for wrong in found for e in wrong.epochs)
     yield Hypothesis(
         found[0].name, "; ".join(wrong.said for wrong in found), _REMEDIES[found[0].name],
         Place("table", (table_id,), "epoch", at), changed, tuple(e for wrong in found for e in wrong.edits),
-        float(fit.chi2[rows].max() / fit.scale), sum(wrong.parameters for wrong in found), len(views.epoch_ids),
+        evidence, sum(wrong.parameters for wrong in found), len(views.epoch_ids),
     )  # fmt: skip
 
 

@@ -25,6 +25,7 @@ class Convention:
 
     columns: the numbers of pairs.csv that change, and by which matrix, where that mends it. shifts: what the lengths of
     shifts are multiplied by. angles: what Euler angles are, as they stand there; 0 where nothing is done to them.
+    by_hand: whether it may happen to any of the pairs, as they are typed row by row.
     """
 
     name: str
@@ -34,6 +35,7 @@ class Convention:
     columns: tuple[tuple[str, ...], FloatArray] | None = None
     shifts: float = 1.0
     angles: float = 0.0
+    by_hand: bool = False
 
     def meant(self, pair: Pair, written: Written) -> Motion | None:
         """The motion of a pair as it was meant; None where it cannot have been misread so."""
@@ -81,7 +83,7 @@ def _of_shifts(said: str, columns: tuple[str, ...] = _SHIFT) -> Convention:
 def _of_angles(said: str) -> Convention:
     factor, columns = ANGLE_RATIOS[f"are {said}"], ", ".join(_EULER)
     return Convention("unit of Euler angles", f"have Euler angles in {said}", f"multiply {columns} by {factor:.9g}",
-                      lambda m: m, (_EULER, factor * np.eye(3)), angles=factor)  # fmt: skip
+                      lambda m: m, (_EULER, factor * np.eye(3)), angles=factor, by_hand=True)  # fmt: skip
 
 
 def _inverted(m: Motion) -> Motion:
@@ -107,7 +109,7 @@ def _by_euler(meant: Callable[[FloatArray], FloatArray]) -> Callable[[Motion], M
 
 
 CONVENTIONS: tuple[Convention, ...] = (
-    Convention("pairs inverted", "are a_from_b, read as b_from_a", "exchange a_id and b_id", _inverted),
+    Convention("pairs inverted", "are a_from_b, read as b_from_a", "exchange a_id and b_id", _inverted, by_hand=True),
     _of_shifts("metres, read as millimetres"),
     _of_shifts("millimetres, read as metres"),
     _of_shifts("inches, read as millimetres"),

@@ -60,7 +60,7 @@ def misread_pairs(case: Case) -> Iterator[Hypothesis]:
         judged = judge.evidence([new for _, new in ways]) if ways else []
         found += [(e, scope, c) for e, (c, _) in zip(judged, ways, strict=True)]
     if not hands and not any(_sure(f) for f in found):
-        parts = [_part(case, c, motions) for c, motions in meant if c.angles and motions]
+        parts = [_part(case, c, motions) for c, motions in meant if c.by_hand and motions]
         looked_at += len(parts)
         found += [part for part in parts if len(part[1].rows) > 1]
     found.sort(key=lambda f: (not _sure(f), -f[0], -len(f[1].rows)))

@@ -24,6 +24,7 @@ from adjust.diagnosis.units.conventions import (
     shrinking,
     slips,
 )
+from adjust.model.observations import ReadingKind
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, IntArray, Survey
 
@@ -35,6 +36,8 @@ _FAR = 1000.0
 _FEW, _ROUGH = 0.1, 4.0
 _SPOILT = 1e6
 """Variance factor of a start at which even the typical observation misses by a thousand sigmas."""
+_SUSPECTS = 3
+"""Set-ups without whose zenith angles the start is looked for: a set-up alone may turn all heights over."""
 _LARGE_START = 2500
 """Readings up to which start values are found anew for every hypothesis that concerns all of a kind."""
 _Way = tuple[Scope, Misreading]
@@ -52,7 +55,7 @@ def misread_readings(case: Case) -> Iterator[Hypothesis]:
     looked_at = len(ways)
     gains = _evidence(survey, before, values, ways)
     if before is not None and max(gains, default=0.0) < _CLEARLY:
-        gains = _without_worst(survey, before, values, ways) or gains
+        gains = _without_worst(survey, before, values, ways)
     found = [(gain, *way) for gain, way in zip(gains, ways, strict=True)]
     # what explains many first: that of single readings is of each alone, which many misread ones have as well
     for some in ([f for f in found if f[0] > _CLEARLY], _slips(survey, before, values)):
@@ -153,23 +156,31 @@ def _in_place(
 
 
 def _without_worst(survey: Survey, before: Screen, values: FloatArray, ways: Sequence[_Way]) -> list[float]:
-    """The same at the start without the angles of the set-up that misses most, which may have spoilt it for all others.
+    """The same at the start without the angles of one set-up that misses most, which may have spoilt it for all others.
 
-    Empty where there is only one set-up, or no such start.
+    Of its horizontal angles, then of zenith angles.
     """
-    kinds = [r.kind for r in survey.readings]
-    angles = [scope for scope, _ in ways if scope.place.kind == "setup" and kinds[scope.rows[0]] in TURNS]
-    worst = max(angles, key=lambda scope: float(np.median(before.readings[scope.rows])), default=None)
-    if worst is None:
-        return []
-    turned = {i for i in worst.rows.tolist() if kinds[i] in TURNS}
-    without = screen(replace(survey, readings=tuple(r for i, r in enumerate(survey.readings) if i not in turned)))
-    apart = None if without is None else screen(survey, without.start)
-    if apart is None:
-        return []
-    mine = [i for i, (scope, _) in enumerate(ways) if set(scope.rows.tolist()) <= set(worst.rows.tolist())]
-    gains = dict(_in_place(apart, values, ways, mine))
-    return [gains.get(i, 0.0) for i in range(len(ways))]
+    gains = [0.0] * len(ways)
+    for kinds in (TURNS, ("zenith",)):
+        for i, gain in _without(survey, before, values, ways, kinds):
+            gains[i] = max(gains[i], gain)
+    return gains
+
+
+def _without(
+    survey: Survey, before: Screen, values: FloatArray, ways: Sequence[_Way], kinds: tuple[ReadingKind, ...]
+) -> Iterator[tuple[int, float]]:
+    """Of the set-ups whose angles of these kinds miss most; nothing where there is one alone, or no such start."""
+    mine = [survey.readings[i].kind in kinds for i in range(len(values))]
+    every = {scope.place.ids: scope for scope, _ in ways if scope.place.kind == "setup" and mine[scope.rows[0]]}
+    worst = sorted(every.values(), key=lambda scope: -float(np.median(before.readings[scope.rows])))
+    for scope in worst[: _SUSPECTS if kinds == ("zenith",) else 1]:
+        lost = {i for i in scope.rows.tolist() if mine[i]}
+        without = screen(replace(survey, readings=tuple(r for i, r in enumerate(survey.readings) if i not in lost)))
+        apart = None if without is None else screen(survey, without.start)
+        if apart is not None:
+            some = [i for i, (s, _) in enumerate(ways) if set(s.rows.tolist()) <= set(scope.rows.tolist())]
+            yield from _in_place(apart, values, ways, some)
 
 
 def _fits_as_it_is(before: Screen, rows: IntArray) -> bool:
