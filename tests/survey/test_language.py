@@ -47,7 +47,7 @@ points exchanged|prism constant|rolling shutter|rotations inverted|rows and colu
 sense of rotation|set-up turned|shift in other axes|sigmas of a group|sign of height differences|slipped decimal
 station moved|stations exchanged|table moved|targets exchanged|the same twice|unit of angles|body of 7
 unit of Euler angles|table misread|sign of an axis|reading mistyped|readings exchanged|points misnumbered
-directions of the second face|kind of distances|distances of another kind
+directions of the second face|kind of distances
 unit of heights|unit of lengths|unit of shifts|unit of sigmas"""
 """Kinds of causes and marks of lines, by which programs tell them apart: shown to nobody."""
 OTHERS = [language for language in LANGUAGES if language != "en"]

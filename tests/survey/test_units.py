@@ -162,6 +162,16 @@ def test_lengths_in_a_column_of_metres(factor: float, unit: str, setup_id: str, 
 
 
 ROWS = {
+    "unit of shifts": ("relay", "pairs", lambda i, row: i % 3 == 0 and row.update(
+        {name: f"{float(row[name]) / 1e3:.9f}" for name in ("tx_mm", "ty_mm", "tz_mm")}),
+                       "and 14 more have shifts in metres, read as millimetres", "multiply tx, ty, tz by 1000"),
+    "sense of rotation": ("total-station", "terrestrial", lambda i, row: row["kind"] == "direction"
+                          and row["setup_id"] == "S1a" and row.update(
+                              value_gon=f"{(400.0 - float(row['value_gon'])) % 400.0:.5f}"),
+                          "of set-up S1a: their values count the other way round", "give them the other sign"),
+    "unit of angles": ("total-station", "terrestrial", lambda i, row: row["kind"] == "direction"
+                       and row["setup_id"] == "S1a" and row.update(value_gon=f"{0.9 * float(row['value_gon']):.5f}"),
+                       "of set-up S1a: their values are degrees, read as gon", "multiply them by 1.111111111"),
     "pairs inverted": ("relay", "pairs", lambda i, row: i % 3 == 0 and row.update(a_id=row["b_id"], b_id=row["a_id"]),
                        "are a_from_b, read as b_from_a", "exchange a_id and b_id"),
     "directions of the second face": ("total-station", "terrestrial", lambda i, row: i % 2 and row["setup_id"] == "S2a"

@@ -110,7 +110,7 @@ def _by_euler(meant: Callable[[FloatArray], FloatArray]) -> Callable[[Motion], M
 
 CONVENTIONS: tuple[Convention, ...] = (
     Convention("pairs inverted", "are a_from_b, read as b_from_a", "exchange a_id and b_id", _inverted, by_hand=True),
-    _of_shifts("metres, read as millimetres"),
+    replace(_of_shifts("metres, read as millimetres"), by_hand=True),
     _of_shifts("millimetres, read as metres"),
     _of_shifts("inches, read as millimetres"),
     *(_of_shifts("metres, read as millimetres", (column,)) for column in _SHIFT),

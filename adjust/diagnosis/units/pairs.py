@@ -31,6 +31,8 @@ _MISSED = 25.0
 """Mean square over sigmas at the start that the typical one of several pairs that are misread has at least."""
 _ROUNDS = 5
 """Turns in which those of the pairs are found that are misread."""
+_FEW = 150
+"""Pairs up to which those are looked for that are misread among others."""
 _LARGE = 500
 """Pairs up to which start values are found anew for every convention."""
 
@@ -59,7 +61,8 @@ def misread_pairs(case: Case) -> Iterator[Hypothesis]:
         looked_at += len(ways)
         judged = judge.evidence([new for _, new in ways]) if ways else []
         found += [(e, scope, c) for e, (c, _) in zip(judged, ways, strict=True)]
-    if not hands and not any(_sure(f) for f in found):
+    few = not hands and case.few("some of the pairs in another convention", len(survey.pairs), _FEW)
+    if few and not any(_sure(f) for f in found):
         parts = [_part(case, c, motions) for c, motions in meant if c.by_hand and motions]
         looked_at += len(parts)
         found += [part for part in parts if len(part[1].rows) > 1]

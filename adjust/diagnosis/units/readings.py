@@ -37,7 +37,7 @@ _FEW, _ROUGH = 0.1, 4.0
 _SPOILT = 1e6
 """Variance factor of a start at which even the typical observation misses by a thousand sigmas."""
 _SUSPECTS = 3
-"""Set-ups without whose zenith angles the start is looked for: a set-up alone may turn all heights over."""
+"""Set-ups without whose angles the start is looked for: the one that it begins with may turn all others over."""
 _LARGE_START = 2500
 """Readings up to which start values are found anew for every hypothesis that concerns all of a kind."""
 _Way = tuple[Scope, Misreading]
@@ -174,7 +174,7 @@ def _without(
     mine = [survey.readings[i].kind in kinds for i in range(len(values))]
     every = {scope.place.ids: scope for scope, _ in ways if scope.place.kind == "setup" and mine[scope.rows[0]]}
     worst = sorted(every.values(), key=lambda scope: -float(np.median(before.readings[scope.rows])))
-    for scope in worst[: _SUSPECTS if kinds == ("zenith",) else 1]:
+    for scope in worst[:_SUSPECTS]:
         lost = {i for i in scope.rows.tolist() if mine[i]}
         without = screen(replace(survey, readings=tuple(r for i, r in enumerate(survey.readings) if i not in lost)))
         apart = None if without is None else screen(survey, without.start)

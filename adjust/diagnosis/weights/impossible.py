@@ -96,8 +96,8 @@ def _hypotheses(survey: Survey, some: Sequence[Sigmas], written: Written) -> lis
             for factor, unit in units.items()]  # fmt: skip
 
 
-def units_of_angles(some: Sequence[Sigmas], written: Written) -> dict[float, str]:
-    """By factor how sigmas were written and read, so that they become usual ones; all where none is."""
+def units_of_angles(some: Sequence[Sigmas], written: Written, only_usual: bool = False) -> dict[float, str]:
+    """By factor how sigmas were written and read, so that they become usual ones; else all where none is."""
     tables = {_TABLES.get(o.field, "") for o in some}
     read = frozenset[str]().union(*(written.words(f"{t}.sigma") for t in tables))
     values = frozenset[str]().union(*(written.words(f"{t}.value") for t in tables))
@@ -105,7 +105,8 @@ def units_of_angles(some: Sequence[Sigmas], written: Written) -> dict[float, str
     ways = [(m, r) for m in meant for r in _SIZES if (r in read if read else (m, r) in _TYPICAL)]
     by = {(m, r): _SIZES[m] / _SIZES[r] for m, r in ways if _SIZES[m] > _ALIKE * _SIZES[r]}
     largest = max(o.largest for o in some)
-    usual = {w: f for w, f in by.items() if _USUAL[0] <= f * largest <= _USUAL[1]} or by
+    usual = {w: f for w, f in by.items() if _USUAL[0] <= f * largest <= _USUAL[1]}
+    usual = usual or ({} if only_usual else by)
     out = dict[float, str]()
     for (m, r), factor in usual.items():
         near = next((f for f in out if 1.0 / _ALIKE < f / factor < _ALIKE), None)

@@ -33,7 +33,7 @@ def small_sigmas(case: Case) -> Iterator[Hypothesis]:
         return
     for some in every:
         misfit, n = _misfit(found, survey, some), sum(s.count for s in some)
-        for factor, unit in units_of_angles(some, case.written).items():
+        for factor, unit in units_of_angles(some, case.written, True).items():
             if factor > _LEAST and misfit - n > 2.0 * n * float(np.log(factor)):
                 said = f"their residuals are about {factor:.2g} times what they say: these sigmas {unit}"
                 yield replace(with_sigmas(survey, some, factor, said, factor), evidence=_EVIDENCE)
