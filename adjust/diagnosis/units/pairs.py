@@ -48,24 +48,7 @@ def misread_pairs(case: Case) -> Iterator[Hypothesis]:
     judge = _by_hands(survey, hands) if hands else _by_start(case)
     if judge is None:
         return
-    found, looked_at = list[_Found](), 0
-    meant = [(c, {i: m for i, p in enumerate(survey.pairs) if (m := c.meant(p, case.written)) is not None})
-             for c in CONVENTIONS]  # fmt: skip
-    last = ""
-    for scope in _scopes(survey, judge.worst):
-        if scope.place.kind != last and any(_sure(f) for f in found):
-            break  # what is wrong with many is not looked for in a few
-        last = scope.place.kind
-        rows = scope.rows.tolist()
-        ways = [(c, {i: motions[i] for i in rows}) for c, motions in meant if all(i in motions for i in rows)]
-        looked_at += len(ways)
-        judged = judge.evidence([new for _, new in ways]) if ways else []
-        found += [(e, scope, c) for e, (c, _) in zip(judged, ways, strict=True)]
-    few = not hands and case.few("some of the pairs in another convention", len(survey.pairs), _FEW)
-    if few and not any(_sure(f) for f in found):
-        parts = [_part(case, c, motions) for c, motions in meant if c.by_hand and motions]
-        looked_at += len(parts)
-        found += [part for part in parts if len(part[1].rows) > 1]
+    found, looked_at = _found(case, judge)
     found.sort(key=lambda f: (not _sure(f), -f[0], -len(f[1].rows)))
     for evidence, scope, convention in found[:_MOST]:
         changed = mended(survey, scope.rows, convention, case.written) if evidence > _CLEARLY else None
@@ -74,6 +57,28 @@ def misread_pairs(case: Case) -> Iterator[Hypothesis]:
             yield Hypothesis(convention.name, cause, f"in pairs.csv {convention.remedy}", scope.place, changed,
                              edits_of(survey, scope.rows, convention), evidence, 1, looked_at,
                              penalty=shrinking(convention.shifts, 3 * len(scope.rows)))  # fmt: skip
+
+
+def _found(case: Case, judge: "_Judge") -> tuple[list[_Found], int]:
+    """What there is evidence for, and how much was looked at; what is wrong with many is not looked for in a few."""
+    survey, found, looked_at, last = case.survey, list[_Found](), 0, ""
+    meant = [(c, {i: m for i, p in enumerate(survey.pairs) if (m := c.meant(p, case.written)) is not None})
+             for c in CONVENTIONS]  # fmt: skip
+    for scope in _scopes(survey, judge.worst):
+        if scope.place.kind != last and any(_sure(f) for f in found):
+            break
+        last = scope.place.kind
+        rows = scope.rows.tolist()
+        ways = [(c, {i: motions[i] for i in rows}) for c, motions in meant if all(i in motions for i in rows)]
+        looked_at += len(ways)
+        judged = judge.evidence([new for _, new in ways]) if ways else []
+        found += [(e, scope, c) for e, (c, _) in zip(judged, ways, strict=True)]
+    few = survey.is_pose_network and case.few("some of the pairs in another convention", len(survey.pairs), _FEW)
+    if few and not any(_sure(f) for f in found):
+        parts = [_part(case, c, motions) for c, motions in meant if c.by_hand and motions]
+        looked_at += len(parts)
+        found += [part for part in parts if len(part[1].rows) > 1]
+    return found, looked_at
 
 
 def _sure(found: _Found) -> bool:
