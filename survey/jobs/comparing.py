@@ -11,9 +11,9 @@ from adjust.diagnosis.between import Between, causes_between
 from adjust.epochs.congruence import CongruenceOptions, congruence
 from adjust.epochs.congruence_result import Congruence, CongruenceTest, Motion
 from adjust.epochs.deformation import Deformation, station_deformations
-from adjust.epochs.shared import shared_observations
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
+from adjust.observations.copies import shared_observations
 from survey.folder.plain import attributes, plain
 from survey.jobs.adjusting.steps import adjust_project
 from survey.project import Project, read

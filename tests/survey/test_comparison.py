@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adjust.epochs.shared import shared_observations
-from adjust.model.observations import Distance, PositionRef
+from adjust.model.observations import Distance, ImageBlock, PositionRef
 from adjust.model.survey import Survey
+from adjust.observations.copies import copied_observations, shared_observations
 from survey.cli import main
 from survey.project import write_project
 from tests.adjust.test_deformation import chain, measured, small
@@ -119,3 +119,32 @@ def test_single_numbers_may_be_read_twice():
     assert shared_observations(first, tape(1.001, 1.002, 1.003, 1.005, 1.004, 1.007, 1.008)) == {}
     assert shared_observations(first, tape(1.001, 1.002, 1.003, 1.004)) == {"distances": 4}
     assert shared_observations(tape(1.0, 2.0), tape(1.0, 2.0)) == {}
+
+
+def test_pairs_that_were_copied_are_named(tmp_path, capsys):
+    survey = measured(chain(), np.random.default_rng(1))
+    first = survey.pairs[0]
+    write_project(tmp_path, replace(survey, pairs=(*survey.pairs, replace(first, pair_id="copy"))))
+    assert main(["adjust", str(tmp_path), "--quiet"]) == 0
+    said = capsys.readouterr()
+    assert f"1 pairs have the very values of others of the same ({first.pair_id} = copy): what was copied" in said.out
+    assert f"labsurvey exclude {tmp_path} pairs:copy" in said.out
+    assert copied_observations(survey) == {}
+
+
+def test_images_and_single_numbers_that_were_copied_are_told_from_those_made_again():
+    ends, rng = (PositionRef("A"), PositionRef("B")), np.random.default_rng(1)
+
+    def image(epoch, uv):
+        return ImageBlock("X", epoch, "board", np.arange(len(uv)), uv, np.tile(np.eye(2), (len(uv), 1, 1)))
+
+    def tape(*values):
+        return tuple(Distance(f"d{k}", *ends, v, 1e-3) for k, v in enumerate(values))
+
+    uv = rng.uniform(0, 1000, (4, 2))
+    blocks = (image("e1", uv), image("e2", uv), image("e3", np.vstack([uv[:3], uv[3:] + 1.0])), image("e4", uv[:3]))
+    assert copied_observations(Survey(image_blocks=blocks)) == {"images": (("X/e1", "X/e2"),)}
+    copied, again = [1.0] * 7, [1.0, 1.001] * 4
+    assert len(copied_observations(Survey(distances=tape(*copied)))["distances"]) == 6
+    assert copied_observations(Survey(distances=tape(*again))) == {}  # six of seven, of a tape with few digits
+    assert copied_observations(Survey(distances=tape(*copied[:6]))) == {}

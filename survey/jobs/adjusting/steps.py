@@ -10,10 +10,11 @@ from tqdm import tqdm
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.graph.assembly import StartValues
-from adjust.model.errors import IndeterminateError, SurveyError
+from adjust.model.errors import IndeterminateError, SurveyError, listed
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.subsets import with_points
 from adjust.model.survey import Survey
+from adjust.observations.copies import copied_observations
 from adjust.statistics.outliers.supported import lost_notes, supported, without_lost_points
 from adjust.statistics.screened_adjustment import CleanOptions
 from survey.jobs.adjusting.astray import cleaned
@@ -182,11 +183,23 @@ def told(project: Project, given: Survey, adjustment: Adjustment) -> Adjustment:
     """An adjustment that says what was noticed when its project was read, and how much of ``given`` it left out."""
     named = 0 if adjustment.diagnosis is None else len(adjustment.diagnosis.told())
     offered = {h.place.ids[0]: n for n, h in enumerate(blurred(project.survey, project.detected), start=named + 1)}
-    warnings = adjustment.warnings + project.notes + project.image_notes + image_warnings(project.detected, offered)
+    noticed = _copies(project) + project.notes + project.image_notes + image_warnings(project.detected, offered)
+    warnings = adjustment.warnings + noticed
     images = sum(b.n_used for b in given.image_blocks)
     images -= int(adjustment.image_residuals.used.sum())
     others = given.n_others_used - adjustment.survey.n_others_used
     return replace(adjustment, warnings=warnings, n_screened=images + others)
+
+
+def _copies(project: Project) -> tuple[str, ...]:
+    """Observations that were copied rather than made again."""
+    tables = {"images": "image", "readings": "terrestrial"}
+    return tuple(
+        f"{len(same)} {kind} have the very values of others of the same ({listed([' = '.join(x) for x in same], 3)}): "
+        "what was copied counts twice, and sigmas come out too small; leave the copies out "
+        f"(labsurvey exclude {project.folder} {tables.get(kind, kind)}:{same[0][1]} ...)"
+        for kind, same in copied_observations(project.survey).items()
+    )
 
 
 def image_warnings(
