@@ -81,8 +81,9 @@ def relay_trackers(trajectories: Sequence[Trajectory]) -> RelayTrackers:
     offsets = tuple(time_offset(trajectories[0], x) for x in trajectories[1:])
     shifts = [0.0, *(o.offset_s for o in offsets)]
     drift, joint, common = choose_interval(trajectories, shifts, _INTERVALS_S)
-    grown = growth(trajectories, shifts, joint, _GROWTH_S)
-    return RelayTrackers(offsets, drift, common, joint, _GROWTH_S, grown)
+    fitting = tuple(s for s in _GROWTH_S if 2.0 * s < np.ptp(common.times_s))
+    grown = growth(trajectories, shifts, joint, fitting)
+    return RelayTrackers(offsets, drift, common, joint, fitting, grown)
 
 
 def tracker_pairs(found: RelayTrackers) -> EyePairs:
