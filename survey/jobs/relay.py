@@ -31,6 +31,7 @@ from survey.project.tables.pairs import pair_columns
 
 _INTERVALS_S = (1.0, 1.5, 2.0, 3.0, 4.0)
 _GROWTH_S = (0.1, 0.3, 1.0, 3.0, 9.0)
+_FEWEST = 4
 _COLUMNS = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 
 
@@ -102,16 +103,18 @@ def read_trajectory(text: str, eye_id: str, name: str = "trajectory") -> Traject
     """A trajectory from lines ``t, x, y, z, qx, qy, qz, qw`` (s, m, unit quaternion of ``world_from_eye``).
 
     The values stand between commas or, as in TUM's files, between blanks.
-    Poses repeated with the same time and value are kept once. Raises SurveyError naming the line for anything else
-    that is not a trajectory.
+    A first line may name the columns. Poses repeated with the same time and value are kept once. Raises SurveyError
+    naming the line for anything else that is not a trajectory.
     """
     rows: list[list[float]] = []
     for line, words in enumerate(text.splitlines(), 1):
         row = words.split(",") if "," in words else words.split()
-        if not row or row[0].lstrip().startswith("#"):
+        if not row or row[0].lstrip().startswith("#") or (not rows and _is_header(row)):
             continue
         if len(row) != len(_COLUMNS):
-            raise SurveyError(f"{name}:{line}: {len(row)} columns, expected {', '.join(_COLUMNS)}")
+            raise SurveyError(
+                f"{name}:{line}: {len(row)} columns, expected {', '.join(_COLUMNS)} between commas or blanks"
+            )
         try:
             values = [float(x) for x in row]
         except ValueError as error:
@@ -121,14 +124,22 @@ def read_trajectory(text: str, eye_id: str, name: str = "trajectory") -> Traject
         if rows and values[0] <= rows[-1][0]:
             what = "comes twice with different poses" if values[0] == rows[-1][0] else "goes backwards"
             raise SurveyError(f"{name}:{line}: time {values[0]} {what}; sort the poses and keep one for each time")
-        if not all(abs(x) < 1e15 for x in values) or abs(np.linalg.norm(values[4:]) - 1.0) > 1e-3:
-            raise SurveyError(f"{name}:{line}: qx,qy,qz,qw is not a unit quaternion, or a value is not finite")
+        if not all(abs(x) < 1e15 for x in values):
+            raise SurveyError(f"{name}:{line}: found {', '.join(f'{x:g}' for x in values)}; every value must be finite")
+        if abs((length := float(np.linalg.norm(values[4:]))) - 1.0) > 1e-3:
+            raise SurveyError(f"{name}:{line}: qx,qy,qz,qw has length {length:.4g}; it must be a unit quaternion")
         rows.append(values)
-    if len(rows) < 3:
-        raise SurveyError(f"{name}: {len(rows)} poses make no trajectory")
+    if len(rows) < _FEWEST:
+        raise SurveyError(f"{name}: {len(rows)} poses make no trajectory; record {_FEWEST} or more, ten a second")
     table = np.array(rows)
     rotation = np.array([Rot3.Quaternion(w, x, y, z).matrix() for x, y, z, w in table[:, 4:].tolist()])
     return Trajectory(FrameRef("camera", eye_id), table[:, 0].copy(), Motions(rotation, table[:, 1:4].copy()))
+
+
+def _is_header(row: Sequence[str]) -> bool:
+    """Whether words name the columns, with or without their units."""
+    named = [word.strip().lower().partition("_")[0] for word in row]
+    return named == [column.partition("_")[0] for column in _COLUMNS]
 
 
 def read_trajectories(paths: Mapping[str, Path]) -> tuple[Trajectory, ...]:

@@ -18,7 +18,9 @@ from adjust.spatial.rigid_motions import Motions
 
 _STEP_S = 0.02  # of the comparison of clocks
 _HALF_S = 0.1  # turning speed over twice this time
+_FEWEST = 50  # steps in common
 _PARTS = 8  # of the time in common, each with an offset of its own
+_GAP = 5.0  # usual times between poses
 _PEAKS = 5  # shifts that are looked at closely
 _AS_WELL = 1.5  # mean square misfit of another offset, in that of the best
 _MOST_NOISE = 2.0  # variance of a pose in between, in those of the poses around it
@@ -56,6 +58,12 @@ class Trajectory:
             R[i] @ rotation_exp(np.einsum("kj,kji->ki", share, turn)), np.einsum("kj,kji->ki", share, x[around])
         )
 
+    def recorded(self, times_s: FloatArray) -> BoolArray:
+        """Whether times (k,) are no part of a gap: poses around are not much farther apart than usually."""
+        apart = np.diff(self.times_s)
+        i = np.clip(np.searchsorted(self.times_s, times_s, side="right") - 1, 0, len(apart) - 1)
+        return np.asarray(apart[i] <= _GAP * np.median(apart))
+
     def turning_speed(self, times_s: FloatArray) -> FloatArray:
         """(k,) rad/s."""
         before, after = self.at(times_s - _HALF_S), self.at(times_s + _HALF_S)
@@ -90,10 +98,12 @@ def time_offset(a: Trajectory, b: Trajectory) -> TimeOffset:
     Raises SurveyError where the turning speeds do not agree at any shift, or at several as well.
     """
     speed = [x.turning_speed(_grid(x.times_s[0], x.times_s[-1])) for x in (a, b)]
+    _refuse_short(a, b, min(map(len, speed)))
     first = b.times_s[0] - a.times_s[0]
     tried = sorted((_fit(a, b, first + shift * _STEP_S) for shift in _coarse(*speed)), key=lambda fit: fit[1])
     best, miss, times = tried[0]
-    correlation = float(np.corrcoef(a.turning_speed(times), b.turning_speed(times + best))[0, 1])
+    speeds = a.turning_speed(times), b.turning_speed(times + best)
+    correlation = float(np.corrcoef(*speeds)[0, 1]) if min(map(np.ptp, speeds)) > 0.0 else 0.0
     if correlation < 0.8:
         raise SurveyError(
             f"eyes {a.eye.frame_id} and {b.eye.frame_id}: their turning speeds agree at no time offset (correlation "
@@ -118,7 +128,19 @@ def _fit(a: Trajectory, b: Trajectory, offset: float) -> tuple[float, float, Flo
     lo = max(a.times_s[0], b.times_s[0] - offset) + 3 * _HALF_S
     hi = min(a.times_s[-1], b.times_s[-1] - offset) - 3 * _HALF_S
     times = np.arange(lo, hi, _STEP_S)
+    kept = [x.recorded(times + o + d) for x, o in ((a, 0.0), (b, offset)) for d in (-_HALF_S, _HALF_S)]
+    times = times[np.logical_and.reduce(kept)]
+    _refuse_short(a, b, len(times))
     return *_refined(a, b, times, offset), times
+
+
+def _refuse_short(a: Trajectory, b: Trajectory, n: int) -> None:
+    """Raise SurveyError for fewer than enough steps in common."""
+    if n < _FEWEST:
+        raise SurveyError(
+            f"eyes {a.eye.frame_id} and {b.eye.frame_id}: their trajectories are together for {_STEP_S * n:.2f} s "
+            f"outside of gaps; record {_STEP_S * _FEWEST:g} s or more, ten poses a second"
+        )
 
 
 def _grid(first: float, last: float) -> FloatArray:
@@ -190,6 +212,8 @@ def common_motions(
             f"{interval_s:g} s; record longer ones, or check the time offsets"
         )
     begin = lo + step * np.arange(int((hi - lo - interval_s) / step) + 1)
+    ends = [x.recorded(begin + o + d) for x, o in zip(trajectories, offsets_s, strict=True) for d in (0.0, interval_s)]
+    begin = begin[np.logical_and.reduce(ends)]
     poses = tuple((x.at(begin + o), x.at(begin + interval_s + o)) for x, o in zip(trajectories, offsets_s, strict=True))
     motions = tuple(before.inverse() @ after for before, after in poses)
     return CommonMotions(
