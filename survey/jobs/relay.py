@@ -31,7 +31,6 @@ from survey.project.tables.pairs import pair_columns
 
 _INTERVALS_S = (1.0, 1.5, 2.0, 3.0, 4.0)
 _GROWTH_S = (0.1, 0.3, 1.0, 3.0, 9.0)
-_FEWEST = 4
 _COLUMNS = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 
 
@@ -127,10 +126,10 @@ def read_trajectory(text: str, eye_id: str, name: str = "trajectory") -> Traject
         if not all(abs(x) < 1e15 for x in values):
             raise SurveyError(f"{name}:{line}: found {', '.join(f'{x:g}' for x in values)}; every value must be finite")
         if abs((length := float(np.linalg.norm(values[4:]))) - 1.0) > 1e-3:
-            raise SurveyError(f"{name}:{line}: qx,qy,qz,qw has length {length:.4g}; it must be a unit quaternion")
+            raise SurveyError(f"{name}:{line}: qx,qy,qz,qw is not a unit quaternion, its length is {length:.4g}")
         rows.append(values)
-    if len(rows) < _FEWEST:
-        raise SurveyError(f"{name}: {len(rows)} poses make no trajectory; record {_FEWEST} or more, ten a second")
+    if len(rows) < 3:
+        raise SurveyError(f"{name}: {len(rows)} poses make no trajectory; record about ten a second")
     table = np.array(rows)
     rotation = np.array([Rot3.Quaternion(w, x, y, z).matrix() for x, y, z, w in table[:, 4:].tolist()])
     return Trajectory(FrameRef("camera", eye_id), table[:, 0].copy(), Motions(rotation, table[:, 1:4].copy()))

@@ -58,11 +58,12 @@ def test_epochs_of_other_names_are_not_compared_in_silence(labs: Path, capsys: p
 @pytest.mark.parametrize(
     ("edit", "said"),
     [
-        (lambda rows: rows[:3], r"b.csv: 3 poses make no trajectory; record 4 or more, ten a second"),
+        (lambda rows: rows[:3], r"eye b: 3 poses are too few; record about ten a second"),
+        (lambda rows: rows[:2], r"b.csv: 2 poses make no trajectory; record about ten a second"),
         (lambda rows: rows[:7], r"eyes a and b: their trajectories are together for 0.\d\d s outside of gaps; record"),
         (lambda rows: [r.replace(",", ";") for r in rows], r"b.csv:1: 1 columns, expected .* between commas or blanks"),
         (lambda rows: ["nan" + rows[0][rows[0].index(",") :], *rows[1:]], r"b.csv:1: found nan, .*must be finite"),
-        (lambda rows: [r.rpartition(",")[0] + ",2" for r in rows], r"b.csv:1: qx,qy,qz,qw has length 2.*unit quat"),
+        (lambda rows: [r.rpartition(",")[0] + ",2" for r in rows], r"b.csv:1: qx,qy,qz,qw is not a unit .*length is 2"),
         (lambda rows: [f"{r.split(',')[0]},{rows[0].split(',', 1)[1]}" for r in rows],
          r"eyes a and b: their turning speeds agree at no time offset .*or it hardly turned"),
     ],

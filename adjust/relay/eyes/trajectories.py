@@ -40,6 +40,8 @@ class Trajectory:
         Straight between the two around where times are so uneven that the cubic would enlarge the errors of poses.
         """
         t = self.times_s
+        if len(t) < 4:
+            raise SurveyError(f"eye {self.eye.frame_id}: {len(t)} poses are too few; record about ten a second")
         if times_s.min(initial=t[0]) < t[0] or times_s.max(initial=t[0]) > t[-1]:
             raise SurveyError(
                 f"eye {self.eye.frame_id}: poses are asked for {times_s.min():.3f} to {times_s.max():.3f} s, its "
