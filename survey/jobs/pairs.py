@@ -32,6 +32,7 @@ from survey.jobs.relay import (
     relay_text,
     relay_trackers,
     tracker_pairs,
+    unit_warnings,
 )
 from survey.project import AdjustmentOptions, write_project
 from survey.project.project import DEFINITION_FILE
@@ -75,13 +76,14 @@ class PairsOutcome:
         }
 
     def warnings(self) -> tuple[str, ...]:
-        """What is wrong with the sigmas that an adjustment of the written pairs will show."""
+        """What is odd about the observations, and what about the sigmas of an adjustment of the written pairs."""
         closed = self.found.closed
         if self.written is None or self.joint or closed is None:
-            return ()
+            return self.found.warnings
         actual, claimed = (np.diagonal(c, axis1=1, axis2=2) for c in (closed.actual_cov, closed.claimed_cov))
         factor = float(np.sqrt(np.mean(actual / claimed)))
         return (
+            *self.found.warnings,
             f"pairs of one eye share its errors, but {self.written} takes them as independent: sigmas of its "
             f"adjustment are {factor:.2f} times too small; those under 'loops closed' are right, --joint "
             "writes no loops",
@@ -142,7 +144,7 @@ def _from_trajectories(folder: Path, station: str | None) -> RelayPairs:
     trackers = relay_trackers(read_trajectories(by_id))
     eyes = tracker_pairs(trackers)
     joint = adjust_eyes(sequences(one_metre(trackers), trackers.drift))
-    return RelayPairs(eyes, looped(eyes), joint)
+    return RelayPairs(eyes, looped(eyes), joint, unit_warnings(trackers.joint))
 
 
 def star(found: RelayPairs) -> tuple[Pair, ...]:

@@ -36,11 +36,15 @@ _COLUMNS = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 
 @dataclass(frozen=True, eq=False)
 class RelayPairs:
-    """eyes: every two eyes by themselves. closed: the same with loops closed, None without loop. joint: all at once."""
+    """eyes: every two eyes by themselves. closed: the same with loops closed, None without loop. joint: all at once.
+
+    warnings: what the observations look like that they should not.
+    """
 
     eyes: EyePairs
     closed: LoopedPairs | None
     joint: EyeAdjustment
+    warnings: tuple[str, ...] = ()
 
     def joint_pairs(self) -> tuple[Pair, ...]:
         """The same pairs from all eyes at once."""
@@ -96,6 +100,16 @@ def one_metre(found: RelayTrackers) -> CommonMotions:
     common, scales = found.common, found.joint.scales
     motions = (m.rescaled(scales.get(e.frame_id, 1.0)) for e, m in zip(common.eyes, common.motions, strict=True))
     return replace(common, motions=tuple(motions))
+
+
+def unit_warnings(joint: EyeAdjustment) -> tuple[str, ...]:
+    """Trackers whose lengths are a power of ten of the first one's."""
+    powers = {eye: np.log10(scale) for eye, scale in joint.scales.items()}
+    return tuple(
+        f"lengths of {eye} times {10.0 ** round(p):g} are those of {joint.eyes[0].frame_id}: one of the two is not in "
+        "metres; write x, y, z of all in metres"
+        for eye, p in powers.items() if round(p) and abs(p - round(p)) < 0.02
+    )  # fmt: skip
 
 
 def read_trajectory(text: str, eye_id: str, name: str = "trajectory") -> Trajectory:

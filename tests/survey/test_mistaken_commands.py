@@ -79,6 +79,17 @@ def test_trajectories_that_cannot_be_meant(
     assert not (tmp_path / "out").exists()
 
 
+def test_millimetres_are_told(labs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(labs / "walk", tmp_path / "walk")
+    path = tmp_path / "walk" / "trajectories" / "b.csv"
+    table = np.loadtxt(path, delimiter=",")
+    np.savetxt(path, table * np.array([1.0, 1e3, 1e3, 1e3, 1.0, 1.0, 1.0, 1.0]), delimiter=",", fmt="%.12g")
+    assert main(["pairs", str(tmp_path / "walk"), "--quiet"]) == 0
+    out = capsys.readouterr().out
+    assert "warning: lengths of b times 0.001 are those of a: one of the two is not in metres" in out
+    assert "lengths of c" not in out
+
+
 def test_gaps_are_left_out(labs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(labs / "walk", tmp_path / "walk")
     path = tmp_path / "walk" / "trajectories" / "b.csv"
