@@ -115,8 +115,8 @@ def time_offset(a: Trajectory, b: Trajectory) -> TimeOffset:
     if other is not None:
         raise SurveyError(
             f"eyes {a.eye.frame_id} and {b.eye.frame_id}: their turning speeds agree at a time offset of {best:.2f} s "
-            f"and at {other:.2f} s as well, since the motion repeats itself or is too quick for the rate of poses; turn the "
-            "station irregularly, and record about ten poses a second"
+            f"and at {other:.2f} s as well, since the motion repeats itself or is too quick for the rate of poses; "
+            "turn the station irregularly, and record about ten poses a second"
         )
     parts = np.array([_refined(a, b, part, best)[0] for part in np.array_split(times, _PARTS)])
     centre = np.array([part.mean() for part in np.array_split(times, _PARTS)])
