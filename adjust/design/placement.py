@@ -2,13 +2,15 @@
 
 At every pose the unknowns are the pose and the errors of the calibration, which are common to all images of an epoch;
 a beacon's own error, where it is not exact, is eliminated with its rows. Then the information of beacons adds up, and
-the pose covariance after one more follows by Woodbury's formula, for all candidates at once.
+the pose covariance after one more follows by Woodbury's formula, for all candidates at once. Beacons that are there
+already are lit from the start, with their own errors and what these share with the calibration's.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
@@ -40,11 +42,11 @@ class PlacementOptions:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Beacons chosen, in the order of choice.
+    """Beacons chosen, in the order of choice, beside those that are there.
 
     chosen: (k,) of the candidates. measure: (k,) worst or mean pose variance after each, in units of the required one
     (infinite where poses are open). exchanged: replacements made afterwards. final: the measure at the end. per_pose:
-    (q,) at the end; seen: (q,) beacons seen from every pose.
+    (q,) at the end; seen: (q,) beacons seen from every pose, with those that are there.
     """
 
     chosen: tuple[int, ...]
@@ -56,14 +58,15 @@ class Placement:
 
 
 def place_beacons(
-    head: Head, poses: Sequence[Pose3], x_in_world: FloatArray, sigma: float, n: int, options: PlacementOptions
-) -> Placement:
+    head: Head, poses: Sequence[Pose3], x_in_world: FloatArray, sigma: float, n: int, options: PlacementOptions,
+    there: Beacons | None = None,
+) -> Placement:  # fmt: skip
     """Choose ``n`` of the candidate places (m, 3) m, each to be surveyed with ``sigma`` (m) per component.
 
-    Raises SurveyError where some pose cannot see ``at_least`` beacons even with all candidates lit, or ``n`` are too
-    few for that.
+    there: beacons that stay where they are and count as placed. Raises SurveyError where some pose cannot see
+    ``at_least`` beacons even with all candidates lit, or ``n`` are too few for that.
     """
-    board = _Board(head, poses, x_in_world, sigma, options)
+    board = _Board(head, poses, x_in_world, sigma, options, there)
     state = _State(board)
     board.check(n)
     measure = []
@@ -76,8 +79,9 @@ def place_beacons(
     exchanged = state.exchange(options.exchanges)
     short = [k for k, s in enumerate(state.counts) if s < options.at_least]
     if short:
+        beside = f" beside {len(board.x_there)} that are there" if len(board.x_there) else ""
         raise SurveyError(
-            f"{len(state.chosen)} beacons are too few: {len(short)} of {len(poses)} poses see fewer than "
+            f"{len(state.chosen)} beacons{beside} are too few: {len(short)} of {len(poses)} poses see fewer than "
             f"{options.at_least} (pose {short[0] + 1} sees {state.counts[short[0]]}); allow more beacons or fewer poses"
         )
     seen = tuple(state.counts.tolist())
@@ -85,11 +89,15 @@ def place_beacons(
 
 
 class _Board:
-    """The rows of every candidate at every pose, whitened, over the pose and the calibration's errors."""
+    """The rows of every candidate at every pose, whitened, over the pose and the calibration's errors.
+
+    Q_there: (q, 6 + r, 6 + r) covariance of these with the beacons that are there; seen_there: (q,) how many are seen.
+    """
 
     def __init__(
-        self, head: Head, poses: Sequence[Pose3], x: FloatArray, sigma: float, options: PlacementOptions
-    ) -> None:
+        self, head: Head, poses: Sequence[Pose3], x: FloatArray, sigma: float, options: PlacementOptions,
+        there: Beacons | None,
+    ) -> None:  # fmt: skip
         m = len(x)
         ids = tuple(f"c{i}" for i in range(m))
         self.options, self.m, self.x = options, m, x
@@ -101,8 +109,27 @@ class _Board:
         self.rows = np.zeros((len(poses), m, 2 * max(most, 1), self.dim))
         for k, pose in enumerate(poses):
             self._fill(k, system, pose.matrix(), sigma)
+        self._light(system, poses, there)
         weight = np.array([options.required_rotation] * 3 + [options.required_translation] * 3)
         self.weight = 1.0 / (6.0 * weight**2)
+
+    def _light(self, system: System, poses: Sequence[Pose3], there: Beacons | None) -> None:
+        """What the beacons that are there do at every pose; their errors are not asked for any more then."""
+        self.Q_there = np.tile(np.diag(np.concatenate([_START**2, np.ones(self.r)])), (len(poses), 1, 1))
+        self.seen_there: IntArray = np.zeros(len(poses), dtype=np.int64)
+        self.x_there = np.zeros((0, 3))
+        if there is None:
+            return
+        self.x_there, old = np.asarray(there.x_in_world), make_system(system.head, there)
+        p, start = len(system.head.cov), np.concatenate([_START**2, np.ones(old.F.shape[1])])
+        kept = scipy.linalg.block_diag(np.eye(6), system.F_inverse[:, :p] @ old.F[:p])
+        for k, pose in enumerate(poses):
+            camera, beacon = in_view(old, pose.matrix())
+            J = np.hstack(evaluate(old, pose.matrix(), camera, beacon)[1:])
+            QJ = start[:, None] * J.T
+            S = self.options.sigma_px**2 * np.eye(len(J)) + J @ QJ
+            self.Q_there[k] = kept @ (np.diag(start) - QJ @ np.linalg.solve(S, QJ.T)) @ kept.T
+            self.seen_there[k] = len(np.unique(beacon))
 
     def _fill(self, k: int, system: System, pose: FloatArray, sigma: float) -> None:
         camera, beacon = in_view(system, pose)
@@ -121,14 +148,15 @@ class _Board:
 
     def check(self, n: int) -> None:
         """Raise where a pose cannot be served."""
-        counts = self.seen.sum(axis=1)
+        counts = self.seen.sum(axis=1) + self.seen_there
         poor = np.flatnonzero(counts < self.options.at_least)
         if len(poor):
             raise SurveyError(
-                f"pose {int(poor[0]) + 1} sees {int(counts[poor[0]])} of all {self.m} places for beacons, but "
+                f"pose {int(poor[0]) + 1} sees {int(counts[poor[0]])} of all {self.m} places for beacons"
+                f"{f' and {len(self.x_there)} beacons that are there' if len(self.x_there) else ''}, but "
                 f"{self.options.at_least} are needed ({len(poor)} such poses); offer more places, or turn the head less"
             )
-        if n < self.options.at_least:
+        if n + len(self.x_there) < self.options.at_least:
             raise SurveyError(f"{n} beacons in all; every pose has to see {self.options.at_least}: allow more")
 
 
@@ -141,9 +169,8 @@ class _State:
 
     def set(self, chosen: Sequence[int]) -> None:
         """Light these beacons alone; the covariances are built anew, which loses no digits."""
-        start = np.concatenate([_START**2, np.ones(self.board.r)])
-        self.Q = np.tile(np.diag(start), (len(self.board.rows), 1, 1))
-        self.counts: IntArray = np.zeros(len(self.board.rows), dtype=np.int64)
+        self.Q = self.board.Q_there
+        self.counts: IntArray = self.board.seen_there
         self.chosen: list[int] = []
         for i in chosen:
             self.add(i)
@@ -181,9 +208,9 @@ class _State:
     def candidates(self) -> BoolArray:
         """(m,) which places are free, far enough from what is chosen."""
         free = np.ones(self.board.m, dtype=np.bool_)
-        for i in self.chosen:
-            free &= np.linalg.norm(self.board.x - self.board.x[i], axis=1) > self.board.options.spacing
-            free[i] = False
+        for x in (*self.board.x_there, *self.board.x[self.chosen]):
+            free &= np.linalg.norm(self.board.x - x, axis=1) > self.board.options.spacing
+        free[self.chosen] = False
         return free
 
     def scores(self) -> FloatArray:

@@ -1,6 +1,7 @@
 """The job ``compare``: two epochs of the same points and stations, adjusted each by itself, and what moved between."""
 
 import math
+import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -47,7 +48,21 @@ class CompareOutcome:
         pairs = zip(self.folders, self.adjustments, strict=True)
         causes = (f"probable cause: {c.cause}; {c.change} (then p {c.p:.2g})" for c in self.causes)
         warnings = (f"{folder}: {warning}" for folder, adjustment in pairs for warning in adjustment.warnings)
-        return (*self._dependence, *causes, *warnings)
+        return (*self._dependence, *self._alone, *causes, *warnings)
+
+    @cached_property
+    def _alone(self) -> tuple[str, ...]:
+        """What stands in one epoch only, where that is more than stands in both: other names, or another survey."""
+        first, second = (
+            {*(p.point_id for p in a.survey.points), *(s.station_id for s in a.survey.stations)}
+            for a in self.adjustments
+        )
+        said = [f"{folder}: {', '.join(sorted(own)[:4])}{f' and {len(own) - 4} more' if len(own) > 4 else ''}"
+                for folder, own in zip(self.folders, (first - second, second - first), strict=True) if own]  # fmt: skip
+        return () if len(first & second) >= len(first ^ second) / 2 else (
+            f"only {len(first & second)} stations and points stand in both epochs, the others in one "
+            f"({'; '.join(said)}), where they are not compared; give the same things the same ids",
+        )  # fmt: skip
 
     @cached_property
     def _dependence(self) -> tuple[str, ...]:
@@ -97,6 +112,8 @@ class CompareOutcome:
 def compare_job(folder_a: Path, folder_b: Path, *, progress: bool = True) -> CompareOutcome:
     """Adjust two project folders and compare their stations; writes nothing. Raises SurveyError."""
     folders = Path(folder_a), Path(folder_b)
+    if os.path.realpath(folders[0]) == os.path.realpath(folders[1]):
+        raise SurveyError(f"{folders[1]}: is the first epoch itself; name the folder of another epoch")
     projects = read(folders[0]), read(folders[1])
     sigmas = _sigmas(projects)
     first, second = (_adjusted(project, progress) for project in projects)

@@ -32,14 +32,17 @@ from survey.jobs.relay import (
     relay_text,
     relay_trackers,
     tracker_pairs,
+    unit_warnings,
 )
-from survey.project import write_project
+from survey.project import AdjustmentOptions, write_project
 from survey.project.project import DEFINITION_FILE
 from survey.solution.quantities import ARCSEC_PER_RAD, first_row, pair_sigmas, pose_dict
 
 TRAJECTORIES = "trajectories"
 _ENDINGS = (".csv", ".txt", ".tum")
 _ALPHA = 0.001
+_OPTIONS = AdjustmentOptions(sigmas="a_priori")
+"""Pairs that share errors close their loops too well, so sigma0 says nothing of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +72,22 @@ class PairsOutcome:
             "pairs": self._pairs(),
             "loops": list(self.triangles),
             "written": None if self.written is None else str(self.written),
+            "warnings": list(self.warnings()),
         }
+
+    def warnings(self) -> tuple[str, ...]:
+        """What is odd about the observations, and what about the sigmas of an adjustment of the written pairs."""
+        closed = self.found.closed
+        if self.written is None or self.joint or closed is None:
+            return self.found.warnings
+        actual, claimed = (np.diagonal(c, axis1=1, axis2=2) for c in (closed.actual_cov, closed.claimed_cov))
+        factor = float(np.sqrt(np.mean(actual / claimed)))
+        return (
+            *self.found.warnings,
+            f"pairs of one eye share its errors, but {self.written} takes them as independent: sigmas of its "
+            f"adjustment are {factor:.2f} times too small; those under 'loops closed' are right, --joint "
+            "writes no loops",
+        )
 
     def _pairs(self) -> dict[str, Any]:
         closed, joint = self.found.closed, self.found.joint_pairs()
@@ -85,7 +103,7 @@ class PairsOutcome:
 
     def text(self) -> str:
         """Summary for people."""
-        lines = [relay_text(self.found).rstrip()]
+        lines = [*(f"warning: {text}" for text in self.warnings()), relay_text(self.found).rstrip()]
         if self.triangles:
             open_ones = sum(not t["closes"] for t in self.triangles)
             lines.append(f"loops: {len(self.triangles)} triangles, of which {open_ones} do not close; the worst first")
@@ -126,7 +144,7 @@ def _from_trajectories(folder: Path, station: str | None) -> RelayPairs:
     trackers = relay_trackers(read_trajectories(by_id))
     eyes = tracker_pairs(trackers)
     joint = adjust_eyes(sequences(one_metre(trackers), trackers.drift))
-    return RelayPairs(eyes, looped(eyes), joint)
+    return RelayPairs(eyes, looped(eyes), joint, unit_warnings(trackers.joint))
 
 
 def star(found: RelayPairs) -> tuple[Pair, ...]:
@@ -171,7 +189,7 @@ def write_pair_project(folder: Path, pairs: Sequence[Pair], title: str) -> Path:
         replace(p, a=FrameRef("station", names[p.a]), b=FrameRef("station", names[p.b])) for p in pairs
     )
     with whole_folder(folder) as place:
-        write_project(place, Survey(stations=stations, pairs=moved), title=title)
+        write_project(place, Survey(stations=stations, pairs=moved), title=title, options=_OPTIONS)
     return folder / DEFINITION_FILE
 
 

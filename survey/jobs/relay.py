@@ -36,11 +36,15 @@ _COLUMNS = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 
 @dataclass(frozen=True, eq=False)
 class RelayPairs:
-    """eyes: every two eyes by themselves. closed: the same with loops closed, None without loop. joint: all at once."""
+    """eyes: every two eyes by themselves. closed: the same with loops closed, None without loop. joint: all at once.
+
+    warnings: what the observations look like that they should not.
+    """
 
     eyes: EyePairs
     closed: LoopedPairs | None
     joint: EyeAdjustment
+    warnings: tuple[str, ...] = ()
 
     def joint_pairs(self) -> tuple[Pair, ...]:
         """The same pairs from all eyes at once."""
@@ -81,8 +85,9 @@ def relay_trackers(trajectories: Sequence[Trajectory]) -> RelayTrackers:
     offsets = tuple(time_offset(trajectories[0], x) for x in trajectories[1:])
     shifts = [0.0, *(o.offset_s for o in offsets)]
     drift, joint, common = choose_interval(trajectories, shifts, _INTERVALS_S)
-    grown = growth(trajectories, shifts, joint, _GROWTH_S)
-    return RelayTrackers(offsets, drift, common, joint, _GROWTH_S, grown)
+    fitting = tuple(s for s in _GROWTH_S if 2.0 * s < np.ptp(common.times_s))
+    grown = growth(trajectories, shifts, joint, fitting)
+    return RelayTrackers(offsets, drift, common, joint, fitting, grown)
 
 
 def tracker_pairs(found: RelayTrackers) -> EyePairs:
@@ -97,20 +102,32 @@ def one_metre(found: RelayTrackers) -> CommonMotions:
     return replace(common, motions=tuple(motions))
 
 
+def unit_warnings(joint: EyeAdjustment) -> tuple[str, ...]:
+    """Trackers whose lengths are a power of ten of the first one's."""
+    powers = {eye: np.log10(scale) for eye, scale in joint.scales.items()}
+    return tuple(
+        f"lengths of {eye} times {10.0 ** round(p):g} are those of {joint.eyes[0].frame_id}: one of the two is not in "
+        "metres; write x, y, z of all in metres"
+        for eye, p in powers.items() if round(p) and abs(p - round(p)) < 0.02
+    )  # fmt: skip
+
+
 def read_trajectory(text: str, eye_id: str, name: str = "trajectory") -> Trajectory:
     """A trajectory from lines ``t, x, y, z, qx, qy, qz, qw`` (s, m, unit quaternion of ``world_from_eye``).
 
     The values stand between commas or, as in TUM's files, between blanks.
-    Poses repeated with the same time and value are kept once. Raises SurveyError naming the line for anything else
-    that is not a trajectory.
+    A first line may name the columns. Poses repeated with the same time and value are kept once. Raises SurveyError
+    naming the line for anything else that is not a trajectory.
     """
     rows: list[list[float]] = []
     for line, words in enumerate(text.splitlines(), 1):
         row = words.split(",") if "," in words else words.split()
-        if not row or row[0].lstrip().startswith("#"):
+        if not row or row[0].lstrip().startswith("#") or (not rows and _is_header(row)):
             continue
         if len(row) != len(_COLUMNS):
-            raise SurveyError(f"{name}:{line}: {len(row)} columns, expected {', '.join(_COLUMNS)}")
+            raise SurveyError(
+                f"{name}:{line}: {len(row)} columns, expected {', '.join(_COLUMNS)} between commas or blanks"
+            )
         try:
             values = [float(x) for x in row]
         except ValueError as error:
@@ -120,14 +137,22 @@ def read_trajectory(text: str, eye_id: str, name: str = "trajectory") -> Traject
         if rows and values[0] <= rows[-1][0]:
             what = "comes twice with different poses" if values[0] == rows[-1][0] else "goes backwards"
             raise SurveyError(f"{name}:{line}: time {values[0]} {what}; sort the poses and keep one for each time")
-        if not all(abs(x) < 1e15 for x in values) or abs(np.linalg.norm(values[4:]) - 1.0) > 1e-3:
-            raise SurveyError(f"{name}:{line}: qx,qy,qz,qw is not a unit quaternion, or a value is not finite")
+        if not all(abs(x) < 1e15 for x in values):
+            raise SurveyError(f"{name}:{line}: found {', '.join(f'{x:g}' for x in values)}; every value must be finite")
+        if abs((length := float(np.linalg.norm(values[4:]))) - 1.0) > 1e-3:
+            raise SurveyError(f"{name}:{line}: qx,qy,qz,qw is not a unit quaternion, its length is {length:.4g}")
         rows.append(values)
     if len(rows) < 3:
-        raise SurveyError(f"{name}: {len(rows)} poses make no trajectory")
+        raise SurveyError(f"{name}: {len(rows)} poses make no trajectory; record about ten a second")
     table = np.array(rows)
     rotation = np.array([Rot3.Quaternion(w, x, y, z).matrix() for x, y, z, w in table[:, 4:].tolist()])
     return Trajectory(FrameRef("camera", eye_id), table[:, 0].copy(), Motions(rotation, table[:, 1:4].copy()))
+
+
+def _is_header(row: Sequence[str]) -> bool:
+    """Whether words name the columns, with or without their units."""
+    named = [word.strip().lower().partition("_")[0] for word in row]
+    return named == [column.partition("_")[0] for column in _COLUMNS]
 
 
 def read_trajectories(paths: Mapping[str, Path]) -> tuple[Trajectory, ...]:

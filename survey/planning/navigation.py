@@ -2,8 +2,10 @@
 
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from itertools import count, islice
 
 import numpy as np
+import scipy.linalg
 from gtsam import Pose3
 
 from adjust.design.placement import Placement, PlacementOptions, place_beacons
@@ -24,9 +26,9 @@ _TRIALS = 1000
 class NavigationOutcome:
     """Navigation from the planned beacons, and from beacons placed for it.
 
-    precision: per pose. beacons: those it was made with. placement: None where none were asked for; places (k, 3) m
-    of the chosen ones. budget, tolerances: of the poses that are determined; simulated: (6,) largest over the poses of
-    RMS error over its prediction with the shared tolerances, simulated anew.
+    precision: per pose. beacons: those it was made with, the placed ones last. placement: None where none were asked
+    for; places (k, 3) m of the chosen ones. budget, tolerances: of the poses that are determined; simulated: (6,)
+    largest over the poses of RMS error over its prediction with the shared tolerances, simulated anew.
     """
 
     station_id: str
@@ -39,6 +41,11 @@ class NavigationOutcome:
     budget: PoseBudget | None
     tolerances: tuple[PoseTolerance, ...]
     simulated: FloatArray
+
+    @property
+    def placed_ids(self) -> tuple[str, ...]:
+        """(k,) names of the placed beacons."""
+        return self.beacons.beacon_ids[len(self.beacons.beacon_ids) - len(self.places) :]
 
     @property
     def sigmas(self) -> FloatArray:
@@ -63,15 +70,25 @@ def plan_navigation(plan: Plan, expected: Adjustment, n_place: int) -> Navigatio
             nav.criterion, nav.required_rotation, nav.required_translation, nav.at_least, sigma_px=nav.sigma_px,
             spacing=nav.spacing,
         )  # fmt: skip
-        placement = place_beacons(head, nav.poses, nav.places, nav.beacon_sigma, n_place, options)
+        placement = place_beacons(head, nav.poses, nav.places, nav.beacon_sigma, n_place, options, there)
         places = nav.places[list(placement.chosen)]
-        ids = tuple(f"N{i + 1}" for i in range(len(places)))
-        beacons = Beacons(ids, places, nav.beacon_sigma**2 * np.eye(3 * len(places)))
+        beacons = _with_new(head, there, places, nav.beacon_sigma)
     if beacons is None:
         raise SurveyError(f"{plan.path}: there are no beacons to navigate from; list [points], or --place some")
     precision = expected_precision(head, beacons, nav.poses, nav.sigma_px)
     found, allowed, ratio = _tolerances(nav, head, beacons, precision)
     return NavigationOutcome(station, nav, head, beacons, precision, placement, places, found, allowed, ratio)
+
+
+def _with_new(head: Head, there: Beacons | None, places: FloatArray, sigma: float) -> Beacons:
+    """The beacons that are there, and after them new ones at places (k, 3) m with names that are free."""
+    k = len(places)
+    old = there or Beacons((), np.zeros((0, 3)), np.zeros((0, 0)))
+    free = (f"N{i}" for i in count(1) if f"N{i}" not in old.beacon_ids)
+    cov = scipy.linalg.block_diag(old.cov, sigma**2 * np.eye(3 * k))
+    cross = None if old.cross_cov is None else np.hstack([old.cross_cov, np.zeros((len(head.cov), 3 * k))])
+    ids = (*old.beacon_ids, *islice(free, k))
+    return Beacons(ids, np.vstack([old.x_in_world, places]), cov, cross)
 
 
 def _station(plan: Plan, expected: Adjustment) -> str:

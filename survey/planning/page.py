@@ -252,8 +252,8 @@ def _placement(n: NavigationOutcome) -> Markup:
     title = f"{what.capitalize()} over beacons placed"
     drawn = chart(lines, title, "beacons", "sigma / required") if lines else Markup()
     rows = [
-        (f"N{i + 1}", *(m.fixed(1e3 * v, 0) for v in place), str(sum(f"N{i + 1}" in e.beacon_ids for e in n.precision)))
-        for i, place in enumerate(n.places)
+        (name, *(m.fixed(1e3 * v, 0) for v in place), str(sum(name in e.beacon_ids for e in n.precision)))
+        for name, place in zip(n.placed_ids, n.places, strict=True)
     ]
     body = m.element("h3", "Where to put beacons") + m.figures((_room(n), drawn))
     said = (

@@ -213,8 +213,8 @@ def _navigation(n: NavigationOutcome) -> dict[str, object]:
     if n.placement is not None:
         p = n.placement
         out["placement"] = {
-            "x_mm": (1e3 * n.places).tolist(), "measure": plain(p.measure), "exchanged": p.exchanged,
-            "final": p.final, "criterion": n.plan.criterion,
+            "ids": list(n.placed_ids), "x_mm": (1e3 * n.places).tolist(), "measure": plain(p.measure),
+            "exchanged": p.exchanged, "final": p.final, "criterion": n.plan.criterion,
         }  # fmt: skip
     return out
 

@@ -113,9 +113,11 @@ def _navigation_lines(o: PlanResult) -> list[str]:
             f"worst {turn[good].max():.3f} deg {shift[good].max():.2f} mm"
         )
     if n.placement is not None:
-        out.append(f"    placed ({n.plan.criterion} pose, in required variances; {n.placement.exchanged} exchanged)")
-        for i, x in enumerate(1e3 * n.places):
-            out.append(f"      N{i + 1:<4}{x[0]:>9.1f}{x[1]:>9.1f}{x[2]:>9.1f} mm")
+        beside = len(n.beacons.beacon_ids) - len(n.places)
+        what = f"{n.plan.criterion} pose, in required variances; {n.placement.exchanged} exchanged"
+        out.append(f"    placed{f' beside the {beside} that are there' if beside else ''} ({what})")
+        for name, x in zip(n.placed_ids, 1e3 * n.places, strict=True):
+            out.append(f"      {name:<5}{x[0]:>9.1f}{x[1]:>9.1f}{x[2]:>9.1f} mm")
         out.append(f"      measure at the end {n.placement.final:.3g}")
     if n.tolerances:
         out.append(f"    {'tolerances':<22}{'alone':>10}{'beside':>10}{'shared':>10}")

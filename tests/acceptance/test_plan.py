@@ -83,9 +83,10 @@ def test_json_and_files(lab, capsys):
     assert len(gains) > 25
     after = found["selection"]["wanted"]["station_from_camera.Z.tz"]
     assert after["sigma_after_mm"] < after["sigma_before_mm"]
-    assert found["navigation"]["beacons"] == 12
+    assert found["navigation"]["beacons"] == 18  # six of the survey, which stay
     assert min(found["navigation"]["beacons_seen"]) >= 3
     assert len(found["navigation"]["placement"]["x_mm"]) == 12
+    assert found["navigation"]["placement"]["ids"] == [f"N{i}" for i in range(1, 13)]
     measure = found["navigation"]["placement"]["measure"]
     assert found["navigation"]["placement"]["final"] <= measure[-1]
     found = run(capsys, "plan", str(lab), "--add", "1", "--out", "there")

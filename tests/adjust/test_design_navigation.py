@@ -62,6 +62,46 @@ def test_placement_is_measured_as_navigation_predicts_it(criterion):
     assert found.final < np.median(others)
 
 
+def measured_together(head, at, there, x, options):
+    """What navigation itself predicts for beacons that are there and others at x (k, 3), all errors as they are."""
+    k, joint = len(x), block_diagonal([there.cov, SIGMA**2 * np.eye(3 * len(x))])
+    cross = np.hstack([there.cross_cov, np.zeros((len(head.cov), 3 * k))])
+    ids = (*there.beacon_ids, *(f"p{i}" for i in range(k)))
+    both = Beacons(ids, np.vstack([there.x_in_world, x]), joint, cross)
+    weight = 1.0 / (6 * np.array([options.required_rotation] * 3 + [options.required_translation] * 3) ** 2)
+    found = expected_precision(head, both, at, options.sigma_px)
+    return max(np.diag(e.cov) @ weight for e in found), tuple(len(e.beacon_ids) for e in found)
+
+
+def correlated_beacons(head, x, seed=7):
+    """Beacons at x (m, 3) that share some of their errors, also with the calibration of the head."""
+    rng, p, m = np.random.default_rng(seed), len(head.cov), 3 * len(x)
+    scale = np.concatenate([np.sqrt(np.diag(head.cov)), np.full(m, 0.6 * SIGMA)])
+    mix = rng.standard_normal((m, 12)) / 6
+    F = np.zeros((p + m, p + 12 + m))
+    F[:p, :p] = np.linalg.cholesky(head.cov + 1e-30 * np.eye(p))
+    F[p:, :p] = scale[p:, None] * rng.standard_normal((m, p)) / (2 * np.sqrt(p))
+    F[p:, p : p + 12], F[p:, p + 12 :] = scale[p:, None] * mix, np.diag(scale[p:])
+    joint = F @ F.T
+    return Beacons(tuple(f"B{i}" for i in range(len(x))), x, joint[p:, p:], joint[:p, p:])
+
+
+def test_beacons_that_are_there_count_as_placed():
+    head, at, x = wide_head(), poses(4), walls(60)
+    there = correlated_beacons(head, x[:8])
+    options = PlacementOptions(spacing=0.2)
+    found = place_beacons(head, at, x, SIGMA, 5, options, there)
+    measure, seen = measured_together(head, at, there, x[list(found.chosen)], options)
+    assert found.final == pytest.approx(measure, rel=1e-4)
+    assert found.seen == seen
+    gaps = np.linalg.norm(x[list(found.chosen), None] - there.x_in_world, axis=2)
+    assert gaps.min() > 0.2
+    blind = place_beacons(head, at, x[8:], SIGMA, 5, PlacementOptions(at_least=0))  # as if nothing were there
+    assert found.final < measured_together(head, at, there, x[8:][list(blind.chosen)], options)[0]
+    one = place_beacons(head, at[:1], x, SIGMA, 1, PlacementOptions(at_least=2), there)
+    assert one.seen[0] >= 2
+
+
 def test_placement_beside_exhaustive_search():
     head, at, x = wide_head(), poses(1), walls(40, seed=5)
     options = PlacementOptions()

@@ -57,9 +57,10 @@ class Run:
 
 
 def _written(place: Path, given: Survey) -> Commands:
-    lab = str(place / "lab")
-    write_project(place / "lab", given)
-    return {"adjust": ["adjust", lab], "compare": ["compare", lab, lab]}
+    lab, again = str(place / "lab"), str(place / "again")
+    for folder in (lab, again):
+        write_project(Path(folder), given)
+    return {"adjust": ["adjust", lab], "compare": ["compare", lab, again]}
 
 
 def board_points(place: Path, n: int) -> Commands:

@@ -54,14 +54,18 @@ def sequences(common: CommonMotions, model: DriftModel) -> tuple[EyeSequence, ..
 
 
 _FIT = EyeOptions(reject=False, free_scales=True)
-_MOST_ROUNDS = 60
+_MOST_ROUNDS = 100
+_LEAST_REDUNDANCY = 1.0
 _ALPHA = 0.05
+_PAUSES = (0.25, 0.5, 1.0, 2.0)
+"""In lengths of the interval."""
 
 
 def fit_drift(common: CommonMotions) -> tuple[DriftModel, EyeAdjustment]:
     """Variance components of rotation and position of every tracker, estimated until they reproduce themselves.
 
-    Foerstner (1979): each component is v'Pv over the redundancy of its group. Needs three eyes, since two cannot tell
+    Foerstner (1979): each component is v'Pv over the redundancy of its group. One that falls until its group has less
+    than one redundancy is as good as zero beside the others and stays there. Needs three eyes, since two cannot tell
     whose errors they are. Raises SurveyError for fewer, NotConvergedError.
     """
     k = len(common.eyes)
@@ -79,7 +83,8 @@ def fit_drift(common: CommonMotions) -> tuple[DriftModel, EyeAdjustment]:
         if np.abs(factor - 1.0).max() < 0.02:
             return model, adjust_eyes(sequences(common, model), (), _FIT)
     raise NotConvergedError(
-        f"the variance components of {k} trackers did not settle; one of them may have no errors that the others see"
+        f"the errors of {k} trackers did not settle in {_MOST_ROUNDS} rounds over intervals of {length:g} s: "
+        f"{len(common.times_s)} motions do not tell whose they are; record longer trajectories with more turns"
     )
 
 
@@ -95,7 +100,8 @@ def _components(solution: EyeSolution, k: int) -> tuple[FloatArray, FloatArray]:
         rows = slice(eye * n, (eye + 1) * n)
         for j, part in enumerate(_PARTS):
             redundancy[eye, j] = own[rows, part].sum()
-            factor[eye, j] = square[rows, part].sum() / redundancy[eye, j]
+            if redundancy[eye, j] > _LEAST_REDUNDANCY:
+                factor[eye, j] = square[rows, part].sum() / redundancy[eye, j]
     return factor, redundancy
 
 
@@ -123,13 +129,25 @@ def choose_interval(
 ) -> tuple[DriftModel, EyeAdjustment, CommonMotions]:
     """The shortest interval whose misclosures are not positively correlated with their neighbours (one-sided test).
 
-    Raises SurveyError where they are at all intervals.
+    Where they are negatively correlated poses have errors of their own, which two motions share that meet in one: then
+    there are pauses between intervals, as long as is needed. Raises SurveyError where they are correlated at all
+    intervals, or the time in common is too short for any.
     """
     limit = float(norm.isf(_ALPHA))
-    seen = []
+    seen: list[str] = []
     for interval in intervals_s:
-        common = common_motions(trajectories, offsets_s, interval)
+        try:
+            common = common_motions(trajectories, offsets_s, interval)
+        except SurveyError:
+            if not seen:
+                raise
+            break  # longer ones do not fit either
         model, adjusted = fit_drift(common)
+        for pause in _PAUSES:
+            if model.autocorrelation > -limit * model.autocorrelation_sigma:
+                break
+            common = common_motions(trajectories, offsets_s, interval, step_s=(1.0 + pause) * interval)
+            model, adjusted = fit_drift(common)
         seen.append(f"{interval:g} s: {model.autocorrelation:+.2f}")
         if model.autocorrelation < limit * model.autocorrelation_sigma:
             return model, adjusted, common

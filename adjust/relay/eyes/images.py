@@ -168,8 +168,10 @@ def eye_sequences(survey: Survey | Adjustment, station_id: str | None = None) ->
             eyes.setdefault(target.station_id, []).append(FrameRef("target", target.target_id))
     if station_id is None:
         several = [s for s, of in eyes.items() if len(of) > 1]
+        if not several:
+            raise SurveyError("no station has two eyes (cameras, or marker blocks that another camera saw) for a pair")
         if len(several) != 1:
-            raise SurveyError(f"stations with two or more eyes: {', '.join(several) or 'none'}; name one of them")
+            raise SurveyError(f"stations with two or more eyes: {', '.join(several)}; name one of them")
         station_id = several[0]
     if station_id not in eyes:
         raise SurveyError(f"station {station_id!r} has no camera; those with cameras are {', '.join(eyes)}")

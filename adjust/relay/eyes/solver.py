@@ -212,6 +212,16 @@ class _Normals:
 
 def solve_eyes(problem: EyeProblem) -> EyeSolution:
     """Least squares. Raises NotConvergedError; the caller has seen to it that everything is determined."""
+    try:
+        return _solved(problem)
+    except (np.linalg.LinAlgError, RuntimeError) as error:  # a matrix that no factorisation takes
+        raise NotConvergedError(
+            f"the equations of the eyes cannot be solved ({error}): their poses do not belong together; check that the "
+            "eyes are rigid on one station, the time offsets, and for wrong poses"
+        ) from None
+
+
+def _solved(problem: EyeProblem) -> EyeSolution:
     U, scales = problem.start, np.zeros(problem.n_scales)
     v = np.zeros((len(problem.observed), 6))
     n_free = 6 * int(problem.free.sum())

@@ -18,7 +18,12 @@ from adjust.spatial.rigid_motions import Motions
 
 _STEP_S = 0.02  # of the comparison of clocks
 _HALF_S = 0.1  # turning speed over twice this time
+_FEWEST = 50  # steps in common
 _PARTS = 8  # of the time in common, each with an offset of its own
+_GAP = 5.0  # usual times between poses
+_PEAKS = 5  # shifts that are looked at closely
+_AS_WELL = 1.5  # mean square misfit of another offset, in that of the best
+_MOST_NOISE = 2.0  # variance of a pose in between, in those of the poses around it
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,18 +35,36 @@ class Trajectory:
     world_from_eye: Motions
 
     def at(self, times_s: FloatArray) -> Motions:
-        """Poses (k,) in between: straight in position, at constant turning speed. Raises SurveyError outside."""
+        """Poses (k,) in between, by the cubic through the four around. Raises SurveyError outside.
+
+        Straight between the two around where times are so uneven that the cubic would enlarge the errors of poses.
+        """
         t = self.times_s
+        if len(t) < 4:
+            raise SurveyError(f"eye {self.eye.frame_id}: {len(t)} poses are too few; record about ten a second")
         if times_s.min(initial=t[0]) < t[0] or times_s.max(initial=t[0]) > t[-1]:
             raise SurveyError(
                 f"eye {self.eye.frame_id}: poses are asked for {times_s.min():.3f} to {times_s.max():.3f} s, its "
                 f"trajectory has {t[0]:.3f} to {t[-1]:.3f} s; check the time offset"
             )
         i = np.clip(np.searchsorted(t, times_s, side="right") - 1, 0, len(t) - 2)
-        share = (times_s - t[i]) / (t[i + 1] - t[i])
+        around = np.clip(i, 1, len(t) - 3)[:, None] + np.arange(-1, 3)
+        share = _cubic(t[around], times_s)
+        uneven = (share**2).sum(axis=1) > _MOST_NOISE
+        after = (times_s - t[i]) / (t[i + 1] - t[i])
+        share[uneven] = np.where(around == i[:, None], 1.0 - after[:, None],
+                                 np.where(around == i[:, None] + 1, after[:, None], 0.0))[uneven]  # fmt: skip
         R, x = self.world_from_eye.rotation, self.world_from_eye.shifts
-        turn = rotation_log(np.swapaxes(R[i], -1, -2) @ R[i + 1])
-        return Motions(R[i] @ rotation_exp(share[:, None] * turn), x[i] + share[:, None] * (x[i + 1] - x[i]))
+        turn = rotation_log(np.swapaxes(R[i], -1, -2)[:, None] @ R[around])
+        return Motions(
+            R[i] @ rotation_exp(np.einsum("kj,kji->ki", share, turn)), np.einsum("kj,kji->ki", share, x[around])
+        )
+
+    def recorded(self, times_s: FloatArray) -> BoolArray:
+        """Whether times (k,) are no part of a gap: poses around are not much farther apart than usually."""
+        apart = np.diff(self.times_s)
+        i = np.clip(np.searchsorted(self.times_s, times_s, side="right") - 1, 0, len(apart) - 1)
+        return np.asarray(apart[i] <= _GAP * np.median(apart))
 
     def turning_speed(self, times_s: FloatArray) -> FloatArray:
         """(k,) rad/s."""
@@ -64,25 +87,38 @@ class TimeOffset:
     drift_sigma_per_s: float
 
 
+def _cubic(nodes: FloatArray, at: FloatArray) -> FloatArray:
+    """Shares (k, 4) of the values at four nodes (k, 4) in that of the cubic through them at (k,), Lagrange's form."""
+    from_node, apart = at[:, None] - nodes, nodes[:, :, None] - nodes[:, None]
+    others = ~np.eye(4, dtype=np.bool_)
+    return np.stack([(from_node[:, o] / apart[:, j, o]).prod(axis=1) for j, o in enumerate(others)], axis=1)
+
+
 def time_offset(a: Trajectory, b: Trajectory) -> TimeOffset:
     """Offset of b's clock against a's by the turning speeds of both, over all shifts with half the time in common.
 
-    Raises SurveyError where the turning speeds do not agree at any shift.
+    Raises SurveyError where the turning speeds do not agree at any shift, or at several as well.
     """
     speed = [x.turning_speed(_grid(x.times_s[0], x.times_s[-1])) for x in (a, b)]
-    first = _coarse(*speed)
-    offset = b.times_s[0] - a.times_s[0] + first[0] * _STEP_S
-    lo = max(a.times_s[0], b.times_s[0] - offset) + 3 * _HALF_S
-    hi = min(a.times_s[-1], b.times_s[-1] - offset) - 3 * _HALF_S
-    times = np.arange(lo, hi, _STEP_S)
-    best = _refined(a, b, times, offset)
-    correlation = float(np.corrcoef(a.turning_speed(times), b.turning_speed(times + best))[0, 1])
+    _refuse_short(a, b, min(map(len, speed)))
+    first = b.times_s[0] - a.times_s[0]
+    tried = sorted((_fit(a, b, first + shift * _STEP_S) for shift in _coarse(*speed)), key=lambda fit: fit[1])
+    best, miss, times = tried[0]
+    speeds = a.turning_speed(times), b.turning_speed(times + best)
+    correlation = float(np.corrcoef(*speeds)[0, 1]) if min(map(np.ptp, speeds)) > 0.0 else 0.0
     if correlation < 0.8:
         raise SurveyError(
             f"eyes {a.eye.frame_id} and {b.eye.frame_id}: their turning speeds agree at no time offset (correlation "
             f"{correlation:.2f}); they are not on one rigid body, or it hardly turned"
         )
-    parts = np.array([_refined(a, b, part, best) for part in np.array_split(times, _PARTS)])
+    other = next((x for x, m, _ in tried[1:] if m < _AS_WELL * miss and abs(x - best) > 2 * _HALF_S), None)
+    if other is not None:
+        raise SurveyError(
+            f"eyes {a.eye.frame_id} and {b.eye.frame_id}: their turning speeds agree at a time offset of {best:.2f} s "
+            f"and at {other:.2f} s as well, since the motion repeats itself or is too quick for the rate of poses; "
+            "turn the station irregularly, and record about ten poses a second"
+        )
+    parts = np.array([_refined(a, b, part, best)[0] for part in np.array_split(times, _PARTS)])
     centre = np.array([part.mean() for part in np.array_split(times, _PARTS)])
     line, cov = np.polyfit(centre - centre.mean(), parts, 1, cov=True)
     return TimeOffset(
@@ -90,12 +126,32 @@ def time_offset(a: Trajectory, b: Trajectory) -> TimeOffset:
     )
 
 
+def _fit(a: Trajectory, b: Trajectory, offset: float) -> tuple[float, float, FloatArray]:
+    """The offset nearby that fits best, its mean square misfit, and the times (k,) of both in common."""
+    lo = max(a.times_s[0], b.times_s[0] - offset) + 3 * _HALF_S
+    hi = min(a.times_s[-1], b.times_s[-1] - offset) - 3 * _HALF_S
+    times = np.arange(lo, hi, _STEP_S)
+    kept = [x.recorded(times + o + d) for x, o in ((a, 0.0), (b, offset)) for d in (-_HALF_S, _HALF_S)]
+    times = times[np.logical_and.reduce(kept)]
+    _refuse_short(a, b, len(times))
+    return *_refined(a, b, times, offset), times
+
+
+def _refuse_short(a: Trajectory, b: Trajectory, n: int) -> None:
+    """Raise SurveyError for fewer than enough steps in common."""
+    if n < _FEWEST:
+        raise SurveyError(
+            f"eyes {a.eye.frame_id} and {b.eye.frame_id}: their trajectories are together for {_STEP_S * n:.2f} s "
+            f"outside of gaps; record {_STEP_S * _FEWEST:g} s or more, ten poses a second"
+        )
+
+
 def _grid(first: float, last: float) -> FloatArray:
     return np.arange(first + 2 * _HALF_S, last - 2 * _HALF_S, _STEP_S)
 
 
-def _coarse(a: FloatArray, b: FloatArray) -> tuple[int, float]:
-    """Shift in steps with the largest correlation among those with half of the shorter series in common."""
+def _coarse(a: FloatArray, b: FloatArray) -> list[int]:
+    """Shifts in steps with the largest correlations around, among those with half of the shorter series in common."""
     least = min(len(a), len(b)) // 2
     shifts = np.arange(least - len(a), len(b) - least + 1)
     size = 1 << int(np.ceil(np.log2(len(a) + len(b))))
@@ -109,18 +165,19 @@ def _coarse(a: FloatArray, b: FloatArray) -> tuple[int, float]:
     sa, sb = correlated(a, one_b), correlated(one_a, b)
     saa, sbb, sab = correlated(a * a, one_b), correlated(one_a, b * b), correlated(a, b)
     r = (n * sab - sa * sb) / np.sqrt(np.maximum((n * saa - sa**2) * (n * sbb - sb**2), 1e-30))
-    best = int(np.argmax(r))
-    return int(shifts[best]), float(r[best])
+    peaks = np.flatnonzero(np.r_[True, r[1:] > r[:-1]] & np.r_[r[:-1] >= r[1:], True])
+    return [int(x) for x in shifts[peaks[np.argsort(-r[peaks], kind="stable")]][:_PEAKS]]
 
 
-def _refined(a: Trajectory, b: Trajectory, times: FloatArray, offset: float) -> float:
+def _refined(a: Trajectory, b: Trajectory, times: FloatArray, offset: float) -> tuple[float, float]:
+    """The offset near this one with the least mean square misfit over times (k,), and that."""
     speed = a.turning_speed(times)
 
     def miss(more: float) -> float:
-        return float(np.sum((speed - b.turning_speed(times + offset + more)) ** 2))
+        return float(np.mean((speed - b.turning_speed(times + offset + more)) ** 2))
 
     found = minimize_scalar(miss, bounds=(-2.5 * _STEP_S, 2.5 * _STEP_S), method="bounded", options={"xatol": 1e-6})
-    return offset + float(found.x)
+    return offset + float(found.x), float(found.fun)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,8 +210,13 @@ def common_motions(
     lo = max(x.times_s[0] - o for x, o in zip(trajectories, offsets_s, strict=True)) + 2 * _HALF_S
     hi = min(x.times_s[-1] - o for x, o in zip(trajectories, offsets_s, strict=True)) - 2 * _HALF_S
     if hi - lo < 2 * interval_s:
-        raise SurveyError(f"the trajectories have only {hi - lo:.1f} s in common; check the time offsets")
+        raise SurveyError(
+            f"the trajectories have only {max(hi - lo, 0.0):.1f} s in common, too little for two motions of "
+            f"{interval_s:g} s; record longer ones, or check the time offsets"
+        )
     begin = lo + step * np.arange(int((hi - lo - interval_s) / step) + 1)
+    ends = [x.recorded(begin + o + d) for x, o in zip(trajectories, offsets_s, strict=True) for d in (0.0, interval_s)]
+    begin = begin[np.logical_and.reduce(ends)]
     poses = tuple((x.at(begin + o), x.at(begin + interval_s + o)) for x, o in zip(trajectories, offsets_s, strict=True))
     motions = tuple(before.inverse() @ after for before, after in poses)
     return CommonMotions(

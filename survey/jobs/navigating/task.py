@@ -43,6 +43,8 @@ def chosen_station(project: Project) -> str:
     if found is not None:
         return found
     carrying = list(dict.fromkeys(c.station_id for c in project.survey.cameras))
+    if not carrying:
+        raise SurveyError(f"{project.folder}/survey.toml: there is no camera; navigation needs a calibrated one")
     raise SurveyError(
         f"{project.folder}/survey.toml: {len(carrying)} stations carry cameras ({', '.join(carrying)}); say which one "
         "is to be navigated with --station"
@@ -53,7 +55,10 @@ def chosen_epochs(project: Project, station: str, request: NavigateRequest) -> l
     """Epochs to navigate, in natural order. Raises SurveyError."""
     own = {c.camera_id for c in project.survey.cameras if c.station_id == station}
     if not own:
-        raise SurveyError(f"{project.folder}/survey.toml: no camera is on station {station!r}")
+        carrying = ", ".join(dict.fromkeys(c.station_id for c in project.survey.cameras))
+        raise SurveyError(
+            f"{project.folder}/survey.toml: no camera is on station {station!r}; stations with cameras: {carrying}"
+        )
     lit, shown = _lit_and_shown(project, own)
     if request.epochs is not None:
         unknown = [e for e in request.epochs if e not in lit]
