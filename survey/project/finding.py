@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from adjust.model.errors import SurveyError
+from adjust.model.errors import SurveyError, listed
 from adjust.model.observations import ImageBlock, position_text
 from survey.folder.text import suggestion
 from survey.project.exclusions import WHAT, Name, name_problem
@@ -90,6 +90,10 @@ def _bare(observed: Observed, text: str) -> tuple[list[Name], ...]:
 
 
 def _meant(observed: Observed, prefix: str, colon: str, rest: str, text: str) -> str:
+    station = f"station:{text.removeprefix('station:')}"
+    pairs = [f"pairs:{p.pair_id}" for p in observed.survey.pairs if station in (p.a.text, p.b.text)]
+    if pairs:
+        return f"a station goes with all that was measured from it: name {listed(pairs, 8, ' ')}"
     if colon and (named := _with_kind(prefix, rest)):
         if named[0].what != "reading":
             return near(observed, named[0])
