@@ -22,7 +22,7 @@ SOURCES = Path("adjust/native")
 ALWAYS = ["-std=c++20", "-fPIC", "-fvisibility=hidden", "-fno-exceptions", "-fno-rtti", "-Wall", "-Wextra"]
 FLAGS = ["-O2", "-g0", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast", "-fno-strict-aliasing"]
 SANITIZERS = ["-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
-CHECKED = ["-O1", "-g1", "-fno-omit-frame-pointer", "-DCHECKED", *SANITIZERS]
+CHECKED = ["-Og", "-g1", "-fno-omit-frame-pointer", "-DCHECKED", *SANITIZERS]
 AVX2 = ["-mavx2", "-mfma"]
 AVX512 = [*AVX2, "-mavx512f", "-mavx512dq", "-mavx512vl", "-mavx512bw"]
 MAC = sys.platform == "darwin"

@@ -7,6 +7,7 @@ are so by two small turns.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import gtsam
@@ -54,29 +55,48 @@ class Plumb:
 
         A change dv of the plumb line and dz of the zero axis turn the axes by v x dv + v (h1.dz - (zero.v) h1.dv) / n.
         """
-        up, radius, dv, dz = self.up, self.radius, np.cross(self.turns.T, self.up), np.cross(self.turns.T, self.zero)
-        if radius > 0.0:
-            p = x + radius * up
-            length = np.linalg.norm(p, axis=1)[:, None]
-            v, share = p / length, radius / length
-            height = (x * (x + 2.0 * radius * up)).sum(axis=1) / (length[:, 0] + radius)
-        else:
-            v, share, height = np.tile(up, (len(x), 1)), np.ones((len(x), 1)), x @ up
+        (v, curved, turned), dz = self.upwards(x), self.turns.T @ skew(self.zero)
         dot = (v @ self.zero)[:, None]
         across = self.zero - dot * v
         n = np.linalg.norm(across, axis=1)[:, None]
-        h1 = np.cross(v, across / n)
-        by_x = np.zeros((len(x), 3, 3))
-        if radius > 0.0:
-            by_x += (skew(v) - v[:, :, None] * (dot / n * h1)[:, None]) / length[:, :, None]
-        turned = share[:, :, None] * (dv - (v @ dv.T)[:, :, None] * v[:, None])
-        twist = (h1 @ dz.T - dot * (turned @ h1[:, :, None])[:, :, 0]) / n
-        by_tilt = np.swapaxes(np.cross(v[:, None], turned) + twist[:, :, None] * v[:, None], 1, 2)
-        return Horizon(np.stack([across / n, h1, v], axis=1), by_x, by_tilt, height, share * (x @ dv.T))
+        crossing = skew(v)
+        h1 = (crossing @ (across / n)[:, :, None])[:, :, 0]
+        by_x = (crossing - v[:, :, None] * (dot / n * h1)[:, None]) * curved[:, :, None]
+        twist = (h1 @ dz.T - dot * (h1[:, None] @ turned)[:, 0]) / n
+        by_tilt = crossing @ turned + v[:, :, None] * twist[:, None]
+        height = x @ self.up
+        if self.radius > 0.0:
+            height = (x * (x + 2.0 * self.radius * self.up)).sum(axis=1) / (1.0 / curved[:, 0] + self.radius)
+        height_by_tilt = self._share(curved) * (x @ self.turned_up)
+        return Horizon(np.stack([across / n, h1, v], axis=1), by_x, by_tilt, height, height_by_tilt)
+
+    def upwards(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """At positions x (n, 3): up (n, 3), the curvature (n, 1) of their level, the derivative of up by the tilts."""
+        if self.radius > 0.0:
+            p = x + self.radius * self.up
+            curved = 1.0 / np.linalg.norm(p, axis=1)[:, None]
+            v = p * curved
+        else:
+            v, curved = np.tile(self.up, (len(x), 1)), np.zeros((len(x), 1))
+        turned = self.turned_up - v[:, :, None] * (v @ self.turned_up)[:, None]
+        return v, curved, self._share(curved)[:, :, None] * turned
+
+    @cached_property
+    def turned_up(self) -> FloatArray:
+        """How ``up`` moves with the tilts (3, 2)."""
+        return np.asarray(-skew(self.up) @ self.turns)
+
+    def _share(self, curved: FloatArray) -> FloatArray:
+        return self.radius * curved if self.radius > 0.0 else np.ones_like(curved)
 
 
 def plumb(vertical: Vertical, zero: Literal["x", "y"], tilt: FloatArray) -> Plumb:
     """The plumb line at ``tilt`` (2,) rad, with horizontal axes counted from the world's axis ``zero``."""
+    return _tilted_plumb(_upright(vertical, zero), tilt)
+
+
+def _upright(vertical: Vertical, zero: Literal["x", "y"]) -> Plumb:
+    """The plumb line without tilt, and the axes that it is tilted about."""
     up = np.asarray(vertical.up_in_world, dtype=float)
     length = float(np.linalg.norm(up))
     if not 0.999 < length < 1.001:
@@ -86,12 +106,14 @@ def plumb(vertical: Vertical, zero: Literal["x", "y"], tilt: FloatArray) -> Plum
     first = axis - up * (up @ axis)
     if np.linalg.norm(first) < 0.1:
         raise SurveyError(f"bearings count from the world's axis {zero}, which is nearly vertical; choose the other")
-    first /= np.linalg.norm(first)
-    turn_axes = tilt_axes(up)
-    vector = tilt @ turn_axes
-    R = Rot3.Expmap(vector).matrix()
-    turns = Rot3.ExpmapDerivative(vector)  # right: R exp(J d) ; in the world: R J d
-    return Plumb(R @ up, R @ first, np.ascontiguousarray(R @ np.asarray(turns) @ turn_axes.T), vertical.radius or 0.0)
+    return Plumb(up, first / np.linalg.norm(first), tilt_axes(up).T, vertical.radius or 0.0)
+
+
+def _tilted_plumb(upright: Plumb, tilt: FloatArray) -> Plumb:
+    right = np.zeros((3, 3), order="F")
+    R = Rot3.Expmap(upright.turns @ tilt, right).matrix()  # R exp(right d) ; in the world: R right d
+    turns = np.ascontiguousarray(R @ right @ upright.turns)
+    return Plumb(R @ upright.up, R @ upright.zero, turns, upright.radius)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +137,11 @@ class VerticalMap:
     def at(self, values: gtsam.Values) -> Plumb:
         """The plumb line at these values."""
         tilt = np.asarray(self.vertical.tilt.values, dtype=float) if self.tilt is None else self.tilt.full(values)
-        return plumb(self.vertical, self.zero, tilt)
+        return _tilted_plumb(self._upright, tilt)
+
+    @cached_property
+    def _upright(self) -> Plumb:
+        return _upright(self.vertical, self.zero)
 
 
 def collect_vertical(survey: Survey, unknowns: Unknowns) -> VerticalMap:
@@ -128,10 +154,8 @@ def collect_vertical(survey: Survey, unknowns: Unknowns) -> VerticalMap:
 
 def up_at(plumb_line: Plumb, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The unit vector upwards at a position x (3,) m, with its derivatives by x (3, 3) and by the tilts (3, 2)."""
-    horizon = plumb_line.horizon(np.asarray(x, dtype=float)[None])
-    up = horizon.axes[0, 2]
-    cross = -skew(up)  # w -> w x up
-    return up, cross @ horizon.by_x[0], cross @ horizon.by_tilt[0]
+    v, curved, turned = plumb_line.upwards(np.asarray(x, dtype=float)[None])
+    return v[0], curved[0] * (np.eye(3) - np.outer(v[0], v[0])), turned[0]
 
 
 def tilted_frame(direction: FloatArray, tilt: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -1,6 +1,7 @@
 """Finding a checkerboard's inner corners, in an order that its colours define."""
 
 import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import cv2
@@ -50,23 +51,31 @@ def find_checkerboard(gray: Gray32, gray8: Gray8, target: Checkerboard) -> Detec
     return nothing_found(reason, other_size=other)
 
 
-def other_board(gray: Gray32, gray8: Gray8, target: Checkerboard) -> tuple[int, int] | None:
-    """Columns and rows of inner corners of a board that has one fewer, as where squares were counted, or one more.
+def other_boards(images: Sequence[tuple[Gray32, Gray8]], target: Checkerboard) -> list[tuple[int, int]]:
+    """Columns and rows of inner corners of boards that have one fewer, as where squares were counted, or one more.
 
-    In both numbers or in one of them.
-
-    To be asked where the target itself was not found. None where there is no such board either.
+    In both numbers or in one of them; of every image that shows such a board. To be asked where the target itself was
+    found in none.
     """
     c, r = target.columns, target.rows
     steps = ((-1, -1), (1, 1), (-1, 0), (0, -1), (1, 0), (0, 1), (1, -1), (-1, 1))
     sizes = [(c + i, r + j) for i, j in steps if min(c + i, r + j) >= 3]
-    for finder in (_glimpsed, _find):  # what is not there takes long: first a quick look for all sizes
-        for columns, rows in sizes:
-            found = finder(gray8, columns, rows)
-            if found is not None:
-                detection, whole = _measured(gray, found)
-                if len(detection):
-                    return _size(whole)
+    for finder in (_glimpsed, _find):  # what is not there takes long: first a quick look at all images for all sizes
+        seen = [size for image in images if (size := _first_size(finder, *image, sizes)) is not None]
+        if seen:
+            return seen
+    return []
+
+
+def _first_size(
+    finder: Callable[[Gray8, int, int], FloatArray | None], gray: Gray32, gray8: Gray8, sizes: list[tuple[int, int]]
+) -> tuple[int, int] | None:
+    for columns, rows in sizes:
+        found = finder(gray8, columns, rows)
+        if found is not None:
+            detection, whole = _measured(gray, found)
+            if len(detection):
+                return _size(whole)
     return None
 
 

@@ -181,27 +181,54 @@ def test_places_that_the_terminal_names_are_places_of_the_page(desk: Page, folde
         assert "There is no such" not in desk.page.inner_text("#inspector")
 
 
-@pytest.mark.parametrize(("place", "shown"), [
-    ("image=X/tX05", "image X/tX05"), ("obs=image_point:X/tX05/board/c41", "observation X/tX05/board/c41"),
-    ("reading=table_angles:turntable/tX05", "reading turntable/tX05"), ("param=lens/X/fx", "parameter lens/X/fx"),
-    ("camera=Y", "camera Y"), ("epoch=tX05", "epoch tX05"), ("target=board", "target board"),
-    ("group=image", "group image"), ("station=head", "station head"), ("table=turntable", "turntable"), ("run=1", ""),
-])  # fmt: skip
-def test_every_kind_of_place_opens_what_it_names(browser: Any, address: str, place: str, shown: str) -> None:
-    """As a link from a terminal or a mail: behind the token, in a page that was not open before."""
+PLACES = {
+    "image=X/tX05": "image X/tX05", "obs=image_point:X/tX05/board/c41": "observation X/tX05/board/c41",
+    "reading=table_angles:turntable/tX05": "reading turntable/tX05", "param=lens/X/fx": "parameter lens/X/fx",
+    "camera=Y": "camera Y", "epoch=tX05": "epoch tX05", "target=board": "target board", "group=image": "group image",
+    "station=head": "station head", "table=turntable": "turntable",
+}  # fmt: skip
+
+
+ANCHOR = "decodeURIComponent(document.querySelector('#inspector .anchor')?.textContent ?? '')"
+
+
+def opens(page: Page, place: str) -> None:
+    """Whether the page shows what the place names."""
+    p = page.page
+    page.wait(f"{ANCHOR} === {json.dumps('#' + place)}")
+    assert p.inner_text("#inspector h2").endswith(PLACES[place])
+    assert p.locator("#inspector dl.facts, #inspector table").count() > 0
+    assert "There is no such" not in p.inner_text("#inspector")
+    if place.startswith(("image=", "obs=", "epoch=")):
+        assert "tX05" in p.inner_text("#right .bar b")
+    if place.startswith(("obs=", "reading=", "param=")):
+        page.wait("document.querySelectorAll('#tables .row[aria-selected=true]').length > 0")
+
+
+@pytest.fixture(scope="module")
+def followed(browser: Any, address: str) -> Iterator[Page]:
+    """A page on which links are followed one after the other, its views as they are at first."""
+    with Page(browser, address, 1280) as found:
+        yield found
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_every_kind_of_place_opens_what_it_names(followed: Page, place: str) -> None:
+    followed.page.evaluate("location.hash = '#camera=X'")
+    followed.wait(f"{ANCHOR} === '#camera=X'")
+    followed.page.evaluate(f"location.hash = {json.dumps('#' + place)}")
+    opens(followed, place)
+
+
+@pytest.mark.parametrize("place", ["obs=image_point:X/tX05/board/c41", "reading=table_angles:turntable/tX05", "run=1"])
+def test_a_link_opens_what_it_names(browser: Any, address: str, place: str) -> None:
+    """From a terminal or a mail: behind the token, in a page that was not open before."""
     with Page(browser, f"{address}&{place}", 1280) as page:
-        p = page.page
         page.wait("document.body.dataset.results !== undefined")
-        if place.startswith("run="):
-            assert p.inner_text("#right h2") == "History"
+        if place == "run=1":
+            assert page.page.inner_text("#right h2") == "History"
         else:
-            assert p.inner_text("#inspector h2").endswith(shown)
-            assert p.locator("#inspector dl.facts, #inspector table").count() > 0
-            assert "There is no such" not in p.inner_text("#inspector")
-        if place.startswith(("image=", "obs=", "epoch=")):
-            assert "tX05" in p.inner_text("#right .bar b")
-        if place.startswith(("obs=", "reading=", "param=")):
-            page.wait("document.querySelectorAll('#tables .row[aria-selected=true]').length > 0")
+            opens(page, place)
 
 
 def test_the_address_of_a_run_shows_the_history(page: Page) -> None:

@@ -40,7 +40,7 @@ def level_residual(observation: Level, world_from_body: ChainPose, vertical: Ver
         up, up_by_x, up_by_tilt = up_at(vertical.at(values), pose.translation())
         u = R @ axis
         sine = float(u @ up)
-        cosine = float(np.linalg.norm(np.cross(u, up)))
+        cosine = float(np.linalg.norm(u - sine * up))
         by_pose = np.concatenate([-up @ R @ skew(axis), u @ up_by_x @ R])[None, :] / cosine
         blocks = [(key, by_pose @ J) for key, J in jacobians]
         if vertical.key is not None:
@@ -80,9 +80,10 @@ def spot_on_target(pose: Pose3, beam: FloatArray, axes: FloatArray) -> tuple[Flo
     s = -q[2] / d[2]
     # a point of the line moves by dq + s dd; back along the line onto z = 0
     onto = np.array([[1.0, 0.0, -d[0] / d[2]], [0.0, 1.0, -d[1] / d[2]]])
-    by_pose = onto @ np.hstack([-R @ skew(offset + s * along), R])
-    by_beam = onto @ np.hstack([R @ axes[:, :2], s * R @ axes[:, :2]])
-    return (q + s * d)[:2], by_pose, by_beam
+    moved = onto @ R
+    across = moved @ axes[:, :2]
+    by_pose = np.concatenate([-moved @ skew(offset + s * along), moved], axis=1)
+    return (q + s * d)[:2], by_pose, np.concatenate([across, s * across], axis=1)
 
 
 def surface_residual(observation: OnSurface, position: Position, surface: Surface, vector: VectorMap) -> Residual:

@@ -80,12 +80,9 @@ def _as_declared(size: tuple[int, int], board: Checkerboard) -> tuple[int, int]:
 
 
 def _other_boards(reports: "Sequence[ImageReport]", board: Checkerboard) -> list[tuple[int, int]]:
-    from survey.detection.checkerboard import other_board
+    from survey.detection.checkerboard import other_boards
     from survey.detection.gray import for_finding, gray_values, read_image
 
-    sizes = []
-    for report in [r for r in reports if r.status != "failed"][:: max(1, len(reports) // _LOOKED_AT)][:_LOOKED_AT]:
-        gray = gray_values(read_image(report.path))
-        size = other_board(gray, for_finding(gray), board)
-        sizes += [] if size is None else [size]
-    return sizes
+    some = [r for r in reports if r.status != "failed"][:: max(1, len(reports) // _LOOKED_AT)][:_LOOKED_AT]
+    grays = [gray_values(read_image(report.path)) for report in some]
+    return other_boards([(gray, for_finding(gray)) for gray in grays], board)
