@@ -60,12 +60,10 @@ def mean_poses(poses: FloatArray, lever: float, ptr: IntArray, members: IntArray
         poses[_medoids(poses, lever, part, member)]
         for part in np.split(np.column_stack([ptr[:-1], ptr[1:]]), range(_AT_ONCE, len(ptr) - 1, _AT_ONCE))
     ])  # fmt: skip
-    live = np.arange(len(mean))
+    live, of, here = np.arange(len(mean)), owner, poses
     for _ in range(_STEPS):
-        rows = np.isin(owner, live) if len(live) < len(mean) else np.ones(len(owner), dtype=np.bool_)
-        of, here = np.searchsorted(live, owner[rows]), poses[rows]
         distance = pose_distance(here, mean[live[of]], lever)
-        chosen = least(distance, member[rows])
+        chosen = least(distance, member)
         first = np.searchsorted(of[chosen], np.arange(len(live)))
         scale = np.maximum(3.0 * medians(distance[chosen], of[chosen], len(live)), 1e-12)
         weights = 1.0 / (1.0 + (distance[chosen] / scale[of[chosen]]) ** 2) ** 2
@@ -76,6 +74,9 @@ def mean_poses(poses: FloatArray, lever: float, ptr: IntArray, members: IntArray
         live = live[going]
         if not len(live):
             break
+        if not going.all():
+            rows = going[of]
+            of, here, member = (np.cumsum(going) - 1)[of[rows]], here[rows], member[rows]
     return mean
 
 
