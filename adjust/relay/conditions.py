@@ -30,13 +30,7 @@ from adjust.pose_network.cycles import connected_parts
 from adjust.pose_network.loops import Loops, evaluate_loops, loop_vectors
 from adjust.relay.loops import LoopBasis, loop_basis, loop_misclosures
 from adjust.relay.network import MeasuredPairs, gtsam_motion, prior_factor, station_values
-from adjust.relay.normal_equations import (
-    NormalEquations,
-    SparseNormals,
-    TreeNormals,
-    condition_matrix,
-    joint_covariance,
-)
+from adjust.relay.normal_equations import NormalEquations, SparseNormals, TreeNormals, joint_covariance
 from adjust.relay.result import AdjustedPairs, adjusted_pairs
 from adjust.spatial.rigid_motions import Motions, right_jacobian
 
@@ -78,8 +72,9 @@ def adjust_conditions(network: MeasuredPairs, options: ConditionOptions = Condit
 
     def step(X: Motions) -> FloatArray:
         at = _Linearised(network, basis, X)
-        multipliers = at.normals.solve(at.w.ravel() - at.B @ at.r.ravel())
-        return np.asarray(-at.r - (at.Q @ (at.B.T @ multipliers).reshape(*at.r.shape, 1))[..., 0])
+        B, Q = at.normals.B, at.normals.Q
+        multipliers = at.normals.solve(at.w.ravel() - B @ at.r.ravel())
+        return np.asarray(-at.r - (Q @ (B.T @ multipliers).reshape(*at.r.shape, 1))[..., 0])
 
     def advice() -> str:
         worst = loop_misclosures(network)
@@ -164,20 +159,19 @@ def _reach(network: MeasuredPairs) -> float:
 
 
 class _Linearised:
-    """Misclosures w, residuals r, cofactors Q, the conditions' matrix B, and their normal equations, at pairs X."""
+    """Misclosures w, residuals r and the normal equations of the conditions, at pairs X."""
 
     def __init__(self, network: MeasuredPairs, basis: LoopBasis, X: Motions) -> None:
         self.w, blocks = evaluate_loops(basis, X)
         self.r = (network.b_from_a.inverse() @ X).log()
         forward = right_jacobian(self.r)
-        self.Q = forward @ network.cov @ np.swapaxes(forward, -1, -2)
-        self.B = condition_matrix(basis, blocks)
+        Q = forward @ network.cov @ np.swapaxes(forward, -1, -2)
         by_tree = basis.tree is not None and 2 * len(basis) > len(np.unique(basis.pair_idx))
-        self.normals: NormalEquations = (TreeNormals if by_tree else SparseNormals)(basis, blocks, self.Q)
+        self.normals: NormalEquations = (TreeNormals if by_tree else SparseNormals)(basis, blocks, Q)
 
     def joint(self, pair_idx: Sequence[int]) -> FloatArray:
         """Joint covariance of some adjusted pairs, stacked."""
-        return joint_covariance(self.normals, self.B, self.Q, pair_idx)
+        return joint_covariance(self.normals, pair_idx)
 
 
 def _closed(

@@ -24,6 +24,9 @@ from adjust.relay.loops import LoopBasis
 class NormalEquations(Protocol):
     """N = B Q B' of one linearisation."""
 
+    B: sp.bsr_array
+    Q: FloatArray
+
     def solve(self, right: FloatArray) -> FloatArray:
         """N^-1 applied to columns (L dim, k) or one vector (L dim,)."""
 
@@ -67,7 +70,7 @@ class SparseNormals:
         graph, dims = _as_factors(self.N, dim), dict.fromkeys(range(len(self.basis)), dim)
         found = Elimination(gtsam.Ordering.ColamdGaussianFactorGraph(graph)).of(graph.eliminateMultifrontal)
         if found is None:
-            return np.array([joint_covariance(self, self.B, self.Q, [e]) for e in range(len(self.Q))])
+            return np.array([joint_covariance(self, [e]) for e in range(len(self.Q))])
         tree, out = TreeCovariance(Cliques.of(found, dims), dims), self.Q.copy()
         loop, order = np.repeat(np.arange(len(self.basis)), self.basis.lengths), np.argsort(of_pair, kind="stable")
         for rows in np.split(order, np.flatnonzero(np.diff(of_pair[order])) + 1) if len(order) else ():
@@ -83,17 +86,15 @@ class TreeNormals:
     def __init__(self, basis: LoopBasis, blocks: FloatArray, Q: FloatArray) -> None:
         if basis.tree is None:
             raise ValueError("these normal equations need the loops of a spanning tree")
-        dim, n_pairs = Q.shape[-1], basis.topology.n_pairs
-        first = basis.ptr[:-1]  # each loop begins with its own pair
-        self.Q, self.chords = Q, basis.tree.chord_idx
+        dim = Q.shape[-1]
+        self.B, self.Q, self.chords = condition_matrix(basis, blocks), Q, basis.tree.chord_idx
         self.tree_pairs = np.setdiff1d(np.unique(basis.pair_idx), self.chords)
-        own = blocks[first]
-        root = own @ np.linalg.cholesky(Q[self.chords])
+        self.own = blocks[basis.ptr[:-1]]  # each loop begins with its own pair
+        root = self.own @ np.linalg.cholesky(Q[self.chords])
         inverse_root = np.linalg.inv(root)
         self.D_inverse = block_diagonal(np.swapaxes(inverse_root, -1, -2) @ inverse_root)
         columns = (self.tree_pairs[:, None] * dim + np.arange(dim)).ravel()
-        self.U = condition_matrix(basis, blocks).tocsc()[:, columns].tocsr()
-        self.n_pairs, self.own = n_pairs, own
+        self.U = self.B.tocsc()[:, columns].tocsr()
         S_root_inverse = whitening(Q[self.tree_pairs])
         S_inverse = scipy.linalg.block_diag(*(np.swapaxes(S_root_inverse, -1, -2) @ S_root_inverse))
         self.capacitance = scipy.linalg.cho_factor(S_inverse + (self.U.T @ self.D_inverse @ self.U).toarray())
@@ -120,15 +121,13 @@ class TreeNormals:
         return out
 
 
-def joint_covariance(
-    normals: NormalEquations, B: sp.bsr_array, Q: FloatArray, pair_idx: Sequence[int] | IntArray
-) -> FloatArray:
+def joint_covariance(normals: NormalEquations, pair_idx: Sequence[int] | IntArray) -> FloatArray:
     """Q_ij - Q_i B_i' N^-1 B_j Q_j of some adjusted pairs, stacked; one solution per column, no inverse."""
-    dim, k = Q.shape[-1], len(pair_idx)
+    Q, dim, k = normals.Q, normals.Q.shape[-1], len(pair_idx)
     index = np.asarray(pair_idx, dtype=np.int64)
     columns = (index[:, None] * dim + np.arange(dim)).ravel()
     own = scipy.linalg.block_diag(*Q[index]) if k else np.zeros((0, 0))
-    BQ = B.tocsc()[:, columns].toarray() @ own
+    BQ = normals.B.tocsc()[:, columns].toarray() @ own
     return np.asarray(own - BQ.T @ normals.solve(BQ))
 
 

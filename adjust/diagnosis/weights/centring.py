@@ -1,7 +1,7 @@
 """Instruments and targets that do not stand over their points, and have no sigma for it: short sights miss most.
 
-Variance components beside the readings' own, by restricted maximum likelihood (Patterson, Thompson 1971): an error of
-sigma s (m) in each horizontal direction, of a target in each reading, of an instrument in all readings of its set-up.
+Variance components beside the readings' own, by restricted maximum likelihood: an error of sigma s (m) in each
+horizontal direction, of a target in each reading, of an instrument in all readings of its set-up.
 """
 
 from collections.abc import Iterator, Sequence
@@ -11,6 +11,7 @@ import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
+from adjust.diagnosis.weights.likeliest import likeliest_size
 from adjust.model.names import grouped
 from adjust.model.result import Adjustment
 from adjust.model.rewriting import with_rows
@@ -24,7 +25,7 @@ _MOST = 1_500
 _ALPHA = 1e-4
 _SEEN = 0.05
 """Share of a set-up's error that the unknowns leave, below which its point moves with it and it does no harm."""
-_SIZES = 1e-5 * np.geomspace(1.0, 3_000.0, 25)
+_SIZES = tuple((1e-5 * np.geomspace(1.0, 3_000.0, 25)).tolist())
 """m, of sigmas that are tried: 0.01 to 30 mm, two of each doubling; what the largest suits best is something else."""
 _LESS_LIKELY = 10.0
 """Minus twice the log likelihood by which the sigma of one explains less than that of another, and is not tried."""
@@ -66,7 +67,7 @@ def missing_centring(case: Case) -> Iterator[Hypothesis]:
     shown = [(e, own) for e, own in zip(errors, at, strict=True) if _shows(e, M[own, own])]
     targets, instruments = ([one for one in shown if bool(one[0].setup_id) == of] for of in (False, True))
     sets = [one for one in (targets, instruments) if one]
-    every = [(some, *_likeliest(b, M, np.concatenate([own for _, own in some])))
+    every = [(some, *likeliest_size(b[own := np.concatenate([of for _, of in some])], M[np.ix_(own, own)], _SIZES))
              for some in (*sets, *([shown] if len(sets) > 1 else []))]  # fmt: skip
     least = min((cost for *_, cost in every), default=0.0)
     most = min(-float(chi2.isf(_ALPHA, 1)), least + _LESS_LIKELY, _with_factors(linear.result))
@@ -97,21 +98,8 @@ def _shows(error: _Error, left: FloatArray) -> bool:
     return not error.setup_id or bool(left.sum() > _SEEN * (error.B**2).sum())
 
 
-def _likeliest(b: FloatArray, M: FloatArray, at: IntArray) -> tuple[float, float]:
-    """That of ``_SIZES``, and minus twice the logarithm of its restricted likelihood over that of none.
-
-    With ``b = B'e`` and M, what the unknowns leave of B'B, v'Pv falls by ``b' inv(M + I / s^2) b`` where the errors
-    ``at`` have variances s^2; ``log det (I + s^2 M)`` counts against it.
-    """
-    values, axes = np.linalg.eigh(M[np.ix_(at, at)])
-    along, left = (axes.T @ b[at]) ** 2, _SIZES[:, None] ** 2 * np.maximum(values, 0.0)
-    costs = (np.log1p(left) - _SIZES[:, None] ** 2 * along / (1.0 + left)).sum(axis=1)
-    best = int(np.argmin(costs))
-    return float(_SIZES[best]), float(costs[best])
-
-
 def _with_factors(result: Adjustment) -> float:
-    """As :func:`_likeliest`, with sigmas of every group of readings times a factor instead: where that says more."""
+    """As :func:`likeliest_size`, with the sigmas of every group of readings times a factor: where that says more."""
     groups = {r.group for r in result.survey.readings}
     tested = [g for g in result.groups if g.group in groups and g.omega > g.redundancy > 0.0]
     return sum(g.redundancy * float(np.log(g.omega / g.redundancy) + 1.0) - g.omega for g in tested)

@@ -11,6 +11,7 @@ import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
+from adjust.diagnosis.weights.likeliest import likeliest_size
 from adjust.model.names import grouped
 from adjust.model.observations import ReadingCovariance
 from adjust.model.survey import FloatArray, IntArray, Survey
@@ -52,22 +53,13 @@ def correlated_readings(case: Case) -> Iterator[Hypothesis]:
 
 
 def _best_size(case: Case, found: Sequence[_Common]) -> tuple[float, float]:
-    """That of ``_SIZES`` for which all residuals are likeliest, and minus twice the logarithm of that, less a constant.
-
-    With the sums s of the whitened residuals of each set and M, what the unknowns leave of their sizes n, v'Pv falls by
-    ``s' inv(M + inv(K)) s`` where the sets have errors of variances K in common; log det of ``I + n K`` counts against.
-    """
+    """That of ``_SIZES`` for which all residuals are likeliest, see :func:`likeliest_size`."""
     if case.linear is None:
         return _UNKNOWN, 0.0
-    sets, own = [s for _, of, _ in found for s in of], np.array([k for _, of, k in found for _ in of])
+    sets, own = [s for _, of, _ in found for s in of], np.array([max(k, 1e-6) for _, of, k in found for _ in of])
     first = case.linear.system.ptr[-1 - len(case.survey.readings)]
     s, M = case.linear.apart([(first + rows, np.ones((len(rows), 1))) for rows in sets])
-    n, costs = np.array([len(rows) for rows in sets]), list[float]()
-    for size in _SIZES:
-        K = (size * np.maximum(own, 1e-6)) ** 2
-        costs.append(float(np.log1p(n * K).sum() - s @ np.linalg.solve(M + np.diag(1.0 / K), s)))
-    best = int(np.argmin(costs))
-    return _SIZES[best], costs[best]
+    return likeliest_size(own * s, M * np.outer(own, own), _SIZES)
 
 
 def _sets(survey: Survey, kind: str) -> list[IntArray]:
