@@ -114,12 +114,13 @@ def test_three_mistakes_are_mended_in_the_page_alone(page: tuple[Page, Path]) ->
     assert "mirrored" in p.inner_text("#left .remedy")
     click("#left .remedy button", "Apply", renews=True)
     counts.append(click.n)
-    assert p.locator("#left .remedy").count() == 0
+    assert "table turntable, epoch" in p.inner_text("#left .remedy")  # which may be mended so, or left out
     click.leave_out(POINT, "reflection")
     counts.append(click.n - sum(counts))
     click.leave_out(READING, "misread")
     counts.append(click.n - sum(counts))
     assert p.inner_text("#verdict") == "✓ Passed"
+    assert p.locator("#left .remedy").count() == 0
     assert counts == [1, 3, 3]
     rows, _ = read_exclusions(folder / "observations")
     assert [(f"{r.exclusion.name}", r.exclusion.reason) for r in rows] == [(POINT, "reflection"), (READING, "misread")]

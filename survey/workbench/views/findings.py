@@ -50,7 +50,9 @@ def remedies(bench: Resident) -> list[dict[str, Any]]:
 
 
 def _anchor_of(place: "Place") -> str | None:
-    """Where a hypothesis sits, as a place of the page."""
+    """Where a hypothesis sits, as a place of the page: of a table the reading, where it is one."""
+    if place.kind == "table" and len(place.epochs) == 1:
+        return anchor("reading", f"table_angles:{'/'.join((*place.ids, *place.epochs))}")
     return anchor(place.kind, "/".join(place.ids)) if place.kind in ANCHORED and place.ids else None
 
 

@@ -8,8 +8,10 @@ import { post } from "./source.js";
 import { verdictText } from "./header.js";
 import { placeOf } from "./tree.js";
 
+/** A link to what an anchor names, whose picture is fetched when it is pointed at. */
+const place = (to, id = decodeURIComponent(to.replace(/^#\w+=/, "")), text = id) => [" ", link(to, text, { data: { id } })];
 /** The places that a message names. */
-const places = (said) => said.anchors.flatMap((to) => [" ", link(to, decodeURIComponent(to.replace(/^#\w+=/, "")), { data: { id: decodeURIComponent(to.replace(/^#\w+=/, "")) } })]);
+const places = (said) => said.anchors.flatMap((to) => place(to));
 
 export class FindingsView {
   /** @param {any} bench @param {any} actions */
@@ -66,7 +68,7 @@ export class FindingsView {
   /** A cause that was tried: what it explains, and one click that carries it out. */
   remedy(r) {
     const evidence = t("explains {share} % of the misfit; sigma0 becomes {sigma0}; test {test}, limit {limit}; probability {sure} %", { share: number(100 * r.explained, 0), sigma0: number(r.sigma0, 3), test: significant(r.statistic, 3), limit: significant(r.critical, 3), sure: number(100 * r.probability, 0) });
-    return make("div", { class: "cause remedy" }, make("p", {}, make("b", {}, `${r.number}. ${r.cause}`), "; ", r.change, r.where ? [" ", make("code", {}, r.where)] : null, r.anchor ? [" ", link(r.anchor, t("show"))] : null), make("p", { class: "quiet" }, evidence),
+    return make("div", { class: "cause remedy" }, make("p", {}, make("b", {}, `${r.number}. ${r.cause}`), "; ", r.change, r.where ? [" ", make("code", {}, r.where)] : null, r.anchor ? place(r.anchor, undefined, t("show")) : null), make("p", { class: "quiet" }, evidence),
       this.bench.state.read_only ? null : r.possible ? button(t("Apply"), () => this.actions.remedy(r.number), r.number === 1 ? "m" : "", { "aria-label": `${t("Apply")}: ${r.cause}` }) : make("p", { class: "quiet" }, t("Only you can do that.")));
   }
 
