@@ -178,6 +178,7 @@ def test_false_alarms_at_the_nominal_rate() -> None:
     assert low <= single <= high
 
 
+@pytest.mark.slow
 def test_no_group_is_taken_for_too_confident_because_its_tests_agree_with_each_other() -> None:
     """Corridors of pairs, of whose redundancy there is a third: their tests vary 1.5 times as much as as many coins.
 

@@ -109,6 +109,7 @@ def test_uneven_times_do_not_enlarge_noise() -> None:
     assert np.sqrt(np.mean(shown**2)) < 1.2e-3
 
 
+@pytest.mark.slow
 def test_a_tracker_without_noticeable_errors_is_no_failure() -> None:
     exact = walk(np.random.default_rng(8), np.zeros(2), np.zeros(2))
     common = common_motions(exact, CLOCKS, 1.0)

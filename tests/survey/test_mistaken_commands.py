@@ -79,6 +79,7 @@ def test_trajectories_that_cannot_be_meant(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_millimetres_are_told(labs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(labs / "walk", tmp_path / "walk")
     path = tmp_path / "walk" / "trajectories" / "b.csv"
@@ -90,6 +91,7 @@ def test_millimetres_are_told(labs: Path, tmp_path: Path, capsys: pytest.Capture
     assert "lengths of c" not in out
 
 
+@pytest.mark.slow
 def test_gaps_are_left_out(labs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(labs / "walk", tmp_path / "walk")
     path = tmp_path / "walk" / "trajectories" / "b.csv"

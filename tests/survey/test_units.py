@@ -201,6 +201,7 @@ def test_rows_that_are_written_as_others_are_read(name: str, tmp_path: Path) -> 
     assert main(["adjust", str(lab), "--quiet", "--try", "1"]) == 0
 
 
+@pytest.mark.slow
 def test_height_differences_of_the_other_sign_are_named_without_a_search(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -261,6 +262,7 @@ def test_a_table_reading_of_another_epoch_is_told(tmp_path: Path, capsys: pytest
     assert told in shown
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2])
 def test_distances_in_metres_among_millimetres_are_left_out_and_named(
     count: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
