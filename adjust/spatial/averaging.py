@@ -11,6 +11,11 @@ _STEPS = 20
 _SETTLED = 1e-4  # of the scale: a further step tells nothing that the motions do
 
 
+def wrapped(angles: FloatArray) -> FloatArray:
+    """Angles (...) rad as the nearest turns, from minus half a turn to half a turn."""
+    return np.asarray((angles + np.pi) % (2.0 * np.pi) - np.pi)
+
+
 def circular_median(angles: FloatArray) -> float:
     """The angle nearest to all others (least sum of absolute differences), of those given; zero of none."""
     return float(circular_medians(angles[None])[0]) if len(angles) else 0.0
@@ -19,7 +24,7 @@ def circular_median(angles: FloatArray) -> float:
 def circular_medians(angles: FloatArray) -> FloatArray:
     """The same (m,) of each row of angles (m, n), n > 0."""
     some = angles[:, :: max(1, angles.shape[1] // 64)]
-    turns = (angles[:, None, :] - some[:, :, None] + np.pi) % (2.0 * np.pi) - np.pi
+    turns = wrapped(angles[:, None, :] - some[:, :, None])
     rows, best = np.arange(len(angles)), np.abs(turns).sum(axis=2).argmin(axis=1)
     return np.asarray(some[rows, best] + np.median(turns[rows, best], axis=1))
 

@@ -12,7 +12,7 @@ from adjust.diagnosis.between import Between, causes_between
 from adjust.epochs.congruence import CongruenceOptions, congruence
 from adjust.epochs.congruence_result import Congruence, CongruenceTest, Motion
 from adjust.epochs.deformation import Deformation, station_deformations
-from adjust.model.errors import SurveyError
+from adjust.model.errors import SurveyError, listed
 from adjust.model.result import Adjustment
 from adjust.observations.copies import shared_observations
 from survey.folder.plain import attributes, plain
@@ -57,8 +57,8 @@ class CompareOutcome:
             {*(p.point_id for p in a.survey.points), *(s.station_id for s in a.survey.stations)}
             for a in self.adjustments
         )
-        said = [f"{folder}: {', '.join(sorted(own)[:4])}{f' and {len(own) - 4} more' if len(own) > 4 else ''}"
-                for folder, own in zip(self.folders, (first - second, second - first), strict=True) if own]  # fmt: skip
+        apart = zip(self.folders, (first - second, second - first), strict=True)
+        said = [f"{folder}: {listed(sorted(own), 4)}" for folder, own in apart if own]
         return () if len(first & second) >= len(first ^ second) / 2 else (
             f"only {len(first & second)} stations and points stand in both epochs, the others in one "
             f"({'; '.join(said)}), where they are not compared; give the same things the same ids",

@@ -13,6 +13,7 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.model.survey import FloatArray, Point, Station, Table
+from adjust.spatial.averaging import wrapped
 from adjust.spatial.rigid import rigid
 from survey.project.targets import Charuco, Checkerboard, MarkerGrid, TargetKind
 from survey.simulate.draft import (
@@ -245,7 +246,7 @@ def turn_to_walls(draft: Draft, letter: str, n: int) -> list[str]:
         level = np.pi * (number // 4 % 2)
         wobble = np.radians(draft.rng.uniform(-5.0, 5.0, 2))
         angles = np.array([level, number % 4 * np.pi / 2]) + wobble
-        epochs.append(add_table_epoch(draft, letter, (angles + np.pi) % (2.0 * np.pi) - np.pi))
+        epochs.append(add_table_epoch(draft, letter, wrapped(angles)))
     return epochs
 
 

@@ -143,7 +143,7 @@ def test_sigmas_are_named_in_the_unit_of_their_column(name: str, tmp_path: Path)
     example, table, change, said, by = SIGMAS[name]
     lab = planted(tmp_path / "lab", example, table, change)
     assert main(["adjust", str(lab), "--quiet"]) == 3
-    (first, *_) = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))["diagnosis"]
+    (first, *_) = diagnosis_of(lab)
     assert (first["name"], said in first["cause"], by in first["change"]) == ("unit of sigmas", True, True)
 
 
@@ -155,7 +155,7 @@ def test_lengths_in_a_column_of_metres(factor: float, unit: str, setup_id: str, 
     lab = planted(tmp_path / "lab", "total-station", "terrestrial", scaled(
         "value_m", factor, lambda row: setup_id in ("", row["setup_id"])))  # fmt: skip
     assert main(["adjust", str(lab), "--quiet"]) == FAILED
-    (first, *_) = json.loads((lab / "results" / "unsolved.json").read_text(encoding="utf-8"))["diagnosis"]
+    (first, *_) = diagnosis_of(lab)
     assert (first["name"], setup_id in first["cause"]) == ("unit of lengths", True)
     assert f"are {unit}, read as metres" in first["cause"]
     assert f"multiply them by {1.0 / factor:g}" in first["change"]
@@ -210,7 +210,7 @@ def test_height_differences_of_the_other_sign_are_named_without_a_search(
         "value_m", -1.0, lambda row: row["kind"] == "height_difference"))  # fmt: skip
     monkeypatch.delattr("adjust.statistics.screened_adjustment.search_outliers")
     assert main(["adjust", str(lab), "--quiet"]) == 3
-    (first, *more) = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))["diagnosis"]
+    first, *more = diagnosis_of(lab)
     assert (first["name"], first["probability"] > 0.99, more) == ("sign of height differences", True, [])
     assert first["change"] == "in terrestrial.csv give them the other sign, or exchange from_id and to_id"
 

@@ -17,11 +17,11 @@ from adjust.diagnosis.table.rereading import (
     reading_scatter,
     renumbered,
     reread,
-    wrapped,
 )
 from adjust.diagnosis.table.views import TableViews
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import PoseParameter, Survey
+from adjust.spatial.averaging import wrapped
 
 _MOST = 0.25
 """Share of the epochs up to which it is single ones that disagree."""

@@ -7,6 +7,7 @@ import numpy as np
 from adjust.diagnosis.table.fit import TableFit, residuals
 from adjust.diagnosis.table.views import TableViews
 from adjust.model.survey import FloatArray, IntArray, Target
+from adjust.spatial.averaging import wrapped
 from adjust.spatial.rigid import inverse, rotation_exp, rotation_log, transform
 from adjust.testing.distributions import chi2
 
@@ -67,11 +68,6 @@ def reading_scatter(views: TableViews, fit: TableFit) -> FloatArray:
     good = good[:: max(1, len(good) // 12)]
     off = [np.abs(wrapped(reread(views, fit, e).angles - views.angles[e])) for e in good]
     return np.asarray(1.4826 * np.median(off, axis=0)) if off else np.zeros(views.angles.shape[1])
-
-
-def wrapped(angle: FloatArray) -> FloatArray:
-    """Angles (...,) rad as the nearest turn, from minus half a turn to half a turn."""
-    return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 def _angles(views: TableViews, R: FloatArray) -> FloatArray:

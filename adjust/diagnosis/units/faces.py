@@ -8,15 +8,14 @@ import numpy as np
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import ChangeReadings, Hypothesis, Place, Rename
 from adjust.diagnosis.screen import Screen, at_best, improvement, screen
+from adjust.diagnosis.units.readings import LARGE_START
 from adjust.model.errors import listed
 from adjust.model.observations import ReadingKind
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import IntArray, Survey
-from adjust.spatial.averaging import circular_median
+from adjust.spatial.averaging import circular_median, wrapped
 
 _CLEARLY = 3.0
-_LARGE_START = 2500
-"""Readings up to which start values are found anew."""
 _OTHER: dict[ReadingKind, ReadingKind] = {
     "horizontal_distance": "slope_distance", "slope_distance": "horizontal_distance"}  # fmt: skip
 
@@ -53,7 +52,7 @@ def _turned_over(before: Screen, mine: IntArray) -> IntArray:
     if batch is None or not len(mine):
         return mine[:0]
     miss = batch.residual[mine]
-    off = np.abs(np.angle(np.exp(1j * (miss - 0.5 * circular_median(2.0 * miss)))))
+    off = np.abs(wrapped(miss - 0.5 * circular_median(2.0 * miss)))
     far = off > 0.5 * np.pi
     return np.asarray(mine[far if 2 * far.sum() <= len(far) else ~far])
 
@@ -61,7 +60,7 @@ def _turned_over(before: Screen, mine: IntArray) -> IntArray:
 def other_kinds(case: Case) -> Iterator[Hypothesis]:
     """All distances of a kind, where they fit the survey's own start as those of the other kind."""
     survey, n = case.survey, len(case.survey.readings)
-    if survey.image_blocks or not case.few("distances of another kind", n, _LARGE_START):
+    if survey.image_blocks or not case.few("distances of another kind", n, LARGE_START):
         return
     before = at_best(case) if n else None
     if before is None:

@@ -38,7 +38,7 @@ _SPOILT = 1e6
 """Variance factor of a start at which even the typical observation misses by a thousand sigmas."""
 _SUSPECTS = 3
 """Set-ups without whose angles the start is looked for: the one that it begins with may turn all others over."""
-_LARGE_START = 2500
+LARGE_START = 2500
 """Readings up to which start values are found anew for every hypothesis that concerns all of a kind."""
 _Way = tuple[Scope, Misreading]
 _Found = tuple[float, Scope, Misreading]
@@ -131,7 +131,7 @@ def _evidence(survey: Survey, before: Screen | None, values: FloatArray, ways: S
         whole = [w or (before.scale > _SPOILT and way[1].name == UNIT_OF_LENGTHS)
                  for w, way in zip(whole, ways, strict=True)]  # fmt: skip
         misread = [i for i, w in enumerate(whole) if w and not _fits_as_it_is(before, ways[i][0].rows)]
-        anew, there = (misread, []) if n <= _LARGE_START else ([], misread)
+        anew, there = (misread, []) if n <= LARGE_START else ([], misread)
         # where all others fit, the start is not spoilt, and of a few readings it says more than a new one of all
         there += [i for i, w in enumerate(whole) if not w or (i in anew and _others_fit(before, ways[i][0].rows))]
     surveys, out = [mended(survey, ways[i][0].rows, ways[i][1]) for i in anew], [0.0] * len(ways)
