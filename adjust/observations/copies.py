@@ -34,7 +34,7 @@ def copied_observations(survey: Survey) -> dict[str, tuple[tuple[str, str], ...]
     Images of a camera at two epochs, pairs of the same frames; distances and readings of a set-up where almost all that
     were made again came out the same.
     """
-    pairs = (((p.a.text, p.b.text, p.b_from_a.matrix().tobytes()), p.pair_id) for p in survey.pairs if p.used)
+    pairs = ((_value(p), p.pair_id) for p in survey.pairs if p.used)
     distances = [((d.a, d.b), d.value, d.distance_id) for d in survey.distances if d.used]
     readings = [((r.kind, r.setup_id, r.at, r.to, r.second), r.value, r.reading_id) for r in survey.readings if r.used]
     found = {"images": _same_images(survey.image_blocks), "pairs": _same(pairs),
