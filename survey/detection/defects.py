@@ -94,15 +94,13 @@ def interlaced_fields(gray: Gray32) -> ImageDefect | None:
     even = gray.copy()
     even[1::2] = np.roll(gray[1::2], -begin, axis=1)  # what is left to go is small
     mean = cv2.sepFilter2D(even, cv2.CV_32F, np.ones((1, 1), np.float32), _BINOMIAL)
-    du, dv = (cv2.Sobel(mean, cv2.CV_32F, *by, ksize=1) / 2.0 for by in ((1, 0), (0, 1)))
-    sign = np.where(np.arange(len(gray)) % 2, 1.0, -1.0)[:, None]
-    comb = sign * (even - mean)
-    used = np.hypot(du, dv) > _EDGE * float(np.ptp(mean))
+    du, dv = _gradient(mean)
+    used = cv2.magnitude(du, dv) > _EDGE * float(np.ptp(mean))
     used[:, : _FASTEST_PX + 1] = used[:, -_FASTEST_PX - 1 :] = False
 
     def columns(at: tuple[IntArray, ...]) -> tuple[FloatArray, FloatArray, FloatArray]:
         X = np.stack([-du[at], -dv[at], mean[at]])
-        return X, X, comb[at]
+        return X, X, np.where(at[0] % 2, 1.0, -1.0) * (even[at] - mean[at])
 
     fit = _by_tiles(used, columns)
     if fit is None:
@@ -126,14 +124,14 @@ def motion_blur(gray: Gray32) -> ImageDefect | None:
     from the direction in which most edges stand or lie.
     """
     smooth = cv2.GaussianBlur(gray, (0, 0), _SMOOTHING_PX)
-    du, dv = (cv2.Sobel(smooth, cv2.CV_32F, *by, ksize=1) / 2.0 for by in ((1, 0), (0, 1)))
+    du, dv = _gradient(smooth)
     window = np.ones((2 * _REACH_PX + 1,) * 2, np.uint8)
-    contrast, slope = cv2.dilate(smooth, window) - cv2.erode(smooth, window), np.hypot(du, dv)
+    contrast, slope = cv2.dilate(smooth, window) - cv2.erode(smooth, window), cv2.magnitude(du, dv)
     parts = [cv2.GaussianBlur(np.asarray(x), (0, 0), 3.0) for x in (du * du, dv * dv, du * dv)]
-    one_way = np.hypot(parts[0] - parts[1], 2.0 * parts[2]) > _STRAIGHT * (parts[0] + parts[1])
+    one_way = cv2.magnitude(parts[0] - parts[1], 2.0 * parts[2]) > _STRAIGHT * (parts[0] + parts[1])
     used = one_way & (slope > _EDGE * contrast) & (contrast > 0.3 * float(contrast.max()))
-    four = ((du[used] + 1j * dv[used]) ** 4 / np.maximum(slope[used], 1e-9) ** 2).sum()
-    middle = float(np.angle(four)) / 2.0
+    double = (du[used] + 1j * dv[used]) ** 2
+    middle = float(np.angle((double * double / np.maximum(slope[used], 1e-9) ** 2).sum())) / 2.0
 
     def columns(at: tuple[IntArray, ...]) -> tuple[FloatArray, FloatArray, FloatArray]:
         g = slope[at]
@@ -156,6 +154,15 @@ def motion_blur(gray: Gray32) -> ImageDefect | None:
     )  # fmt: skip
 
 
+def _gradient(gray: cv2.typing.MatLike) -> tuple[Gray32, Gray32]:
+    """Along rows and along columns: half of what the neighbours on both sides differ by."""
+    return _half_difference(gray, 1, 0), _half_difference(gray, 0, 1)
+
+
+def _half_difference(gray: cv2.typing.MatLike, u: int, v: int) -> Gray32:
+    return np.asarray(cv2.Sobel(gray, cv2.CV_32F, u, v, ksize=1, scale=0.5), np.float32)
+
+
 _BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
 _Columns = Callable[[tuple[IntArray, ...]], tuple[FloatArray, FloatArray, FloatArray]]
 
@@ -172,8 +179,9 @@ def _by_tiles(used: BoolArray, columns: _Columns) -> tuple[FloatArray, FloatArra
     rows, cols = at = np.divmod(of, used.shape[1])
     H, X, y = columns(at)
     edge = -(-max(used.shape) // _TILES)
-    tile = np.unique((rows // edge) * _TILES + cols // edge, return_inverse=True)[1]
-    n = int(tile.max()) + 1
+    place = (rows // edge) * _TILES + cols // edge
+    there = np.bincount(place) > 0
+    n, tile = int(there.sum()), (np.cumsum(there) - 1)[place]
 
     def summed(products: FloatArray) -> FloatArray:
         return np.array([np.bincount(tile, p, n) for p in products]).T

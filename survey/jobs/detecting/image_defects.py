@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from adjust.model.survey import Survey
+from adjust.native.parallel import side_by_side
 from survey.project.detected import DetectedImage, ImageKey, named
 
 if TYPE_CHECKING:  # brings in OpenCV
@@ -30,15 +31,17 @@ _REMEDIES = {
 
 def defects(reports: "Sequence[ImageReport]") -> dict[ImageKey, str]:
     """By image what is wrong with it, and the measure of that, of those that were looked at."""
-    found = {}
-    for report in _chosen([r for r in reports if r.status != "failed"]):
-        from survey.detection.defects import image_defect
-        from survey.detection.gray import gray_values, read_image
+    chosen = _chosen([r for r in reports if r.status != "failed"])
+    texts = side_by_side(_defect, chosen)
+    return {(r.camera_id, r.epoch_id): text for r, text in zip(chosen, texts, strict=True) if text}
 
-        defect = image_defect(_region(gray_values(read_image(report.path)), report))
-        if defect is not None:
-            found[report.camera_id, report.epoch_id] = defect.text
-    return found
+
+def _defect(report: "ImageReport") -> str:
+    from survey.detection.defects import image_defect
+    from survey.detection.gray import gray_values, read_image
+
+    defect = image_defect(_region(gray_values(read_image(report.path)), report))
+    return defect.text if defect is not None else ""
 
 
 def _chosen(reports: "Sequence[ImageReport]") -> "list[ImageReport]":
