@@ -32,7 +32,6 @@ from survey.jobs.relay import (
     relay_text,
     relay_trackers,
     tracker_pairs,
-    unit_warnings,
 )
 from survey.project import AdjustmentOptions, write_project
 from survey.project.project import DEFINITION_FILE
@@ -144,7 +143,7 @@ def _from_trajectories(folder: Path, station: str | None) -> RelayPairs:
     trackers = relay_trackers(read_trajectories(by_id))
     eyes = tracker_pairs(trackers)
     joint = adjust_eyes(sequences(one_metre(trackers), trackers.drift))
-    return RelayPairs(eyes, looped(eyes), joint, unit_warnings(trackers.joint))
+    return RelayPairs(eyes, looped(eyes), joint, trackers.warnings)
 
 
 def star(found: RelayPairs) -> tuple[Pair, ...]:

@@ -30,6 +30,7 @@ from survey.project.tables.files import write_table
 from survey.project.tables.pairs import pair_columns
 
 _INTERVALS_S = (1.0, 1.5, 2.0, 3.0, 4.0)
+_MISSED = 0.5  # of the sigma of a motion that the cubics between poses may miss
 _GROWTH_S = (0.1, 0.3, 1.0, 3.0, 9.0)
 _COLUMNS = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 
@@ -53,7 +54,10 @@ class RelayPairs:
 
 @dataclass(frozen=True, eq=False)
 class RelayTrackers:
-    """What trackers on one station gave: clocks against the first, drift, pairs; growth (L, k - 1, 2) by interval."""
+    """What trackers on one station gave: clocks against the first, drift, pairs; growth (L, k - 1, 2) by interval.
+
+    warnings: what the trajectories look like that they should not.
+    """
 
     offsets: tuple[TimeOffset, ...]
     drift: DriftModel
@@ -61,6 +65,7 @@ class RelayTrackers:
     joint: EyeAdjustment
     growth_intervals_s: tuple[float, ...]
     growth: FloatArray
+    warnings: tuple[str, ...] = ()
 
 
 def relay_pairs(source: Path | str | Survey | Adjustment, station_id: str | None = None) -> RelayPairs:
@@ -87,7 +92,8 @@ def relay_trackers(trajectories: Sequence[Trajectory]) -> RelayTrackers:
     drift, joint, common = choose_interval(trajectories, shifts, _INTERVALS_S)
     fitting = tuple(s for s in _GROWTH_S if 2.0 * s < np.ptp(common.times_s))
     grown = growth(trajectories, shifts, joint, fitting)
-    return RelayTrackers(offsets, drift, common, joint, fitting, grown)
+    warnings = _unit_warnings(joint) + _rate_warnings(trajectories, drift)
+    return RelayTrackers(offsets, drift, common, joint, fitting, grown, warnings)
 
 
 def tracker_pairs(found: RelayTrackers) -> EyePairs:
@@ -102,7 +108,7 @@ def one_metre(found: RelayTrackers) -> CommonMotions:
     return replace(common, motions=tuple(motions))
 
 
-def unit_warnings(joint: EyeAdjustment) -> tuple[str, ...]:
+def _unit_warnings(joint: EyeAdjustment) -> tuple[str, ...]:
     """Trackers whose lengths are a power of ten of the first one's."""
     powers = {eye: np.log10(scale) for eye, scale in joint.scales.items()}
     return tuple(
@@ -110,6 +116,23 @@ def unit_warnings(joint: EyeAdjustment) -> tuple[str, ...]:
         "metres; write x, y, z of all in metres"
         for eye, p in powers.items() if round(p) and abs(p - round(p)) < 0.02
     )  # fmt: skip
+
+
+def _rate_warnings(trajectories: Sequence[Trajectory], drift: DriftModel) -> tuple[str, ...]:
+    """Trackers whose motion between poses is uncertain, in what motions of theirs are uncertain by in all."""
+    out = []
+    for i, x in enumerate(trajectories):
+        missed = x.missed_between()
+        whole = np.array([drift.rotation[i], drift.position[i]]) * np.sqrt(drift.interval_s)
+        if (missed > _MISSED * whole).any():
+            rate = (len(x.times_s) - 1) / np.ptp(x.times_s)
+            enough = rate * float((missed / (_MISSED * whole)).max() * 3.0) ** 0.25
+            out.append(
+                f"{x.eye.frame_id}: {rate:.2g} poses a second are too few for its motion: those in between are off by "
+                f"{1e3 * missed[0]:.2g} mrad and {1e3 * missed[1]:.2g} mm, which sigmas hold in part only and which "
+                f"opens triangles; record {np.ceil(enough):.0f} a second, or move more slowly"
+            )
+    return tuple(out)
 
 
 def read_trajectory(text: str, eye_id: str, name: str = "trajectory") -> Trajectory:
@@ -189,7 +212,7 @@ def relay_text(found: RelayPairs) -> str:
 def trackers_text(found: RelayTrackers) -> str:
     """Summary for people: clocks, drift, scales, pairs."""
     ids = [eye.frame_id for eye in found.common.eyes]
-    lines = [f"left out: {outlier}" for outlier in found.joint.outliers]
+    lines = [*found.warnings, *(f"left out: {outlier}" for outlier in found.joint.outliers)]
     for eye, o in zip(ids[1:], found.offsets, strict=True):
         lines.append(
             f"clock of {eye}: {o.offset_s:+.4f} s against {ids[0]} (sigma {1e3 * o.sigma_s:.1f} ms, drift "

@@ -136,3 +136,32 @@ def test_motions_that_repeat_themselves_tell_no_clock() -> None:
     ]  # fmt: skip
     with pytest.raises(SurveyError, match="the motion repeats itself or is too quick"):
         time_offset(*both)
+
+
+def test_what_cubics_miss_is_told_apart_from_noise() -> None:
+    how = np.stack([np.full((2, 3), 0.4), np.ones((2, 3))])
+    rng = np.random.default_rng(4)
+    for rate, noise in ((5.0, 0.0), (5.0, 1e-3), (10.0, 1e-4)):
+        t = np.arange(0.0, 120.0, 1.0 / rate)
+        middle = t[5:-6] + 0.5 / rate
+        body, way = carried(t, how)
+        exact = Trajectory(FrameRef("camera", "a"), t, Motions(body.as_matrix(), way))
+        turned = Rotation.from_rotvec(noise * rng.standard_normal((len(t), 3)))
+        noisy = Motions((body * turned).as_matrix(), way + noise * rng.standard_normal((len(t), 3)))
+        true, there = carried(middle, how)
+        found = exact.at(middle)
+        missed = (
+            np.sqrt(np.mean((Rotation.from_matrix(found.rotation).inv() * true).as_rotvec() ** 2)),
+            np.sqrt(np.mean((found.shifts - there) ** 2)),
+        )
+        told = replace(exact, world_from_eye=noisy).missed_between()
+        np.testing.assert_allclose(told, missed, rtol=0.3)
+
+
+@pytest.mark.slow
+def test_poses_too_far_apart_for_the_motion_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    for rates, named in (((30.0, 5.0, 15.0), ["b"]), ((30.0, 10.0, 15.0), [])):
+        monkeypatch.setattr("tests.adjust.test_relay_trajectories.RATES", rates)
+        found = relay_trackers(walk(np.random.default_rng([5, 1]), np.full(2, 1e-4), np.zeros(2))).warnings
+        assert [text.partition(":")[0] for text in found] == named
+        assert all("5 poses a second are too few" in text for text in found)

@@ -54,11 +54,39 @@ class Trajectory:
         after = (times_s - t[i]) / (t[i + 1] - t[i])
         share[uneven] = np.where(around == i[:, None], 1.0 - after[:, None],
                                  np.where(around == i[:, None] + 1, after[:, None], 0.0))[uneven]  # fmt: skip
+        turn, shift = self._shared(share, around, i)
+        return Motions(self.world_from_eye.rotation[i] @ rotation_exp(turn), shift)
+
+    def _shared(self, share: FloatArray, around: IntArray, i: IntArray) -> tuple[FloatArray, FloatArray]:
+        """By shares (k, 4) of the poses around: rotations against pose i (k,), rad, and positions, m; (k, 3) each."""
         R, x = self.world_from_eye.rotation, self.world_from_eye.shifts
         turn = rotation_log(np.swapaxes(R[i], -1, -2)[:, None] @ R[around])
-        return Motions(
-            R[i] @ rotation_exp(np.einsum("kj,kji->ki", share, turn)), np.einsum("kj,kji->ki", share, x[around])
-        )
+        return np.einsum("kj,kji->ki", share, turn), np.einsum("kj,kji->ki", share, x[around])
+
+    def missed_between(self) -> FloatArray:
+        """(2,) root mean square of what the cubic misses halfway between two poses, rad and m; 0 of too few poses.
+
+        It grows with the fourth derivative of the motion (the remainder of Lagrange's form). That is told apart from
+        the noise of poses by how each pose misses the cubics through two of its neighbours on either side, and through
+        every second one: noise is missed alike, a motion sixteen times as much.
+        """
+        t = self.times_s
+        i = np.arange(4, len(t) - 4)
+        span = t[i + 4] - t[i - 4]
+        i = i[span < 2.0 * np.median(span)] if len(i) else i  # no gaps
+        if len(i) < _FEWEST:
+            return np.zeros(2)
+        factors, squares = [], []
+        for step in (1, 2):
+            around = i[:, None] + step * np.array([-2, -1, 1, 2])
+            share = _cubic(t[around], t[i])
+            turn, shift = self._shared(share, around, i)
+            factors.append([1.0 + (share**2).sum(axis=1).mean(), np.square(_remainder(t[around], t[i])).mean()])
+            squares.append([np.square(turn).mean(), np.square(shift - self.world_from_eye.shifts[i]).mean()])
+        _, fourth = np.linalg.solve(factors, squares)
+        around = i[:, None] + np.arange(-1, 3)
+        halfway = np.square(_remainder(t[around], (t[i] + t[i + 1]) / 2.0)).mean()
+        return np.asarray(np.sqrt(np.maximum(fourth, 0.0) * halfway))
 
     def recorded(self, times_s: FloatArray) -> BoolArray:
         """Whether times (k,) are no part of a gap: poses around are not much farther apart than usually."""
@@ -92,6 +120,11 @@ def _cubic(nodes: FloatArray, at: FloatArray) -> FloatArray:
     from_node, apart = at[:, None] - nodes, nodes[:, :, None] - nodes[:, None]
     others = ~np.eye(4, dtype=np.bool_)
     return np.stack([(from_node[:, o] / apart[:, j, o]).prod(axis=1) for j, o in enumerate(others)], axis=1)
+
+
+def _remainder(nodes: FloatArray, at: FloatArray) -> FloatArray:
+    """(k,) times the fourth derivative / 24 what the cubic through four nodes (k, 4) misses at (k,)."""
+    return np.asarray((at[:, None] - nodes).prod(axis=1))
 
 
 def time_offset(a: Trajectory, b: Trajectory) -> TimeOffset:
