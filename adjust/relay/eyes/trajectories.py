@@ -6,6 +6,7 @@ turns. Motions over an interval do not know in which world an eye counts, so tra
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -39,6 +40,12 @@ class Trajectory:
 
         Straight between the two around where times are so uneven that the cubic would enlarge the errors of poses.
         """
+        self._refuse_outside(times_s)
+        i, share = self._shares(times_s)
+        x = self.world_from_eye.shifts[self._nodes[0][i]]
+        return Motions(self._attitudes(i, share), np.einsum("kj,kji->ki", share, x))
+
+    def _refuse_outside(self, times_s: FloatArray) -> None:
         t = self.times_s
         if len(t) < 4:
             raise SurveyError(f"eye {self.eye.frame_id}: {len(t)} poses are too few; record about ten a second")
@@ -47,18 +54,32 @@ class Trajectory:
                 f"eye {self.eye.frame_id}: poses are asked for {times_s.min():.3f} to {times_s.max():.3f} s, its "
                 f"trajectory has {t[0]:.3f} to {t[-1]:.3f} s; check the time offset"
             )
-        i = np.clip(np.searchsorted(t, times_s, side="right") - 1, 0, len(t) - 2)
+
+    @cached_property
+    def _nodes(self) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Of each interval the four poses around, Lagrange's denominators of them, and turns (4, 3) to them."""
+        t, R, i = self.times_s, self.world_from_eye.rotation, np.arange(len(self.times_s) - 1)
         around = np.clip(i, 1, len(t) - 3)[:, None] + np.arange(-1, 3)
-        share = _cubic(t[around], times_s)
-        uneven = (share**2).sum(axis=1) > _MOST_NOISE
-        after = (times_s - t[i]) / (t[i + 1] - t[i])
-        share[uneven] = np.where(around == i[:, None], 1.0 - after[:, None],
-                                 np.where(around == i[:, None] + 1, after[:, None], 0.0))[uneven]  # fmt: skip
-        R, x = self.world_from_eye.rotation, self.world_from_eye.shifts
-        turn = rotation_log(np.swapaxes(R[i], -1, -2)[:, None] @ R[around])
-        return Motions(
-            R[i] @ rotation_exp(np.einsum("kj,kji->ki", share, turn)), np.einsum("kj,kji->ki", share, x[around])
-        )
+        apart = t[around][:, :, None] - t[around][:, None] + np.eye(4)
+        return around, apart.prod(axis=2), rotation_log(np.swapaxes(R[i], -1, -2)[:, None] @ R[around])
+
+    def _shares(self, times_s: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Intervals (k,) in which times are, and the shares (k, 4) of the poses around in what is there."""
+        t = self.times_s
+        i = np.clip(np.searchsorted(t, times_s, side="right") - 1, 0, len(t) - 2)
+        around, below, _ = self._nodes
+        d = (times_s[:, None] - t[around[i]]).T
+        share = np.stack([d[1] * d[2] * d[3], d[0] * d[2] * d[3], d[0] * d[1] * d[3], d[0] * d[1] * d[2]], axis=1)
+        share /= below[i]
+        uneven = np.flatnonzero((share**2).sum(axis=1) > _MOST_NOISE)
+        j, at = i[uneven], times_s[uneven]
+        after = ((at - t[j]) / (t[j + 1] - t[j]))[:, None]
+        share[uneven] = (around[j] == j[:, None]) * (1.0 - after) + (around[j] == j[:, None] + 1) * after
+        return i, share
+
+    def _attitudes(self, i: IntArray, share: FloatArray) -> FloatArray:
+        """(k, 3, 3) from what :meth:`_shares` says."""
+        return self.world_from_eye.rotation[i] @ rotation_exp(np.einsum("kj,kji->ki", share, self._nodes[2][i]))
 
     def recorded(self, times_s: FloatArray) -> BoolArray:
         """Whether times (k,) are no part of a gap: poses around are not much farther apart than usually."""
@@ -68,8 +89,10 @@ class Trajectory:
 
     def turning_speed(self, times_s: FloatArray) -> FloatArray:
         """(k,) rad/s."""
-        before, after = self.at(times_s - _HALF_S), self.at(times_s + _HALF_S)
-        turn = rotation_log(np.swapaxes(before.rotation, -1, -2) @ after.rotation)
+        both = np.concatenate([times_s - _HALF_S, times_s + _HALF_S])
+        self._refuse_outside(both)
+        before, after = np.split(self._attitudes(*self._shares(both)), 2)
+        turn = rotation_log(np.swapaxes(before, -1, -2) @ after)
         return np.asarray(np.linalg.norm(turn, axis=1) / (2.0 * _HALF_S))
 
 
@@ -85,13 +108,6 @@ class TimeOffset:
     correlation: float
     drift_per_s: float
     drift_sigma_per_s: float
-
-
-def _cubic(nodes: FloatArray, at: FloatArray) -> FloatArray:
-    """Shares (k, 4) of the values at four nodes (k, 4) in that of the cubic through them at (k,), Lagrange's form."""
-    from_node, apart = at[:, None] - nodes, nodes[:, :, None] - nodes[:, None]
-    others = ~np.eye(4, dtype=np.bool_)
-    return np.stack([(from_node[:, o] / apart[:, j, o]).prod(axis=1) for j, o in enumerate(others)], axis=1)
 
 
 def time_offset(a: Trajectory, b: Trajectory) -> TimeOffset:
