@@ -22,7 +22,8 @@ from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import Clock, FloatArray, Survey, Target
 from adjust.native.lenses import FISHEYE
-from adjust.observations.clocks import between, nearest
+from adjust.observations.between_epochs import between
+from adjust.observations.clocks import nearest
 from adjust.spatial.rigid import inverse, rigid, transform
 from adjust.statistics.score import LinearScores
 from adjust.testing.criteria import sidak

@@ -16,7 +16,7 @@ from adjust.model.survey import FloatArray, IntArray, Survey, VectorParameter
 from adjust.native.images import MAX_MAP, LensArrays, WarpArrays
 from adjust.native.lenses import MAX_LENS
 
-Shift = Callable[["State", gtsam.Values, Sequence[ShiftedSlot]], None]
+Shift = Callable[["State", gtsam.Values, Sequence[ShiftedSlot] | None], None]
 
 
 class State:
@@ -33,7 +33,7 @@ class State:
     """
 
     def __init__(self, survey: Survey, unknowns: Unknowns, shift: Shift = lambda state, values, slots: None) -> None:
-        """shift: fills slot_R, slot_t and D of the slots at the times of clocks, where there are any."""
+        """shift: fills slot_R, slot_t and D of these slots at the times of clocks, or of all, where there are any."""
         self.unknowns, self.shift = unknowns, shift
         self.targets = {t.target_id: i for i, t in enumerate(survey.targets)}
         self.lens_states = LensStates(survey, unknowns)
@@ -121,7 +121,7 @@ class State:
             self._load_poses(values)
             self._load_points(values)
             self._move_tables(values, self.unknowns.table_slots.values())
-            self.shift(self, values, list(self.unknowns.shifted_slots.values()))
+            self.shift(self, values, None)
         else:
             shifted = [s for slot in slots if (s := self.unknowns.shifted_slots.get(slot)) is not None]
             asked = list(dict.fromkeys([*slots, *(n for s in shifted for n in s.nodes)]))

@@ -20,7 +20,8 @@ from adjust.model.observations import FrameRef, ImageBlock, PositionRef
 from adjust.model.result import ParameterName
 from adjust.model.rewriting import vector_parameters
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey, VectorParameter
-from adjust.observations.clocks import Shifts, collect_clocks, shift
+from adjust.observations.between_epochs import Shifting
+from adjust.observations.clocks import Shifts, collect_clocks
 from adjust.observations.factors import (
     ChainPose,
     Position,
@@ -84,7 +85,7 @@ class GraphBuilder:
         if self.times is not None:
             seen, pair_chains = self._at_their_times(self.times, seen, pair_chains)
         self.vector_starts |= geometry.starts
-        state = State(self.survey, self.unknowns, shift)
+        state = State(self.survey, self.unknowns, Shifting(self.unknowns))
         pairs = self._pair_batch(state)
         at = {ref: self._position(state, ref, chain) for ref, chain in positions.items()}
         values = self._values(start)

@@ -12,7 +12,8 @@ from adjust.model.observations import Coordinates, PositionRef, position_text
 from adjust.model.result import ParameterName
 from adjust.model.rewriting import vector_parameters
 from adjust.model.survey import FloatArray, PointParameter, PoseParameter, Survey, VectorPrior
-from adjust.observations.clocks import Shifts, reading_residual
+from adjust.observations.between_epochs import reading_residual
+from adjust.observations.clocks import Shifts
 from adjust.observations.factors import (
     ObservationFactor,
     Position,

@@ -14,6 +14,6 @@ extern "C" __attribute__((visibility("default"))) const Entry *navigation() {
         entry<sure_forms>("sure_forms"),
         entry<elimination_tree>("elimination_tree"), entry<gather_cliques>("gather_cliques"), entry<clique_nodes>("clique_nodes"),
         entry<elimination_room>("elimination_room"), entry<eliminate>("eliminate"), entry<solve_poses>("solve_poses"),
-        entry<eliminate_rows>("eliminate_rows"), entry<compose_poses>("compose_poses"), {nullptr, nullptr, nullptr}};
+        entry<eliminate_rows>("eliminate_rows"), entry<compose_poses>("compose_poses"), entry<right_jacobians>("right_jacobians"), {nullptr, nullptr, nullptr}};
     return table;
 }

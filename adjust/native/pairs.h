@@ -32,6 +32,39 @@ inline void cross_matrix(const double *v, double sign, Mat &out) {
     for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j) out[i][j] = sign * skew(v, i, j);
 }
+// Element of 1 + f [w]x [w]x, which is w w' - w^2.
+inline double squared(const double *w, double square, double f, int i, int j) { return f * w[i] * w[j] + (i == j ? 1.0 - f * square : 0.0); }
+// Lower left block of the right Jacobian of SE(3) at d (Barfoot 2017, eq. 7.86, at the opposite tangent).
+inline void coupling(const double *d, const double (&c)[4], Mat &Q) {
+    Mat P, U, PU, UP, PUP, far, near;
+    cross_matrix(d, -1.0, P);
+    cross_matrix(d + 3, -1.0, U);
+    times3(P, U, PU), times3(U, P, UP), times3(PU, P, PUP), times3(P, PU, far), times3(UP, P, near);
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j)
+            Q[i][j] = 0.5 * U[i][j] + c[1] * (PU[i][j] + UP[i][j] + PUP[i][j]) + c[2] * (far[i][j] + near[i][j] - 3.0 * PUP[i][j]);
+    times3(PUP, P, far), times3(P, PUP, near);
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) Q[i][j] += c[3] * (far[i][j] + near[i][j]);
+}
+// Right Jacobians of SO(3) or SE(3) at d (n, 3 or 6), or with `back` their inverses.
+inline void right_jacobians(In<double, 2> d, int64_t back, Out<double, 3> out) {
+    for (int64_t e = 0; e < d.n[0]; ++e) {
+        const double *w = &d(e, 0), square = dot3(w, w), half = std::sin(0.5 * root(square));
+        double c[4];
+        Mat turn, Q, far, near;
+        motion_coefficients(square, c);
+        const double odd = back ? 0.5 : square < 1e-16 ? -0.5 : -2.0 * half * half / square;
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 3; ++j) out(e, i, j) = turn[i][j] = squared(w, square, c[back ? 0 : 1], i, j) + odd * skew(w, i, j);
+        if (d.n[1] == 3) continue;
+        coupling(w, c, Q);
+        times3(turn, Q, far), times3(far, turn, near);
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 3; ++j)
+                out(e, 3 + i, 3 + j) = turn[i][j], out(e, i, 3 + j) = 0.0, out(e, 3 + i, j) = back ? -near[i][j] : Q[i][j];
+    }
+}
 
 // One pair: residual, Jr^-1 of it (by_a) and Ad(b_from_a^-1) (turn); the derivative by b is -by_a turn.
 inline void pair_row(In<double, 2> R_a, Vector t_a, In<double, 2> R_b, Vector t_b, In<double, 2> measured, Vector shift, double *residual,
@@ -52,24 +85,16 @@ inline void pair_row(In<double, 2> R_a, Vector t_a, In<double, 2> R_b, Vector t_
     const double square = dot3(residual, residual);
     double c[4];
     motion_coefficients(square, c);
-    Mat right, P, U, PU, UP, PUP, far, near, Q;
+    Mat right, far, near, Q;
     for (int i = 0; i < 3; ++i) {
         residual[3 + i] = 0.0;
-        for (int j = 0; j < 3; ++j) {  // [w]x [w]x = w w' - w^2
-            const double even = c[0] * residual[i] * residual[j] + (i == j ? 1.0 - c[0] * square : 0.0), odd = 0.5 * skew(residual, i, j);
+        for (int j = 0; j < 3; ++j) {
+            const double even = squared(residual, square, c[0], i, j), odd = 0.5 * skew(residual, i, j);
             right[i][j] = even + odd;
             residual[3 + i] += (even - odd) * arm[j];
         }
     }
-    cross_matrix(residual, -1.0, P);
-    cross_matrix(residual + 3, -1.0, U);
-    times3(P, U, PU), times3(U, P, UP), times3(PU, P, PUP), times3(P, PU, far), times3(UP, P, near);
-    for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j)
-            Q[i][j] = 0.5 * U[i][j] + c[1] * (PU[i][j] + UP[i][j] + PUP[i][j]) + c[2] * (far[i][j] + near[i][j] - 3.0 * PUP[i][j]);
-    times3(PUP, P, far), times3(P, PUP, near);
-    for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j) Q[i][j] += c[3] * (far[i][j] + near[i][j]);
+    coupling(residual, c, Q);
     times3(right, Q, far), times3(far, right, near);
     for (int i = 0; i < 3; ++i) back[i] = -(present[0][i] * place[0] + present[1][i] * place[1] + present[2][i] * place[2]);
     for (int i = 0; i < 3; ++i)

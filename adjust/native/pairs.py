@@ -9,6 +9,7 @@ _PAIRS = "a[E] b[E] R[S,3,3] t[S,3] measured[E,3,3] shift[E,3]"
 _pair_jacobians = Function("pair_jacobians", f"{_PAIRS} residual[E,6] by_b[E,6,6] by_a[E,6,6] turn[E,6,6]")
 _pair_rows = Function("pair_rows", f"{_PAIRS} W[E,6,6] white[E,6] by_b[E,6,6] by_a[E,6,6]")
 _compose_poses = Function("compose_poses", "order[N] parent[N] R[N,3,3] t[N,3]")
+_right_jacobians = Function("right_jacobians", "d[n,k] back J[n,k,k]")
 _sure_forms = Function("sure_forms", "Q[E,6,6] v[E,6] least form[E]")
 
 
@@ -41,6 +42,14 @@ def compose_poses(order: IntArray, parent: IntArray, R: FloatArray, t: FloatArra
     order: (N,) parents first.
     """
     _compose_poses(order, parent, R, t)
+
+
+def right_jacobians(d: FloatArray, back: bool) -> FloatArray:
+    """Right Jacobians (..., k, k) of rotations (k = 3) or motions (6) at tangents (..., k); back: their inverses."""
+    tangents = np.ascontiguousarray(d, dtype=np.float64)
+    out = np.empty((*d.shape, d.shape[-1]))
+    _right_jacobians(tangents.reshape(-1, d.shape[-1]), back, out.reshape(-1, *out.shape[-2:]))
+    return out
 
 
 def sure_forms(Q: FloatArray, v: FloatArray, least: float) -> FloatArray:

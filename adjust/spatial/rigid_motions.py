@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
-from adjust.spatial.rigid import adjoint, rigid, rotation_exp, rotation_log, skew
-
-_SMALL = 0.3  # rad; below it the series are exact to the last digit, above it the closed forms lose none
+from adjust.native.pairs import right_jacobians
+from adjust.spatial.rigid import adjoint, rigid, rotation_exp, rotation_log
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,78 +119,9 @@ def exp(delta: FloatArray) -> Motions:
 
 def right_jacobian(delta: FloatArray) -> FloatArray:
     """Jr (n, dim, dim): ``Exp(d + e) = Exp(d) Exp(Jr e)`` to first order."""
-    omega = delta[..., :3]
-    K = skew(omega)
-    _, b, c = _coefficients(omega)
-    turn = np.eye(3) - b * K + c * (K @ K)
-    if delta.shape[-1] == 3:
-        return np.asarray(turn)
-    out = np.zeros((*delta.shape[:-1], 6, 6))
-    out[..., :3, :3] = out[..., 3:, 3:] = turn
-    out[..., 3:, :3] = _coupling(delta)
-    return out
+    return right_jacobians(delta, False)
 
 
 def right_jacobian_inverse(delta: FloatArray) -> FloatArray:
     """Jr^-1 (n, dim, dim), the derivative of Log: ``Log(Exp(d) Exp(e)) = d + Jr^-1 e`` to first order."""
-    omega = delta[..., :3]
-    K = skew(omega)
-    turn = np.eye(3) + 0.5 * K + _inverse_coefficient(omega) * (K @ K)
-    if delta.shape[-1] == 3:
-        return np.asarray(turn)
-    out = np.zeros((*delta.shape[:-1], 6, 6))
-    out[..., :3, :3] = out[..., 3:, 3:] = turn
-    out[..., 3:, :3] = -turn @ _coupling(delta) @ turn
-    return out
-
-
-def _series(x: FloatArray, terms: tuple[float, ...]) -> FloatArray:
-    """Polynomial in x = angle^2."""
-    return np.asarray(np.polynomial.polynomial.polyval(x, np.array(terms)))
-
-
-def _angles(omega: FloatArray) -> tuple[FloatArray, BoolArray, FloatArray]:
-    """Angle (..., 1, 1), where it is small, and the angle made safe to divide by."""
-    angle = np.linalg.norm(omega, axis=-1)[..., None, None]
-    small = angle < _SMALL
-    return angle, small, np.where(small, 1.0, angle)
-
-
-def _coefficients(omega: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3."""
-    angle, small, safe = _angles(omega)
-    x = angle**2
-    a = _series(x, (1, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800))
-    b = _series(x, (1 / 2, -1 / 24, 1 / 720, -1 / 40320, 1 / 3628800, -1 / 479001600))
-    c = _series(x, (1 / 6, -1 / 120, 1 / 5040, -1 / 362880, 1 / 39916800, -1 / 6227020800))
-    sine, cosine = np.sin(safe), np.cos(safe)
-    return (
-        np.where(small, a, sine / safe),
-        np.where(small, b, (1.0 - cosine) / safe**2),
-        np.where(small, c, (safe - sine) / safe**3),
-    )
-
-
-def _inverse_coefficient(omega: FloatArray) -> FloatArray:
-    """1/x^2 - (1 + cos x)/(2 x sin x), written with the half angle so that it holds up to half a turn."""
-    angle, small, safe = _angles(omega)
-    series = _series(angle**2, (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160, 691 / 1307674368000))
-    half = 0.5 * safe
-    return np.where(small, series, (1.0 - half * np.cos(half) / np.sin(half)) / safe**2)
-
-
-def _coupling(delta: FloatArray) -> FloatArray:
-    """Lower left block of the right Jacobian of rigid motions (Barfoot's Q at the opposite tangent)."""
-    omega, u = -delta[..., :3], -delta[..., 3:]
-    P, U = skew(omega), skew(u)
-    angle, small, safe = _angles(omega)
-    x = angle**2
-    _, _, c1 = _coefficients(omega)
-    c2 = _series(x, (1 / 24, -1 / 720, 1 / 40320, -1 / 3628800, 1 / 479001600, -1 / 87178291200))
-    c3 = _series(x, (1 / 120, -1 / 2520, 1 / 120960, -1 / 9979200, 1 / 1245404160, -1 / 217945728000))
-    sine, cosine = np.sin(safe), np.cos(safe)
-    c2 = np.where(small, c2, (safe**2 + 2.0 * cosine - 2.0) / (2.0 * safe**4))
-    c3 = np.where(small, c3, (2.0 * safe - 3.0 * sine + safe * cosine) / (2.0 * safe**5))
-    PU, UP = P @ U, U @ P
-    PUP = PU @ P
-    return np.asarray(0.5 * U + c1 * (PU + UP + PUP) + c2 * (P @ PU + UP @ P - 3.0 * PUP) + c3 * (PUP @ P + P @ PUP))
+    return right_jacobians(delta, True)

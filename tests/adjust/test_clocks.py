@@ -13,7 +13,7 @@ from adjust.frames.runs import within_motion
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
-from adjust.observations.clocks import weights
+from adjust.observations.between_epochs import weights
 from survey.simulate import Truth, resample
 from tests.adjust import helpers as h
 from tests.adjust.moving import board_before_cameras, camera_on_hand, clock, head_on_moving_table

@@ -6,16 +6,17 @@ intervals grow with the root of time where the world drifts, and not at all wher
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from adjust.model.errors import NotConvergedError, SurveyError
 from adjust.model.survey import FloatArray
-from adjust.relay.eyes.eyes import EyeAdjustment, EyeOptions, adjust_eyes
+from adjust.relay.eyes.checks import refuse_undetermined
+from adjust.relay.eyes.eyes import EyeAdjustment, station_of
 from adjust.relay.eyes.sequences import EyeSequence
-from adjust.relay.eyes.solver import EyeProblem, EyeSolution, Weights, linearise
+from adjust.relay.eyes.setup import eye_setup
+from adjust.relay.eyes.solver import EyeProblem, EyeSolution, Weights, linearise, solve_eyes
 from adjust.relay.eyes.trajectories import CommonMotions, Trajectory, common_motions
 from adjust.testing.distributions import norm
 
@@ -53,7 +54,6 @@ def sequences(common: CommonMotions, model: DriftModel) -> tuple[EyeSequence, ..
     )
 
 
-_FIT = EyeOptions(reject=False, free_scales=True)
 _MOST_ROUNDS = 100
 _LEAST_REDUNDANCY = 1.0
 _ALPHA = 0.05
@@ -73,15 +73,18 @@ def fit_drift(common: CommonMotions) -> tuple[DriftModel, EyeAdjustment]:
         raise SurveyError(f"{k} trackers cannot tell whose errors are whose; give three or more, or sigmas")
     length = float(common.times_s[0, 1] - common.times_s[0, 0])
     model = DriftModel(length, np.full(k, 3e-3), np.full(k, 1e-2), 0.0, 0.0, np.zeros((k, 2)))
+    setup, solution = refuse_undetermined(eye_setup(sequences(common, model), free_scales=True)), None
     for _ in range(_MOST_ROUNDS):
-        adjusted = adjust_eyes(sequences(common, model), (), _FIT)
-        factor, redundancy = _components(adjusted.solution, k)
+        solution = solve_eyes(setup.problem, solution)
+        factor, redundancy = _components(solution, k)
         model = DriftModel(
             length, model.rotation * np.sqrt(factor[:, 0]), model.position * np.sqrt(factor[:, 1]),
-            *_autocorrelation(adjusted.solution, k), redundancy,
+            *_autocorrelation(solution, k), redundancy,
         )  # fmt: skip
+        cov = np.concatenate([s.cov for s in sequences(common, model)])
+        setup = replace(setup, problem=replace(setup.problem, cov=cov))
         if np.abs(factor - 1.0).max() < 0.02:
-            return model, adjust_eyes(sequences(common, model), (), _FIT)
+            return model, station_of(refuse_undetermined(setup), solve_eyes(setup.problem, solution))
     raise NotConvergedError(
         f"the errors of {k} trackers did not settle in {_MOST_ROUNDS} rounds over intervals of {length:g} s: "
         f"{len(common.times_s)} motions do not tell whose they are; record longer trajectories with more turns"
@@ -107,12 +110,16 @@ def _components(solution: EyeSolution, k: int) -> tuple[FloatArray, FloatArray]:
 
 def _residual_variances(problem: EyeProblem, solution: EyeSolution) -> FloatArray:
     """The diagonal (n, 6) of Q_vv of the observations' residuals."""
-    at = linearise(problem, solution.unknowns, solution.scales, np.zeros((len(problem.observed), 6)))
-    weights = Weights(problem, at)
-    QBt = csr_array(weights.QBt)
-    by = QBt @ weights.solve(at.by)
-    all_of_it = QBt.multiply(weights.solve(QBt.T.toarray()).T).sum(axis=1)
-    return np.asarray(all_of_it - ((by @ solution.cov) * by).sum(axis=1)).reshape(-1, 6)
+    c, none = problem.conditions, np.zeros((len(problem.observed), 6))
+    at = linearise(problem, solution.unknowns, solution.scales, none)
+    weights, own = Weights(problem, at), none
+    for rows, R in weights.stars:
+        B_k = at.by_k[rows].reshape(len(rows), -1, 6)
+        own[c.k_idx[rows[:, 0]]] = ((R @ B_k @ problem.cov[c.k_idx[rows[:, 0]]]) ** 2).sum(axis=1)
+        R_l = np.swapaxes(R.reshape(*R.shape[:2], -1, 6), 1, 2)
+        own[c.l_idx[rows]] = ((R_l @ (at.by_l @ problem.cov[c.l_idx])[rows]) ** 2).sum(axis=2)
+    by = weights.residuals(weights.solve(at.by))
+    return np.asarray(own - ((by @ solution.cov) * by).sum(axis=2))
 
 
 def _autocorrelation(solution: EyeSolution, k: int) -> tuple[float, float]:

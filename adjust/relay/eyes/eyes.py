@@ -115,7 +115,11 @@ def adjust_eyes(
     SurveyError naming the undetermined direction where the turns do not suffice.
     """
     setup = refuse_undetermined(eye_setup(sequences, known, options.free_scales))
-    solution, outliers = solve_screened(setup, options.reject)
+    return station_of(setup, *solve_screened(setup, options.reject))
+
+
+def station_of(setup: EyeSetup, solution: EyeSolution, outliers: tuple[OutlierEpoch, ...] = ()) -> EyeAdjustment:
+    """The eyes as they were solved for. Raises SurveyError where a rotation is uncertain."""
     k = len(setup.eyes)
     place = np.concatenate([solution.rows(i) for i in range(k)])
     target = np.concatenate([6 * i + np.arange(6) for i in range(k) if len(solution.rows(i))])

@@ -33,8 +33,8 @@ def solve_screened(setup: EyeSetup, reject: bool) -> tuple[EyeSolution, tuple[Ou
                     f"{setup.epoch_ids[before.worst]}; check that the eyes are rigid on the station, that targets did "
                     "not move, and the time offsets"
                 )
-            problem = replace(problem, conditions=problem.conditions[used], start=before.solution.unknowns)
-        solution = solve_eyes(problem)
+            problem = replace(problem, conditions=problem.conditions[used])
+        solution = solve_eyes(problem, None if before is None else before.solution)
         return solution, one_group(_all_tests(setup.problem, solution, used), np.full(m, 6), used)
 
     search = Search(solve, _FAMILY, many=1)

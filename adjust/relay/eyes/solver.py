@@ -14,9 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-import scipy.sparse as sp
 
-from adjust.graph.elimination import positive_definite_lu
 from adjust.model.errors import NotConvergedError
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.spatial.rigid_motions import Motions, right_jacobian, right_jacobian_inverse
@@ -28,6 +26,7 @@ _MOST_STEPS, _STILL = 50, 1e-9
 class EyeConditions:
     """m conditions between observed poses ``k_idx`` and ``l_idx`` (m,).
 
+    Those of one ``k_idx`` stand together, each with an ``l_idx`` of its own that is nowhere a ``k_idx``: a star.
     eye_k, eye_l, world_k, world_l: (m,) which unknown each takes; of motions the worlds are the eyes.
     scale_k, scale_l: (m,) which unknown scale of lengths each takes, -1 for none.
     """
@@ -129,11 +128,10 @@ def linearise(problem: EyeProblem, U: Motions, scales: FloatArray, v: FloatArray
     by_world_k = -J @ (U[c.world_k].inverse() @ U[c.world_l] @ Pl).inverse().adjoint()
     by_pose_k, by_pose_l = -by_eye_k, J
     by = np.zeros((len(c), 6, 6 * len(U) + problem.n_scales))
-    row = np.arange(len(c))
+    by_unknown, row = by[:, :, : 6 * len(U)].reshape(len(c), 6, len(U), 6), np.arange(len(c))
     parts = by_eye_k, -J @ C.inverse().adjoint(), by_world_k, J @ Pl.inverse().adjoint()
     for idx, D in zip((c.eye_k, c.eye_l, c.world_k, c.world_l), parts, strict=True):
-        for j in range(6):
-            by[row, :, 6 * idx + j] += D[:, :, j]  # each row once, so nothing is lost
+        by_unknown[row, :, idx] += D  # each row once, so nothing is lost
     for idx, pose, D in ((c.scale_k, Pk, by_pose_k), (c.scale_l, Pl, by_pose_l)):
         has = idx >= 0
         if has.any():
@@ -174,21 +172,61 @@ def own_blocks(problem: EyeProblem, at: Linearised) -> FloatArray:
 
 
 class Weights:
-    """M = B Q B' of the conditions, factorised, with Q block diagonal or full."""
+    """M = B Q B' of the conditions, whose inverse is R' R, with Q block diagonal or full.
+
+    stars: of conditions that share errors, (g, c) g times equally many, and their R (g, 6c, 6c).
+    """
 
     def __init__(self, problem: EyeProblem, at: Linearised) -> None:
-        m, n = len(at.f), len(problem.observed)
-        order, ptr = ((at.by_k, problem.conditions.k_idx), (at.by_l, problem.conditions.l_idx)), np.arange(m + 1)
-        B_k, B_l = (sp.bsr_array((np.ascontiguousarray(D), i, ptr), shape=(6 * m, 6 * n)) for D, i in order)
-        self.B = (B_k + B_l).tocsr()
-        if problem.cov.ndim == 3:
-            Q = sp.bsr_array((np.ascontiguousarray(problem.cov), np.arange(n), np.arange(n + 1)), shape=(6 * n, 6 * n))
-            self.QBt = (Q @ self.B.T).tocsc()
-            self.solve = positive_definite_lu((self.B @ self.QBt).tocsc()).solve
+        self.at, self.conditions, self.Q, self.n = at, problem.conditions, problem.cov, len(problem.observed)
+        m, k = len(at.f), self.conditions.k_idx
+        self.first = np.flatnonzero(np.append(True, k[1:] != k[:-1]))[: len(k)]
+        if self.Q.ndim == 3:
+            many = np.diff(np.append(self.first, m))
+            stars = [self.first[many == c][:, None] + np.arange(c) for c in np.unique(many).tolist()]
+            self.stars = [(rows, self._root(rows)) for rows in stars]
         else:
-            self.QBt = np.asarray(problem.cov @ self.B.T.toarray())
-            root = scipy.linalg.cho_factor(np.asarray(self.B @ self.QBt))
-            self.solve = lambda right: scipy.linalg.cho_solve(root, right)
+            Bt = self.back(np.eye(6 * m)).reshape(-1, 6 * m)
+            L = np.linalg.cholesky(Bt.T @ self.Q @ Bt)
+            R = scipy.linalg.solve_triangular(L, np.eye(6 * m), lower=True)
+            self.stars = [(np.arange(m)[None], R[None])]
+
+    def _root(self, rows: IntArray) -> FloatArray:
+        """Of stars (g, c)."""
+        g, c = rows.shape
+        B_k, B_l = self.at.by_k[rows].reshape(g, 6 * c, 6), self.at.by_l[rows]
+        M = B_k @ self.Q[self.conditions.k_idx[rows[:, 0]]] @ np.swapaxes(B_k, -1, -2)
+        own, each = B_l @ self.Q[self.conditions.l_idx[rows]] @ np.swapaxes(B_l, -1, -2), np.arange(c)
+        M.reshape(g, c, 6, c, 6)[:, each, :, each] += np.swapaxes(own, 0, 1)
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(M)))
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """M^-1 of columns (6m, r)."""
+        out, parts = np.empty_like(right), right.reshape(len(self.at.f), 6, -1)
+        for rows, R in self.stars:
+            y = np.swapaxes(R, -1, -2) @ (R @ parts[rows].reshape(len(rows), R.shape[1], -1))
+            out.reshape(parts.shape)[rows] = y.reshape(*rows.shape, 6, -1)
+        return out
+
+    def across(self, v: FloatArray) -> FloatArray:
+        """B v (6m,) of observations moved by v (n, 6)."""
+        c = self.conditions
+        of_k, of_l = (D @ v[i][..., None] for D, i in ((self.at.by_k, c.k_idx), (self.at.by_l, c.l_idx)))
+        return np.asarray((of_k + of_l).ravel())
+
+    def back(self, y: FloatArray) -> FloatArray:
+        """B' y (n, 6, r) of columns (6m, r)."""
+        c, parts = self.conditions, y.reshape(len(self.at.f), 6, -1)
+        out = np.zeros((self.n, 6, parts.shape[2]))
+        out[c.k_idx[self.first]] = np.add.reduceat(np.swapaxes(self.at.by_k, -1, -2) @ parts, self.first)
+        out[c.l_idx] = np.swapaxes(self.at.by_l, -1, -2) @ parts
+        return out
+
+    def residuals(self, y: FloatArray) -> FloatArray:
+        """Q B' y (n, 6, r) of columns (6m, r)."""
+        B_y = self.back(y)
+        joint = self.Q.ndim == 2
+        return np.asarray((self.Q @ B_y.reshape(6 * self.n, -1)).reshape(B_y.shape) if joint else self.Q @ B_y)
 
 
 class _Normals:
@@ -197,8 +235,8 @@ class _Normals:
     def __init__(self, problem: EyeProblem, U: Motions, scales: FloatArray, v: FloatArray) -> None:
         self.at = linearise(problem, U, scales, v)
         self.weights = Weights(problem, self.at)
-        self.w = self.at.f.ravel() - self.weights.B @ v.ravel()
-        self.MA = np.asarray(self.weights.solve(self.at.by))
+        self.w = self.at.f.ravel() - self.weights.across(v)
+        self.MA = self.weights.solve(self.at.by)
         self.N, self.right = self.at.by.T @ self.MA, self.MA.T @ self.w
         self.omega_known = 0.0
         for known in problem.known:
@@ -210,10 +248,13 @@ class _Normals:
             self.omega_known += float(r[0] @ P @ r[0])
 
 
-def solve_eyes(problem: EyeProblem) -> EyeSolution:
-    """Least squares. Raises NotConvergedError; the caller has seen to it that everything is determined."""
+def solve_eyes(problem: EyeProblem, before: EyeSolution | None = None) -> EyeSolution:
+    """Least squares. Raises NotConvergedError; the caller has seen to it that everything is determined.
+
+    before: of the same unknowns and observations, where to begin instead of at the start.
+    """
     try:
-        return _solved(problem)
+        return _solved(problem, before)
     except (np.linalg.LinAlgError, RuntimeError) as error:  # a matrix that no factorisation takes
         raise NotConvergedError(
             f"the equations of the eyes cannot be solved ({error}): their poses do not belong together; check that the "
@@ -221,15 +262,16 @@ def solve_eyes(problem: EyeProblem) -> EyeSolution:
         ) from None
 
 
-def _solved(problem: EyeProblem) -> EyeSolution:
-    U, scales = problem.start, np.zeros(problem.n_scales)
-    v = np.zeros((len(problem.observed), 6))
+def _solved(problem: EyeProblem, before: EyeSolution | None) -> EyeSolution:
+    U, scales, v = problem.start, np.zeros(problem.n_scales), np.zeros((len(problem.observed), 6))
+    if before is not None:
+        U, scales, v = before.unknowns, before.scales, before.residuals
     n_free = 6 * int(problem.free.sum())
     for iteration in range(1, _MOST_STEPS + 1):
         normals = _Normals(problem, U, scales, v)
         weights, by = normals.weights, normals.at.by
         step = -scipy.linalg.cho_solve(scipy.linalg.cho_factor(normals.N), normals.right)
-        v = np.asarray(-(weights.QBt @ weights.solve(normals.w + by @ step))).reshape(-1, 6)
+        v = np.asarray(-weights.residuals(weights.solve(normals.w + by @ step))[..., 0])
         delta = np.zeros((len(U), 6))
         delta[problem.free] = step[:n_free].reshape(-1, 6)
         U, scales = U.retract(delta), scales + step[n_free:]
@@ -244,11 +286,11 @@ def _solved(problem: EyeProblem) -> EyeSolution:
 
 def _finish(problem: EyeProblem, U: Motions, scales: FloatArray, v: FloatArray, iterations: int) -> EyeSolution:
     normals = _Normals(problem, U, scales, v)
-    at, cov, w = normals.at, np.linalg.inv(normals.N), normals.w
-    omega = normals.omega_known + float(w @ np.asarray(normals.weights.solve(w)))
+    at, cov, w = normals.at, np.asarray(np.linalg.inv(normals.N)), normals.w
+    omega = normals.omega_known + float(w @ normals.weights.solve(w))
     A, w = at.by.reshape(len(at.f), 6, -1), w.reshape(-1, 6)
     left = own_blocks(problem, at) - A @ cov @ np.swapaxes(A, -1, -2)
     test = np.einsum("mi,mij,mj->m", w, np.linalg.pinv(left, rcond=1e-9, hermitian=True), w)
-    influence = np.asarray(-cov @ (normals.weights.B.T @ normals.MA).T)
+    influence = np.asarray(-cov @ normals.weights.back(normals.MA).reshape(-1, len(cov)).T)
     redundancy = 6 * len(at.f) + 6 * len(problem.known) - len(cov)
     return EyeSolution(problem, U, scales, cov, v, w, test, influence, omega, redundancy, iterations)

@@ -6,6 +6,7 @@ turns. Motions over an interval do not know in which world an eye counts, so tra
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -39,6 +40,12 @@ class Trajectory:
 
         Straight between the two around where times are so uneven that the cubic would enlarge the errors of poses.
         """
+        self._refuse_outside(times_s)
+        i, share = self._shares(times_s)
+        x = self.world_from_eye.shifts[self._nodes[0][i]]
+        return Motions(self._attitudes(i, share), np.einsum("kj,kji->ki", share, x))
+
+    def _refuse_outside(self, times_s: FloatArray) -> None:
         t = self.times_s
         if len(t) < 4:
             raise SurveyError(f"eye {self.eye.frame_id}: {len(t)} poses are too few; record about ten a second")
@@ -47,21 +54,29 @@ class Trajectory:
                 f"eye {self.eye.frame_id}: poses are asked for {times_s.min():.3f} to {times_s.max():.3f} s, its "
                 f"trajectory has {t[0]:.3f} to {t[-1]:.3f} s; check the time offset"
             )
-        i = np.clip(np.searchsorted(t, times_s, side="right") - 1, 0, len(t) - 2)
-        around = np.clip(i, 1, len(t) - 3)[:, None] + np.arange(-1, 3)
-        share = _cubic(t[around], times_s)
-        uneven = (share**2).sum(axis=1) > _MOST_NOISE
-        after = (times_s - t[i]) / (t[i + 1] - t[i])
-        share[uneven] = np.where(around == i[:, None], 1.0 - after[:, None],
-                                 np.where(around == i[:, None] + 1, after[:, None], 0.0))[uneven]  # fmt: skip
-        turn, shift = self._shared(share, around, i)
-        return Motions(self.world_from_eye.rotation[i] @ rotation_exp(turn), shift)
 
-    def _shared(self, share: FloatArray, around: IntArray, i: IntArray) -> tuple[FloatArray, FloatArray]:
-        """By shares (k, 4) of the poses around: rotations against pose i (k,), rad, and positions, m; (k, 3) each."""
-        R, x = self.world_from_eye.rotation, self.world_from_eye.shifts
-        turn = rotation_log(np.swapaxes(R[i], -1, -2)[:, None] @ R[around])
-        return np.einsum("kj,kji->ki", share, turn), np.einsum("kj,kji->ki", share, x[around])
+    @cached_property
+    def _nodes(self) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Of each interval the four poses around, Lagrange's denominators of them, and turns (4, 3) to them."""
+        t, R, i = self.times_s, self.world_from_eye.rotation, np.arange(len(self.times_s) - 1)
+        around = np.clip(i, 1, len(t) - 3)[:, None] + np.arange(-1, 3)
+        return around, _below(t[around]), rotation_log(np.swapaxes(R[i], -1, -2)[:, None] @ R[around])
+
+    def _shares(self, times_s: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Intervals (k,) in which times are, and the shares (k, 4) of the poses around in what is there."""
+        t = self.times_s
+        i = np.clip(np.searchsorted(t, times_s, side="right") - 1, 0, len(t) - 2)
+        around, below, _ = self._nodes
+        share = _above((times_s[:, None] - t[around[i]]).T) / below[i]
+        uneven = np.flatnonzero((share**2).sum(axis=1) > _MOST_NOISE)
+        j, at = i[uneven], times_s[uneven]
+        after = ((at - t[j]) / (t[j + 1] - t[j]))[:, None]
+        share[uneven] = (around[j] == j[:, None]) * (1.0 - after) + (around[j] == j[:, None] + 1) * after
+        return i, share
+
+    def _attitudes(self, i: IntArray, share: FloatArray) -> FloatArray:
+        """(k, 3, 3) from what :meth:`_shares` says."""
+        return self.world_from_eye.rotation[i] @ rotation_exp(np.einsum("kj,kji->ki", share, self._nodes[2][i]))
 
     def missed_between(self) -> FloatArray:
         """(2,) root mean square of what the cubic misses halfway between two poses, rad and m; 0 of too few poses.
@@ -70,7 +85,7 @@ class Trajectory:
         the noise of poses by how each pose misses the cubics through two of its neighbours on either side, and through
         every second one: noise is missed alike, a motion sixteen times as much.
         """
-        t = self.times_s
+        t, R, x = self.times_s, self.world_from_eye.rotation, self.world_from_eye.shifts
         i = np.arange(4, len(t) - 4)
         span = t[i + 4] - t[i - 4]
         i = i[span < 2.0 * np.median(span)] if len(i) else i  # no gaps
@@ -79,10 +94,11 @@ class Trajectory:
         factors, squares = [], []
         for step in (1, 2):
             around = i[:, None] + step * np.array([-2, -1, 1, 2])
-            share = _cubic(t[around], t[i])
-            turn, shift = self._shared(share, around, i)
+            share = _above((t[i, None] - t[around]).T) / _below(t[around])
+            turn = np.einsum("kj,kji->ki", share, rotation_log(np.swapaxes(R[i], -1, -2)[:, None] @ R[around]))
+            shift = np.einsum("kj,kji->ki", share, x[around])
             factors.append([1.0 + (share**2).sum(axis=1).mean(), np.square(_remainder(t[around], t[i])).mean()])
-            squares.append([np.square(turn).mean(), np.square(shift - self.world_from_eye.shifts[i]).mean()])
+            squares.append([np.square(turn).mean(), np.square(shift - x[i]).mean()])
         _, fourth = np.linalg.solve(factors, squares)
         around = i[:, None] + np.arange(-1, 3)
         halfway = np.square(_remainder(t[around], (t[i] + t[i + 1]) / 2.0)).mean()
@@ -96,8 +112,10 @@ class Trajectory:
 
     def turning_speed(self, times_s: FloatArray) -> FloatArray:
         """(k,) rad/s."""
-        before, after = self.at(times_s - _HALF_S), self.at(times_s + _HALF_S)
-        turn = rotation_log(np.swapaxes(before.rotation, -1, -2) @ after.rotation)
+        both = np.concatenate([times_s - _HALF_S, times_s + _HALF_S])
+        self._refuse_outside(both)
+        before, after = np.split(self._attitudes(*self._shares(both)), 2)
+        turn = rotation_log(np.swapaxes(before, -1, -2) @ after)
         return np.asarray(np.linalg.norm(turn, axis=1) / (2.0 * _HALF_S))
 
 
@@ -115,11 +133,14 @@ class TimeOffset:
     drift_sigma_per_s: float
 
 
-def _cubic(nodes: FloatArray, at: FloatArray) -> FloatArray:
-    """Shares (k, 4) of the values at four nodes (k, 4) in that of the cubic through them at (k,), Lagrange's form."""
-    from_node, apart = at[:, None] - nodes, nodes[:, :, None] - nodes[:, None]
-    others = ~np.eye(4, dtype=np.bool_)
-    return np.stack([(from_node[:, o] / apart[:, j, o]).prod(axis=1) for j, o in enumerate(others)], axis=1)
+def _above(d: FloatArray) -> FloatArray:
+    """(k, 4) Lagrange's numerators at times that are d (4, k) after four nodes."""
+    return np.stack([d[1] * d[2] * d[3], d[0] * d[2] * d[3], d[0] * d[1] * d[3], d[0] * d[1] * d[2]], axis=1)
+
+
+def _below(nodes: FloatArray) -> FloatArray:
+    """(k, 4) Lagrange's denominators of four nodes (k, 4)."""
+    return np.asarray((nodes[:, :, None] - nodes[:, None] + np.eye(4)).prod(axis=2))
 
 
 def _remainder(nodes: FloatArray, at: FloatArray) -> FloatArray:
