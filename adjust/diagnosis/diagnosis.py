@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from adjust.diagnosis.case import Case
-from adjust.diagnosis.hypothesis import Hypothesis
+from adjust.diagnosis.hypothesis import Hypothesis, told_edit
 from adjust.diagnosis.search import Search
 from adjust.diagnosis.trial import Misfit, Trial, misfit_of
 from adjust.model.errors import SurveyError
@@ -80,7 +80,7 @@ class Diagnosis:
         return (*shown[:-1], f"{shown[-1]}; {self.note}") if shown and self.note else shown
 
     def told(self) -> list[dict[str, Any]]:
-        """The candidates for machines: name, cause, change, ids, epochs, how sure it is, and where to edit."""
+        """The candidates for machines: name, cause, change, ids, epochs, how sure it is, where to edit, the edits."""
         return [
             {
                 "name": c.hypothesis.name, "cause": c.hypothesis.cause, "change": c.hypothesis.change,
@@ -88,6 +88,7 @@ class Diagnosis:
                 "epochs": list(c.hypothesis.place.epochs), "explained": c.explained, "statistic": c.statistic,
                 "critical": c.critical, "probability": c.probability, "sigma0": c.sigma0,
                 "where": c.where, "can_be_tried": bool(c.hypothesis.edits),
+                "edits": [told_edit(edit) for edit in c.hypothesis.edits],
             }
             for c in self.candidates[:_SHOWN]
         ]  # fmt: skip

@@ -1,8 +1,8 @@
 """What may be wrong with a survey: one cause, the one change that would mend it, and where a project says it."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal, get_args
 
 import numpy as np
 from gtsam import Pose3, Rot3
@@ -100,6 +100,27 @@ class LeaveOut:
 
 
 Edit = ScaleKey | SetKey | ChangeColumns | ExchangeColumns | ChangeReadings | Rename | LeaveOut
+_EDITS: dict[str, Any] = {kind.__name__: kind for kind in get_args(Edit)}
+
+
+def told_edit(edit: Edit) -> dict[str, Any]:
+    """For machines: its kind, and its fields by name."""
+    return {"edit": type(edit).__name__, **{f.name: getattr(edit, f.name) for f in fields(edit)}}
+
+
+def edit_told(told: Mapping[str, Any]) -> Edit:
+    """The edit that :func:`told_edit` tells, as JSON has it. KeyError, TypeError or ValueError for what is none."""
+    values = {name: _tuples(value) for name, value in told.items() if name != "edit"}
+    for name in ("matrix", "offset") if told["edit"] == ChangeColumns.__name__ else ():
+        values[name] = np.array(values[name], dtype=float)
+    edit: Edit = _EDITS[told["edit"]](**values)
+    return edit
+
+
+def _tuples(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _tuples(x) for name, x in value.items()}
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from survey.folder.text import NOT_OURS
 from survey.project.detected import read_detected, same_file
 from survey.project.project import IMAGES_FOLDER
 from survey.solution.earlier.previous import input_hashes, tables_in
-from survey.solution.earlier.runs import installed_versions
+from survey.solution.earlier.runs import installed_versions, same_versions
 from survey.solution.records import sections
 
 _BESIDE = ("covariance.npz", "residuals.csv", "residuals_other.csv", "report.html")
@@ -33,11 +33,6 @@ def unchanged_solution(folder: Path) -> dict[str, object] | None:
         return solution if same else None
     except (SurveyError, *NOT_OURS):
         return None  # no results, or not ours: adjusting says what is wrong
-
-
-def same_versions(versions: Mapping[str, str]) -> bool:
-    """Whether this Python and these packages are installed in these versions."""
-    return bool(versions) and versions.items() <= installed_versions().items()
 
 
 def _images_are(folder: Path, recorded: Mapping[str, Mapping[str, object]]) -> bool:

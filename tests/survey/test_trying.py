@@ -1,5 +1,6 @@
 """Changes that a diagnosis names, made in the files of a project: all or nothing, to the letter, and taken back."""
 
+import json
 import shutil
 import tomllib
 from collections.abc import Callable
@@ -20,6 +21,8 @@ from adjust.diagnosis.hypothesis import (
     Rename,
     ScaleKey,
     SetKey,
+    edit_told,
+    told_edit,
 )
 from adjust.diagnosis.names.epochs import exchanged_cameras
 from adjust.diagnosis.names.given import wrong_given
@@ -30,13 +33,18 @@ from adjust.diagnosis.units.pairs import misread_pairs
 from adjust.diagnosis.units.readings import misread_readings
 from adjust.model.errors import SurveyError
 from adjust.model.survey import Survey
+from survey.cli import main
+from survey.folder.plain import plain
+from survey.jobs.adjusting import trying
 from survey.jobs.adjusting.edits import file_of, kept_name
 from survey.jobs.adjusting.places import ProjectFiles
-from survey.jobs.adjusting.trying import carried_out
+from survey.jobs.adjusting.steps import adjust_project
+from survey.jobs.adjusting.trying import carried_out, try_job
 from survey.jobs.adjusting.written import written_of
 from survey.jobs.excluding import include_job
 from survey.project import read
 from survey.project.writing import write_project
+from tests import labs
 from tests.acceptance.planted_mistakes import MISTAKES, survey_of
 from tests.labs import with_euler_angles
 
@@ -281,3 +289,68 @@ def test_the_line_of_a_reading(tmp_path: Path) -> None:
     after = {r.reading_id: r.value for r in read(hall).survey.readings}
     assert {n for n in before if after[n] != before[n]} == {"r7"}
     assert after["r7"] - before["r7"] == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("edit", [
+    ScaleKey(("targets", "board", "square_mm"), 2.5), SetKey(("cameras", "L", "lens", "free"), ("k1", 0.1)),
+    ChangeColumns("pairs", ("tx_mm", "ty_mm"), np.array([[0.0, 1.0], [0.1 + 0.2, 0.0]]), np.array([1.0, 2.0]),
+                  {"pair_id": ("p1", "p2")}),
+    ExchangeColumns("pairs", ("a_id", "b_id")), ChangeReadings(("r1", "r2"), -1.0, 1.0 / 3.0, "distances", "sigma"),
+    Rename("image_points", "camera_id", {"L": "R", "R": "L"}, {"epoch_id": ("t1",)}), LeaveOut(("epoch:t1",)),
+], ids=lambda e: type(e).__name__)  # fmt: skip
+def test_an_edit_as_results_tell_it_is_the_same_edit(edit: Edit) -> None:
+    again = edit_told(json.loads(json.dumps(plain(told_edit(edit)))))
+    assert type(again) is type(edit)
+    for name, value in vars(edit).items():
+        np.testing.assert_array_equal(getattr(again, name), value)
+
+
+@pytest.fixture
+def swapped(tmp_path: Path) -> Path:
+    """An adjusted project with a mistake, of which its results tell the cause."""
+    lab = labs.example("relay", tmp_path / "lab")
+    labs.with_rows(lab / "observations" / "pairs.csv", lambda i, row: i % 3 == 0 and row.update(
+        a_id=row["b_id"], b_id=row["a_id"]))  # fmt: skip
+    assert main(["adjust", str(lab), "--quiet"]) == 3
+    return lab
+
+
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What the project is called each time that it is adjusted for its diagnosis."""
+    adjusted: list[str] = []
+    monkeypatch.setattr(trying, "adjust_project", lambda project, progress: adjusted.append(
+        project.folder.name) or adjust_project(project, progress))  # fmt: skip
+    return adjusted
+
+
+@pytest.mark.slow
+def test_a_cause_that_results_tell_is_carried_out_at_once(
+    swapped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As it is where they are not there, and the project is adjusted first."""
+    adjusted, other = counted(monkeypatch), tmp_path / "other"
+    shutil.copytree(swapped, other)
+    shutil.rmtree(other / "results")
+    said = [try_job(folder, 1) for folder in (swapped, other)]
+    assert adjusted == ["other"]
+    assert said[0] == said[1]
+    assert files(swapped / "observations") == files(other / "observations")
+    with pytest.raises(SurveyError, match="names no cause that it could change"):
+        try_job(swapped, 1)  # its inputs are others by now
+    assert adjusted == ["other", "lab"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("changed", [
+    lambda edit, _: edit.update(table="../../pairs"), lambda edit, _: edit.update(edit="Survey"),
+    lambda edit, _: edit.pop("columns"), lambda _, inputs: inputs["versions"].update(gtsam="0"),
+], ids=["elsewhere", "no edit", "no columns", "other versions"])  # fmt: skip
+def test_results_that_are_not_ours_are_not_carried_out(
+    changed: Callable, swapped: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    adjusted, path = counted(monkeypatch), swapped / "results" / "solution.json"
+    solution = json.loads(path.read_text(encoding="utf-8"))
+    changed(solution["diagnosis"][0]["edits"][0], solution["inputs"])
+    path.write_text(json.dumps(solution), encoding="utf-8")
+    assert "pairs.csv: changed" in try_job(swapped, 1)
+    assert adjusted == ["lab"]

@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.spatial.vertical import Horizon
 
 DIRECTION, ANGLE, ZENITH, AZIMUTH, SLOPE, HORIZONTAL, HEIGHT = range(7)
+_IS_TURN = np.array([kind in (DIRECTION, ANGLE, AZIMUTH) for kind in range(7)])
 AT, TO, SECOND, ORIENTATION, CENTRING, INSTRUMENT, TILT, BODY = 0, 3, 6, 9, 10, 13, 17, 19
 """First columns of the derivatives: positions (3 each), orientation, centring (3), instrument (4), tilts (2), and the
 rotation (3, about its own axes) of the body that an instrument which is not levelled stands on."""
@@ -90,11 +91,7 @@ def wrapped(kind: IntArray, predicted: FloatArray, observed: FloatArray) -> Floa
     """Predicted minus observed (n,); those of horizontal angles to (-pi, pi]."""
     v = predicted - observed
     turns = np.ceil((v - np.pi) / (2.0 * np.pi))
-    return np.asarray(np.where(_is_turn(kind), v - 2.0 * np.pi * turns, v))
-
-
-def _is_turn(kind: IntArray) -> BoolArray:
-    return np.isin(kind, (DIRECTION, ANGLE, AZIMUTH))
+    return np.asarray(np.where(_IS_TURN[kind], v - 2.0 * np.pi * turns, v))
 
 
 def _centring(r: Readings, u: Geometry, rows: IntArray) -> FloatArray:
@@ -143,17 +140,19 @@ def _sights(
     g *= factor[:, None]
     w = _times(back, g)
     A[:, AT : AT + 3], A[:, to_column : to_column + 3], A[:, CENTRING : CENTRING + 3] = -w, w, -g
-    turn = np.cross(w, d + offset)
+    turn = _cross(w, d + offset)
     levelled = np.flatnonzero(body < 0)
     A[on_body, BODY : BODY + 3] = _times(F[on_body], turn[on_body])
     _add_turn(horizon, a[levelled], turn[levelled], levelled, AT, A)
     raised = np.flatnonzero(h_b[:, 0])
-    _add_turn(horizon, b[raised], np.cross(h_b * up_b, w)[raised], raised, to_column, A)
+    _add_turn(horizon, b[raised], _cross((h_b * up_b)[raised], w[raised]), raised, to_column, A)
     return factor * value, A
 
 
 def _add_turn(h: Horizon, at: IntArray, turn: FloatArray, rows: IntArray, column: int, A: FloatArray) -> None:
     """What the axes at positions ``at`` add to A by turning with the position and the tilts."""
+    if not len(rows):
+        return
     A[rows, column : column + 3] += _times(np.swapaxes(h.by_x[at], 1, 2), turn)
     A[rows, TILT : TILT + 2] += _times(np.swapaxes(h.by_tilt[at], 1, 2), turn)
 
@@ -164,16 +163,25 @@ def _shape(kind: IntArray, sign: float, q: FloatArray) -> tuple[FloatArray, Floa
     h2 = x * x + y * y
     h, s2 = np.sqrt(h2), h2 + z * z
     s, zero = np.sqrt(s2), np.zeros(len(q))
-    turn, zenith, slope = _is_turn(kind), kind == ZENITH, kind == SLOPE
+    turn, zenith, slope = _IS_TURN[kind], kind == ZENITH, kind == SLOPE
+
+    def of_kind(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> FloatArray:
+        return np.where(turn, a, np.where(zenith, b, np.where(slope, c, d)))
+
     with np.errstate(divide="ignore", invalid="ignore"):
-        value = np.select([turn, zenith, slope], [sign * np.arctan2(y, x), np.arctan2(h, z), s], h)
+        value = of_kind(sign * np.arctan2(y, x), np.arctan2(h, z), s, h)
         by_turn, by_zenith = (-sign * y / h2, sign * x / h2, zero), (x * z / (h * s2), y * z / (h * s2), -h / s2)
         by_slope, by_horizontal = (x / s, y / s, z / s), (x / h, y / h, zero)
-    parts = zip(by_turn, by_zenith, by_slope, by_horizontal, strict=True)
-    g = np.stack([np.select([turn, zenith, slope], [a, b, c], d) for a, b, c, d in parts], axis=1)
+    g = np.stack([of_kind(*parts) for parts in zip(by_turn, by_zenith, by_slope, by_horizontal, strict=True)], axis=1)
     none = np.where(slope, s, h) == 0.0
     value[none], g[none] = np.nan, 0.0
     return value, g
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Of vectors (n, 3), without what np.cross asks first."""
+    (a1, a2, a3), (b1, b2, b3) = a.T, b.T
+    return np.stack([a2 * b3 - a3 * b2, a3 * b1 - a1 * b3, a1 * b2 - a2 * b1], axis=1)
 
 
 def _times(A: FloatArray, x: FloatArray) -> FloatArray:

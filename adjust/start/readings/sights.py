@@ -5,6 +5,9 @@ Coordinates are taken along the zero of bearings, counter-clockwise of it, and u
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
+from math import sqrt
+from statistics import median
 from typing import TypeVar, cast
 
 import numpy as np
@@ -49,9 +52,14 @@ class Sights:
                 for s, above in slopes:
                     across = s * s - (height[b] - height[a] + above) ** 2
                     if across > 0.0:
-                        found.setdefault((min(a, b), max(a, b)), []).append(float(np.sqrt(across)))
-        median = {pair: float(np.median(v)) for pair, v in found.items()}
-        return median | {(b, a): d for (a, b), d in median.items()}
+                        found.setdefault((min(a, b), max(a, b)), []).append(sqrt(across))
+        middle = {pair: median(v) for pair, v in found.items()}
+        return middle | {(b, a): d for (a, b), d in middle.items()}
+
+    @cached_property
+    def rises(self) -> list[tuple[Node, Node, float]]:
+        """Height differences, the median of all of each pair."""
+        return [(a, b, median(values)) for (a, b), values in self.rise.items()]
 
 
 def node_of(ref: PositionRef) -> Node:
@@ -97,9 +105,15 @@ def spread(steps: Sequence[tuple[Node, Node, _Value]], known: Mapping[Node, _Val
             for b, step in near.get(a, ()):
                 if b not in out:
                     ways.setdefault(b, []).append(out[a] + step)
-        out |= {b: cast(_Value, np.median(values, axis=0)) for b, values in ways.items()}
+        out |= {b: _middle(values) for b, values in ways.items()}
         front = list(ways)
     return out
+
+
+def _middle(values: Sequence[_Value]) -> _Value:
+    if isinstance(values[0], float):
+        return median(values)
+    return cast(_Value, np.median(values, axis=0))
 
 
 def best_of_places(

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping
+from statistics import median
 
 import numpy as np
 
@@ -68,7 +69,7 @@ def _spread(
             height = spread_heights(sights, xy, height, heights_known)
             assumed = dict(height)
             if rough:
-                mean = float(np.median(list(height.values()))) if height else 0.0
+                mean = median(height.values()) if height else 0.0
                 assumed = dict.fromkeys(sorted(sights.nodes), mean) | height
             found = PlaneStart(sights, sights.distances(assumed)).find(xy)
             xy = xy | found.xy
@@ -85,11 +86,11 @@ def spread_heights(
 
     seeded: whether any height was given; else the first one is zero.
     """
-    steps = [(a, b, float(np.median(rises))) for (a, b), rises in sights.rise.items()]
+    steps = list(sights.rises)
     for (a, b), angles in sights.zenith.items():
         if a in xy and b in xy and xy[a] != xy[b]:
             d = abs(xy[b] - xy[a])
-            steps.append((a, b, float(np.median([d / np.tan(z) + up for z, up in angles]))))
+            steps.append((a, b, median([float(d / np.tan(z) + up) for z, up in angles])))
     if not known and not seeded and steps:
         count = Counter(n for a, b, _ in steps for n in (a, b))
         known = {max(count, key=lambda n: (count[n], n)): 0.0}

@@ -157,11 +157,12 @@ def _criteria(near: _Near, limits: FloatArray) -> FloatArray:
     J, R, g = np.zeros(1), near.R[None], near.g[None]
     for k, limit in zip(map(len, near.at), limits.tolist(), strict=True):
         own, across, behind = R[:, :k, :k], R[:, :k, k:], R[:, k:, k:]
-        fine = np.linalg.eigvalsh(own)[:, 0] > CONTROLLED
+        fine = (np.linalg.eigvalsh(own)[:, 0] if k > 1 else own[:, 0, 0]) > CONTROLLED
         right = np.concatenate([across, g[:, :k, None]], axis=2)
-        solved = np.linalg.solve(np.where(fine[:, None, None], own, np.eye(k)), right)
+        divisor = np.where(fine[:, None, None], own, np.eye(k))
+        solved = np.linalg.solve(divisor, right) if k > 1 else right / divisor
         share = np.einsum("si,si->s", g[:, :k], solved[..., -1])
-        less = across.transpose(0, 2, 1) @ solved
+        less = across.transpose(0, 2, 1) @ solved if k > 1 else across.transpose(0, 2, 1) * solved
         J = np.concatenate([J, np.where(fine, J + limit - share, np.inf)])
         R, g = np.concatenate([behind, behind - less[..., :-1]]), np.concatenate([g[:, k:], g[:, k:] - less[..., -1]])
     return J

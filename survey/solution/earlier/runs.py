@@ -62,6 +62,11 @@ def installed_versions() -> dict[str, str]:
     return found
 
 
+def same_versions(versions: Mapping[str, str]) -> bool:
+    """Whether this Python and these packages are installed in these versions."""
+    return bool(versions) and versions.items() <= installed_versions().items()
+
+
 def command_line(command: str, folder: Path, *words: str | Path, **flags: object) -> str:
     """A command as it can be given again, with its options; folders by their names, as results may be moved."""
     said = [f"--{name}" if value is True else f"--{name} {_shown(value)}" for name, value in flags.items() if value]
