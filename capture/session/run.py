@@ -100,7 +100,8 @@ def _heard(seconds: float) -> int | None:
     """The next signal, waited for."""
     if hasattr(signal, "sigtimedwait"):
         heard = signal.sigtimedwait(_SIGNALS, seconds)
-        return None if heard is None else heard.si_signo
+        # where the process was suspended meanwhile, Python tells of a signal that there was not, of any number
+        return None if heard is None or heard.si_signo not in _SIGNALS else heard.si_signo
     time.sleep(seconds)
     return _noted.popleft() if _noted else None
 

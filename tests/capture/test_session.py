@@ -228,6 +228,26 @@ def test_pause_and_go_on(tmp_path, run_it):
 
 
 @pytest.mark.slow
+def test_a_run_that_was_suspended_goes_on(tmp_path):
+    """As by Ctrl-Z and fg: that is no signal to a session."""
+    plan = write_plan(tmp_path, options="wait_s = 0.1")
+    process = processes().Process(target=run_plan_quietly, args=(str(plan),))
+    process.start()
+    while not list((tmp_path / "lab" / "images").rglob("Y/t*.png")):
+        assert process.is_alive()
+        time.sleep(0.005)
+    for _ in range(5):
+        os.kill(process.pid, signal.SIGSTOP)
+        time.sleep(0.06)
+        os.kill(process.pid, signal.SIGCONT)
+        time.sleep(0.01)
+    process.join(120)
+    assert process.exitcode == 0
+    require_complete(plan, 6)
+    assert events(plan, "paused") == []
+
+
+@pytest.mark.slow
 def test_two_sessions_on_one_folder_are_refused(tmp_path):
     plan = write_plan(tmp_path)
     holder = "import sys,time,pathlib; from capture.session.folder import session_lock as L\n"

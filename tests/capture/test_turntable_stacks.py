@@ -2,6 +2,7 @@
 
 import math
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import pytest
 
 from adjust.model.errors import SurveyError
 from capture.devices.turntable import Axis, ControllerError, LimitError, Settle, StoppedError, TableDisconnectedError
+from capture.devices.turntables import ports
 from capture.devices.turntables.ascii import AsciiController
 from capture.devices.turntables.dialect import read_dialect, shipped_dialects
 from capture.devices.turntables.moving import MovingTable
@@ -132,6 +134,25 @@ def test_mute_controller_is_a_lost_connection(tmp_path):
             table.locate()
         server.inject("SPEAK")
         assert np.allclose(table.position, 0.0, atol=1e-6)
+
+
+def test_a_reply_is_not_late_while_the_whole_machine_is_held_up(tmp_path, monkeypatch):
+    """Neither controller nor driver get anything done for longer than a reply may take."""
+    held_up = iter([True])
+
+    def select_later(*given):
+        if given[3] and next(held_up, False):  # whoever waits
+            os.kill(server.pid, signal.SIGSTOP)
+            time.sleep(0.7)
+            os.kill(server.pid, signal.SIGCONT)
+            return [], [], []  # the clock says that the time is over
+        return select(*given)
+
+    with table_server(tmp_path) as server, ascii_table(server) as table:
+        select = ports.select.select
+        monkeypatch.setattr(ports.select, "select", select_later)
+        assert np.allclose(table.position, 0.0, atol=1e-6)
+        assert next(held_up, None) is None
 
 
 def test_nobody_there():

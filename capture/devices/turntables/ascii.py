@@ -12,6 +12,8 @@ from capture.devices.turntable import AxisState, ControllerError, TableDisconnec
 from capture.devices.turntables.dialect import Command, Dialect
 from capture.devices.turntables.ports import Port, open_port
 
+_LOOKS = 10  # at what has arrived, within the time for a reply
+
 
 class AsciiController:
     """A ``Controller`` by dialect. channels, signs, zeros: of each axis; angle = sign * (controller's) + zero, rad."""
@@ -26,7 +28,7 @@ class AsciiController:
     def open(self) -> None:
         """Connect and send what the dialect wants first."""
         try:
-            self._port = open_port(self.address, self._dialect.reply_timeout_s, self._dialect.serial)
+            self._port = open_port(self.address, self._dialect.reply_timeout_s / _LOOKS, self._dialect.serial)
         except (OSError, ValueError) as error:  # SerialException is an OSError
             found = f"{self.address}: cannot be opened ({error})"
             raise TableDisconnectedError(f"{found}; check cable and address") from error
@@ -122,7 +124,7 @@ class AsciiController:
         try:
             port.reset_input_buffer()  # a reply that came too late must not answer this question
             self._send(port, line)
-            reply = port.read_until(end) if answered else b""
+            reply = _reply(port, end) if answered else b""
         except OSError as error:
             raise TableDisconnectedError(f"{self.address}: connection lost ({error}); check cable and power") from error
         if self._dialect.pause_s:
@@ -131,3 +133,16 @@ class AsciiController:
             waited = f"{self._dialect.reply_timeout_s:g} s"
             raise TableDisconnectedError(f"{self.address}: no reply to {line!r} within {waited}; check cable and power")
         return str(reply[: len(reply) - len(end)].decode(self._dialect.encoding, "replace")) if answered else ""
+
+
+def _reply(port: Port, end: bytes) -> bytes:
+    """Up to and with ``end``, less where it does not come in time.
+
+    The time is counted in looks: while this process is held up, as on a busy machine, a reply is not late.
+    """
+    reply = b""
+    for _ in range(_LOOKS):
+        reply += port.read_until(end)
+        if reply.endswith(end):
+            break
+    return reply

@@ -54,8 +54,7 @@ class TcpPort:
         """Up to and with ``end``, less where the time is over before."""
         last = time.monotonic() + self._timeout_s
         while end not in self._buffer:
-            left = last - time.monotonic()
-            if left <= 0 or not select.select([self._socket], [], [], left)[0]:
+            if not select.select([self._socket], [], [], max(0.0, last - time.monotonic()))[0]:
                 break
             self._receive()
         head, found, rest = self._buffer.partition(end)
