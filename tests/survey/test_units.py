@@ -161,10 +161,15 @@ def test_lengths_in_a_column_of_metres(factor: float, unit: str, setup_id: str, 
     assert f"multiply them by {1.0 / factor:g}" in first["change"]
 
 
+QUATERNION = ("qw", "qx", "qy", "qz")
 ROWS = {
     "unit of shifts": ("relay", "pairs", lambda i, row: i % 3 == 0 and row.update(
         {name: f"{float(row[name]) / 1e3:.9f}" for name in ("tx_mm", "ty_mm", "tz_mm")}),
                        "and 14 more have shifts in metres, read as millimetres", "multiply tx, ty, tz by 1000"),
+    "order of quaternions": ("relay", "pairs", lambda i, row: i % 3 == 0 and row.update(
+        zip(QUATERNION, [row[name] for name in (*QUATERNION[1:], "qw")], strict=True)),
+                             "and 14 more have quaternions in the order x y z w, read as w x y z",
+                             "put the last of the four numbers first"),
     "sense of rotation": ("total-station", "terrestrial", lambda i, row: row["kind"] == "direction"
                           and row["setup_id"] == "S1a" and row.update(
                               value_gon=f"{(400.0 - float(row['value_gon'])) % 400.0:.5f}"),
