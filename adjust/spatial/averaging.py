@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from adjust.model.survey import FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.spatial.rigid import nearest_rotation, rigid
 
 _MEDOID_LIMIT = 40  # more candidates than this are thinned out for the quadratic search of the medoid
@@ -60,21 +60,20 @@ def mean_poses(poses: FloatArray, lever: float, ptr: IntArray, members: IntArray
     1 / (1 + (d / s)^2)^2, s three times the median distance. Nearly half of the motions may be wrong.
     members: (n,) numbers in order; neighbours of equal number are alternatives of one observation, the nearest counts.
     """
-    owner, new = np.repeat(np.arange(len(ptr) - 1), np.diff(ptr)), np.ones(len(poses), dtype=np.bool_)
-    if members is not None:
-        new[1:] = (np.diff(members) != 0) | (np.diff(owner) != 0)
+    owner = np.repeat(np.arange(len(ptr) - 1), np.diff(ptr))
+    new = np.ones(len(poses), dtype=np.bool_) if members is None else _begins(members) | _begins(owner)
     member = np.cumsum(new) - 1
     mean = np.concatenate([
         poses[_medoids(poses, lever, part, member)]
         for part in np.split(np.column_stack([ptr[:-1], ptr[1:]]), range(_AT_ONCE, len(ptr) - 1, _AT_ONCE))
     ])  # fmt: skip
-    live, of, here = np.arange(len(mean)), owner, poses
+    live, of, of_member, here = np.arange(len(mean)), owner, owner[new], poses
     for _ in range(_STEPS):
         distance = pose_distance(here, mean[live[of]], lever)
         chosen = least(distance, member)
-        first = np.searchsorted(of[chosen], np.arange(len(live)))
-        scale = np.maximum(3.0 * medians(distance[chosen], of[chosen], len(live)), 1e-12)
-        weights = 1.0 / (1.0 + (distance[chosen] / scale[of[chosen]]) ** 2) ** 2
+        near, first = distance[chosen], np.searchsorted(of_member, np.arange(len(live)))
+        scale = np.maximum(3.0 * medians(near, of_member, len(live)), 1e-12)
+        weights = 1.0 / (1.0 + (near / scale[of_member]) ** 2) ** 2
         total = np.add.reduceat(weights[:, None, None] * here[chosen, :3], first)
         step = rigid(nearest_rotation(total[..., :3]), total[..., 3] / np.add.reduceat(weights, first)[:, None])
         going = pose_distance(step, mean[live], lever) >= _SETTLED * scale
@@ -83,18 +82,26 @@ def mean_poses(poses: FloatArray, lever: float, ptr: IntArray, members: IntArray
         if not len(live):
             break
         if not going.all():
-            rows = going[of]
-            of, here, member = (np.cumsum(going) - 1)[of[rows]], here[rows], member[rows]
+            rows, number = going[of], np.cumsum(going) - 1
+            of, here, member = number[of[rows]], here[rows], member[rows]
+            of_member = number[of_member[going[of_member]]]
     return mean
+
+
+def _begins(numbers: IntArray) -> BoolArray:
+    """(n,) whether a number is another one than that before it."""
+    out = np.ones(len(numbers), dtype=np.bool_)
+    np.not_equal(numbers[1:], numbers[:-1], out=out[1:])
+    return out
 
 
 def least(values: FloatArray, owner: IntArray) -> IntArray:
     """Position of the least of the values (n,) of each owner (n,), whose numbers are in order; the first of equals."""
-    new = np.diff(owner, prepend=-1) != 0
+    new = _begins(owner)
     if new.all():
         return np.arange(len(owner))
     hits = np.flatnonzero(values == np.minimum.reduceat(values, np.flatnonzero(new))[np.cumsum(new) - 1])
-    return np.asarray(hits[np.diff(owner[hits], prepend=-1) != 0])
+    return np.asarray(hits[_begins(owner[hits])])
 
 
 def medians(values: FloatArray, owner: IntArray, k: int) -> FloatArray:
@@ -120,7 +127,7 @@ def _medoids(poses: FloatArray, lever: float, spans: IntArray, member: IntArray)
     first = np.cumsum(n) - n
     other = kept[np.repeat(begin[owner[trial]] - first, n) + np.arange(n.sum())]
     d = pose_distance(poses[low + np.repeat(trial, n)], poses[low + other], lever)
-    changes = np.diff(own[other], prepend=-1) != 0
+    changes = _begins(own[other])
     changes[first] = True
     runs = np.flatnonzero(changes)
     sums = np.add.reduceat(np.minimum.reduceat(d, runs), np.searchsorted(runs, first))

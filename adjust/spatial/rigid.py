@@ -35,15 +35,18 @@ def rotation_log(r: FloatArray) -> FloatArray:
 def nearest_rotation(m: FloatArray) -> FloatArray:
     """Rotations (..., 3, 3) nearest to matrices in the Frobenius norm (orthogonal Procrustes, Schoenemann 1966)."""
     u, _, vt = np.linalg.svd(m)
-    sign = np.sign(np.linalg.det(u @ vt))
-    u = u.copy()
-    u[..., :, 2] *= sign[..., None]
-    return np.asarray(u @ vt)
+    out = u @ vt
+    mirrored = np.linalg.det(out) < 0.0
+    if mirrored.any():
+        u[..., :, 2] *= np.where(mirrored, -1.0, 1.0)[..., None]
+        out = u @ vt
+    return np.asarray(out)
 
 
 def rigid(r: FloatArray, t: FloatArray) -> FloatArray:
     """Rigid motions (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3)."""
-    out = np.zeros((*np.broadcast_shapes(r.shape[:-2], t.shape[:-1]), 4, 4))
+    many, shifts = r.shape[:-2], t.shape[:-1]
+    out = np.zeros((*(many if many == shifts else np.broadcast_shapes(many, shifts)), 4, 4))
     out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = r, t, 1.0
     return out
 
@@ -73,15 +76,21 @@ def adjoint(m: FloatArray) -> FloatArray:
     return out
 
 
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Of two vectors (3,), without what np.cross asks first."""
+    (a1, a2, a3), (b1, b2, b3) = a.tolist(), b.tolist()
+    return np.array([a2 * b3 - a3 * b2, a3 * b1 - a1 * b3, a1 * b2 - a2 * b1])
+
+
 def rotation_to(a: FloatArray, b: FloatArray) -> FloatArray:
     """The smallest rotation (3, 3) that turns direction a (3,) into direction b (3,)."""
     a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
-    axis, cosine = np.cross(a, b), float(a @ b)
+    axis, cosine = _cross(a, b), float(a @ b)
     sine = float(np.linalg.norm(axis))
     if sine < _TINY:
         if cosine > 0:
             return np.eye(3)
-        axis = np.cross(a, np.eye(3)[int(np.argmin(np.abs(a)))])
+        axis = _cross(a, np.eye(3)[int(np.argmin(np.abs(a)))])
         return rotation_exp(np.pi * axis / np.linalg.norm(axis))
     return rotation_exp(axis / sine * float(np.arctan2(sine, cosine)))
 

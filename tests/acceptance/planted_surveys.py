@@ -18,6 +18,7 @@ SMALL_LAB = LabSize(7, 4, 4, 4, 5)
 Path = Callable[[float], Pose3]
 
 
+@cache
 def survey_of(kind: str, seed: int) -> tuple[Survey, Truth]:
     """A good survey of a kind, with its truth."""
     return KINDS[kind](seed)
@@ -59,7 +60,6 @@ def held_lens(seed: int) -> tuple[Survey, Truth]:
     return replace(survey, cameras=cameras), truth
 
 
-@cache
 def small_head(seed: int) -> tuple[Survey, Truth]:
     """Three cameras on a two-axis table before a board."""
     return head_on_table(seed, n_table_epochs=9, n_free_epochs=5)
