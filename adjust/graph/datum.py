@@ -20,7 +20,7 @@ from adjust.frames.unknowns import Unknown
 from adjust.graph.assembly import AdjustmentGraph, Evaluation
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, IntArray
-from adjust.observations.motions import MOVED, READINGS_MOVED, reading_motions, vector_motions
+from adjust.observations.motions import MOVED, READINGS_MOVED, orientation_motions, reading_motions, vector_motions
 from adjust.spatial.motions import motions_of, points_motions, poses_at, poses_motions
 
 if TYPE_CHECKING:
@@ -30,13 +30,29 @@ BLIND = 1e-8
 """Length of the whitened Jacobian times a scaled direction that is not seen; rounding reaches 1e-13."""
 
 
-def gauge(graph: AdjustmentGraph, unknown: Unknown, values: gtsam.Values) -> FloatArray:
-    """How an unknown moves (dim, 7) with the whole survey: translations, rotations (about the world origin), scale."""
+def gauges(graph: AdjustmentGraph, keys: Sequence[int], values: gtsam.Values) -> FloatArray:
+    """How unknowns move, one after the other (n, 7), with the whole survey.
+
+    By translations, rotations (about the world origin), scale.
+    """
+    of = [graph.unknowns.by_key[key] for key in keys]
+    points, poses = ([u for u in of if u.kind == kind] for kind in ("point", "pose"))
+    x = np.array([values.atPoint3(u.key) for u in points]).reshape(-1, 3)
+    world = np.array([in_world(graph.survey, u.name) for u in poses], dtype=np.bool_)
+    moved = [*points_motions(x), *poses_motions(*poses_at(values, [u.key for u in poses]), world)]
+    out = dict(zip([u.key for u in [*points, *poses]], moved, strict=True))
+    if graph.terrestrial is not None and any(u.name[0] == "orientation" for u in of):
+        out |= orientation_motions(graph.survey, graph.unknowns, graph.terrestrial, values)
+    out |= {u.key: _vector_gauge(graph, u, values) for u in of if u.key not in out}
+    return np.concatenate([out[key] for key in keys]) if keys else np.zeros((0, 7))
+
+
+def _vector_gauge(graph: AdjustmentGraph, unknown: Unknown, values: gtsam.Values) -> FloatArray:
     if unknown.name[0] in MOVED:
         return vector_motions(graph.survey, graph.unknowns, unknown, values)
     if unknown.name[0] in READINGS_MOVED:
-        return reading_motions(graph.survey, graph.unknowns, graph.terrestrial, unknown, values)
-    return motions_of(unknown, values, in_world(graph.survey, unknown.name))
+        return reading_motions(graph.unknowns, unknown, values)
+    return motions_of(unknown, values, False)
 
 
 def visible_keys(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph) -> list[int]:
@@ -144,17 +160,11 @@ class InnerDatum:
 
 def survey_motions(graph: AdjustmentGraph, values: gtsam.Values, directions: FloatArray) -> dict[int, FloatArray]:
     """How every unknown moves (dim, k) with the motions ``directions`` (7, k) of the whole survey."""
-    unknowns = graph.unknowns.by_name.values()
-    points = [u.key for u in unknowns if u.kind == "point"]
-    x = np.array([values.atPoint3(key) for key in points]).reshape(-1, 3)
-    out = dict(zip(points, points_motions(x) @ directions, strict=True))
-    poses = [u for u in unknowns if u.kind == "pose"]
-    world = np.array([in_world(graph.survey, u.name) for u in poses], dtype=np.bool_)
-    moved = poses_motions(*poses_at(values, [u.key for u in poses]), world) @ directions
-    out |= dict(zip([u.key for u in poses], moved, strict=True))
+    unknowns = list(graph.unknowns.by_name.values())
+    moved = gauges(graph, [u.key for u in unknowns], values) @ directions
+    ends = np.cumsum([u.dim for u in unknowns])
+    out = dict(zip([u.key for u in unknowns], np.split(moved, ends[:-1]), strict=True))
     for u in unknowns:
-        if u.kind == "vector":
-            out[u.key] = gauge(graph, u, values) @ directions
         for i in graph.unknowns.held.get(u.key, ()):
             out[u.key][i] = 0.0
     return out
@@ -164,7 +174,7 @@ def defects(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, values: g
     """Directions (7, k) of the whole-survey motions that the observations do not see."""
     keys = visible_keys(graph, linear)
     stack = stacking(graph, keys)
-    B = np.concatenate([gauge(graph, graph.unknowns.by_key[k], values) for k in keys])
+    B = gauges(graph, keys, values)
     d = np.sqrt(normal_diagonal(linear, stack))
     lengths = np.linalg.norm(d[:, None] * B, axis=0)
     usable = lengths > 0.0

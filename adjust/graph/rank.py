@@ -5,7 +5,7 @@ import numpy as np
 
 from adjust.frames.unknowns import Unknown
 from adjust.graph.assembly import AdjustmentGraph
-from adjust.graph.datum import BLIND, Stacking, gauge, independent_rows, stacking, times, visible_keys
+from adjust.graph.datum import BLIND, Stacking, gauges, independent_rows, stacking, times, visible_keys
 from adjust.model.errors import IndeterminateError, listed
 from adjust.model.survey import FloatArray, Station
 from adjust.observations.images.bundle_hidden import BundleHidden
@@ -97,7 +97,7 @@ def describe_null_space(
     null, scale = null_space(linear, stack, graph)
     if null.shape[1] == 0:
         return None
-    motions = np.concatenate([gauge(graph, graph.unknowns.by_key[k], values) for k in stack.at]) * scale[:, None]
+    motions = gauges(graph, list(stack.at), values) * scale[:, None]
     scaled = _without_weak_motions(linear, stack, np.linalg.qr(null * scale[:, None])[0], motions, scale)
     if scaled.shape[1] == 0:
         return None

@@ -270,8 +270,8 @@ inline void errors(Ints which, const Batch &B, Out<double, 1> chi, Out<double, 1
     }
 }
 
-// Whitened rows (2 n, n_local + 1) of block b over its local unknowns, residual last.
-inline void rows_of_block(int64_t b, const Batch &B, Room &room, Out<double, 2> out) {
+// put(row, column, number) of the whitened rows (2 n, n_local + 1) of block b over its local unknowns, residual last.
+template <class F> inline void rows_of_block(int64_t b, const Batch &B, Room &room, F &&put) {
     const int n = int(B.n_local(b)) + 1;
     V least = all<V>(__builtin_inf());
     clear_unused(B, b, room);
@@ -280,14 +280,14 @@ inline void rows_of_block(int64_t b, const Batch &B, Room &room, Out<double, 2> 
         local_columns(B, b, chunk, least, room);
         for (int p = 0; p < size; ++p)
             for (int s = 0; s < 2; ++s)
-                for (int j = 0; j < n; ++j) out(2 * (lo - B.blocks.ptr[b] + p) + s, j) = room.A[j][s * chunk.full + p];
+                for (int j = 0; j < n; ++j) put(2 * (lo - B.blocks.ptr[b] + p) + s, j, room.A[j][s * chunk.full + p]);
     });
 }
 
-// The same of listed blocks, which have equally many points and columns: out (g, 2 n, n_local + 1).
+// These rows of listed blocks, which have equally many points and columns: out (g, 2 n, n_local + 1).
 inline void block_rows(Ints which, const Batch &B, Out<double, 3> out) {
     Room room;
-    for (int64_t i = 0; i < which.n[0]; ++i) rows_of_block(which[i], B, room, out[i]);
+    for (int64_t i = 0; i < which.n[0]; ++i) rows_of_block(which[i], B, room, [&](int64_t row, int j, double v) { out(i, row, j) = v; });
 }
 
 // Turns rows B (its columns one after the other, of a whole number of vectors) into the upper triangular R (k, k) above
@@ -400,32 +400,42 @@ template <class F, class G> inline void each_segment(const Segments &S, int64_t 
     }
 }
 
-// For each listed block: its condensed rows, chained to its keys, into flat from at[b], and r_out (B, n). Keys one after
-// the other, each (n, its width); place counts columns, width (B,) all of a block.
-inline void serve(Ints which, const Blocks &blocks, const Lenses &lenses, const Segments &S, In<double, 3> C, In<double, 3> D, Ints width, Ints at,
-                  In<double, 3> H, Out<double, 1> flat, Out<double, 2> r_out) {
+// Where rows of blocks go: of block b `height` ones from the `first` on among `rows` of a factor, whose keys come one after the
+// other from flat[at], each (rows, its dim), and whose residuals begin at r[r_at].
+struct RowPlaces {
+    explicit RowPlaces(Reader &r) : height(r), first(r), rows(r), at(r), r_at(r) {}
+    Ints height, first, rows, at, r_at;
+};
+
+// For each listed block: its rows, condensed where that makes them fewer, chained to its keys, and their residuals.
+inline void serve(Ints which, const Batch &B, const Segments &S, In<double, 3> C, In<double, 3> D, const RowPlaces &places, In<double, 3> H,
+                  Out<double, 1> flat, Out<double, 1> r) {
+    Room room;
     double T[MAX_LOCAL][MAX_LOCAL], E[6][MAX_KEY];
     for (int64_t index = 0; index < which.n[0]; ++index) {
-        const int64_t b = which[index], nl = lenses.n_free[blocks.camera[b]];
-        const int n = int(nl + 6 + blocks.n_warp[b] + 1);
-        for (int j = 0; j < n; ++j)
-            for (int c = 0; c < n; ++c) T[j][c] = H(b, j, c);
-        half_cholesky(T, n);
-        for (int j = 0; j < n; ++j) r_out(b, j) = T[j][n - 1];
-        std::memset(flat.data + at[b], 0, sizeof(double) * n * width[b]);
-        const auto key = [&](int64_t s) { return flat.data + at[b] + n * (S.place[s] - S.within[s]) + S.within[s]; };
+        const int64_t b = which[index], nl = B.lenses.n_free[B.blocks.camera[b]], first_row = places.first[b];
+        const int n = int(B.n_local(b)) + 1, height = int(places.height[b]);
+        for (int j = 0; j < height; ++j)
+            for (int c = 0; c < n; ++c) T[j][c] = height < n ? 0.0 : H(b, j, c);
+        if (height < n) rows_of_block(b, B, room, [&](int64_t row, int j, double v) { T[row][j] = v; });
+        else half_cholesky(T, n);
+        for (int j = 0; j < height; ++j) r(places.r_at[b] + first_row + j) = T[j][n - 1];
+        const auto key = [&](int64_t s) {
+            return flat.data + places.at[b] + places.rows[b] * (S.place[s] - S.within[s]) + first_row * S.dim[s] + S.within[s];
+        };
+        for (int64_t s = S.ptr[b]; s < S.ptr[b + 1]; ++s) std::memset(key(s) - S.within[s], 0, sizeof(double) * height * S.dim[s]);
         each_segment(S, b, nl,
             [&](int64_t s, int64_t first) {
                 double *o = key(s);
                 const int64_t k = S.n[s], dim = S.dim[s];
-                for (int j = 0; j < n; ++j)
+                for (int j = 0; j < height; ++j)
                     for (int64_t c = 0; c < k; ++c) o[j * dim + c] += S.factor[s] * T[j][first + c];
             },
             [&](int64_t s) {
                 double *o = key(s);
                 const int64_t k = S.n[s];
                 pose_by_key(s, S, C, D, E);
-                for (int j = 0; j < n; ++j)
+                for (int j = 0; j < height; ++j)
                     for (int a = 0; a < 6; ++a)
                         for (int64_t c = 0; c < k; ++c) o[j * k + c] += T[j][nl + a] * E[a][c];
             });

@@ -41,7 +41,8 @@ _errors = Function("errors", f"which[*] {_BATCH} chi[B] depth[B]")
 _block_rows = Function("block_rows", f"which[g] {_BATCH} out[g,*,*]")
 _condensed_rows = Function("condensed_rows", f"which[g] {_BATCH} factors[g,*,{N_SHAPE}] out[g,*,*]")
 _serve = Function(
-    "serve", f"which[*] {BLOCKS} {LENSES} {SEGMENTS} {CHAINED} width[B] at[B] H[B,m,m] flat[*] r[B,m]"
+    "serve",
+    f"which[*] {_BATCH} {SEGMENTS} {CHAINED} height[B] first[B] rows[B] at[B] r_at[B] H[B,m,m] flat[*] r[*]",
 )
 _local_by_keys = Function("local_by_keys", f"which[g] n_lens[g] {SEGMENTS} {CHAINED} G[g,*,*]")
 _all_statistics = Function(
@@ -218,15 +219,25 @@ def condensed_rows(which: IntArray, at: BlocksAt, factors: FloatArray, out: Floa
     _condensed_rows(which, *at.arrays, factors, out)
 
 
-def serve(
-    which: IntArray, at: BlocksAt, keys: ByKeys, begin: IntArray, H: FloatArray, flat: FloatArray, r_out: FloatArray
-) -> None:  # fmt: skip
-    """For each listed block: its condensed rows, chained to its keys, into ``flat`` from begin[b], and r_out (B, n).
+class RowPlaces(NamedTuple):
+    """Where rows of blocks (B,) go: ``height`` ones from the ``first`` on among ``rows`` of the block's factor.
 
-    Keys one after the other, each (n, its width); ``segments.place`` counts columns.
+    Its keys come one after the other from ``at`` on, each (rows, its width), its residuals from ``r_at`` on.
     """
-    segments, C, D, width = keys
-    _serve(which, *at.blocks, *at.lenses, *segments, C, D, width, begin, H, flat, r_out)
+
+    height: IntArray
+    first: IntArray
+    rows: IntArray
+    at: IntArray
+    r_at: IntArray
+
+
+def serve(
+    which: IntArray, at: BlocksAt, keys: ByKeys, places: RowPlaces, H: FloatArray, flat: FloatArray, r: FloatArray
+) -> None:  # fmt: skip
+    """For each listed block: its rows, condensed where they are many, chained to its keys, into ``flat`` and ``r``."""
+    segments, C, D, _ = keys
+    _serve(which, *at.arrays, *segments, C, D, *places, H, flat, r)
 
 
 def local_by_keys(which: IntArray, n_lens: IntArray, keys: ByKeys, G: FloatArray) -> None:

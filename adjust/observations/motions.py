@@ -7,11 +7,11 @@ from adjust.frames.unknowns import Unknown, Unknowns
 from adjust.model.survey import FloatArray, Surface, Survey, Vertical, tilt_axes
 from adjust.observations.terrestrial import equations as k
 from adjust.observations.terrestrial.batch import TerrestrialBatch
-from adjust.spatial.motions import point_motions
+from adjust.spatial.motions import point_motions, points_motions
 from adjust.spatial.rigid import skew
 from adjust.spatial.vertical import VERTICAL, tilted
 
-MOVED, READINGS_MOVED = ("vertical", "beam", "surface"), ("orientation", "instrument", "centring")
+MOVED, READINGS_MOVED = ("vertical", "beam", "surface"), ("instrument", "centring")
 
 
 def vector_motions(survey: Survey, unknowns: Unknowns, unknown: Unknown, values: gtsam.Values) -> FloatArray:
@@ -61,15 +61,10 @@ def surface_motions(surface: Surface, full: FloatArray) -> FloatArray:
     return np.vstack([turn, across @ (shift - np.outer(n, reference @ shift) / (n @ reference))])
 
 
-def reading_motions(
-    survey: Survey, unknowns: Unknowns, batch: TerrestrialBatch | None, unknown: Unknown, values: gtsam.Values
-) -> FloatArray:
-    """Motions (dim, 7) of one of ``READINGS_MOVED``; ``batch`` was last evaluated near ``values``."""
-    out = np.zeros((unknown.dim, 7))
-    vector = unknowns.vectors[unknown.name]
+def reading_motions(unknowns: Unknowns, unknown: Unknown, values: gtsam.Values) -> FloatArray:
+    """Motions (dim, 7) of an instrument or a centring."""
+    out, vector = np.zeros((unknown.dim, 7)), unknowns.vectors[unknown.name]
     full = vector.full(values)
-    if unknown.name[0] == "orientation":
-        return out if batch is None else _orientation(survey, unknowns, batch, unknown, values)
     for i, component in enumerate(vector.free):
         value = full[vector.names.index(component)]
         if component == "distance_scale":  # what lengthens in the world is read as before
@@ -81,22 +76,23 @@ def reading_motions(
     return out
 
 
-def _orientation(
-    survey: Survey, unknowns: Unknowns, batch: TerrestrialBatch, unknown: Unknown, values: gtsam.Values
-) -> FloatArray:
-    """The directions stay as they were read: the orientation turns by what the survey turns more than the axes do."""
-    out = np.zeros((1, 7))
-    a = batch.layout.arrays
-    number = list(batch.parameters.orientations).index(unknown.name[1])
-    first = int(np.flatnonzero((a.orientation == number) & (a.kind == k.DIRECTION))[0])
-    if a.body[first] >= 0:
-        return out
-    at = a.at[first]
-    turn = -batch.horizon.by_x[at] @ point_motions(batch.X[at])
-    turn[:, 3:6] += np.eye(3)
+def orientation_motions(
+    survey: Survey, unknowns: Unknowns, batch: TerrestrialBatch, values: gtsam.Values
+) -> dict[int, FloatArray]:
+    """Of all orientations (1, 7), by key; ``batch`` was last evaluated near ``values``.
+
+    The directions stay as they were read: the orientation turns by what the survey turns more than the axes do.
+    """
+    a, maps = batch.layout.arrays, list(batch.parameters.orientations.values())
+    rows = np.flatnonzero((a.orientation >= 0) & (a.kind == k.DIRECTION) & (a.body < 0))
+    number, first = np.unique(a.orientation[rows], return_index=True)
+    at = a.at[rows[first]]
+    turn = -batch.horizon.by_x[at] @ points_motions(batch.X[at])
+    turn[:, :, 3:6] += np.eye(3)
     tilt = batch.parameters.vertical.tilt
     if tilt is not None and tilt.key is not None:
         by_free = batch.horizon.by_tilt[at] @ tilt.matrix
         turn -= by_free @ vector_motions(survey, unknowns, unknowns.by_name[VERTICAL], values)
-    out[0] = batch.sign * (batch.horizon.axes[at, 2] @ turn)
-    return out
+    out = np.zeros((len(maps), 1, 7))
+    out[number] = batch.sign * (batch.horizon.axes[at, 2][:, None] @ turn)
+    return {vector.key: moved for vector, moved in zip(maps, out, strict=True) if vector.key is not None}

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -31,24 +32,36 @@ Truth = Mapping[tuple[str, ...], Any]
 
 def plain_axes(survey: Survey, tilt: FloatArray, x: FloatArray) -> FloatArray:
     """Rows: zero of bearings, right hand of it seen from above (clockwise), up; at x."""
+    round_ = survey.vertical.radius is not None
+    return _axes(survey, tuple(tilt.tolist()), tuple(x.tolist()) if round_ else (0.0, 0.0, 0.0))
+
+
+@lru_cache(16)
+def _axes(survey: Survey, tilt: tuple[float, ...], x: tuple[float, ...]) -> FloatArray:
+    """The same; on planes they are everywhere."""
     up0 = np.asarray(survey.vertical.up_in_world, dtype=float)
-    R = Rot3.Expmap(tilt @ tilt_axes(up0)).matrix()
+    R = Rot3.Expmap(np.array(tilt) @ tilt_axes(up0)).matrix()
     axis = np.eye(3)["xyz".index(survey.bearings.zero)]
     zero = axis - (axis @ up0) * up0
     zero = R @ (zero / np.linalg.norm(zero))
     up = R @ up0
     if survey.vertical.radius is not None:
-        up = x + survey.vertical.radius * up
+        up = np.array(x) + survey.vertical.radius * up
         up = up / np.linalg.norm(up)
     north = zero - (zero @ up) * up
     north /= np.linalg.norm(north)
     return np.array([north, np.cross(north, up), up])
 
 
+@lru_cache(4)
+def _setups(survey: Survey) -> dict[str, Setup]:
+    return {s.setup_id: s for s in survey.setups}
+
+
 def plain_reading(survey: Survey, r: Reading, truth: Truth, x: Mapping[PositionRef, FloatArray]) -> float:
     """The error-free value of a reading, from the geometry alone."""
     tilt = np.asarray(truth.get(("vertical",), survey.vertical.tilt.values), dtype=float)
-    setup = next((s for s in survey.setups if s.setup_id == r.setup_id), None)
+    setup = _setups(survey).get(r.setup_id or "")
     p = np.zeros(4)
     if setup is not None and setup.instrument_id is not None:
         p = np.asarray(truth.get(("instrument", setup.instrument_id),

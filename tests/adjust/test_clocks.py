@@ -97,6 +97,17 @@ def test_factors_alone_agree_with_the_batch() -> None:
         np.testing.assert_allclose(alone.at(key), served.at(key), rtol=1e-9, atol=1e-9 * np.abs(served.at(key)).max())
 
 
+def test_the_rows_of_an_image_are_one_factor() -> None:
+    """Each at a time of its own, with as many rows as coordinates where no more are unknown."""
+    survey, truth = SURVEYS["rows"]()
+    graph = h.build(survey, h.start_at(truth))
+    coordinates = [2 * len(b.uv) for b in survey.image_blocks if b.camera_id == "right"]
+    factors = [graph.graph.at(i) for i in range(graph.others_graph.size(), graph.graph.size())]
+    assert len(graph.images.blocks) > 3 * len(survey.image_blocks)
+    assert len(factors) == len(survey.image_blocks)
+    assert sorted(f.dim() for f in factors)[-len(coordinates) :] == sorted(coordinates)
+
+
 def test_weights_are_those_of_a_polynomial() -> None:
     times = np.array([[0.0, -1.0, 0.8, 2.1, -2.0]])
 

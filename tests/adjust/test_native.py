@@ -83,16 +83,16 @@ def test_vector_instructions_change_nothing(name: str, instructions: str) -> Non
 
 
 def _squares_of_served(call: Call, arrays: list[np.ndarray]) -> np.ndarray:
-    """R'R of the condensed rows [R, r] of each block: R itself is open where a block alone determines too little."""
+    """R'R of the rows [R, r] of each block: R itself is open where a block alone determines too little."""
     names = [argument for argument, kind in call.function.kinds() if kind not in "nd"]
     a = dict(zip(names, arrays, strict=True))
     out = []
     for b in a["which"]:
-        n = int(a["n_free"][a["camera"][b]] + 7 + a["n_warp"][b])
-        rows = [a["r"][b, :n, None]]
+        n, mine = int(a["rows"][b]), slice(int(a["first"][b]), int(a["first"][b] + a["height"][b]))
+        rows = [a["r"][int(a["r_at"][b]) :][mine, None]]
         for s in range(int(a["segment_ptr"][b]), int(a["segment_ptr"][b + 1])):
-            at, k = int(a["at"][b] + n * a["place"][s]), int(a["n"][s])
-            rows.append(a["flat"][at : at + n * k].reshape(n, k))
+            at, k = int(a["at"][b] + n * (a["place"][s] - a["within"][s])), int(a["dim"][s])
+            rows.append(a["flat"][at : at + n * k].reshape(n, k)[mine])
         M = np.hstack(rows)
         out.append((M.T @ M).ravel())
     return np.concatenate(out)

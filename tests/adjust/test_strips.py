@@ -9,7 +9,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.graph.assembly import AdjustmentGraph, StartValues
 from adjust.graph.bending import bending_of, tree
-from adjust.graph.datum import gauge
+from adjust.graph.datum import gauges
 from adjust.graph.solver import solve
 from adjust.lenses.models import MODELS
 from adjust.model.observations import ImageBlock
@@ -51,8 +51,8 @@ def wall(n: int, known: int = 6, seed: int = 0, free: tuple[str, ...] = ("fx",),
 def test_a_survey_that_turns_as_a_whole_keeps_its_shape() -> None:
     """By a third of a radian; moved each for itself, points leave along tangents."""
     graph, delta = wall(60, known=0), gtsam.VectorValues()
-    for key, unknown in graph.unknowns.by_key.items():
-        delta.insert(key, gauge(graph, unknown, graph.start) @ [0.2, -0.4, 0.1, 0.3, -0.2, 0.1, 0.0])
+    for key in graph.unknowns.by_key:
+        delta.insert(key, gauges(graph, [key], graph.start) @ [0.2, -0.4, 0.1, 0.3, -0.2, 0.1, 0.0])
     bending = bending_of(graph)
     assert bending is not None
     straight = graph.start.retract(delta)

@@ -9,7 +9,7 @@ import pytest
 
 from adjust.adjustment import adjust
 from adjust.graph.building import GraphBuilder
-from adjust.graph.datum import gauge, inner_datum
+from adjust.graph.datum import gauges, inner_datum
 from adjust.graph.solver import solve
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
@@ -189,7 +189,7 @@ def test_whole_survey_motions_change_no_reading(vertical: Vertical, unseen: Sequ
     graph = GraphBuilder(survey, {}).build(start_near(survey, truth, 0))
     graph.prepare(graph.start, jacobians=True)
     assert graph.terrestrial is not None
-    motions = {u.key: gauge(graph, u, graph.start) for u in graph.unknowns.by_name.values()}
+    motions = {key: gauges(graph, [key], graph.start) for key in graph.unknowns.by_key}
     for i in unseen:
         moved = gtsam.VectorValues()
         for key, motion in motions.items():

@@ -8,7 +8,7 @@ import pytest
 
 from adjust.graph.assembly import AdjustmentGraph, StartValues
 from adjust.graph.cliques import Cliques
-from adjust.graph.datum import Stacking, gauge, stacking, whitened_rows
+from adjust.graph.datum import Stacking, gauges, stacking, whitened_rows
 from adjust.graph.elimination import Elimination
 from adjust.graph.rank import is_seen
 from adjust.graph.solver import SolveOptions, solve
@@ -76,7 +76,7 @@ def test_a_free_traverse_has_the_covariances_of_inner_constraints() -> None:
     linear = graph.graph.linearize(solved.values)
     stack = stacking(graph, [u.key for u in graph.unknowns.by_name.values()])
     A = whitened_rows(linear, stack).toarray()
-    G = np.concatenate([gauge(graph, graph.unknowns.by_key[k], solved.values) for k in stack.at])[:, [0, 1, 2, 5]]
+    G = gauges(graph, list(stack.at), solved.values)[:, [0, 1, 2, 5]]
     assert np.abs(A @ G).max() < 1e-6 * np.abs(A).max()
     is_point = np.concatenate([np.full(at.stop - at.start, graph.unknowns.by_key[k].kind == "point")
                                for k, at in stack.at.items()])  # fmt: skip

@@ -1,7 +1,9 @@
-"""All image points of known targets: one compiled pass evaluates them, one condensed factor per block serves GTSAM.
+"""All image points of known targets: one compiled pass evaluates them, one condensed factor per image serves GTSAM.
 
 A block's rows are the upper triangular square root of its augmented normal matrix over [lens | camera_from_target |
 warp | residual]: the same linear system and chi-square as its 2n rows, for any n (Lawson and Hanson 1974, chapter 27).
+Where 2n are fewer, as of the parts of an image whose rows have times of their own, they are these. The parts of an
+image are on the same keys, and one factor.
 """
 
 from collections.abc import Sequence
@@ -24,6 +26,7 @@ from adjust.native.images import (
     KeyArrays,
     PointArrays,
     PointStatistics,
+    RowPlaces,
     all_statistics,
     block_rows,
     condensed_rows,
@@ -118,6 +121,25 @@ class ImageBatch:
         self.H = np.zeros((len(self.blocks), most, most))
         self.chi, self.depth = np.zeros(len(self.blocks)), np.zeros(len(self.blocks))
         self._flat: FloatArray | None = None
+        self._place_rows()
+
+    def _place_rows(self) -> None:
+        """Which blocks are together a factor, numbered from ``factor_ptr``, and where their rows go."""
+        k = self.of_blocks
+        seen, count = [(b.camera_id, b.epoch_id, b.target_id) for b in self.blocks], np.diff(k.ptr)
+        alike: BoolArray = np.array([False, *(a == b for a, b in pairwise(seen))][: len(seen)], dtype=np.bool_)
+        alike[1:] &= count[1:] == count[:-1]
+        same = k.key == k.key[np.maximum(np.arange(len(k.key)) - count[k.block], 0)]
+        alike[k.block[~same]] = False
+        begins = np.flatnonzero(~alike)
+        self.factor_of: IntArray = np.cumsum(~alike) - 1
+        self.factor_ptr: IntArray = np.append(begins, len(seen))
+        height = np.minimum(self.n_rows, np.maximum(2 * np.diff(self.ptr), 1))
+        end = np.concatenate([[0], np.cumsum(height)])
+        self.height: IntArray = np.diff(end[self.factor_ptr])
+        size = np.cumsum(np.append(0, self.height * k.columns[begins]))
+        first = end[begins][self.factor_of]
+        self._places = RowPlaces(height, end[:-1] - first, self.height[self.factor_of], size[self.factor_of], first)
 
     @cached_property
     def keys(self) -> list[list[int]]:
@@ -156,42 +178,42 @@ class ImageBatch:
         if self._flat is None:
             self._make_room()
         runs = self._all if which is None else [which]
-        run_split(serve, runs, self.at(self.W), self.by_keys, self._at, self.H, self._flat, self.r)
+        run_split(serve, runs, self.at(self.W), self.by_keys, self._places, self.H, self._flat, self.r)
 
     def _make_room(self) -> None:
         """Where the rows of all factors are written, and views of them for GTSAM."""
-        k = self.of_blocks
-        sizes = self.n_rows * k.columns
-        self._at = np.cumsum(np.append(0, sizes))[:-1].astype(np.int64)
-        self._flat, self.r = np.zeros(int(sizes.sum())), np.zeros((len(self.blocks), int(self.n_rows.max(initial=1))))
+        k, begins = self.of_blocks, self.factor_ptr[:-1]
+        at, ends = self._places.at[begins], np.cumsum(self.height)
+        self._flat, self.r = np.zeros(int((self.height * k.columns[begins]).sum())), np.zeros(int(self.height.sum()))
+        self._residuals = np.split(self.r, ends[:-1])
         self._views: list[list[FloatArray]] = []
-        for b in range(len(self.blocks)):
-            rows, views = int(self.n_rows[b]), []
-            for i in range(k.ptr[b], k.ptr[b + 1]):
-                at, n = int(self._at[b] + rows * k.place[i]), int(k.width[i])
-                views.append(self._flat[at : at + rows * n].reshape(rows, n))
-            self._views.append(views)
+        for begin, rows, b in zip(at.tolist(), self.height.tolist(), begins.tolist(), strict=True):
+            mine = range(int(k.ptr[b]), int(k.ptr[b + 1]))
+            parts = [(begin + rows * int(k.place[i]), int(k.width[i])) for i in mine]
+            self._views.append([self._flat[a : a + rows * n].reshape(rows, n) for a, n in parts])
 
-    def _evaluate_alone(self, b: int, values: gtsam.Values, jacobians: bool) -> None:
-        self.state.load(values, self.chains.slots(b))
-        c, links = self.chains, slice(self.chains.ptr[b], self.chains.ptr[b + 1])
-        c.R[b : b + 1], c.t[b : b + 1], c.C[links] = c.one(self.state, b)
-        alone: IntArray = np.array([b])
-        self._evaluate([alone], jacobians)
+    def _evaluate_alone(self, blocks: IntArray, values: gtsam.Values, jacobians: bool) -> None:
+        self.state.load(values, [slot for b in blocks.tolist() for slot in self.chains.slots(b)])
+        c = self.chains
+        for b in blocks.tolist():
+            links = slice(c.ptr[b], c.ptr[b + 1])
+            c.R[b : b + 1], c.t[b : b + 1], c.C[links] = c.one(self.state, b)
+        self._evaluate([blocks], jacobians)
         if jacobians:
-            self.serve(alone)
+            self.serve(blocks)
 
-    def residual(self, b: int, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
-        """What GTSAM's custom factor of block ``b`` returns: its condensed residual, and its rows by key."""
+    def residual(self, factor: int, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
+        """What GTSAM's custom factor of this number returns: its residuals, and its rows by key."""
+        begin, end = int(self.factor_ptr[factor]), int(self.factor_ptr[factor + 1])
         if not self.state.served:
-            self._evaluate_alone(b, values, jacobians is not None)
+            self._evaluate_alone(np.arange(begin, end), values, jacobians is not None)
         if jacobians is None:  # only the length of a residual is asked for: zeros, then the length
-            length = np.zeros(int(self.n_rows[b]))
-            length[-1] = np.sqrt(self.chi[b])
+            length = np.zeros(int(self.height[factor]))
+            length[-1] = np.sqrt(self.chi[begin:end].sum())
             return length
-        for i, view in enumerate(self._views[b]):
+        for i, view in enumerate(self._views[factor]):
             jacobians[i] = view
-        return np.asarray(self.r[b, : self.n_rows[b]])
+        return np.asarray(self._residuals[factor])
 
     def set_weights(self, weights: FloatArray) -> None:
         """Weights (N,) on top of the covariances; a point of weight zero is left out, the others are used."""
@@ -205,12 +227,12 @@ class ImageBatch:
         return np.asarray((w00 * u + w01 * v) ** 2 + (w11 * v) ** 2)
 
     def add_factors(self, graph: gtsam.NonlinearFactorGraph, which: IntArray | None = None) -> None:
-        """One custom factor for each of these blocks, or of all, that has an unknown."""
-        noise = {int(n): gtsam.noiseModel.Unit.Create(int(n)) for n in np.unique(self.n_rows)}
-        for b in range(len(self.blocks)) if which is None else which.tolist():
-            keys = self.keys[b]
+        """A custom factor for the parts of each image among these blocks, or all, that have an unknown."""
+        noise = {n: gtsam.noiseModel.Unit.Create(n) for n in np.unique(self.height).tolist()}
+        for i in np.unique(self.factor_of if which is None else self.factor_of[which]).tolist():
+            keys = self.keys[int(self.factor_ptr[i])]
             if keys:
-                graph.add(evaluated(noise[int(self.n_rows[b])], keys, partial(self.residual, b)))
+                graph.add(evaluated(noise[int(self.height[i])], keys, partial(self.residual, i)))
 
     def alike(self) -> list[IntArray]:
         """All blocks in sets with the same numbers of points, rows and columns, none of much more than ``_AT_ONCE``."""
