@@ -90,3 +90,33 @@ def test_names_that_only_names_contradict_are_not_blamed(tmp_path: Path) -> None
             exchanged(lab, table, a, b)
         assert main(["adjust", str(lab), "--quiet"]) == 0
         assert "diagnosis" not in json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("setup_id", ["S1a", "S2a"])
+def test_scale_of_the_distances_of_one_setup(setup_id: str, tmp_path: Path) -> None:
+    """300 ppm: told as an error that the distances of every set-up have in common, each its own."""
+    lab = labs.example("total-station", tmp_path / "lab")
+    change(lab, "terrestrial", lambda _, row: row["setup_id"] == setup_id and row["value_m"] and row.update(
+        value_m=f"{1.0003 * float(row['value_m']):.7f}"))  # fmt: skip
+    first, *_ = named(lab)
+    assert (first["name"], first["ids"]) == ("scale of distances", [setup_id])
+    assert mends(lab)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("setup_id", "height", "missing"), [("S1a", 1612.0, "0"), ("S2a", 1547.0, ""),
+                                                             ("S3a", 1583.0, "0")])  # fmt: skip
+def test_forgotten_height_of_an_instrument(setup_id: str, height: float, missing: str, tmp_path: Path) -> None:
+    """Sights to the instrument's point were left out, and nothing said; of the last one there was no solution."""
+    lab = labs.example("total-station", tmp_path / "lab")
+    change(lab, "terrestrial", lambda _, row: row["setup_id"] == setup_id and row.update(instrument_height_mm=missing))
+    first, *_ = named(lab)
+    assert (first["name"], first["ids"]) == ("instrument height", [setup_id])
+    assert "it stands there as 0, and was forgotten" in first["cause"]
+    assert mends(lab)
+    rows = (lab / "observations" / "terrestrial.csv").read_text(encoding="utf-8").splitlines()
+    column = rows[0].split(",").index("instrument_height_mm")
+    given = {float(row.split(",")[column]) for row in rows[1:] if f",{setup_id}," in row
+             and row.startswith(("zenith", "slope"))}  # fmt: skip
+    assert given == {pytest.approx(height, abs=1.0)}
