@@ -14,6 +14,7 @@ from adjust.diagnosis.names.points import exchanged_points
 from adjust.diagnosis.names.rays import exchanged_in_images
 from adjust.diagnosis.names.setups import rows_of_another_setup
 from adjust.diagnosis.names.stations import exchanged_stations
+from adjust.diagnosis.names.throughout import exchanged_throughout
 from adjust.diagnosis.table.misread import misread_tables
 from adjust.diagnosis.targets.layout import other_layouts
 from adjust.diagnosis.targets.size import wrong_sizes
@@ -33,13 +34,13 @@ Family = Callable[[Case], Iterable[Hypothesis]]
 SCORES: tuple[Family, ...] = (effects.hypotheses,)
 IMAGES: tuple[Family, ...] = (mirrored_images, other_layouts, turned_alone)
 NAMES: tuple[Family, ...] = (
-    exchanged_points, wrong_given, misplaced_epochs, misnamed_images, exchanged_in_images, rows_of_another_setup,
-    exchanged_stations,
+    exchanged_points, exchanged_throughout, wrong_given, misplaced_epochs, misnamed_images, exchanged_in_images,
+    rows_of_another_setup, exchanged_stations,
 )  # fmt: skip
 VALUES: tuple[Family, ...] = (misread_heights, impossible_sigmas)
 """Told by the values alone: the first ones that are tried."""
 UNITS: tuple[Family, ...] = (misread_readings, second_faces, other_kinds, wrong_heights, misread_pairs)
-IN_COMMON = (*VALUES, *UNITS, small_sigmas)
+IN_COMMON = (*VALUES, exchanged_points, exchanged_throughout, *UNITS, small_sigmas)
 """What several observations that were left out, with all others fitting, may have in common."""
 TIME: tuple[Family, ...] = (forgotten_motion, unsynchronised)
 WEIGHTS: tuple[Family, ...] = (odd_sigmas, wrong_factors, small_sigmas, correlated_readings, missing_centring)

@@ -11,6 +11,7 @@ import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, SetKey
+from adjust.diagnosis.names.throughout import in_readings
 from adjust.diagnosis.screen import Fit, Screen, at_best, improvement, screen
 from adjust.diagnosis.units.conventions import LENGTH_RATIOS
 from adjust.model.rewriting import with_rows
@@ -20,6 +21,7 @@ _CLEARLY = 2.0
 _MOST, _TRIALS = 4, 80
 _SLIPS = (10.0, 0.1, 100.0, 0.01, 1000.0, 0.001)
 _LARGE = 2500
+_EXCHANGED = "given points exchanged"
 _SPOILT = 1e6
 """Variance factor of a start at which the typical reading misses by so much that no single one stands out."""
 
@@ -39,7 +41,12 @@ def wrong_given(case: Case) -> Iterator[Hypothesis]:
     fits = map(screen, changed) if before is None else before.afresh(changed)
     found = [replace(h, evidence=e, looked_at=len(tried)) for h, fit in zip(tried, fits, strict=True)
              if (e := _evidence(before, fit)) > _CLEARLY]  # fmt: skip
-    yield from sorted(found, key=lambda h: -h.evidence)[:_MOST]
+    for h in sorted(found, key=lambda h: -h.evidence)[:_MOST]:
+        other = in_readings(survey, (h.place.ids[0], h.place.ids[1])) if h.name == _EXCHANGED else None
+        if other is not None and isinstance(other.survey, Survey):
+            e = _evidence(before, screen(other.survey))
+            yield from [replace(other, evidence=e, looked_at=len(tried))] if e > _CLEARLY else []
+        yield h
 
 
 def _misses(survey: Survey, before: Screen, ids: tuple[str, ...]) -> bool:
@@ -73,7 +80,7 @@ def _exchanges(survey: Survey, given: list[str]) -> Iterator[Hypothesis]:
     for a, b in combinations(given, 2):
         cause = f"the given coordinates of points {a} and {b} are each other's"
         remedy = f"exchange the coordinates of {a} and {b} in survey.toml"
-        yield _changed(survey, "given points exchanged", cause, remedy, "x_in_world", {a: x[b], b: x[a]})
+        yield _changed(survey, _EXCHANGED, cause, remedy, "x_in_world", {a: x[b], b: x[a]})
 
 
 def _slips(survey: Survey, given: list[str]) -> Iterator[Hypothesis]:

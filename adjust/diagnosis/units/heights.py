@@ -5,17 +5,19 @@ unit are told by the values alone: an instrument's axis lies in its housing, so 
 millimetres of its point nor a hundred metres above it.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import ChangeReadings, Hypothesis, Place
-from adjust.diagnosis.screen import at_best
+from adjust.diagnosis.screen import Screen, at_best, screen
 from adjust.diagnosis.weights.impossible import SURE
 from adjust.model.errors import listed
 from adjust.model.observations import Reading, position_text
+from adjust.model.result import Adjustment
 from adjust.model.rewriting import Fields, with_rows
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.observations.terrestrial.batch import TerrestrialBatch
@@ -23,18 +25,24 @@ from adjust.statistics.score import LinearScores
 
 _CLEARLY = 3.0
 _FEWEST, _MOST = 3, 4
+SCALE, INSTRUMENT, _TARGET = "scale of distances", "instrument height", "target height"
 _LARGEST = 10.0
 """m: what no height of an instrument or a target, and no reflector's constant, is wrong by."""
 _HEIGHTS = ("instrument_height", "target_height", "second_height")
 _UNITS = {1e3: ("are metres, read as millimetres", 2e-4, 3e-3), 1e-3: ("are millimetres, read as metres", 100.0, 1e5)}
 """By the factor that mends them: heights in another unit, and from where to where (m) they then stand."""
+_LINEAR, _EXACT, _BELOW = 0.02, 1e-5, 0.05
+"""m: changes of heights above which sights turn in another proportion, of the last step, and of what stands below."""
+_ROUNDS, _SUSPECTS = 5, 3
+_CLEAR_DROP = 9.0
+"""Of v'Pv, by which a size is clearly another one."""
 _SEEN = 1e-4
 """Share of a constant's column that no unknown takes over, below which it does not show."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Constant:
-    """rows: of the readings that a change by 1 m changes by ``by`` (n,)."""
+    """rows: of the readings that a change by 1 m (of a scale: by 1) changes by ``by`` (n,)."""
 
     name: str
     text: str
@@ -42,6 +50,23 @@ class _Constant:
     rows: IntArray
     by: FloatArray
     remedy: str
+
+    @property
+    def field(self) -> str:
+        """Of its readings that is changed."""
+        return {INSTRUMENT: "instrument_height", _TARGET: "target_height"}.get(self.name, "value")
+
+    def amount(self, size: float) -> str:
+        """The change of what stands there, in words."""
+        return f"{-1e6 * size:+.0f} ppm" if self.name == SCALE else \
+            f"{1e3 * (-size if self.field == 'value' else size):+.1f} mm"  # fmt: skip
+
+    def edit(self, survey: Survey, size: float) -> ChangeReadings:
+        """The same of ``terrestrial.csv``."""
+        ids = tuple(survey.readings[i].reading_id for i in self.rows.tolist())
+        if self.name == SCALE:
+            return ChangeReadings(ids, 1.0 - size)
+        return ChangeReadings(ids, 1.0, -size if self.field == "value" else size, field=self.field)
 
 
 def misread_heights(case: Case) -> Iterator[Hypothesis]:
@@ -94,15 +119,20 @@ def wrong_heights(case: Case) -> Iterator[Hypothesis]:
     if before is None or batch is None:
         return
     constants = list(_constants(survey, batch.A))
-    judged = _by_scores(case, constants) or [_evidence(before.scale, batch, c) for c in constants]
+    judged = _by_scores(case, constants) or _by_misses(case, before, batch, constants)
     found = [(e, c, d) for c, (e, d) in zip(constants, judged, strict=True) if e > _CLEARLY and abs(d) < _LARGEST]
     for evidence, constant, metres in sorted(found, key=lambda f: (-f[0], -len(f[1].rows)))[:_MOST]:
-        changed = _changed(survey, constant, metres)
-        amount = -metres if constant.name == "prism constant" else metres
-        yield Hypothesis(
-            constant.name, f"{constant.text} is wrong by about {-1e3 * amount:+.1f} mm",
-            f"{constant.remedy} by {1e3 * amount:+.1f} mm", constant.place, changed, (), evidence, 1, len(constants),
-        )  # fmt: skip
+        yield _hypothesis(survey, constant, metres, len(constants), evidence)
+
+
+def _hypothesis(survey: Survey, constant: _Constant, metres: float, looked_at: int, evidence: float) -> Hypothesis:
+    forgotten, below = _given(survey, constant, metres)
+    return Hypothesis(
+        constant.name, f"{constant.text} is wrong by about {constant.amount(-metres)}{forgotten}",
+        f"{constant.remedy} by {constant.amount(metres)}", constant.place, _changed(survey, constant, metres),
+        (constant.edit(survey, metres),), evidence, 1 + below, looked_at,
+        partial(_finer, survey, constant, metres, looked_at, evidence),
+    )  # fmt: skip
 
 
 def _by_scores(case: Case, constants: list[_Constant]) -> list[tuple[float, float]]:
@@ -119,7 +149,12 @@ def _by_scores(case: Case, constants: list[_Constant]) -> list[tuple[float, floa
     linear: LinearScores | None = case.linear
     if linear is None or linear.result is not result:
         linear = LinearScores(result)
-    ptr, sigma = linear.system.ptr, np.array([r.sigma for r in case.survey.readings])
+    return [(linear.ratio(drop), metres) for drop, metres in _scores(linear, constants)]
+
+
+def _scores(linear: LinearScores, constants: Sequence[_Constant]) -> list[tuple[float, float]]:
+    """By how much v'Pv falls, and the constant; 0 of what does not show."""
+    ptr, sigma = linear.system.ptr, np.array([r.sigma for r in linear.result.survey.readings])
     first = int(ptr[len(ptr) - 1 - len(sigma)])
     columns = [c.by / sigma[c.rows] for c in constants]
     g, M = linear.apart([(first + c.rows, b[:, None]) for c, b in zip(constants, columns, strict=True)])
@@ -127,7 +162,17 @@ def _by_scores(case: Case, constants: list[_Constant]) -> list[tuple[float, floa
     sure = m > _SEEN * np.array([b @ b for b in columns])
     metres = np.where(sure, -g / np.where(sure, m, 1.0), 0.0)
     drop = np.where(sure, g**2 / np.where(sure, m, 1.0), 0.0)
-    return [(float(result.omega / max(result.omega - d, 1.0)), float(x)) for d, x in zip(drop, metres, strict=True)]
+    return list(zip(drop.tolist(), metres.tolist(), strict=True))
+
+
+def _finer(
+    survey: Survey, constant: _Constant, metres: float, looked_at: int, evidence: float, result: Adjustment
+) -> list[Hypothesis]:
+    """The same with the size that the adjustment with it shows, where that is clearly another one."""
+    drop, more = _scores(LinearScores(result), [constant])[0]
+    if drop < _CLEAR_DROP or not all(r.used for r in result.survey.readings):
+        return []
+    return [replace(_hypothesis(survey, constant, metres + more, looked_at, evidence), follow=None)]
 
 
 def _constants(survey: Survey, A: FloatArray) -> Iterator[_Constant]:
@@ -137,6 +182,7 @@ def _constants(survey: Survey, A: FloatArray) -> Iterator[_Constant]:
     up_to, up_at, along = A[:, 5], A[:, 2], np.ones(len(A))  # by the heights of the two ends' positions, and by lengths
     tilted = np.isin(kinds, ("zenith", "slope_distance", "height_difference"))
     lengths = np.isin(kinds, ("slope_distance", "horizontal_distance"))
+    values = np.array([r.value for r in survey.readings])
 
     def of(name: str, text: str, place: Place, which: BoolArray, by: FloatArray, remedy: str) -> Iterator[_Constant]:
         rows = np.flatnonzero(which)
@@ -145,38 +191,115 @@ def _constants(survey: Survey, A: FloatArray) -> Iterator[_Constant]:
 
     for setup_id in dict.fromkeys(s for s in setups.tolist() if s):
         mine = setups == setup_id
-        yield from of("instrument height", f"the instrument's height at set-up {setup_id}",
+        yield from of(INSTRUMENT, f"the instrument's height at set-up {setup_id}",
                       Place("setup", (setup_id,), "instrument_height_m"), mine & tilted, up_at,
                       "change instrument_height of its rows in terrestrial.csv")  # fmt: skip
         yield from of("prism constant", f"the reflector's constant at set-up {setup_id}",
                       Place("setup", (setup_id,), "value"), mine & lengths, along,
                       "change the distances of its rows in terrestrial.csv")  # fmt: skip
+        yield from of(SCALE, f"the scale of the distances of set-up {setup_id}",
+                      Place("setup", (setup_id,), "value"), mine & lengths, values,
+                      "change the distances of its rows in terrestrial.csv")  # fmt: skip
     for target in dict.fromkeys(targets.tolist()):
-        yield from of("target height", f"the target's height on point {target}",
+        yield from of(_TARGET, f"the target's height on point {target}",
                       Place("point", (target,), "target_height_m"), (targets == target) & tilted, up_to,
                       "change target_height of its rows in terrestrial.csv")  # fmt: skip
     yield from of("prism constant", "the reflector's constant of all distances", Place("instrument", (), ""), lengths,
                   along, "give an instrument's distance_offset, or change all distances")  # fmt: skip
+    yield from of(SCALE, "the scale of all distances", Place("instrument", (), ""), lengths, values,
+                  "give an instrument's distance_scale, or change all distances")  # fmt: skip
 
 
-def _evidence(scale: float, batch: TerrestrialBatch, constant: _Constant) -> tuple[float, float]:
-    """How many times smaller the misfit of its readings becomes, and the constant's change (m)."""
-    rows = constant.rows
+def _given(survey: Survey, constant: _Constant, metres: float) -> tuple[str, bool]:
+    """That a height was forgotten, in words; whether it would be below zero, which is one thing more to believe."""
+    if constant.field == "value":
+        return "", False
+    heights = [getattr(survey.readings[i], constant.field) for i in constant.rows.tolist()]
+    none = constant.name == INSTRUMENT and not any(heights) and metres > 0.0
+    return ": it stands there as 0, and was forgotten" if none else "", min(heights) + metres < -_BELOW
+
+
+def _by_misses(
+    case: Case, before: Screen, batch: TerrestrialBatch, constants: Sequence[_Constant]
+) -> list[tuple[float, float]]:
+    """The same by what the readings miss where everything else stays where it is.
+
+    An instrument takes its point along, so that sights to that by others say the same as the heights of their targets.
+    """
+    judged = [_evidence(before, batch, c) for c in constants]
+    of_targets = {c.place.ids[0]: j for c, j in zip(constants, judged, strict=True) if c.name == _TARGET}
+    points = {r.setup_id: str(r.at.point_id) for r in case.survey.readings if r.at.frame is None}
+    for i, c in enumerate(constants):
+        told = of_targets.get(points.get(c.place.ids[0], "")) if c.name == INSTRUMENT else None
+        judged[i] = judged[i] if told is None else max(judged[i], (told[0], -told[1]))
+    if case.result is None:
+        for i, found in _apart(case.survey, before, constants):
+            judged[i] = found if found[0] > _CLEARLY else judged[i]
+    return judged
+
+
+def _apart(
+    survey: Survey, before: Screen, constants: Sequence[_Constant]
+) -> Iterator[tuple[int, tuple[float, float]]]:
+    """At the start without what an instrument's height is in, which may have spoilt all others, or told all of them.
+
+    Of those that stand there as 0, then of those whose readings miss most.
+    """
+    some = [i for i, c in enumerate(constants) if c.name == INSTRUMENT]
+    given = {i: any(survey.readings[k].instrument_height for k in constants[i].rows) for i in some}
+    worst = {i: -float(np.median(before.readings[constants[i].rows])) for i in some}
+    for i in sorted(some, key=lambda i: (given[i], worst[i]))[:_SUSPECTS]:
+        lost = {*constants[i].rows.tolist()}
+        without = screen(replace(survey, readings=tuple(r for k, r in enumerate(survey.readings) if k not in lost)))
+        apart = None if without is None else screen(survey, without.start)
+        if apart is not None and apart.graph.terrestrial is not None:
+            own = replace(constants[i], by=apart.graph.terrestrial.A[constants[i].rows, 2])
+            yield i, _evidence(apart, apart.graph.terrestrial, own)
+
+
+def _evidence(before: Screen, batch: TerrestrialBatch, constant: _Constant) -> tuple[float, float]:
+    """How many times smaller the misfit of its readings becomes, and the constant's change (m).
+
+    A height that is off by so much that sights no longer turn in proportion is found in steps.
+    """
+    rows, scale = constant.rows, before.scale
     sigma, miss = batch.sigma[rows], -batch.residual[rows]  # observed minus predicted
-    weight = np.abs(constant.by) / sigma
-    if not (weight > 0).any() or not np.isfinite(miss).all():
+    if not np.isfinite(miss).all():
         return 0.0, 0.0
-    some = weight > 0
-    metres = float(np.quantile(miss[some] / constant.by[some], 0.5, weights=weight[some], method="inverted_cdf"))
+    metres, left = _one_step(scale, sigma, miss, constant.by)
+    if constant.field != "value" and _LINEAR < abs(metres) < _LARGEST:
+        alone: Fields = dict.fromkeys(before.graph.survey.others, ())
+        alone["readings"] = tuple(before.graph.survey.readings[i] for i in rows)
+        part = replace(before.graph.survey, image_blocks=(), reading_covariances=(), **alone)
+        own = replace(constant, rows=np.arange(len(rows)))
+        for _ in range(_ROUNDS):
+            found = screen(_changed(part, own, metres), before.start)
+            again = None if found is None else found.graph.terrestrial
+            if again is None or not np.isfinite(again.residual).all():
+                break
+            by = again.A[:, 2 if constant.name == INSTRUMENT else 5]
+            more, left = _one_step(scale, sigma, -again.residual, by)
+            metres += more
+            if abs(more) < _EXACT:
+                break
     old = np.minimum((miss / sigma) ** 2 / scale, CAP).sum()
-    new = np.minimum(((miss - constant.by * metres) / sigma) ** 2 / scale, CAP).sum()
-    return float(old / (new + 0.1 * len(rows) + 1.0)), metres
+    return float(old / (left + 0.1 * len(rows) + 1.0)), metres
+
+
+def _one_step(scale: float, sigma: FloatArray, miss: FloatArray, by: FloatArray) -> tuple[float, float]:
+    """The change of a constant that most of its readings speak for, and their bounded misfit after it."""
+    weight = np.abs(by) / sigma
+    some = weight > 0
+    if not some.any():
+        return 0.0, float(np.minimum((miss / sigma) ** 2 / scale, CAP).sum())
+    metres = float(np.quantile(miss[some] / by[some], 0.5, weights=weight[some], method="inverted_cdf"))
+    return metres, float(np.minimum(((miss - by * metres) / sigma) ** 2 / scale, CAP).sum())
 
 
 def _changed(survey: Survey, constant: _Constant, metres: float) -> Survey:
     """With the constant as it probably was; its readings then fit without it."""
-    heights = {"instrument height": "instrument_height", "target height": "target_height"}
-    field, by = (heights[constant.name], metres) if constant.name in heights else ("value", -metres)
+    field, by = constant.field, np.full(len(constant.rows), metres) if constant.field != "value" else (
+        -metres * constant.by)  # fmt: skip
     mine = {i: survey.readings[i] for i in constant.rows.tolist()}
-    new: dict[int, Fields] = {i: {field: getattr(r, field) + by} for i, r in mine.items()}
+    new: dict[int, Fields] = {i: {field: getattr(mine[i], field) + d} for i, d in zip(mine, by.tolist(), strict=True)}
     return with_rows(survey, "readings", {i: replace(r, **new[i]) for i, r in mine.items()})

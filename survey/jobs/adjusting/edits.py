@@ -25,7 +25,7 @@ from survey.folder.text import csv_rows, csv_text, read_text
 from survey.folder.units import from_si, to_si
 from survey.project.declared.editing import with_product, with_value
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
-from survey.project.tables.layouts import LAYOUTS
+from survey.project.tables.layouts import HEIGHTS, LAYOUTS
 
 KEPT = "kept"
 TableEdit = ChangeColumns | ExchangeColumns | ChangeReadings | Rename
@@ -147,10 +147,12 @@ def _changed(row: Mapping[str, str], edit: TableEdit) -> dict[str, str]:
         a, b = edit.columns
         return {a: row[b], b: row[a]}
     if isinstance(edit, ChangeReadings):
-        column, unit = next(((f"{edit.field}_{u}", u) for u in _UNITS if row.get(f"{edit.field}_{u}")), ("", ""))
+        there = [(f"{edit.field}_{u}", u) for u in _UNITS if f"{edit.field}_{u}" in row]
+        blank = there[:1] if edit.field in HEIGHTS else []  # a height that is not given is zero
+        column, unit = next(((c, u) for c, u in there if row[c]), next(iter(blank), ("", "")))
         if not column:
             raise ValueError("written as degrees-minutes-seconds, or elsewhere")
-        si = edit.factor * float(to_si(float(row[column]), unit)) + edit.offset
+        si = edit.factor * float(to_si(float(row[column] or 0.0), unit)) + edit.offset
         return {column: f"{float(from_si(si, unit)):.12g}"}
     values = edit.matrix @ np.array([float(row[name]) for name in edit.columns]) + edit.offset
     new = {name: f"{value:.12g}" for name, value in zip(edit.columns, values, strict=True)}

@@ -23,7 +23,7 @@ _LARGE = 1.15
 
 _PART = 0.8
 """Variance factor of a group below which a part of it may be far smaller."""
-_SEVERAL = 3
+_SEVERAL = 2
 """Observations that were left out from which on they may have one cause."""
 NOT_LOOKED_FOR = ("two mistakes at once", "bodies that bend or never rest", "refraction")
 """Told where nothing is named; the documentation says more."""
@@ -151,7 +151,7 @@ def _left_out(survey: Survey, result: Adjustment, project: Project) -> "Diagnosi
 
     Of several first what they may have in common.
     """
-    left_out = survey.n_others_used - result.survey.n_others_used + int((~result.other_arrays.used).sum())
+    left_out = survey.n_others_used - result.survey.n_others_used
     if left_out <= 0:
         return None
     from adjust.diagnosis.diagnosis import Diagnosis, diagnose  # here: as above

@@ -1,0 +1,122 @@
+"""Mistakes of one table, one set-up, one axis: each is named as that part's, and mended by `--try`."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from survey.cli import FAILED, main
+from tests import labs
+
+
+def named(lab: Path) -> list[dict[str, Any]]:
+    """The candidates of its diagnosis, whether it was adjusted or not."""
+    assert main(["adjust", str(lab), "--quiet"]) in (FAILED, 3)
+    found = (lab / "results" / name for name in ("unsolved.json", "solution.json"))
+    told = next(json.loads(path.read_text(encoding="utf-8"))["diagnosis"] for path in found if path.exists())
+    return list(told)
+
+
+def mends(lab: Path) -> bool:
+    return main(["adjust", str(lab), "--quiet", "--try", "1"]) == 0
+
+
+def change(lab: Path, table: str, by: Any) -> None:
+    labs.with_rows(lab / "observations" / f"{table}.csv", by)
+
+
+def exchanged(lab: Path, table: str, a: str, b: str) -> None:
+    other = {a: b, b: a}
+    change(lab, table, lambda _, row: row.update({end: other.get(row[end], row[end]) for end in ("from_id", "to_id")}))
+
+
+def hold(lab: Path, *points: str) -> None:
+    """The points at their true places."""
+    truth = json.loads((lab / "truth.json").read_text(encoding="utf-8"))["parameters"]
+    text = (lab / "survey.toml").read_text(encoding="utf-8")
+    for name in points:
+        x_mm = [1e3 * x for x in truth[f"point/{name}"]]
+        text = text.replace(f"\n{name} = {{}}\n", f'\n{name} = {{ x_mm = {x_mm}, treatment = "held" }}\n')
+    text = text.partition("[datum]")[0] + '[datum]\nkind = "given"\n'
+    (lab / "survey.toml").write_text(text, encoding="utf-8")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("a", "b"), [("B01", "B12"), ("B03", "B07")])
+def test_points_exchanged_in_all_rows_of_a_table_are_named_not_what_they_contradict(
+    a: str, b: str, tmp_path: Path
+) -> None:
+    """Two distances of the caliper were left out, and nothing else said; in the one table or in the other is alike."""
+    lab = labs.example("total-station", tmp_path / "lab")
+    exchanged(lab, "terrestrial", a, b)
+    first, *_ = named(lab)
+    assert (first["name"], first["ids"]) == ("points exchanged", [a, b])
+    assert "in all rows of terrestrial.csv (or in all rows of distances.csv: what was observed cannot" in first["cause"]
+    assert mends(lab)
+    solution = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))
+    assert (solution["summary"]["fit"], solution["warnings"]) == ("fits", [])
+
+
+@pytest.mark.slow
+def test_another_exchange_that_explains_as_much_is_told_beside_it(tmp_path: Path) -> None:
+    """Calipers of the same length: the first end of one under the name of the second end of the other."""
+    lab = labs.example("total-station", tmp_path / "lab")
+    exchanged(lab, "terrestrial", "B05", "B10")
+    assert {tuple(c["ids"]) for c in named(lab)} == {("B05", "B10"), ("B06", "B09")}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("tables", "name"), [
+    (["terrestrial"], "points exchanged"), (["terrestrial", "distances"], "given points exchanged"),
+])  # fmt: skip
+def test_points_exchanged_against_given_coordinates(tables: list[str], name: str, tmp_path: Path) -> None:
+    lab = labs.example("total-station", tmp_path / "lab")
+    hold(lab, "B01", "B05", "B10", "B12")
+    for table in tables:
+        exchanged(lab, table, "B05", "B10")
+    first, *more = named(lab)
+    assert (first["name"], first["ids"], more) == (name, ["B05", "B10"], [])
+    assert mends(lab)
+
+
+def test_names_that_only_names_contradict_are_not_blamed(tmp_path: Path) -> None:
+    """Exchanged in every table, or between points that no other table tells apart; one distance may be any other's."""
+    for i, (tables, a, b) in enumerate([
+        (("terrestrial", "distances"), "B03", "B07"), (("terrestrial",), "S1", "S2"), (("terrestrial",), "S1", "B05"),
+    ]):  # fmt: skip
+        lab = labs.example("total-station", tmp_path / f"lab{i}")
+        for table in tables:
+            exchanged(lab, table, a, b)
+        assert main(["adjust", str(lab), "--quiet"]) == 0
+        assert "diagnosis" not in json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("setup_id", ["S1a", "S2a"])
+def test_scale_of_the_distances_of_one_setup(setup_id: str, tmp_path: Path) -> None:
+    """300 ppm: told as an error that the distances of every set-up have in common, each its own."""
+    lab = labs.example("total-station", tmp_path / "lab")
+    change(lab, "terrestrial", lambda _, row: row["setup_id"] == setup_id and row["value_m"] and row.update(
+        value_m=f"{1.0003 * float(row['value_m']):.7f}"))  # fmt: skip
+    first, *_ = named(lab)
+    assert (first["name"], first["ids"]) == ("scale of distances", [setup_id])
+    assert mends(lab)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("setup_id", "height", "missing"), [("S1a", 1612.0, "0"), ("S2a", 1547.0, ""),
+                                                             ("S3a", 1583.0, "0")])  # fmt: skip
+def test_forgotten_height_of_an_instrument(setup_id: str, height: float, missing: str, tmp_path: Path) -> None:
+    """Sights to the instrument's point were left out, and nothing said; of the last one there was no solution."""
+    lab = labs.example("total-station", tmp_path / "lab")
+    change(lab, "terrestrial", lambda _, row: row["setup_id"] == setup_id and row.update(instrument_height_mm=missing))
+    first, *_ = named(lab)
+    assert (first["name"], first["ids"]) == ("instrument height", [setup_id])
+    assert "it stands there as 0, and was forgotten" in first["cause"]
+    assert mends(lab)
+    rows = (lab / "observations" / "terrestrial.csv").read_text(encoding="utf-8").splitlines()
+    column = rows[0].split(",").index("instrument_height_mm")
+    given = {float(row.split(",")[column]) for row in rows[1:] if f",{setup_id}," in row
+             and row.startswith(("zenith", "slope"))}  # fmt: skip
+    assert given == {pytest.approx(height, abs=1.0)}
