@@ -37,10 +37,6 @@ class Topology:
         """Number of measured pairs."""
         return len(self.pair_ids)
 
-    def ends(self, pair_idx: int) -> tuple[str, str]:
-        """Ids of the two stations of a pair."""
-        return self.station_ids[int(self.a_idx[pair_idx])], self.station_ids[int(self.b_idx[pair_idx])]
-
 
 @dataclass(frozen=True, eq=False)
 class PoseNetwork(Topology):

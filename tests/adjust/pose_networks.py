@@ -24,6 +24,14 @@ class Simulated:
     wrong: tuple[str, ...]
 
 
+def omega_of(minimum: Minimum) -> float:
+    """V'Pv of the pairs in use and the priors."""
+    batch, values = minimum.graph.pairs, minimum.solved.values
+    between_held = np.flatnonzero(batch.arrays.used & batch.both_held)  # these have no factor
+    white = batch.arrays.whitening[between_held] @ batch.jacobians(values)[0][between_held, :, None]
+    return minimum.graph.omega(values) + float(np.sum(white**2))
+
+
 @dataclass(frozen=True, eq=False)
 class Solved:
     """A solved network by positions: rotations (N, 3, 3), translations (N, 3) m, and what its precision says."""
@@ -41,7 +49,7 @@ class Solved:
 
     @property
     def omega(self) -> float:
-        return self.minimum.omega
+        return omega_of(self.minimum)
 
     @property
     def iterations(self) -> int:
