@@ -16,7 +16,6 @@ from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.result import Adjustment
 from adjust.model.survey import Datum, FloatArray, Point, PointParameter, PoseParameter, Station, Survey
-from adjust.pose_network import pose_network
 from adjust.pose_network.cycles import connected_parts, loop_labels
 from adjust.pose_network.from_survey import network_from_survey, network_of_pairs
 from adjust.pose_network.network import PoseNetwork
@@ -29,7 +28,7 @@ from adjust.statistics.outliers.snooping import Snooping
 from adjust.statistics.outliers.watched import WatchedSnooping
 from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
 from tests.adjust.chordal import chordal_cost, minimize_chordal
-from tests.adjust.pose_networks import exp6, network_jacobians, omega_of, simulate, solve_network
+from tests.adjust.pose_networks import exp6, network_jacobians, omega_of, pose_network, simulate, solve_network
 
 
 def screened(network: PoseNetwork) -> Adjustment:
