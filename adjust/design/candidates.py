@@ -100,10 +100,6 @@ class DesignMatrix:
     A: sparse.csr_matrix
     observations: tuple[Observed, ...]
 
-    def normal(self) -> FloatArray:
-        """Normal matrix (n, n) of all observations."""
-        return np.asarray((self.A.T @ self.A).toarray())
-
 
 def design_matrix(survey: Survey, start: StartValues) -> DesignMatrix:
     """Whitened rows of every observation of the survey at ``start``; nothing is condensed or hidden.

@@ -313,10 +313,6 @@ class VarianceComponents:
     converged: bool
     method: str
 
-    def factor(self, group: str) -> float:
-        """The factor of a group, 1 where there is none."""
-        return next((c.factor for c in self.components if c.group == group), 1.0)
-
 
 @dataclass(frozen=True)
 class Decision:

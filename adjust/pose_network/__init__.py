@@ -4,7 +4,7 @@ Their pairs as arrays, a start from averaged rotations, the one graph solved ove
 their loops. Misclosures, the condition form and networks that grow are in :mod:`adjust.relay`.
 """
 
-from adjust.pose_network.network import PoseNetwork, pose_network
+from adjust.pose_network.network import PoseNetwork
 from adjust.pose_network.solve import NetworkOptions
 
-__all__ = ["NetworkOptions", "PoseNetwork", "pose_network"]
+__all__ = ["NetworkOptions", "PoseNetwork"]

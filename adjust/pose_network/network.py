@@ -1,16 +1,14 @@
 """Stations joined by measured relative poses or rotations, as arrays, and what defines the datum."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from gtsam import Pose3, Rot3
 
 from adjust.model.errors import IndeterminateError, SurveyError, listed
-from adjust.model.observations import FrameRef, Pair
-from adjust.model.survey import BoolArray, Datum, FloatArray, IntArray, PoseParameter, Station, Survey, Treatment
+from adjust.model.survey import BoolArray, Datum, FloatArray, IntArray, PoseParameter, Survey
 from adjust.observations.pair_arrays import PairArrays
 from adjust.pose_network.cycles import connected_parts
 from adjust.spatial.rigid import nearest_rotation
@@ -37,10 +35,6 @@ class Topology:
         """Number of measured pairs."""
         return len(self.pair_ids)
 
-    def ends(self, pair_idx: int) -> tuple[str, str]:
-        """Ids of the two stations of a pair."""
-        return self.station_ids[int(self.a_idx[pair_idx])], self.station_ids[int(self.b_idx[pair_idx])]
-
 
 @dataclass(frozen=True, eq=False)
 class PoseNetwork(Topology):
@@ -50,16 +44,16 @@ class PoseNetwork(Topology):
     (N, 3): ``world_from_station`` of the held ones and of those with a prior, start of the others, nan where nothing is
     known. prior_cov: (6, 6) by station position.
     inner: positions of the stations that carry inner constraints (free network), empty where the datum is given.
-    survey: that it is of, None where there is only the network.
+    survey: that it is of.
     """
 
     arrays: PairArrays
     station_rotations: FloatArray
     station_translations: FloatArray
     held: IntArray
-    prior_cov: Mapping[int, FloatArray] = field(default_factory=dict)
-    inner: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    survey: Survey | None = None
+    prior_cov: Mapping[int, FloatArray]
+    inner: IntArray
+    survey: Survey
 
     @property
     def rotations(self) -> FloatArray:
@@ -154,35 +148,16 @@ class PoseNetwork(Topology):
         return connected_parts(self.n_stations, self.a_idx[rows], self.b_idx[rows])
 
 
-def pose_network(
-    station_ids: Sequence[str], pair_ids: Sequence[str], a_idx: npt.ArrayLike, b_idx: npt.ArrayLike,
-    rotations: FloatArray, translations: FloatArray | None, cov: FloatArray, *,
-    held: Mapping[int, FloatArray] | None = None, start: Mapping[int, FloatArray] | None = None,
-    prior: Mapping[int, tuple[FloatArray, FloatArray]] | None = None,
-    inner: Sequence[int] | None = None, used: BoolArray | None = None,
-) -> PoseNetwork:  # fmt: skip
-    """A checked network from arrays.
-
-    translations: (E, 3), nan rows for pairs of which only the rotation was measured; None where that is all of them.
-    cov: (E, 6, 6), or (E, 3, 3) without translations. held, start: ``world_from_station`` (4, 4) by station position.
-    prior: the same with covariance (6, 6). inner: station positions for inner constraints; a network without held,
-    prior or inner stations takes all of them. Raises SurveyError naming the first pair or station that is wrong.
-    """
-    n_pairs = len(pair_ids)
-    t = np.full((n_pairs, 3), np.nan) if translations is None else np.array(translations, dtype=float)
-    Q = _full_cov(np.asarray(cov, dtype=float), t, n_pairs)
-    use = np.ones(n_pairs, dtype=np.bool_) if used is None else np.asarray(used, dtype=np.bool_)
-    measured = PairArrays(np.array(rotations, dtype=float).reshape(n_pairs, 3, 3), t, Q, use)
-    a, b = (np.asarray(x, dtype=np.int64).ravel() for x in (a_idx, b_idx))
-    who = Topology(tuple(station_ids), tuple(pair_ids), a, b)
-    return network_of(who, measured, held or {}, start or {}, prior or {}, inner)
-
-
 def network_of(
     who: Topology, measured: PairArrays, held: Mapping[int, FloatArray], start: Mapping[int, FloatArray],
-    prior: Mapping[int, tuple[FloatArray, FloatArray]], inner: Sequence[int] | None, survey: Survey | None = None,
+    prior: Mapping[int, tuple[FloatArray, FloatArray]], inner: Sequence[int] | None, survey: Survey,
 ) -> PoseNetwork:  # fmt: skip
-    """The same from pairs as arrays."""
+    """A checked network.
+
+    held, start: ``world_from_station`` (4, 4) by station position. prior: the same with covariance (6, 6). inner:
+    station positions for inner constraints; a network without held, prior or inner stations takes all of them. Raises
+    SurveyError naming the first pair or station that is wrong.
+    """
     n = who.n_stations
     R, T = np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan)
     known = {**start, **{k: p for k, (p, _) in prior.items()}, **held}
@@ -200,31 +175,15 @@ def network_of(
     return network
 
 
-def _full_cov(cov: FloatArray, t: FloatArray, n_pairs: int) -> FloatArray:
-    """(E, 6, 6) with infinite variances where nothing was measured."""
-    measured = np.isfinite(t).all(axis=1)
-    out = np.zeros((n_pairs, 6, 6))
-    k = cov.shape[-1] if cov.ndim == 3 else 0
-    if cov.shape not in ((n_pairs, 6, 6), (n_pairs, 3, 3)):
-        raise SurveyError(f"covariances of {n_pairs} pairs have shape {cov.shape}; expected ({n_pairs}, 6, 6)")
-    out[:, :k, :k] = cov
-    out[~measured, 3:, :] = out[~measured, :, 3:] = 0.0
-    for i in range(3, 6):
-        out[~measured, i, i] = np.inf
-    return out
-
-
 def check_network(network: PoseNetwork) -> None:
     """Raise SurveyError for what cannot be, naming the pair or station."""
-    n, E = network.n_stations, network.n_pairs
+    n = network.n_stations
     for what, ids in (("station", network.station_ids), ("pair", network.pair_ids)):
         if len(set(ids)) != len(ids):
             twice = next(x for i, x in enumerate(ids) if x in ids[:i])
             raise SurveyError(f"{what} id {twice!r} occurs twice; give every {what} a name of its own")
     a, b = network.a_idx, network.b_idx
-    if len(a) != E or len(b) != E or len(network.used) != E or len(network.translations) != E:
-        raise SurveyError(f"{E} pair ids, but arrays of {len(a)}, {len(b)}, {len(network.used)} pairs")
-    if E == 0:
+    if network.n_pairs == 0:
         raise SurveyError("a network needs at least one measured pair")
     _pairs_where(network, (a < 0) | (a >= n) | (b < 0) | (b >= n), "names a station that does not exist")
     _pairs_where(network, a == b, "joins a station with itself")
@@ -280,8 +239,7 @@ def _as_survey(network: PoseNetwork) -> Survey:
     inner = network.anchor is not None
     whole = len(network.inner) == network.n_stations
     datum = Datum("inner", (), () if whole else tuple(network.station_ids[i] for i in network.inner.tolist()))
-    known = network.survey or Survey(stations=_stations(network), pairs=_pairs(network))
-    stations = known.stations
+    known, stations = network.survey, network.survey.stations
     if network.rotation_only:
         stations = tuple(replace(s, world_from_station=_turning_only(s.world_from_station)) for s in stations)
     return replace(known, stations=stations, datum=datum if inner else Datum())
@@ -293,22 +251,3 @@ def _turning_only(given: PoseParameter) -> PoseParameter:
         return given
     turn = Rot3() if given.value is None else given.value.rotation()
     return replace(given, value=Pose3(turn, np.zeros(3)), held=("tx", "ty", "tz"))
-
-
-def _stations(network: PoseNetwork) -> tuple[Station, ...]:
-    out = []
-    for i, station in enumerate(network.station_ids):
-        R, t = network.station_rotations[i], network.station_translations[i]
-        value = Pose3(Rot3(R), t) if np.isfinite(t).all() else None
-        prior = network.prior_cov.get(i)
-        treatment: Treatment = "held" if network.is_held[i] else "free" if prior is None else "prior"
-        out.append(Station(station, world_from_station=PoseParameter(value, treatment, prior)))
-    return tuple(out)
-
-
-def _pairs(network: PoseNetwork) -> tuple[Pair, ...]:
-    frames = [FrameRef("station", s) for s in network.station_ids]
-    rows = zip(network.pair_ids, network.a_idx.tolist(), network.b_idx.tolist(), network.arrays.poses,
-               network.is_pose.tolist(), network.cov, network.used.tolist(), strict=True)  # fmt: skip
-    return tuple(Pair(i, frames[a], frames[b], motion if pose else motion.rotation(), cov if pose else cov[:3, :3],
-                      used=used) for i, a, b, motion, pose, cov, used in rows)  # fmt: skip

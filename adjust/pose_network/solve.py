@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from gtsam import Pose3, Rot3
@@ -46,19 +45,6 @@ class Minimum:
     translations: FloatArray
     graph: AdjustmentGraph
     solved: Solved
-
-    @cached_property
-    def omega(self) -> float:
-        """V'Pv of the pairs in use and the priors."""
-        batch, values = self.graph.pairs, self.solved.values
-        if batch is None:
-            raise ValueError("a network has pairs")
-        omega = self.graph.omega(values)
-        between_held = np.flatnonzero(batch.arrays.used & batch.both_held)
-        if len(between_held):  # these have no factor
-            white = batch.arrays.whitening[between_held] @ batch.jacobians(values)[0][between_held, :, None]
-            omega += float(np.sum(white**2))
-        return omega
 
 
 def minimize(

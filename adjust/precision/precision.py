@@ -138,15 +138,6 @@ class Precision(Covariances):
         for j, i in enumerate(bundle.reduced):
             self.hidden[bundle.point_key[i]] = points[j]
 
-    def cov(self, key: int) -> FloatArray:
-        """Covariance (dim, dim) of one unknown."""
-        Q = self.hidden[key].copy() if key in self.hidden else self.tree.marginal(key)
-        Q = _in_datum(self.transformation, [key], Q)
-        held = list(self.graph.unknowns.held.get(key, ()))
-        if held:
-            Q[held], Q[:, held] = 0.0, 0.0
-        return Q
-
     def joint(self, names: Sequence[ParameterName]) -> FloatArray:
         """See :class:`Covariances`."""
         keys = [self.graph.unknowns.by_name[name].key for name in names]

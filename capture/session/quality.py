@@ -34,11 +34,6 @@ class ImageQuality:
     blur_px: float
     points: Mapping[str, FloatArray] = field(default_factory=dict)
 
-    @property
-    def found(self) -> tuple[str, ...]:
-        """Ids of the targets that were found."""
-        return tuple(target_id for target_id, uv in self.points.items() if len(uv))
-
 
 def image_quality(frame: Frame, targets: Mapping[str, DetectableTarget] | None = None) -> ImageQuality:
     """Quality of a frame, and the targets in it; without ``targets`` none is looked for."""

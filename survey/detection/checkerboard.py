@@ -89,7 +89,7 @@ def _measured(gray: Gray32, rough: FloatArray) -> tuple[Detection, FloatArray]:
 
     Empty where they are no corners of a board.
     """
-    grid, ambiguous = _ordered(gray, rough)
+    grid = _ordered(gray, rough)
     edges = grid_edges(grid)
     start = grid.reshape(-1, 2)
     fit = refine_corners(gray, start, edges.reshape(-1, 2, 2))
@@ -103,17 +103,12 @@ def _measured(gray: Gray32, rough: FloatArray) -> tuple[Detection, FloatArray]:
         return nothing_found("the board ends before the size that was looked for"), rough
     row, column = np.divmod(np.arange(keep.size), grid.shape[1])
     fit = unbent(fit, np.stack([column, row], axis=1).astype(float), keep)
-    notes: tuple[str, ...] = ()
-    if not keep.all():
-        notes += (f"{int((~keep).sum())} of {keep.size} corners were not sharp or not free",)
-    if ambiguous:
-        notes += ("order is ambiguous: the board looks the same after a turn",)
-    blur, contrast = np.median([fit.blur_px[keep], fit.contrast[keep]], axis=1).tolist()
+    blur_px, contrast = np.median([fit.blur_px[keep], fit.contrast[keep]], axis=1).tolist()
     measured = np.where(keep[:, None], fit.uv, start).reshape(grid.shape)
     if not of_neighbours(gray, measured, contrast):
         return nothing_found("corners found, but not those of neighbouring squares"), rough
     whole = grown(gray, measured, contrast)
-    return Detection(np.flatnonzero(keep), fit.uv[keep], fit.cov[keep], blur, contrast, notes, ambiguous), whole
+    return Detection(np.flatnonzero(keep), fit.uv[keep], fit.cov[keep], blur_px), whole
 
 
 def _find(gray8: Gray8, columns: int, rows: int) -> FloatArray | None:
@@ -184,8 +179,8 @@ def _found_in(coarse: Gray8, pattern: tuple[int, int]) -> tuple[bool, Any]:
     return ok, corners
 
 
-def _ordered(gray: Gray32, grid: FloatArray) -> tuple[FloatArray, bool]:
-    """The grid (rows, columns, 2) in the order that ``find_checkerboard`` defines, and whether that is ambiguous."""
+def _ordered(gray: Gray32, grid: FloatArray) -> FloatArray:
+    """The grid (rows, columns, 2) in the order that ``find_checkerboard`` defines."""
     (a, b), (c, d) = (grid[:, -1] - grid[:, 0]).mean(0), (grid[-1] - grid[0]).mean(0)
     if a * d < b * c:
         grid = grid[:, ::-1]
@@ -196,7 +191,7 @@ def _ordered(gray: Gray32, grid: FloatArray) -> tuple[FloatArray, bool]:
         quarter, begins_dark = grid.transpose(1, 0, 2)[:, ::-1], dark == (rows % 2 == 0)
         turns += [(quarter, begins_dark), (quarter[::-1, ::-1], begins_dark)]
     possible = [turn for turn, begins_dark in turns if begins_dark] or [turn for turn, _ in turns]
-    return min(possible, key=lambda turn: float(turn[0, 0].sum())), len(possible) > 1
+    return min(possible, key=lambda turn: float(turn[0, 0].sum()))
 
 
 def grid_edges(grid: FloatArray) -> FloatArray:

@@ -54,13 +54,11 @@ def find_markers(gray: Gray32, seen: SeenMarkers, target: MarkerGrid | MarkerBlo
     """The corners of those of the target's markers that are in the image; a marker seen twice is left out."""
     wanted = _first_indices(target)
     markers, quads = seen.of(target.dictionary, set(wanted))
-    notes: tuple[str, ...] = ()
     twice = sorted(m for m, count in Counter(markers.tolist()).items() if count > 1 and m in wanted)
-    if twice:
-        notes += (f"marker {', '.join(map(str, twice))} seen more than once: left out",)
     keep = np.array([m in wanted and m not in twice for m in markers.tolist()], bool)
     if not keep.any():
-        return nothing_found(f"none of the {len(wanted)} markers ({target.dictionary}) was found", notes)
+        copies = f"; seen more than once, and left out: {', '.join(map(str, twice))}" if twice else ""
+        return nothing_found(f"none of the {len(wanted)} markers ({target.dictionary}) was found{copies}")
     markers, quads = markers[keep], quads[keep]
     cells = int(marker_dictionary(target.dictionary).markerSize) + 2
     gap = cells * target.gap_m / target.marker_m if isinstance(target, MarkerGrid) else 1.0  # what a finder needs
@@ -68,7 +66,7 @@ def find_markers(gray: Gray32, seen: SeenMarkers, target: MarkerGrid | MarkerBlo
     point_idx = np.array([wanted[m] + corner for m in markers.tolist() for corner in range(4)], np.int64)
     # the faces of a block do not share a plane
     fit = unbent(fit, target.points()[1][point_idx, :2], fit.good & isinstance(target, MarkerGrid))
-    return _detection(point_idx, fit, notes, "marker corners")
+    return _detection(point_idx, fit, "marker corners")
 
 
 def find_charuco(gray: Gray32, gray8: Gray8, target: Charuco) -> Detection:
@@ -89,7 +87,7 @@ def find_charuco(gray: Gray32, gray8: Gray8, target: Charuco) -> Detection:
         return nothing_found(f"the {n} corners found lie on one line")
     edges, margin = _board_edges(squares[point_idx], H), 0.5 * (1.0 - target.marker_m / target.square_m)
     fit = refine_corners(gray, start, edges, margin * _across(edges))
-    return _detection(point_idx, unbent(fit, squares[point_idx], fit.good), (), "corners")
+    return _detection(point_idx, unbent(fit, squares[point_idx], fit.good), "corners")
 
 
 def one_threshold() -> cv2.aruco.DetectorParameters:
@@ -167,15 +165,13 @@ def _board_edges(xy: FloatArray, H: FloatArray) -> FloatArray:
     return np.asarray(jacobian.transpose(0, 2, 1))
 
 
-def _detection(point_idx: IntArray, fit: CornerFit, notes: tuple[str, ...], name: str) -> Detection:
+def _detection(point_idx: IntArray, fit: CornerFit, name: str) -> Detection:
     good = fit.good
-    if not good.all():
-        notes += (f"{int((~good).sum())} of {good.size} {name} were not sharp or not free",)
     if not good.any():
-        return nothing_found(f"found, but none of its {good.size} {name} could be measured", notes)
+        return nothing_found(f"found, but none of its {good.size} {name} could be measured")
     order = np.argsort(point_idx[good], kind="stable")
-    blur, contrast = float(np.median(fit.blur_px[good])), float(np.median(fit.contrast[good]))
-    return Detection(point_idx[good][order], fit.uv[good][order], fit.cov[good][order], blur, contrast, notes)
+    blur_px = float(np.median(fit.blur_px[good]))
+    return Detection(point_idx[good][order], fit.uv[good][order], fit.cov[good][order], blur_px)
 
 
 _LARGEST = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "ARUCO_ORIGINAL", "APRILTAG_16H5", "APRILTAG_25H9",

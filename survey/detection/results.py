@@ -14,18 +14,14 @@ class Detection:
     """Points of one target in one image; empty where it was not found, and ``reason`` says why.
 
     point_idx: (n,) positions in the target's ``points()``. uv: (n, 2) px. cov: (n, 2, 2) px^2.
-    blur_px: median standard deviation of the point spread. contrast: median step from dark to bright, grey values.
-    ambiguous: the target looks the same after a turn, so its order is a convention (see ``find_checkerboard``).
-    notes: what was left out, and why. other_size: columns and rows of inner corners of a board that is there instead.
+    blur_px: median standard deviation of the point spread.
+    other_size: columns and rows of inner corners of a board that is there instead.
     """
 
     point_idx: IntArray
     uv: FloatArray
     cov: FloatArray
     blur_px: float = float("nan")
-    contrast: float = float("nan")
-    notes: tuple[str, ...] = ()
-    ambiguous: bool = False
     reason: str = ""
     other_size: tuple[int, int] | None = None
 
@@ -33,10 +29,10 @@ class Detection:
         return len(self.point_idx)
 
 
-def nothing_found(reason: str, notes: tuple[str, ...] = (), other_size: tuple[int, int] | None = None) -> Detection:
+def nothing_found(reason: str, other_size: tuple[int, int] | None = None) -> Detection:
     """An empty detection."""
     none = np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2))
-    return Detection(*none, notes=notes, reason=reason, other_size=other_size)
+    return Detection(*none, reason=reason, other_size=other_size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +47,6 @@ class Spots:
     diameter_px: FloatArray
     peak: FloatArray
     saturated: IntArray
-    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.uv)

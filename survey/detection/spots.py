@@ -45,19 +45,10 @@ def detect_spots(image: AnyImage, options: SpotOptions | None = None) -> Spots:
     good &= ((p[:, :2] > -0.5) & (p[:, :2] < np.array(gray.shape[::-1]) - 0.5)).all(axis=1)
     sized = good & (width >= low) & (width <= high)
     round_ = sized & (np.maximum(shape, elongation) <= options.max_elongation)
-    notes = tuple(
-        f"{int(n)} {what}"
-        for n, what in (
-            ((~good).sum(), "bright places are no single spot"),
-            ((good & ~sized).sum(), f"spots outside {low:g} to {high:g} px diameter"),
-            ((sized & ~round_).sum(), f"spots longer than {options.max_elongation:g} times their width"),
-        )
-        if n
-    )
     order = np.flatnonzero(round_)[np.argsort(-peak[round_], kind="stable")][: options.max_count]
     floor = np.where(saturated[order] > 0, SATURATED_FLOOR_PX, SPOT_FLOOR_PX)
     honest = cov[order] + floor[:, None, None] ** 2 * np.eye(2)
-    return Spots(p[order, :2], honest, width[order], peak[order], saturated[order], notes)
+    return Spots(p[order, :2], honest, width[order], peak[order], saturated[order])
 
 
 def outside_targets(spots: Spots, detections: Iterable[Detection]) -> Spots:
@@ -71,9 +62,7 @@ def outside_targets(spots: Spots, detections: Iterable[Detection]) -> Spots:
         keep &= ~np.array(inside, bool)
     if keep.all():
         return spots
-    notes = (*spots.notes, f"{int((~keep).sum())} bright places on or beside a target")
-    peak, saturated = spots.peak[keep], spots.saturated[keep]
-    return Spots(spots.uv[keep], spots.cov[keep], spots.diameter_px[keep], peak, saturated, notes)
+    return Spots(spots.uv[keep], spots.cov[keep], spots.diameter_px[keep], spots.peak[keep], spots.saturated[keep])
 
 
 def _diameters(p: FloatArray, profile: npt.NDArray[np.int64]) -> FloatArray:

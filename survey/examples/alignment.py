@@ -16,7 +16,6 @@ CENTRE = np.array([-0.1, 0.07, 0.6])
 BEAM = np.array([0.004, -0.003, 0.01, 0.02])
 LEVEL_SIGMA_G, SPOT_SIGMA_MM, TABLE_SIGMA_ARCSEC = 5e-5, 0.05, 8.0
 TRACE_DEG = np.arange(-10.0, 10.1, 2.5)
-FEET_MM = {"left": (0.0, 0.0), "right": (200.0, 0.0), "far": (100.0, -140.0)}
 
 DEFINITION = """# A board above a turntable, to be made parallel to it (levels, then the trace of a laser).
 format = 1

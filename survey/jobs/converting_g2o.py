@@ -27,12 +27,11 @@ def survey_from_g2o(
 
     Raises SurveyError for what cannot be read, or named in a project.
     """
-    found = read_g2o_file(source, information, use_vertices=True, block_diagonal=block_diagonal)
-    network = found.network
-    for station in network.station_ids:
-        if (problem := id_problem(station)) is not None:
-            raise SurveyError(f"{source}: vertex {station}: {problem}")
-    return network.as_survey, found.notes
+    found = read_g2o_file(source, information, block_diagonal)
+    for station in found.survey.stations:
+        if (problem := id_problem(station.station_id)) is not None:
+            raise SurveyError(f"{source}: vertex {station.station_id}: {problem}")
+    return found.survey, found.notes
 
 
 def project_to_g2o(source: Path, target: Path, information: Information) -> tuple[int, int, str, tuple[str, ...]]:

@@ -1,7 +1,7 @@
 """``plan.toml``: what is to be measured, what could be measured in addition, and the precision that is wanted."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -103,12 +103,11 @@ class Plan:
     required: tuple[Requirement, ...] = ()
     wanted: tuple[str, ...] = ()
     navigation: NavigationPlan | None = None
-    inputs: dict[str, str] = field(default_factory=dict)
 
 
 def read_plan(folder: Path, survey: Survey) -> Plan:
     """Read ``plan.toml`` of a project folder. Raises SurveyError with file and line."""
-    root, digest = read_toml(Path(folder) / PLAN_FILE)
+    root, _ = read_toml(Path(folder) / PLAN_FILE)
     root.allow("image_sigma_px", "seen", "epochs", "candidates", "required", "wanted", "navigation", *SINGLES)
     names = Names.of(survey)
     candidates = root.table("candidates")
@@ -122,7 +121,6 @@ def read_plan(folder: Path, survey: Survey) -> Plan:
         required=tuple(_requirement(node) for node in tables_of(root, "required")),
         wanted=root.names("wanted", ()),
         navigation=read_navigation(root.table("navigation"), survey) if root.has("navigation") else None,
-        inputs={PLAN_FILE: digest},
     )
 
 

@@ -394,7 +394,7 @@ def relative(found: FloatArray, expected: FloatArray) -> float:
 
 
 def covariance_of(precision: Precision, name: ParameterName) -> FloatArray:
-    return precision.cov(precision.graph.unknowns.by_name[name].key)
+    return precision.joint([name])
 
 
 # -- small surveys -----------------------------------------------------------------------------------------------------

@@ -8,12 +8,55 @@ import numpy as np
 from gtsam import Pose3, Rot3
 from scipy.spatial.transform import Rotation
 
-from adjust.model.survey import FloatArray
+from adjust.model.observations import FrameRef, Pair
+from adjust.model.survey import FloatArray, PoseParameter, Station, Survey
+from adjust.observations.pair_arrays import PairArrays
 from adjust.observations.pairs import PairStatistics
-from adjust.pose_network import PoseNetwork, pose_network
+from adjust.pose_network import PoseNetwork
+from adjust.pose_network.from_survey import network_from_survey
+from adjust.pose_network.network import Topology, network_of
 from adjust.pose_network.solve import DEFAULTS, Minimum, NetworkOptions, minimize
 from adjust.precision.precision import Precision
 from adjust.spatial.rigid_motions import Motions, right_jacobian_inverse
+from adjust.start.given import without_starts
+from survey.interop.networks.g2o import read_g2o_file
+
+
+def pose_network(
+    station_ids, pair_ids, a_idx, b_idx, rotations, translations, cov, *,
+    held=None, start=None, prior=None, inner=None, used=None,
+) -> PoseNetwork:  # fmt: skip
+    """A checked network from arrays.
+
+    translations: (E, 3), nan rows for pairs of which only the rotation was measured; None where that is all of them.
+    cov: (E, 6, 6), or (E, 3, 3) without translations. held, start, prior, inner: as of ``network_of``.
+    """
+    n, held, start, prior = len(pair_ids), held or {}, start or {}, prior or {}
+    t = np.full((n, 3), np.nan) if translations is None else np.array(translations, dtype=float)
+    Q, turns = np.zeros((n, 6, 6)), ~np.isfinite(t).all(axis=1)
+    Q[:, : np.shape(cov)[1], : np.shape(cov)[2]] = cov
+    Q[turns, 3:, :] = Q[turns, :, 3:] = 0.0
+    Q[turns, 3:, 3:] = np.diag(np.full(3, np.inf))
+    R = np.array(rotations, dtype=float)
+    measured = PairArrays(R, t, Q, np.ones(n, dtype=bool) if used is None else np.array(used, dtype=bool))
+    a, b = (np.array(x, dtype=np.int64) for x in (a_idx, b_idx))
+    frames = {i: FrameRef("station", s) for i, s in enumerate(station_ids)}
+    pairs = tuple(
+        Pair(name, frames.get(i), frames.get(j), m.rotation() if turn else m, q[:3, :3] if turn else q, used=use)
+        for name, i, j, m, q, turn, use in zip(pair_ids, a, b, measured.poses, Q, turns, measured.used, strict=True)
+    )
+    given = {i: PoseParameter(Pose3(p)) for i, p in start.items()}
+    given |= {i: PoseParameter(Pose3(p), "prior", q) for i, (p, q) in prior.items()}
+    given |= {i: PoseParameter(Pose3(p), "held") for i, p in held.items()}
+    stations = (Station(s, world_from_station=given.get(i, PoseParameter())) for i, s in enumerate(station_ids))
+    who, survey = Topology(tuple(station_ids), tuple(pair_ids), a, b), Survey(stations=tuple(stations), pairs=pairs)
+    return network_of(who, measured, held, start, prior, inner, survey)
+
+
+def network_of_file(path, information="tangent", block_diagonal=False, start=False) -> PoseNetwork:
+    """The network of a g2o file; start: with that of the file's vertices."""
+    survey = read_g2o_file(path, information, block_diagonal).survey
+    return network_from_survey(survey if start else without_starts(survey, points=False, poses=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,6 +65,14 @@ class Simulated:
     rotations: FloatArray
     translations: FloatArray
     wrong: tuple[str, ...]
+
+
+def omega_of(minimum: Minimum) -> float:
+    """V'Pv of the pairs in use and the priors."""
+    batch, values = minimum.graph.pairs, minimum.solved.values
+    between_held = np.flatnonzero(batch.arrays.used & batch.both_held)  # these have no factor
+    white = batch.arrays.whitening[between_held] @ batch.jacobians(values)[0][between_held, :, None]
+    return minimum.graph.omega(values) + float(np.sum(white**2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +92,7 @@ class Solved:
 
     @property
     def omega(self) -> float:
-        return self.minimum.omega
+        return omega_of(self.minimum)
 
     @property
     def iterations(self) -> int:

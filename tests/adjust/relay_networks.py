@@ -86,13 +86,18 @@ def differences(found, true):
     return np.array([Pose3.Logmap(t.between(as_gtsam(found, i))) for i, t in enumerate(true)])
 
 
+def ends(top, pair_idx):
+    """Ids of the two stations of a pair."""
+    return top.station_ids[top.a_idx[pair_idx]], top.station_ids[top.b_idx[pair_idx]]
+
+
 def pairs_of(simulated):
     """The network as observations of a survey."""
     network, top = simulated.network, simulated.network.topology
     return tuple(
         Pair(
             top.pair_ids[e],
-            *(FrameRef("station", s) for s in top.ends(e)),
+            *(FrameRef("station", s) for s in ends(top, e)),
             as_gtsam(network.b_from_a, e),
             network.cov[e],
         )

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.pose_network import NetworkOptions, pose_network
+from adjust.pose_network import NetworkOptions
 from adjust.relay.result import AdjustedPairs, adjusted_pairs
 from adjust.spatial.rigid_motions import Motions
-from tests.adjust.pose_networks import Solved, solve_network
+from tests.adjust.pose_networks import Solved, pose_network, solve_network
 from tests.adjust.relay_networks import as_gtsam
 
 OPTIONS = NetworkOptions(max_step=1e-9)

@@ -69,7 +69,7 @@ def test_expectation_is_the_covariance_of_an_adjustment_of_simulated_readings() 
     assert planned.omega == 0.0
     assert planned.redundancy == solved.redundancy
     dense = design_matrix(exact(survey, start), start)
-    Q = np.linalg.inv(dense.normal())
+    Q = np.linalg.inv((dense.A.T @ dense.A).toarray())
     for name, estimate in planned.estimates.items():
         s = np.sqrt(np.diag(estimate.cov))
         free = np.flatnonzero(s > 0.0)

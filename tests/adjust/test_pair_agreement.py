@@ -7,14 +7,14 @@ import pytest
 
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray
-from adjust.pose_network import PoseNetwork, pose_network
+from adjust.pose_network import PoseNetwork
 from adjust.pose_network.agreement import _connected, agreeing, disagreeing
 from adjust.pose_network.cycles import flat, short_loops
 from adjust.pose_network.loops import evaluate_loops, walked
 from adjust.pose_network.network import survey_of
 from adjust.statistics.outliers import search
 from adjust.statistics.screened_adjustment import adjust_cleaned
-from tests.adjust.pose_networks import exp6, simulate
+from tests.adjust.pose_networks import exp6, pose_network, simulate
 
 
 def _disagreeing(network: PoseNetwork) -> set[str]:

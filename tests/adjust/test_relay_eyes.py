@@ -21,6 +21,7 @@ from adjust.relay.eyes.sequences import EyeSequence, KnownWorlds
 from adjust.relay.eyes.setup import eye_setup
 from adjust.relay.eyes.solver import EyeProblem, linearise
 from adjust.spatial.rigid_motions import Motions
+from tests.adjust.relay_networks import ends
 from tests.adjust.relay_station import EYES, Station4, Trackers, motions, poses, random_rigid
 from tests.sizes import size
 
@@ -392,7 +393,7 @@ def test_actual_covariance_of_closed_loops_is_the_scatter() -> None:
         closed = close_loops(pairs_of(eye_sequences(station.survey(seed, 0.05))))
         adjusted = closed.adjusted.pairs
         for i in (0, 4):
-            pair = adjusted.network.topology.ends(i)
+            pair = ends(adjusted.network.topology, i)
             true = station.pair(pair[0][7:], pair[1][7:])
             value = poses(adjusted.b_from_a)[i]
             d = Pose3.Logmap(true.between(value))

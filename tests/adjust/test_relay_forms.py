@@ -22,6 +22,7 @@ from tests.adjust.relay_networks import (
     chain_with_chords,
     complete,
     differences,
+    ends,
     grid,
     motions,
     pairs_of,
@@ -187,7 +188,7 @@ def test_pairs_do_not_depend_on_the_datum_and_unmeasured_ones_have_their_covaria
         np.testing.assert_allclose(a[1], b[1], atol=1e-9 * np.abs(a[1]).max())
     np.testing.assert_array_equal(other.station(top.station_ids[7])[1], 0.0)
     # a measured pair by its ends, along and against its direction
-    a, b = top.ends(4)
+    a, b = ends(top, 4)
     np.testing.assert_allclose(first.pair(a, b)[1], first.pairs.cov[4], atol=1e-12)
     backward, Ad = first.pair(b, a)[1], as_gtsam(first.pairs.b_from_a, 4).AdjointMap()
     np.testing.assert_allclose(backward, Ad @ first.pairs.cov[4] @ Ad.T, atol=1e-9 * np.abs(backward).max())
@@ -301,7 +302,7 @@ def test_network_from_pairs():
     pairs = pairs_of(simulated)
     network = network_from_pairs((*pairs, replace(pairs[0], pair_id="unused", used=False)))
     assert network.topology.n_pairs == 6
-    assert network.topology.ends(0) == ("station:C1", "station:C2")
+    assert ends(network.topology, 0) == ("station:C1", "station:C2")
     np.testing.assert_array_equal(network.b_from_a.translation, simulated.network.b_from_a.translation)
     rotations = network_from_pairs(pairs, rotations_only=True)
     assert rotations.dim == 3

@@ -11,10 +11,9 @@ from gtsam import BetweenFactorPose3, Pose3, PriorFactorPose3, Rot3
 from scipy.spatial.transform import Rotation
 
 from adjust.model.survey import FloatArray, IntArray
-from adjust.pose_network import PoseNetwork, pose_network
+from adjust.pose_network import PoseNetwork
 from adjust.pose_network.start import find_network_start
-from survey.interop.networks.g2o import read_g2o_file
-from tests.adjust.pose_networks import solve_network
+from tests.adjust.pose_networks import network_of_file, pose_network, solve_network
 from tests.benchmarks.cases import Arrays
 from tests.benchmarks.outcome import Competitor, Outcome
 
@@ -38,7 +37,7 @@ class PoseGraph(Arrays):
 
 def read(path: Path, block_diagonal: bool = False) -> PoseGraph:
     """A g2o file, with the start that ours finds."""
-    network = read_g2o_file(path, block_diagonal=block_diagonal).network
+    network = network_of_file(path, block_diagonal=block_diagonal)
     start = np.tile(np.eye(4), (network.n_stations, 1, 1))
     start[:, :3, :3], start[:, :3, 3] = find_network_start(network)
     return PoseGraph(

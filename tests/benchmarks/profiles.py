@@ -20,8 +20,7 @@ from adjust.precision import precision
 from adjust.precision.precision import Precision
 from adjust.precision.tree import TreeCovariance
 from adjust.start import find_start
-from survey.interop.networks.g2o import read_g2o_file
-from tests.adjust.pose_networks import solve_network
+from tests.adjust.pose_networks import network_of_file, solve_network
 from tests.benchmarks import tables, terrestrial
 from tests.benchmarks.data import calibration, rough_start, survey
 from tests.data import data_folder
@@ -171,7 +170,7 @@ def pose_graphs(names: Sequence[str]) -> str:
     """For published graphs."""
     columns = {}
     for name in names:
-        network = read_g2o_file(data_folder("calibration", "pose_graphs") / f"{name}.g2o").network
+        network = network_of_file(data_folder("calibration", "pose_graphs") / f"{name}.g2o")
 
         def run(clock: Clock, network: Any = network) -> None:
             fresh = network.with_used(network.used)

@@ -255,7 +255,7 @@ EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 4 0 0 4 0 4
 def _g2o(path: Path) -> object:
     from survey.interop.networks.g2o import read_g2o_file
 
-    return read_g2o_file(path).network, read_g2o_file(path, "quaternion", True).network
+    return read_g2o_file(path).survey, read_g2o_file(path, "quaternion").survey
 
 
 def _foreign(name: str) -> Callable[[Path], object]:

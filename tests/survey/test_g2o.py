@@ -10,7 +10,7 @@ from survey.interop.networks.g2o import read_g2o_file, write_g2o
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.converting import convert_job
 from survey.project import read
-from tests.adjust.pose_networks import simulate, solve_network
+from tests.adjust.pose_networks import network_of_file, simulate, solve_network
 from tests.data import data_folder
 
 EDGE = "EDGE_SE3:QUAT 0 1 1 2 3 0 0 0.1 1 " + " ".join(["1 0 0 0 0 0", "1 0 0 0 0", "1 0 0 0", "4 0 0", "4 0", "4"])
@@ -19,7 +19,7 @@ VERTEX = "VERTEX_SE3:QUAT {} 0 0 0 0 0 0 1"
 
 def test_gtsam_reads_the_same(tmp_path: Path) -> None:
     path = data_folder("calibration", "pose_graphs") / "smallGrid3D.g2o"
-    net = read_g2o_file(path, use_vertices=True).network
+    net = network_of_file(path, start=True)
     graph, values = gtsam.readG2o(str(path), True)
     assert graph.size() == net.n_pairs
     assert values.size() == net.n_stations
@@ -38,19 +38,20 @@ def test_written_networks_come_back(tmp_path: Path, information) -> None:
     net = simulate(4, 3).network
     solution = solve_network(net)
     write_g2o(tmp_path / "n.g2o", net, solution.rotations, solution.translations, information)
-    back = read_g2o_file(tmp_path / "n.g2o", information, use_vertices=True).network
+    back = network_of_file(tmp_path / "n.g2o", information, start=True)
     assert back.cov == pytest.approx(net.cov, rel=1e-9, abs=1e-15)
     assert back.rotations == pytest.approx(net.rotations, abs=1e-12)
-    assert back.station_translations == pytest.approx(solution.translations, abs=1e-12)
+    order = [back.index_of[str(i)] for i in range(net.n_stations)]
+    assert back.station_translations[order] == pytest.approx(solution.translations, abs=1e-12)
     assert solve_network(back).omega == pytest.approx(solution.omega, rel=1e-9)
 
 
 def test_the_two_meanings_of_the_rotation_information_differ_by_four(tmp_path: Path) -> None:
     path = tmp_path / "n.g2o"
     path.write_text("\n".join([VERTEX.format(0), VERTEX.format(1), EDGE]))
-    tangent, quaternion = read_g2o_file(path).network, read_g2o_file(path, "quaternion").network
-    assert np.diag(tangent.cov[0]) == pytest.approx([0.25] * 3 + [1.0] * 3)
-    assert np.diag(quaternion.cov[0]) == pytest.approx([1.0] * 6)
+    tangent, quaternion = (read_g2o_file(path, meant).survey.pairs for meant in ("tangent", "quaternion"))
+    assert np.diag(tangent[0].cov) == pytest.approx([0.25] * 3 + [1.0] * 3)
+    assert np.diag(quaternion[0].cov) == pytest.approx([1.0] * 6)
 
 
 @pytest.mark.parametrize(
@@ -94,8 +95,8 @@ def test_indefinite_information_is_counted_and_named_with_its_lines(tmp_path: Pa
 def test_blocks_alone_are_read_where_that_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = _partly_indefinite(tmp_path / "n.g2o")
     found = read_g2o_file(path, block_diagonal=True)
-    assert np.diag(found.network.cov[1]) == pytest.approx([1 / 9] * 3 + [1 / 4] * 3)
-    assert np.count_nonzero(found.network.cov[1]) == 6
+    assert np.diag(found.survey.pairs[1].cov) == pytest.approx([1 / 9] * 3 + [1 / 4] * 3)
+    assert np.count_nonzero(found.survey.pairs[1].cov) == 6
     assert "dropped (block-diagonal reading); as a whole 2 of the matrices are not" in found.notes[0]
     assert main(["convert", str(path), str(tmp_path / "p"), "--block-diagonal"]) == 0
     assert "2 of 3 edges was dropped" in capsys.readouterr().out

@@ -9,9 +9,11 @@ from gtsam import Rot3
 
 from adjust.model.errors import SurveyError
 from survey.cli import main
-from survey.examples.alignment import FEET_MM, OFF, alignment_files
+from survey.examples.alignment import OFF, alignment_files
 from survey.jobs.aligning import align_job
 from survey.jobs.working_sheet import steps
+
+FEET_MM = {"left": (0.0, 0.0), "right": (200.0, 0.0), "far": (100.0, -140.0)}
 
 ARCSEC = np.pi / 648000
 

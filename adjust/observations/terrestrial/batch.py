@@ -74,11 +74,6 @@ class TerrestrialBatch:
         """All unknowns that a reading depends on, used or not."""
         return {key for chunk in self.layout.chunks for key in chunk.keys}
 
-    def set_weights(self, weights: FloatArray) -> None:
-        """Weights (N,) on top of the covariances; zero leaves a reading out."""
-        self.state.outdate()
-        self.weights = np.array(weights, dtype=float)
-
     # -- evaluation --------------------------------------------------------------------------------------------------
 
     def _load(self, values: gtsam.Values, positions: IntArray | None, bodies: Sequence[int]) -> None:

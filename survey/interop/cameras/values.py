@@ -27,15 +27,14 @@ BROWN_4 = ("fx", "fy", "u0", "v0", "k1", "k2", "p1", "p2")
 BROWN_5 = (*BROWN_4, "k3")
 BROWN_8 = (*BROWN_5, "k4", "k5", "k6")
 FISHEYE_4 = ("fx", "fy", "u0", "v0", "k1", "k2", "k3", "k4")
-_EXACT_PX = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class MappedLens:
     """A lens as another program has it. values: by parameter name. cov: (n, n) in the order of the model, or None.
 
-    exact: whether it is the same lens; else largest_px says how far the two differ anywhere in the image, and note
-    says so for people.
+    largest_px: how far the two lenses differ anywhere in the image. note: says so for people where they do, and which
+    lens it is of one that changes.
     """
 
     model: str
@@ -43,11 +42,6 @@ class MappedLens:
     cov: FloatArray | None
     largest_px: float = 0.0
     note: str | None = None
-
-    @property
-    def exact(self) -> bool:
-        """Whether nothing was approximated."""
-        return self.largest_px == 0.0
 
     def array(self, *names: str) -> FloatArray:
         """Values of the named parameters."""
@@ -83,15 +77,14 @@ def mapped_lens(
         model, values, camera_constants(camera), wanted, lens_constants(wanted, camera.image_size), camera.image_size,
         free=free, cov=cov,
     )  # fmt: skip
-    u, v = found.largest_at
-    largest = found.largest_difference_px
+    largest, (u, v) = found.largest_difference_px, found.largest_at
     note = (
         f"camera {camera.camera_id}: the lens {model.name} is written as {wanted.name} with {', '.join(free)}, which "
         f"differs by up to {largest:.2g} px, at ({u:.0f}, {v:.0f}); the rms is {found.rms_px:.2g} px"
     )
     return MappedLens(
         wanted.name, dict(zip(wanted.names, map(float, found.values), strict=True)), found.cov,
-        max(largest, _EXACT_PX), note if taken is None else f"{taken}; {note}",
+        largest, note if taken is None else f"{taken}; {note}",
     )  # fmt: skip
 
 

@@ -13,11 +13,14 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
+from gtsam import Pose3, Rot3
 from scipy.spatial.transform import Rotation
 
 from adjust.model.errors import SurveyError, listed
-from adjust.model.survey import BoolArray, FloatArray
-from adjust.pose_network.network import PoseNetwork, pose_network
+from adjust.model.observations import FrameRef, Pair
+from adjust.model.survey import BoolArray, FloatArray, PoseParameter, Station, Survey
+from adjust.pose_network.from_survey import network_from_survey
+from adjust.pose_network.network import PoseNetwork
 from survey.folder.text import atomic_write
 
 Information = Literal["tangent", "quaternion"]
@@ -39,19 +42,16 @@ class _Edge(NamedTuple):
 class G2oFile:
     """What a file was read as. notes: what was not taken as it stands, for people."""
 
-    network: PoseNetwork
+    survey: Survey
     notes: tuple[str, ...] = ()
 
 
-def read_g2o_file(
-    path: Path, information: Information = "tangent", use_vertices: bool = False, block_diagonal: bool = False
-) -> G2oFile:
-    """The network of a file. What ``FIX`` names is held at its vertex, else the first station at its vertex.
+def read_g2o_file(path: Path, information: Information = "tangent", block_diagonal: bool = False) -> G2oFile:
+    """Stations and pairs of a file. What ``FIX`` names is held at its vertex, else the first station at its vertex.
 
-    use_vertices: take the other vertices as a start; by default the program finds its own. block_diagonal: of all
-    information matrices only the 3 x 3 blocks of translation and rotation count, what stands between them is dropped.
-    Raises SurveyError with file and line for what cannot be read, and for information matrices that are not positive
-    definite.
+    The other vertices are start values. block_diagonal: of all information matrices only the 3 x 3 blocks of
+    translation and rotation count, what stands between them is dropped. Raises SurveyError with file and line for what
+    cannot be read, and for information matrices that are not positive definite.
     """
     vertices: dict[str, tuple[list[float], int]] = {}
     edges: list[_Edge] = []
@@ -77,7 +77,9 @@ def read_g2o_file(
     stations = dict(zip(vertices, _rows(vertices.values(), 7, path), strict=True))
     rows = _rows([(edge.row, edge.line) for edge in edges], 28, path)
     info, notes = _information(path, edges, rows[:, 7:], information, block_diagonal)
-    return G2oFile(_network(path, stations, edges, rows, fixed, info, use_vertices), notes)
+    survey = _survey(path, stations, edges, rows, fixed, np.asarray(np.linalg.inv(info), dtype=float))
+    network_from_survey(survey)  # which checks it
+    return G2oFile(survey, notes)
 
 
 def _numbers(words: Sequence[str], n: int, path: Path, line: int) -> list[float]:
@@ -103,28 +105,25 @@ def _rows(found: Collection[tuple[list[float], int]], n: int, path: Path) -> Flo
     return rows
 
 
-def _poses(rows: FloatArray) -> FloatArray:
-    out = np.tile(np.eye(4), (len(rows), 1, 1))
-    out[:, :3, :3], out[:, :3, 3] = Rotation.from_quat(rows[:, 3:7]).as_matrix(), rows[:, :3]
-    return out
+def _poses(rows: FloatArray) -> list[Pose3]:
+    turns = Rotation.from_quat(rows[:, 3:7]).as_matrix()
+    return [Pose3(Rot3(R), t) for R, t in zip(turns, rows[:, :3], strict=True)]
 
 
-def _network(
-    path: Path, stations: dict[str, FloatArray], edges: list[_Edge], rows: FloatArray, fixed: list[str],
-    info: FloatArray, use_vertices: bool,
-) -> PoseNetwork:  # fmt: skip
+def _survey(
+    path: Path, stations: dict[str, FloatArray], edges: list[_Edge], rows: FloatArray, fixed: list[str], cov: FloatArray
+) -> Survey:
     ids = list(dict.fromkeys([*stations, *(x for e in edges for x in (e.i, e.j))]))
-    index = {s: k for k, s in enumerate(ids)}
     unknown = next((f for f in fixed if f not in stations), None)
     if unknown is not None:
         raise SurveyError(f"{path}: FIX {unknown} names a vertex that the file does not hold")
     given = dict(zip(stations, _poses(np.array(list(stations.values())).reshape(-1, 7)), strict=True))
-    held = {index[s]: given[s] for s in fixed} or {0: given.get(ids[0], np.eye(4))}
-    poses = _poses(rows)
-    return pose_network(
-        ids, _edge_names(edges), [index[e.j] for e in edges], [index[e.i] for e in edges],
-        poses[:, :3, :3], poses[:, :3, 3], np.asarray(np.linalg.inv(info), dtype=float), held=held,
-        start={index[s]: p for s, p in given.items()} if use_vertices else None,
+    held = {s: PoseParameter(given.get(s, Pose3()), "held") for s in fixed or ids[:1]}
+    frames = {s: FrameRef("station", s) for s in ids}
+    return Survey(
+        stations=tuple(Station(s, world_from_station=held.get(s, PoseParameter(given.get(s)))) for s in ids),
+        pairs=tuple(Pair(name, frames[e.j], frames[e.i], i_from_j, Q) for name, e, i_from_j, Q
+                    in zip(_edge_names(edges), edges, _poses(rows), cov, strict=True)),
     )  # fmt: skip
 
 
