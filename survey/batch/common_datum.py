@@ -174,11 +174,11 @@ class _Epoch:
         self, target: Mapping[str, Pose3 | FloatArray], carriers: Sequence[str], level: float, spread: float
     ) -> dict[str, Moved]:
         """In the datum of the carriers that stayed. spread: variance of a difference over that of the epoch."""
-        stable = list(carriers)
+        stable, limit = list(carriers), {size: float(chi2.isf(level, size)) for size in (3, 6)}
         self.align(target, stable)
         while 2 * (len(stable) - 1) >= len(carriers):
             tests = {n: self._test(target, n) / spread for n in stable}
-            limits = {n: float(chi2.isf(level, len(self.cov(n)))) for n in stable}
+            limits = {n: limit[self._size(n)] for n in stable}
             worst = max(tests, key=lambda n: tests[n] / limits[n])
             rest = [n for n in stable if n != worst]
             short = np.linalg.matrix_rank(self._motions(target, rest)) < self.directions.shape[1]
@@ -191,10 +191,12 @@ class _Epoch:
 
     def cov(self, name: str) -> FloatArray:
         """Covariance as it turned and grew along, in the tangent of a pose."""
-        place = self.places[name]
-        n = 3 if place.wxyz is None else 6
+        n = self._size(name)
         J = self.L if n == 3 else np.diag([1.0] * 3 + [self.scale] * 3)
-        return np.asarray(J @ np.array(place.cov).reshape(n, n) @ J.T)
+        return np.asarray(J @ np.array(self.places[name].cov).reshape(n, n) @ J.T)
+
+    def _size(self, name: str) -> int:
+        return 3 if self.places[name].wxyz is None else 6
 
     def _test(self, target: Mapping[str, Pose3 | FloatArray], name: str) -> float:
         d, C = differences_of(target[name], self.values[name]), self.cov(name)
@@ -208,11 +210,11 @@ class _Epoch:
         self, target: Mapping[str, Pose3 | FloatArray], stable: Sequence[str], out: Sequence[str], name: str
     ) -> FloatArray:
         """Sigmas (3 or 6,) of what the motion of the whole gained, in the tangent of a pose."""
-        own = values_motions((self.values[name],)) @ self.directions
-        total = np.zeros(len(own))
-        if out:
-            G = self._motions(target, stable)
-            own = own @ np.linalg.inv(G.T @ G)
+        total = np.zeros(self._size(name))
+        if not out:
+            return total
+        G = self._motions(target, stable)
+        own = values_motions((self.values[name],)) @ self.directions @ np.linalg.inv(G.T @ G)
         for m in out:
             B = own @ self._motions(target, [m]).T
             total += sigmas_in(B @ self.cov(m) @ B.T)
