@@ -75,7 +75,8 @@ def need_playwright() -> Any:
 def launched() -> Iterator[Any]:
     """Debian's Chromium; nothing is downloaded."""
     with need_playwright().sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=need_browser(), args=["--no-sandbox", "--disable-gpu"])
+        args = ["--no-sandbox", "--disable-gpu", "--window-size=1280,800"]  # of most pages: no tab has to grow
+        found = playwright.chromium.launch(executable_path=need_browser(), args=args)
         yield found
         found.close()
 

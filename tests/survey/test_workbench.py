@@ -27,6 +27,7 @@ from survey.workbench.rows import BY_PEOPLE, IN_USE, columns, point_rows
 from survey.workbench.session import Workbench
 from survey.workbench.situation import CancelledError, ChangedError
 from tests import labs
+from tests.survey.adjusted_benches import adjusted_bench
 
 pytestmark = pytest.mark.slow
 
@@ -38,9 +39,7 @@ def mine(lab, tmp_path):
 
 @pytest.fixture
 def bench(mine):
-    made = survey.Workbench(mine)
-    made.adjust()
-    return made
+    return adjusted_bench(mine)
 
 
 def exclusions(folder):
@@ -105,8 +104,7 @@ def test_undone_is_as_before_and_redone_as_decided(bench, mine):
 
 def test_a_planted_mistake_is_found_left_out_and_back(mine):
     name = wrong_point(mine)
-    bench = Workbench(mine)
-    bench.adjust()
+    bench = adjusted_bench(mine)
     worst = bench.findings()["findings"][0]
     assert worst["id"] == f"image_point:{name}"
     assert worst["share"] > 1.0
@@ -157,8 +155,7 @@ def test_older_decisions_and_foreign_changes_are_refused(bench, mine):
 
 def test_read_only_writes_nothing(mine):
     before = {p: p.read_bytes() for p in mine.rglob("*") if p.is_file()}
-    bench = Workbench(mine, read_only=True)
-    bench.adjust()
+    bench = adjusted_bench(mine, read_only=True)
     for act in (lambda: bench.exclude("camera:right", reason="x"), bench.undo, bench.save, lambda: bench.restore(1)):
         with pytest.raises(SurveyError, match="reading only"):
             act()
@@ -336,8 +333,7 @@ def definition(folder):
 
 def test_decisions_in_the_definition_keep_its_comments_and_come_back(mine):
     (mine / "survey.toml").write_text("# my laboratory\n" + definition(mine) + "\n# the end\n")
-    bench = Workbench(mine)
-    bench.adjust()
+    bench = adjusted_bench(mine)
     before, first = definition(mine), bench.adjustment
     bench.set_sigma_scale("image", 2.0)
     assert bench.adjustment.omega < first.omega
@@ -408,8 +404,7 @@ def spoilt(tmp_path):
 
 def test_a_remedy_is_carried_out_by_one_call_and_taken_back_by_undo_unless_others_changed_the_table(spoilt):
     folder, before = spoilt
-    bench = Workbench(folder)
-    bench.adjust()
+    bench = adjusted_bench(folder)
     table = folder / "observations/image_points.csv"
     found = bench.findings()["remedies"]
     assert "mirrored" in found[0]["cause"]
@@ -480,8 +475,7 @@ def test_the_network_of_readings_is_where_the_solution_is(tmp_path):
     cells = lines[2].split(",")
     wrong, cells[at] = f"distances:{cells[0]}", repr(float(cells[at]) + 3.0)
     path.write_text("\n".join([*lines[:2], ",".join(cells), *lines[3:]]) + "\n")
-    bench = Workbench(tmp_path / "lab")
-    bench.adjust()
+    bench = adjusted_bench(tmp_path / "lab")
     found = bench.network()
     assert found["n_nowhere"] == 0
     adjusted = {o.ids[0]: o.adjusted[0] for o in bench.adjustment.other_residuals if o.kind == "distance"}

@@ -28,6 +28,7 @@ from survey.workbench.server import WEB, Server
 from survey.workbench.session import Workbench
 from survey.workbench.views.project import PARTS
 from tests.browsing import SECONDS
+from tests.survey.adjusted_benches import adjusted_bench
 from tests.survey.test_workbench import exclusions, wrong_point
 
 TOKEN = "secret-token-of-this-test"
@@ -44,8 +45,7 @@ def mine(lab, tmp_path):
 
 @contextmanager
 def page(folder, read_only=False):
-    bench = Workbench(folder, read_only=read_only)
-    bench.adjust()
+    bench = adjusted_bench(folder, read_only)
     with TestClient(Server(bench, TOKEN).app(), base_url=BASE) as client:
         yield client
 
@@ -301,8 +301,7 @@ def test_images_by_name_with_a_tag(mine):
 
 
 def test_it_ends_with_pages_still_open(mine):
-    bench = Workbench(mine)
-    bench.adjust()
+    bench = adjusted_bench(mine)
     with Listening(Server(bench, TOKEN, "c"), "127.0.0.1", 0) as listening:
         with urlopen(Request(f"{listening.address}api/state", headers=HERE), timeout=20) as answer:
             assert json.load(answer)["version"] == 1
