@@ -7,12 +7,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
-from urllib.parse import urljoin
 
 import pytest
 
 from survey.report import page as printing
-from survey.report.modules import WEB as SHARED
 from survey.workbench.guard import new_token
 from survey.workbench.live import Listening
 from survey.workbench.server import Server
@@ -52,8 +50,6 @@ INKED = """((c) => {
   return d.getImageData(0, 0, c.width, c.height).data.filter((x, k) => k % 4 === 3 && x > 0).length;
 })"""
 """How many pixels of a canvas something is drawn in; a function of the canvas."""
-_WAITS = "/icon.svg"
-"""Where a tab waits for its next page: in the same process, and nothing runs there."""
 BROWSER = next((path for name in printing.BROWSERS if (path := shutil.which(name))), None)
 
 
@@ -79,7 +75,7 @@ def need_playwright() -> Any:
 def launched() -> Iterator[Any]:
     """Debian's Chromium; nothing is downloaded."""
     with need_playwright().sync_playwright() as playwright:
-        args = ["--no-sandbox", "--disable-gpu", "--window-size=1280,800"]  # that of most pages: growing takes long
+        args = ["--no-sandbox", "--disable-gpu", "--window-size=1280,800"]  # of most pages: no tab has to grow
         found = playwright.chromium.launch(executable_path=need_browser(), args=args)
         yield found
         found.close()
@@ -88,38 +84,28 @@ def launched() -> Iterator[Any]:
 class Page:
     """A page, with what it complained of and what it asked of others: of nothing where it is left without an error.
 
-    All pages of a browser are in tabs of one context, for which scripts are compiled once; what a page keeps for the
-    next one goes when it is closed, and its tab, which takes longer to open than a page, waits for the next. ``apart``:
-    in a context, and so in a process, of its own.
+    All pages of a browser are tabs of one context, for which scripts are compiled once. What a page keeps for the next
+    one goes when it is closed. ``apart``: in a context, and so in a process, of its own.
     """
 
     def __init__(
         self, browser: Any, address: str, width: int, ready: str = READY, dark: bool = False, apart: bool = False
     ) -> None:
         shared = [] if apart else browser.contexts
-        context = shared[0] if shared else browser.new_context(locale="en-GB")
-        waiting = [tab for tab in context.pages if tab.url.endswith(_WAITS)]
-        self.page = waiting[0] if waiting else context.new_page()
+        self.page = (shared[0] if shared else browser.new_context(locale="en-GB")).new_page()
         self.page.set_viewport_size({"width": width, "height": 800})
         self.page.emulate_media(color_scheme="dark" if dark else "light")
         self.complaints: list[str] = []
-        known, base = (address.split("#")[0], "blob:"), address if address.startswith("http") else SHARED.as_uri() + "/"
-        self._waits_at = urljoin(base, _WAITS.removeprefix("/"))
-        self._heard = {
-            "pageerror": lambda error: self.complaints.append(str(error)),
-            "console": lambda m: self.complaints.append(m.text) if m.type in ("error", "warning") else None,
-            "request": lambda r: None if r.url.startswith(known) else self.complaints.append(r.url),
-        }
-        for event, listener in self._heard.items():
-            self.page.on(event, listener)
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("console", lambda m: self.complaints.append(m.text) if m.type in ("error", "warning") else None)
+        self.page.on("request", lambda r: None if r.url.startswith((address.split("#")[0], "blob:")) else
+                     self.complaints.append(r.url))  # fmt: skip
         self.page.goto(address)
         self.wait(ready)
 
     def close(self) -> None:
-        self.page.evaluate("localStorage.clear(); sessionStorage.clear()")
-        for event, listener in self._heard.items():
-            self.page.remove_listener(event, listener)
-        self.page.goto(self._waits_at)
+        self.page.evaluate("localStorage.clear()")
+        self.page.close()
 
     def __enter__(self) -> Self:
         return self

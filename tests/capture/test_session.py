@@ -117,7 +117,7 @@ def test_lost_camera_stops_clearly_and_the_rest_follows(tmp_path):
 @pytest.mark.slow
 def test_connection_of_the_table_cut_at_work(tmp_path):
     with table_server(tmp_path, *FAST) as server:
-        plan = write_plan(tmp_path, server.url, n=(3, 4), options="wait_s = 0.1")
+        plan = write_plan(tmp_path, server.url, n=(3, 3), options="wait_s = 0.1")
         context = processes()
         process = context.Process(target=run_plan_quietly, args=(str(plan),))
         process.start()
@@ -131,7 +131,7 @@ def test_connection_of_the_table_cut_at_work(tmp_path):
         process.join(120)
         assert process.exitcode == 0
         assert n == 3
-        require_complete(plan, 12)
+        require_complete(plan, 9)
         assert any("connection lost" in line for line in events(plan, "retry"))
 
 
@@ -210,7 +210,7 @@ def test_interrupt_stops_the_table_within_50_ms(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("run_it", [pause_after_two, pause_as_on_macos])
 def test_pause_and_go_on(tmp_path, run_it):
-    plan = write_plan(tmp_path, n=(3, 4), options="wait_s = 0.1")
+    plan = write_plan(tmp_path, options="wait_s = 0.1")
     process = processes().Process(target=run_it, args=(str(plan),))
     process.start()
     images, journal = tmp_path / "lab" / "images", tmp_path / "lab" / "capture" / "journal.jsonl"
@@ -219,11 +219,11 @@ def test_pause_and_go_on(tmp_path, run_it):
         time.sleep(0.005)
     n = len(list(images.rglob("Y/t*.png")))
     time.sleep(0.3)
-    assert len(list(images.rglob("Y/t*.png"))) == n < 12
+    assert len(list(images.rglob("Y/t*.png"))) == n < 6
     os.kill(process.pid, signal.SIGUSR1)
     process.join(120)
     assert process.exitcode == 0
-    require_complete(plan, 12)
+    require_complete(plan, 6)
     assert len(events(plan, "paused")) == len(events(plan, "resumed")) == 1
 
 

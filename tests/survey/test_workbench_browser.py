@@ -62,9 +62,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     wrong[4] = str(float(wrong[4]) + 4.0)
     with path.open("w", newline="") as stream:
         csv.writer(stream, lineterminator="\n").writerows(rows)
+    image = cv2.imencode(".png", np.full((1024, 1280), 90, np.uint8))[1].tobytes()
     for camera, epoch in {(row[1], row[0]) for row in rows[1:]}:
         (out / "images" / camera).mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(out / "images" / camera / f"{epoch}.png"), np.full((1024, 1280), 90, np.uint8))
+        (out / "images" / camera / f"{epoch}.png").write_bytes(image)
     toml = out / "survey.toml"
     toml.write_text(re.sub(r'(?m)^title = .*', 'title = "<img src=x onerror=window.ran=1>"', toml.read_text()))
     return out
