@@ -28,6 +28,8 @@ _FEWEST, _MOST = 3, 4
 SCALE, INSTRUMENT, _TARGET = "scale of distances", "instrument height", "target height"
 _LARGEST = 10.0
 """m: what no height of an instrument or a target, and no reflector's constant, is wrong by."""
+_LARGEST_SCALE = 0.01
+"""The same of scales: beyond that it is another unit."""
 _HEIGHTS = ("instrument_height", "target_height", "second_height")
 _UNITS = {1e3: ("are metres, read as millimetres", 2e-4, 3e-3), 1e-3: ("are millimetres, read as metres", 100.0, 1e5)}
 """By the factor that mends them: heights in another unit, and from where to where (m) they then stand."""
@@ -55,6 +57,11 @@ class _Constant:
     def field(self) -> str:
         """Of its readings that is changed."""
         return {INSTRUMENT: "instrument_height", _TARGET: "target_height"}.get(self.name, "value")
+
+    @property
+    def largest(self) -> float:
+        """What it is not wrong by."""
+        return _LARGEST_SCALE if self.name == SCALE else _LARGEST
 
     def amount(self, size: float) -> str:
         """The change of what stands there, in words."""
@@ -120,7 +127,7 @@ def wrong_heights(case: Case) -> Iterator[Hypothesis]:
         return
     constants = list(_constants(survey, batch.A))
     judged = _by_scores(case, constants) or _by_misses(case, before, batch, constants)
-    found = [(e, c, d) for c, (e, d) in zip(constants, judged, strict=True) if e > _CLEARLY and abs(d) < _LARGEST]
+    found = [(e, c, d) for c, (e, d) in zip(constants, judged, strict=True) if e > _CLEARLY and abs(d) < c.largest]
     for evidence, constant, metres in sorted(found, key=lambda f: (-f[0], -len(f[1].rows)))[:_MOST]:
         yield _hypothesis(survey, constant, metres, len(constants), evidence)
 
