@@ -156,9 +156,11 @@ def test_zero_of_an_axis_that_is_another_one_from_an_epoch_on(axis: int, since: 
     assert mends(lab)
 
 
+@pytest.mark.slow
 def test_table_to_be_added_that_has_a_header_only_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Its stations were blamed, which no pair tied to the rest."""
     lab = labs.example("relay", tmp_path / "lab")
+    assert main(["adjust", str(lab), "--quiet"]) == 0
     table = lab / "more" / "observations" / "pairs.csv"
     table.write_text(table.read_text(encoding="utf-8").splitlines()[0] + "\n", encoding="utf-8")
     assert main(["add", str(lab), str(lab / "more"), "--quiet"]) == FAILED
