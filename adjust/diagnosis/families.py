@@ -20,7 +20,7 @@ from adjust.diagnosis.targets.layout import other_layouts
 from adjust.diagnosis.targets.size import wrong_sizes
 from adjust.diagnosis.time.forgotten_motion import forgotten_motion
 from adjust.diagnosis.time.synchronisation import unsynchronised
-from adjust.diagnosis.units.faces import other_kinds, second_faces
+from adjust.diagnosis.units.faces import other_kinds, second_faces, turned_circles
 from adjust.diagnosis.units.heights import misread_heights, wrong_heights
 from adjust.diagnosis.units.pairs import misread_pairs
 from adjust.diagnosis.units.readings import misread_readings
@@ -39,7 +39,7 @@ NAMES: tuple[Family, ...] = (
 )  # fmt: skip
 VALUES: tuple[Family, ...] = (misread_heights, impossible_sigmas)
 """Told by the values alone: the first ones that are tried."""
-UNITS: tuple[Family, ...] = (misread_readings, second_faces, other_kinds, wrong_heights, misread_pairs)
+UNITS: tuple[Family, ...] = (misread_readings, second_faces, turned_circles, other_kinds, wrong_heights, misread_pairs)
 IN_COMMON = (*VALUES, exchanged_points, exchanged_throughout, *UNITS, small_sigmas)
 """What several observations that were left out, with all others fitting, may have in common."""
 TIME: tuple[Family, ...] = (forgotten_motion, unsynchronised)

@@ -93,13 +93,23 @@ class ChangeReadings:
 
 
 @dataclass(frozen=True)
+class SetReadings:
+    """A column of ``terrestrial.csv`` gets this word in the rows of some readings, by id."""
+
+    ids: tuple[str, ...]
+    column: str
+    value: str
+    table: str = "terrestrial"
+
+
+@dataclass(frozen=True)
 class LeaveOut:
     """Rows of ``exclusions.csv``, each as a person would name it: "image:Y/hY06", "epoch:t09", "pairs:p3"."""
 
     names: tuple[str, ...]
 
 
-Edit = ScaleKey | SetKey | ChangeColumns | ExchangeColumns | ChangeReadings | Rename | LeaveOut
+Edit = ScaleKey | SetKey | ChangeColumns | ExchangeColumns | ChangeReadings | SetReadings | Rename | LeaveOut
 _EDITS: dict[str, Any] = {kind.__name__: kind for kind in get_args(Edit)}
 
 
@@ -214,6 +224,24 @@ def crop_keys(
         *(SetKey((*path, key), float(f"{value:.6g}")) for key, value in values.items()),
         SetKey((*path, "size_px"), tuple(round(scale * n) for n in camera.image_size)),
     )
+
+
+def new_setup(survey: Survey, setup_id: str) -> str:
+    """A name for a part of a set-up that nothing has yet."""
+    known, number = {r.setup_id for r in survey.readings} | {s.setup_id for s in survey.setups}, 2
+    while f"{setup_id}-{number}" in known:
+        number += 1
+    return f"{setup_id}-{number}"
+
+
+def split_setup(survey: Survey, setup_id: str, late: Sequence[str]) -> tuple[Edit, ...]:
+    """These directions as those of a set-up of their own with the same instrument; none where more is said of it."""
+    given, name = next((s for s in survey.setups if s.setup_id == setup_id), None), new_setup(survey, setup_id)
+    if given is not None and (given.centring_sigma or given.height_sigma or not given.levelled):
+        return ()
+    keys = () if given is None or given.instrument_id is None else (
+        SetKey(("setups", name, "instrument"), given.instrument_id),)  # fmt: skip
+    return SetReadings(tuple(late), "setup_id", name), *keys
 
 
 def found_by(keys: Sequence[Edit], change: str) -> str:

@@ -30,7 +30,7 @@ class Merged:
     """A merged project under construction in ``place``.
 
     origins: of every line of a merged file, by its path in the project. entries: paths that differ from the old ones.
-    new_ids: what NEW defines, by kind. rows: number of new rows by table.
+    new_ids: what NEW defines, by kind. rows: number of new rows by table. without_rows: tables of NEW that have none.
     """
 
     folder: Path
@@ -40,6 +40,7 @@ class Merged:
     entries: list[str] = field(default_factory=list)
     new_ids: dict[str, list[str]] = field(default_factory=dict)
     rows: dict[str, int] = field(default_factory=dict)
+    without_rows: list[Path] = field(default_factory=list)
 
     def translated(self, error: SurveyError) -> SurveyError:
         """The error with the files and lines that the user knows instead of those of the merged project."""
@@ -73,6 +74,9 @@ def merge(folder: Path, new: Path, place: Path) -> Merged:
     for path in sorted((merged.folder / name for name in _point_files(old)), key=str):
         _link_into(path, merged)
     _take_images(merged)
+    if merged.without_rows and not any(merged.rows.values()):  # else its stations would be blamed, which nothing places
+        raise SurveyError(f"{merged.without_rows[0]}: no row below its header, so that nothing is observed; write the "
+                          "rows that are to be added, or remove the file")  # fmt: skip
     if not merged.rows and not any(merged.new_ids.values()):
         raise SurveyError(f"{new}: nothing to add; put tables into {new}/{OBSERVATIONS_FOLDER}, such as pairs.csv")
     return merged
@@ -166,7 +170,8 @@ def _merge_tables(merged: Merged) -> None:
             continue
         if path.stem not in LAYOUTS:
             raise SurveyError(f"{path}: unknown table {path.stem!r}; {suggestion(path.stem, LAYOUTS)}")
-        read_table(path, LAYOUTS[path.stem])  # its own faults, with its own lines
+        if not len(read_table(path, LAYOUTS[path.stem])):  # its own faults are told with its own lines
+            merged.without_rows.append(path)
         if path.suffix == ".parquet" or (old / f"{path.stem}.parquet").exists():
             raise SurveyError(f"{path}: Parquet tables cannot be added to; write both tables as CSV")
         _merge_table(merged, old / path.name, path, target / path.name)

@@ -115,8 +115,53 @@ def test_forgotten_height_of_an_instrument(setup_id: str, height: float, missing
     assert (first["name"], first["ids"]) == ("instrument height", [setup_id])
     assert "it stands there as 0, and was forgotten" in first["cause"]
     assert mends(lab)
-    rows = (lab / "observations" / "terrestrial.csv").read_text(encoding="utf-8").splitlines()
-    column = rows[0].split(",").index("instrument_height_mm")
-    given = {float(row.split(",")[column]) for row in rows[1:] if f",{setup_id}," in row
-             and row.startswith(("zenith", "slope"))}  # fmt: skip
-    assert given == {pytest.approx(height, abs=1.0)}
+    heights: list[float] = []
+    change(lab, "terrestrial", lambda _, row: row["setup_id"] == setup_id and row["kind"] != "direction"
+           and heights.append(float(row["instrument_height_mm"])))  # fmt: skip
+    assert heights == [pytest.approx(height, abs=1.0)] * len(heights)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("turn_gon", "first_late"), [(0.05, 7), (0.05, 10), (50.0, 7)])
+def test_circle_turned_within_a_setup(turn_gon: float, first_late: int, tmp_path: Path) -> None:
+    """Located only, or four directions left out, or no solution: the set is split."""
+    lab, seen = labs.example("total-station", tmp_path / "lab"), list[int]()
+
+    def turned(_: int, row: dict[str, str]) -> None:
+        if row["setup_id"] == "S2a" and row["kind"] == "direction":
+            seen.append(1)
+            if len(seen) > first_late:
+                row["value_gon"] = f"{(float(row['value_gon']) + turn_gon) % 400.0:.5f}"
+
+    change(lab, "terrestrial", turned)
+    first, *_ = named(lab)
+    assert (first["name"], first["ids"]) == ("set-up turned", ["S2a"])
+    assert mends(lab)
+    text = (lab / "observations" / "terrestrial.csv").read_text(encoding="utf-8")
+    assert text.count(",S2a-2,") == len(seen) - first_late
+    assert '[setups.S2a-2]\ninstrument = "total_station"' in (lab / "survey.toml").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("axis", "since"), [(1, 11), (1, 20), (2, 20)])
+def test_zero_of_an_axis_that_is_another_one_from_an_epoch_on(axis: int, since: int, tmp_path: Path) -> None:
+    """Told as a board, a station or a camera that was moved."""
+    lab, column = labs.example("head", tmp_path / "lab"), f"axis{axis}_deg"
+    change(lab, "table_angles", lambda i, row: i >= since and row.update({column: repr(float(row[column]) + 0.5)}))
+    assert main(["adjust", str(lab), "--quiet"]) in (0, 3)
+    first, *_ = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))["diagnosis"]
+    assert (first["name"], len(first["epochs"])) == ("zero of an axis", 33 - since)
+    assert f"the zero of axis{axis} is another one" in first["cause"]
+    assert "was turned about that axis: what was observed cannot tell" in first["cause"]
+    assert mends(lab)
+
+
+@pytest.mark.slow
+def test_table_to_be_added_that_has_a_header_only_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its stations were blamed, which no pair tied to the rest."""
+    lab = labs.example("relay", tmp_path / "lab")
+    assert main(["adjust", str(lab), "--quiet"]) == 0
+    table = lab / "more" / "observations" / "pairs.csv"
+    table.write_text(table.read_text(encoding="utf-8").splitlines()[0] + "\n", encoding="utf-8")
+    assert main(["add", str(lab), str(lab / "more"), "--quiet"]) == FAILED
+    assert f"{table}: no row below its header" in capsys.readouterr().err

@@ -15,6 +15,7 @@ from adjust.diagnosis.effects.freed import bent_targets, unsteady_axes, untied
 from adjust.diagnosis.effects.pixels import pixels
 from adjust.diagnosis.effects.shapes import shapes
 from adjust.diagnosis.effects.steps import steps
+from adjust.diagnosis.effects.zeros import zeros
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.prediction import Linear
 from adjust.model.errors import SurveyError
@@ -35,7 +36,7 @@ def hypotheses(case: Case) -> Iterator[Hypothesis]:
 
 
 def _scored(case: Case, linear: Linear) -> Iterator[Hypothesis]:
-    effects = [e for make in (steps, pixels, clocks, shapes) for e in _formed(make, case, linear)]
+    effects = [e for make in (steps, zeros, pixels, clocks, shapes) for e in _formed(make, case, linear)]
     excess = linear.result.omega - linear.result.redundancy
     clear = [e for e in effects if e.first.seen and e.first.drop > _SHARE * excess]
     if not clear:

@@ -19,6 +19,7 @@ from adjust.diagnosis.hypothesis import (
     crop_keys,
     found_by,
     motion_text,
+    split_setup,
 )
 from adjust.diagnosis.prediction import Linear, Prediction, adjusted_values
 from adjust.lenses.models import CENTRE
@@ -62,7 +63,10 @@ def _step(survey: Survey, course: Course, cut: int, first: Score, looked_at: int
         return f"{what.format(thing)} {before} {since}{_amount(course.name[0], theta, sigmas)}{alike}"
 
     keys = _lens_keys(survey, course, since, first)
-    change = found_by(keys, f"leave out what was observed from {since} on, or give it a name of its own there")
+    remedy = f"leave out what was observed from {since} on, or give it a name of its own there"
+    if course.kind == "reading":
+        remedy = f"give the directions from {since} on a set-up of their own: another orientation"
+    change = found_by(keys, remedy)
     hypothesis = Hypothesis(name, "", change, place, survey, keys or _edits(survey, course, later), 1.0, 1, looked_at)
     chosen = frozenset(later)
     return Effect(
@@ -154,7 +158,7 @@ def _edits(survey: Survey, course: Course, later: Sequence[str]) -> tuple[Edit, 
     if course.kind == "pair":
         return (LeaveOut(tuple(f"pairs:{p}" for p in later)),)
     if course.kind == "reading":
-        return ()
+        return split_setup(survey, course.name[1], later)
     rows = [b for b in survey.image_blocks if b.epoch_id in later and _concerns(b, course)]
     if course.name[0] in _OF_TARGETS:
         return (LeaveOut(tuple(dict.fromkeys(f"target:{b.camera_id}/{b.epoch_id}/{b.target_id}" for b in rows))),)

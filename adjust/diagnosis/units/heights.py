@@ -28,14 +28,16 @@ _FEWEST, _MOST = 3, 4
 SCALE, INSTRUMENT, _TARGET = "scale of distances", "instrument height", "target height"
 _LARGEST = 10.0
 """m: what no height of an instrument or a target, and no reflector's constant, is wrong by."""
+_LARGEST_SCALE = 0.01
+"""The same of scales: beyond that it is another unit."""
 _HEIGHTS = ("instrument_height", "target_height", "second_height")
 _UNITS = {1e3: ("are metres, read as millimetres", 2e-4, 3e-3), 1e-3: ("are millimetres, read as metres", 100.0, 1e5)}
 """By the factor that mends them: heights in another unit, and from where to where (m) they then stand."""
 _LINEAR, _EXACT, _BELOW = 0.02, 1e-5, 0.05
 """m: changes of heights above which sights turn in another proportion, of the last step, and of what stands below."""
 _ROUNDS, _SUSPECTS = 5, 3
-_CLEAR_DROP = 9.0
-"""Of v'Pv, by which a size is clearly another one."""
+_CLEAR_DROP, _NOISE = 9.0, 5.0
+"""Of v'Pv, by which a size is clearly another one; its sigmas, within which that then leaves nothing but noise."""
 _SEEN = 1e-4
 """Share of a constant's column that no unknown takes over, below which it does not show."""
 
@@ -55,6 +57,11 @@ class _Constant:
     def field(self) -> str:
         """Of its readings that is changed."""
         return {INSTRUMENT: "instrument_height", _TARGET: "target_height"}.get(self.name, "value")
+
+    @property
+    def largest(self) -> float:
+        """What it is not wrong by."""
+        return _LARGEST_SCALE if self.name == SCALE else _LARGEST
 
     def amount(self, size: float) -> str:
         """The change of what stands there, in words."""
@@ -120,7 +127,7 @@ def wrong_heights(case: Case) -> Iterator[Hypothesis]:
         return
     constants = list(_constants(survey, batch.A))
     judged = _by_scores(case, constants) or _by_misses(case, before, batch, constants)
-    found = [(e, c, d) for c, (e, d) in zip(constants, judged, strict=True) if e > _CLEARLY and abs(d) < _LARGEST]
+    found = [(e, c, d) for c, (e, d) in zip(constants, judged, strict=True) if e > _CLEARLY and abs(d) < c.largest]
     for evidence, constant, metres in sorted(found, key=lambda f: (-f[0], -len(f[1].rows)))[:_MOST]:
         yield _hypothesis(survey, constant, metres, len(constants), evidence)
 
@@ -170,7 +177,8 @@ def _finer(
 ) -> list[Hypothesis]:
     """The same with the size that the adjustment with it shows, where that is clearly another one."""
     drop, more = _scores(LinearScores(result), [constant])[0]
-    if drop < _CLEAR_DROP or not all(r.used for r in result.survey.readings):
+    promising = result.omega - drop < result.redundancy + _NOISE * float(np.sqrt(2.0 * max(result.redundancy, 1)))
+    if drop < _CLEAR_DROP or not promising or not all(r.used for r in result.survey.readings):
         return []
     return [replace(_hypothesis(survey, constant, metres + more, looked_at, evidence), follow=None)]
 
@@ -230,7 +238,8 @@ def _by_misses(
     of_targets = {c.place.ids[0]: j for c, j in zip(constants, judged, strict=True) if c.name == _TARGET}
     points = {r.setup_id: str(r.at.point_id) for r in case.survey.readings if r.at.frame is None}
     for i, c in enumerate(constants):
-        told = of_targets.get(points.get(c.place.ids[0], "")) if c.name == INSTRUMENT else None
+        none = c.name == INSTRUMENT and not any(case.survey.readings[k].instrument_height for k in c.rows)
+        told = of_targets.get(points.get(c.place.ids[0], "")) if none else None
         judged[i] = judged[i] if told is None else max(judged[i], (told[0], -told[1]))
     if case.result is None:
         for i, found in _apart(case.survey, before, constants):

@@ -18,6 +18,7 @@ from adjust.diagnosis.hypothesis import (
     Rename,
     ScaleKey,
     SetKey,
+    SetReadings,
 )
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
@@ -28,7 +29,7 @@ from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
 from survey.project.tables.layouts import HEIGHTS, LAYOUTS
 
 KEPT = "kept"
-TableEdit = ChangeColumns | ExchangeColumns | ChangeReadings | Rename
+TableEdit = ChangeColumns | ExchangeColumns | ChangeReadings | SetReadings | Rename
 _UNITS = ("deg", "gon", "m", "mm", "arcsec", "mgon", "cc")
 _NUMBERED = "reading_id"
 """The column that rows may leave blank: their id is then that of their number."""
@@ -134,6 +135,8 @@ def _table(path: Path, text: str, edit: TableEdit, chosen: Hypothesis) -> str:
 
 def _columns(edit: TableEdit) -> tuple[tuple[str, ...], Mapping[str, frozenset[str]]]:
     """The columns that an edit changes, and which values choose its rows."""
+    if isinstance(edit, SetReadings):
+        return (edit.column,), {_NUMBERED: frozenset(edit.ids)}
     if isinstance(edit, ChangeReadings):
         return (), {LAYOUTS[edit.table].ids[0] if edit.table != "terrestrial" else _NUMBERED: frozenset(edit.ids)}
     where = {column: frozenset(values) for column, values in edit.where.items()}
@@ -143,6 +146,8 @@ def _columns(edit: TableEdit) -> tuple[tuple[str, ...], Mapping[str, frozenset[s
 def _changed(row: Mapping[str, str], edit: TableEdit) -> dict[str, str]:
     if isinstance(edit, Rename):
         return {edit.column: edit.names.get(row[edit.column], row[edit.column])}
+    if isinstance(edit, SetReadings):
+        return {edit.column: edit.value}
     if isinstance(edit, ExchangeColumns):
         a, b = edit.columns
         return {a: row[b], b: row[a]}

@@ -9,7 +9,17 @@ from types import MappingProxyType
 import numpy as np
 
 from adjust.diagnosis.diagnosis import Diagnosis
-from adjust.diagnosis.hypothesis import ChangeReadings, Edit, Hypothesis, LeaveOut, Place, Rename, ScaleKey, SetKey
+from adjust.diagnosis.hypothesis import (
+    ChangeReadings,
+    Edit,
+    Hypothesis,
+    LeaveOut,
+    Place,
+    Rename,
+    ScaleKey,
+    SetKey,
+    SetReadings,
+)
 from survey.folder.text import read_text
 from survey.project.declared.editing import LENGTHS
 from survey.project.declared.toml_text import key_lines
@@ -75,7 +85,7 @@ class ProjectFiles:
             return self.key(*edit.path)
         if isinstance(edit, LeaveOut):
             return next(filter(None, (self.rows(table, wanted) for table, wanted in _left_out(edit.names))), "")
-        if isinstance(edit, ChangeReadings):
+        if isinstance(edit, ChangeReadings | SetReadings):
             column = "reading_id" if edit.table == "terrestrial" else LAYOUTS[edit.table].ids[0]
             return self.rows(edit.table, {column: edit.ids}) or self._numbered(edit.ids)
         more: Wanted = {edit.column: tuple(edit.names)} if isinstance(edit, Rename) else {}
