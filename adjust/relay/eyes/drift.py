@@ -74,14 +74,14 @@ def fit_drift(common: CommonMotions) -> tuple[DriftModel, EyeAdjustment]:
     length = float(common.times_s[0, 1] - common.times_s[0, 0])
     model = DriftModel(length, np.full(k, 3e-3), np.full(k, 1e-2), 0.0, 0.0, np.zeros((k, 2)))
     for _ in range(_MOST_ROUNDS):
-        adjusted = adjust_eyes(sequences(common, model), (), _FIT)
+        adjusted = adjust_eyes(sequences(common, model), _FIT)
         factor, redundancy = _components(adjusted.solution, k)
         model = DriftModel(
             length, model.rotation * np.sqrt(factor[:, 0]), model.position * np.sqrt(factor[:, 1]),
             *_autocorrelation(adjusted.solution, k), redundancy,
         )  # fmt: skip
         if np.abs(factor - 1.0).max() < 0.02:
-            return model, adjust_eyes(sequences(common, model), (), _FIT)
+            return model, adjust_eyes(sequences(common, model), _FIT)
     raise NotConvergedError(
         f"the errors of {k} trackers did not settle in {_MOST_ROUNDS} rounds over intervals of {length:g} s: "
         f"{len(common.times_s)} motions do not tell whose they are; record longer trajectories with more turns"
