@@ -88,18 +88,16 @@ def relative_poses(adjustment: Adjustment, pairs: Sequence[tuple[str, str]]) -> 
 
 
 def station_deformations(
-    first: Adjustment, second: Adjustment, pairs: Sequence[tuple[str, str]] | None = None, alpha: float = 0.05,
-    scale: tuple[bool, bool] = (False, False),
-) -> tuple[Deformation, ...]:  # fmt: skip
-    """Deformation of every pair (a, b) of stations between two adjustments of independent observations.
+    first: Adjustment, second: Adjustment, alpha: float = 0.05, scale: tuple[bool, bool] = (False, False)
+) -> tuple[Deformation, ...]:
+    """Deformation of each common station with the next, in the order of the first survey, between two adjustments.
 
-    pairs: of stations of both; without it, each common station with the next in the order of the first survey.
-    alpha: error probability of all pairs together (Sidak 1967). scale: whether the covariance of the first, and of the
-    second, is multiplied with its sigma0^2; the tests then take sigma0 as known, which needs some redundancy.
-    A prior that both epochs share counts twice. Raises SurveyError where fewer than two stations are common, or a named
-    one is not in both.
+    Their observations are independent. alpha: error probability of all pairs together (Sidak 1967). scale: whether the
+    covariance of the first, and of the second, is multiplied with its sigma0^2; the tests then take sigma0 as known,
+    which needs some redundancy.
+    A prior that both epochs share counts twice. Raises SurveyError where fewer than two stations are common.
     """
-    chosen = _consecutive(first, second) if pairs is None else tuple(pairs)
+    chosen = _consecutive(first, second)
     factors = [_factor(x, s) for x, s in zip((first, second), scale, strict=True)]
     return _deformations(chosen, relative_poses(first, chosen), relative_poses(second, chosen), factors, alpha)
 

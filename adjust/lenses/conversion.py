@@ -57,19 +57,17 @@ def convert(
     *,
     free: Sequence[str] | None = None,
     cov: FloatArray | None = None,
-    radius_px: float | None = None,
 ) -> Conversion:
     """The lens of ``model_to`` nearest to the given one over the image.
 
     free: parameters of the new model to be fitted (None: all but the rational terms); the others are zero.
-    cov: (n, n) covariance of ``values``. radius_px: only the image within this distance from its middle counts, where
-    the old model has no meaning beyond.
+    cov: (n, n) covariance of ``values``.
     Raises SurveyError where a pixel has no ray in the old model or a ray no pixel in the new one, and where the free
     parameters cannot be told apart.
     """
     values = np.asarray(values, dtype=np.float64)
     columns = _free_columns(model_to, free)
-    old, uv = Optics(model_from, values, constants_from), _grid(image_size, FIT_STEPS, radius_px)
+    old, uv = Optics(model_from, values, constants_from), _grid(image_size, FIT_STEPS)
     rays, same_image = _rays(old, model_to, uv), np.array_equal(constants_from[:3], constants_to[:3])
     if model_from.kind == model_to.kind == kernels.AICON and free is None and same_image:
         fitted = rebalance_aicon(values, constants_from[3], constants_to[3])
@@ -77,7 +75,7 @@ def convert(
         fitted = _fit(model_to, _start(old, model_to, constants_to, columns), constants_to, columns, rays, uv)
     jacobian = _jacobian(old, Optics(model_to, fitted, constants_to), columns, rays, uv)
 
-    check = _grid(image_size, CHECK_STEPS, radius_px)
+    check = _grid(image_size, CHECK_STEPS)
     seen = project(model_to, fitted, constants_to, _rays(old, model_to, check))
     differences = np.linalg.norm(seen - check, axis=1)
     worst = int(np.argmax(differences))
@@ -132,14 +130,11 @@ def _free_columns(model: LensModel, free: Sequence[str] | None) -> list[int]:
     return [i for i, name in enumerate(model.names) if name in free]
 
 
-def _grid(image_size: tuple[int, int], steps: tuple[int, int], radius_px: float | None) -> FloatArray:
+def _grid(image_size: tuple[int, int], steps: tuple[int, int]) -> FloatArray:
     """Pixels (n, 2) evenly over the image, its outer edges included."""
     width, height = image_size
     u, v = np.meshgrid(np.linspace(-0.5, width - 0.5, steps[0] + 1), np.linspace(-0.5, height - 0.5, steps[1] + 1))
-    uv = np.column_stack([u.ravel(), v.ravel()])
-    if radius_px is None:
-        return uv
-    return uv[np.hypot(uv[:, 0] - (width - 1) / 2, uv[:, 1] - (height - 1) / 2) <= radius_px]
+    return np.column_stack([u.ravel(), v.ravel()])
 
 
 def _rays(old: Optics, model_to: LensModel, uv: FloatArray) -> FloatArray:

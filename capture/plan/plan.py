@@ -188,15 +188,15 @@ class Estimate:
         return self.moving_s + self.waiting_s + self.imaging_s
 
 
-def estimate(plan: CapturePlan, start: FloatArray | None = None) -> Estimate:
-    """Time that the plan takes from ``start`` (n,) rad, the first pose where it is not given.
+def estimate(plan: CapturePlan) -> Estimate:
+    """Time that the plan takes from its first pose on.
 
     The axes turn at once, so the slowest counts; exposures of one set overlap, so the longest counts.
     """
     moving = 0.0
     table = plan.table
     if table is not None and plan.poses:
-        here = np.array(plan.poses[0].angles if start is None else start, float)
+        here = np.array(plan.poses[0].angles, float)
         for pose in plan.poses:
             rows = zip(table.axes, pose.angles, here, strict=True)
             there = np.array([axis.axis.target(float(angle), float(now)) for axis, angle, now in rows])

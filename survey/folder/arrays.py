@@ -6,7 +6,6 @@ import struct
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, Any
 
@@ -20,16 +19,13 @@ _DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, Runtim
            KeyError, IndexError, OverflowError, SyntaxError, tokenize.TokenError)  # fmt: skip
 
 
-def read_arrays(path: Path, names: Iterable[str] | None = None) -> dict[str, npt.NDArray[Any]]:
-    """The arrays of these names, by default all.
-
-    Raises ValueError for a file that is no such archive, or too large; OSError.
-    """
+def read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
+    """All arrays by name. Raises ValueError for a file that is no such archive, or too large; OSError."""
     try:
         with zipfile.ZipFile(path) as archive:
             _check_sizes(archive, path.stat().st_size)
-            wanted = [n.removesuffix(".npy") for n in archive.namelist()] if names is None else names
-            return {name: _array(archive, f"{name}.npy") for name in wanted}
+            names = [n.removesuffix(".npy") for n in archive.namelist()]
+            return {name: _array(archive, f"{name}.npy") for name in names}
     except _DAMAGE as error:
         raise ValueError(f"{path.name} is damaged: {error}") from error
 

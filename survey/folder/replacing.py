@@ -153,7 +153,10 @@ def _replace(folder: Path, folders: list[str], files: list[str]) -> None:
             for entry in folders:
                 trade(adding / entry, folder / entry)
             for entry in files:
-                _move(adding / entry, folder / entry)
+                if os.path.lexists(adding / entry):
+                    _put(adding / entry, folder / entry)
+                else:
+                    (folder / entry).unlink(missing_ok=True)
             for above in {(folder / entry).parent for entry in (*folders, *files)}:
                 sync_folder(above)
             (before / LIST).unlink()  # from here on the new state holds
@@ -189,13 +192,6 @@ def _link(source: Path, target: Path) -> None:
         os.link(source, target, follow_symlinks=False)
     except (OSError, NotImplementedError):
         shutil.copy2(source, target, follow_symlinks=False)
-
-
-def _move(new: Path, there: Path) -> None:
-    if not os.path.lexists(new):
-        there.unlink(missing_ok=True)
-        return
-    _put(new, there)
 
 
 def _put(source: Path, there: Path) -> None:

@@ -70,9 +70,9 @@ def indexed(made: Any, index: Sequence[str]) -> Any:
     return made.set_index(list(index) if len(index) > 1 else index[0])
 
 
-def _axes(pattern: str, of: Callable[[Any], Any], names: str = "xyz") -> dict[str, Callable[[Any], float]]:
-    """A column for each of the numbers that a thing has, named after the axes."""
-    return {pattern.format(c): partial(_number, of, k) for k, c in enumerate(names)}
+def _semi_axes(of: Callable[[Any], Any]) -> dict[str, Callable[[Any], float]]:
+    """A column for each of the semi-axes, mm, that a thing has."""
+    return {f"{c}_mm": partial(_number, of, k) for k, c in enumerate("abc")}
 
 
 def _number(of: Callable[[Any], Any], k: int, thing: Any) -> float:
@@ -85,7 +85,7 @@ def points(s: Solved) -> Any:
              if name[0] == "point"]  # fmt: skip
     own = ("point_id", *(pattern.format(c) for pattern in ("{}_mm", "sigma_{}_mm") for c in "xyz"))
     return frame(found, ["point_id"], {
-        **{key: itemgetter(key) for key in own}, **_axes("{}_mm", itemgetter("ellipsoid_95_semi_axes_mm"), "abc"),
+        **{key: itemgetter(key) for key in own}, **_semi_axes(itemgetter("ellipsoid_95_semi_axes_mm")),
         "status": lambda x: _status(x["status"]),
     })  # fmt: skip
 
@@ -237,7 +237,7 @@ def relative_precision(s: Solved) -> Any:
     return frame(s.precision.relative, ["a", "b"], {
         "a": lambda r: r.a[-1], "b": lambda r: r.b[-1], "distance_mm": lambda r: 1e3 * r.distance,
         "sigma_mm": lambda r: 1e3 * r.sigma_distance,
-        **_axes("{}_mm", lambda r: [*(1e3 * np.asarray(r.ellipsoid.semi_axes)), np.nan, np.nan], "abc"),
+        **_semi_axes(lambda r: [*(1e3 * np.asarray(r.ellipsoid.semi_axes)), np.nan, np.nan]),
         "sigma_rotation_arcsec": turn,
     })  # fmt: skip
 

@@ -89,7 +89,7 @@ def test_no_white_noise_explains_the_poses(recording: str) -> None:
         EyeSequence(FrameRef("camera", i), ids, p, cov, (i,) * len(ids))
         for i, p in zip(IDS[:2], (a.at(times), other), strict=True)
     ]
-    pair = adjust_eyes(eyes, (), EyeOptions(reject=False))
+    pair = adjust_eyes(eyes, EyeOptions(reject=False))
     w = pair.solution.misclosure
     correlated = (w[1:] * w[:-1]).sum() / (w * w).sum()
     assert correlated > 0.6
@@ -123,7 +123,7 @@ def test_lengths_of_the_trackers_differ(recording: str) -> None:
     assert joint.scales["MARS"] < 1.0 - 3 * joint.scale_sigmas["MARS"]
     assert joint.scales["MARS"] < joint.scales["NERO"] < 1.01
     held = adjust_eyes(
-        sequences(solved(recording)[1].common, solved(recording)[1].drift), (), EyeOptions(reject=False)
+        sequences(solved(recording)[1].common, solved(recording)[1].drift), EyeOptions(reject=False)
     )
     assert held.omega - joint.omega > chi2.ppf(0.999, 2)
 
@@ -146,7 +146,7 @@ def independent_pairs(result: RelayTrackers) -> list[Pair]:
     for start, (i, j) in enumerate(((0, 1), (1, 2), (0, 2))):
         own = common[slice(start, None, 3)]
         both = [sequences(own, result.drift)[k] for k in (i, j)]
-        pair = adjust_eyes(both, (), EyeOptions(reject=False)).pair(IDS[i], IDS[j])
+        pair = adjust_eyes(both, EyeOptions(reject=False)).pair(IDS[i], IDS[j])
         assert isinstance(pair.b_from_a, Pose3)
         t = pair.b_from_a.rotation().unrotate(pair.b_from_a.translation())  # the lever arm in frame a, as its tangent
         spread = max(result.joint.scale_sigmas[IDS[k]] for k in (i, j) if k > 0)
@@ -208,7 +208,7 @@ def joint_graph(result: RelayTrackers) -> dict[tuple[str, str], tuple[Pose3, Flo
     joint = np.zeros((18, 18))
     joint[6:, 6:] = graph.precision.joint(names)
     # the same without station poses: conditions between motions
-    conditions = adjust_eyes(sequences(common, result.drift), (), EyeOptions(reject=False))
+    conditions = adjust_eyes(sequences(common, result.drift), EyeOptions(reject=False))
     assert graph.omega == pytest.approx(conditions.omega, rel=1e-6)
     assert np.sqrt(np.diag(conditions.cov)[6:]) == pytest.approx(np.sqrt(np.diag(joint)[6:]), rel=0.02)
     out = {}

@@ -85,7 +85,7 @@ def test_covariance_is_that_of_the_derivatives_also_of_large_deformations():
     moved[2] = moved[2] @ small([0.5, -0.4, 0.3, 0.2, 0.3, -0.1])
     rng = np.random.default_rng(2)
     epochs = [adjusted(measured(p, rng)) for p in (poses, moved)]
-    (d,) = station_deformations(*epochs, [("S2", "S3")])
+    d = next(d for d in station_deformations(*epochs) if (d.a, d.b) == ("S2", "S3"))
     (P1, C1), (P2, C2) = (relative_pose(e, "S2", "S3") for e in epochs)
 
     def at(x):
@@ -189,7 +189,7 @@ def test_held_stations_have_no_error_and_no_test():
 def test_what_cannot_be_compared_is_said():
     result = adjusted(measured(chain(), np.random.default_rng(11)))
     with pytest.raises(SurveyError, match="'X' was not adjusted as a fixed station; fixed stations: S0, S1"):
-        station_deformations(result, result, [("S0", "X")])
+        relative_pose(result, "S0", "X")
     with pytest.raises(SurveyError, match="to itself"):
         relative_pose(result, "S0", "S0")
     pose = PoseParameter(Pose3(Rot3(), np.zeros(3)), "held")

@@ -17,7 +17,7 @@ from adjust.model.survey import FloatArray
 from adjust.relay.eyes.eyes import EyeOptions, adjust_eyes
 from adjust.relay.eyes.images import camera_sequence, eye_sequences, target_sequence
 from adjust.relay.eyes.pairs import close_loops, pairs_of, triangle_misclosure
-from adjust.relay.eyes.sequences import EyeSequence, KnownWorlds
+from adjust.relay.eyes.sequences import EyeSequence
 from adjust.relay.eyes.setup import eye_setup
 from adjust.relay.eyes.solver import EyeProblem, linearise
 from adjust.spatial.rigid_motions import Motions
@@ -117,7 +117,7 @@ def test_minimum_is_that_of_all_true_poses_as_unknowns() -> None:
     """The conditions' minimum against SciPy's over station poses, eyes and worlds, with noise large enough to tell."""
     trackers = Trackers(6, n=6)
     sequences = trackers.measured(0.01, 0.02)
-    found = adjust_eyes(sequences, (), EyeOptions(reject=False))
+    found = adjust_eyes(sequences, EyeOptions(reject=False))
     k, n = 3, 6
     measured = [poses(s.reference_from_eye) for s in sequences]
     roots = [np.linalg.inv(np.linalg.cholesky(s.cov)) for s in sequences]
@@ -221,11 +221,11 @@ def test_eyes_that_see_several_worlds_and_not_at_all_epochs() -> None:
 def test_influence_is_the_derivative() -> None:
     trackers = Trackers(9, n=5)
     sequences = trackers.measured(1e-6, 1e-6)
-    found = adjust_eyes(sequences, (), EyeOptions(reject=False))
+    found = adjust_eyes(sequences, EyeOptions(reject=False))
     step = np.zeros((5, 6))
     step[2] = [1e-5, -2e-5, 3e-5, 1e-4, 2e-4, -1e-4]
     moved = [replace(sequences[0], reference_from_eye=sequences[0].reference_from_eye.retract(step)), *sequences[1:]]
-    again = adjust_eyes(moved, (), EyeOptions(reject=False))
+    again = adjust_eyes(moved, EyeOptions(reject=False))
     predicted = found.by_observation()[:, :30] @ step.ravel()
     actual = (found.station_from_eye.inverse() @ again.station_from_eye).log().ravel()
     assert np.abs(actual - predicted).max() < 2e-3 * np.abs(predicted).max()
@@ -287,35 +287,15 @@ def test_wrong_epochs_are_found_and_listed() -> None:
     assert test.passed
 
 
-# -- known targets and marker blocks -----------------------------------------------------------------------------------
-
-
-def test_two_targets_with_known_relation_need_one_epoch() -> None:
-    """Covariance by hand: X = A^-1 Z B, errors of the three add up through their adjoints."""
-    trackers = Trackers(16, k=2, n=1)
-    a, b = trackers.measured()
-    Z = Pose3(np.linalg.inv(trackers.room_from_world[0]) @ trackers.room_from_world[1])
-    z_cov = np.diag(np.repeat([2e-4, 5e-4], 3) ** 2)
-    found = adjust_eyes((a, b), (KnownWorlds("wa", "wb", Z, z_cov),))
-    A, B = (poses(s.reference_from_eye)[0] for s in (a, b))
-    X = A.inverse().compose(Z).compose(B)
-    by_a, by_z = X.inverse().AdjointMap(), B.inverse().AdjointMap()
-    cov = by_a @ a.cov[0] @ by_a.T + by_z @ z_cov @ by_z.T + b.cov[0]
-    assert X.equals(poses(found.station_from_eye)[1], 1e-12)
-    assert np.allclose(found.cov[6:, 6:], cov, rtol=1e-9, atol=1e-18)
+def test_different_targets_of_one_epoch_are_refused_and_the_same_one_helps() -> None:
     with pytest.raises(SurveyError, match="nothing turns"):
-        adjust_eyes((a, b))
-
-
-def test_a_known_relation_helps_and_the_same_target_is_exact() -> None:
+        adjust_eyes(Trackers(16, k=2, n=1).measured())
     trackers = Trackers(17, k=2, n=6)
     trackers.room_from_world[1] = np.eye(4)
     sequences = trackers.measured()
     alone = adjust_eyes(sequences)
-    related = adjust_eyes(sequences, (KnownWorlds("wa", "wb", Pose3(), np.eye(6) * 1e-14),))
     same = adjust_eyes([replace(s, world_ids=("w",) * 6) for s in sequences])
     assert np.all(np.diag(same.cov)[6:] < np.diag(alone.cov)[6:])
-    assert np.allclose(related.cov, same.cov, rtol=1e-4, atol=1e-14)
 
 
 # -- from images -------------------------------------------------------------------------------------------------------

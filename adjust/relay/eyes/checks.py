@@ -66,8 +66,8 @@ def _turns(setup: EyeSetup, rows: IntArray) -> tuple[FloatArray | None, float]:
     sigma = _rotation_sigma(problem.cov, np.concatenate([c.k_idx[rows], c.l_idx[rows]]))
     if setup.motions:
         return rotation_log(R[c.k_idx[rows]]), sigma
-    # a relation of the two worlds, or through other eyes' worlds: what is weak shows in the covariances instead
-    if problem.known or len({*c.world_k.tolist(), *c.world_l.tolist()}) > 2 * len(setup.eyes):
+    # through other eyes' worlds: what is weak shows in the covariances instead
+    if len({*c.world_k.tolist(), *c.world_l.tolist()}) > 2 * len(setup.eyes):
         return None, sigma
     if bool((c.world_k[rows] == c.world_l[rows]).any()):
         return None, sigma

@@ -19,7 +19,7 @@ from adjust.model.survey import FloatArray
 from adjust.precision.precision import global_test
 from adjust.relay.eyes.checks import OutlierEpoch, refuse_undetermined
 from adjust.relay.eyes.screening import solve_screened
-from adjust.relay.eyes.sequences import EyeSequence, KnownWorlds
+from adjust.relay.eyes.sequences import EyeSequence
 from adjust.relay.eyes.setup import EyeSetup, eye_setup
 from adjust.relay.eyes.solver import EyeSolution
 from adjust.spatial.rigid_motions import Motions
@@ -105,16 +105,14 @@ class EyeAdjustment:
         return ids.index(eye_id)
 
 
-def adjust_eyes(
-    sequences: Sequence[EyeSequence], known: Sequence[KnownWorlds] = (), options: EyeOptions = EyeOptions()
-) -> EyeAdjustment:
+def adjust_eyes(sequences: Sequence[EyeSequence], options: EyeOptions = EyeOptions()) -> EyeAdjustment:
     """The eyes of a station from poses of each in its own world, which stays unmoved while the station moves.
 
     Or from their motions over the same intervals, for eyes whose worlds drift, as those of trackers. Epochs are joined
-    by their ids. Worlds of the same name are the same; of ``known`` ones the relation is an observation. Raises
-    SurveyError naming the undetermined direction where the turns do not suffice.
+    by their ids. Worlds of the same name are the same. Raises SurveyError naming the undetermined direction where the
+    turns do not suffice.
     """
-    setup = refuse_undetermined(eye_setup(sequences, known, options.free_scales))
+    setup = refuse_undetermined(eye_setup(sequences, options.free_scales))
     return station_of(setup, *solve_screened(setup, options.reject))
 
 

@@ -55,7 +55,7 @@ def pairs_of(sequences: Sequence[EyeSequence], options: EyeOptions = _EYES) -> E
     for i, j in combinations(range(len(sequences)), 2):
         a, b = sequences[i], sequences[j]
         try:
-            adjusted = adjust_eyes((a, b), (), options)
+            adjusted = adjust_eyes((a, b), options)
         except SurveyError as error:
             refused.append(f"pair {a.eye.frame_id}-{b.eye.frame_id}: {error}")
             continue

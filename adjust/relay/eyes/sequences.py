@@ -1,10 +1,9 @@
-"""What eyes observed, as frozen values: poses or motions of eyes, targets known to each other."""
+"""What eyes observed, as frozen values: poses or motions of eyes."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-from gtsam import Pose3
 
 from adjust.model.observations import FrameRef
 from adjust.model.survey import FloatArray
@@ -30,13 +29,3 @@ class EyeSequence:
     def joint_cov(self) -> FloatArray:
         """(6n, 6n), whatever was given."""
         return self.cov if self.cov.ndim == 2 else np.asarray(scipy.linalg.block_diag(*self.cov))
-
-
-@dataclass(frozen=True, eq=False)
-class KnownWorlds:
-    """Two targets known to each other: ``a_from_b`` with covariance (6, 6) in frame b, by the names of the worlds."""
-
-    a_id: str
-    b_id: str
-    a_from_b: Pose3
-    cov: FloatArray

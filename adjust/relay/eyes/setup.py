@@ -10,15 +10,12 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.pose_network.cycles import Forest, adjacency, breadth_first, connected_parts
-from adjust.relay.eyes.sequences import EyeSequence, KnownWorlds
-from adjust.relay.eyes.solver import EyeConditions, EyeProblem, KnownMotion
+from adjust.relay.eyes.sequences import EyeSequence
+from adjust.relay.eyes.solver import EyeConditions, EyeProblem
 from adjust.spatial.averaging import mean_pose, typical_distance
 from adjust.spatial.rigid import inverse
 from adjust.spatial.rigid_motions import Motions
 from adjust.start.closed_forms.hand_eye import relative_motions, solve_ax_xb
-
-_Relations = list[tuple[int, int, KnownWorlds]]
-"""Worlds known to each other: their unknowns a and b, and what is known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,9 +33,7 @@ class EyeSetup:
     scaled_eyes: tuple[int, ...]
 
 
-def eye_setup(
-    sequences: Sequence[EyeSequence], known: Sequence[KnownWorlds] = (), free_scales: bool = False
-) -> EyeSetup:
+def eye_setup(sequences: Sequence[EyeSequence], free_scales: bool = False) -> EyeSetup:
     """Conditions between the first eye that observed anything at an epoch and every other one.
 
     free_scales: of motions, whether every eye but the first has a scale of its own. Raises SurveyError for eyes that
@@ -56,54 +51,34 @@ def eye_setup(
         used = dict.fromkeys(world_ids[i] for i in obs.ravel().tolist())
         world_idx = {w: len(eyes) + i for i, w in enumerate(used)}
         worlds = np.array([world_idx.get(w, -1) for w in world_ids], dtype=np.int64)[obs]
-    relations = [(world_idx[r.a_id], world_idx[r.b_id], r) for r in known if {r.a_id, r.b_id} <= world_idx.keys()]
     scaled = tuple(range(1, len(eyes))) if free_scales and moving else ()
     scale = eye - 1 if scaled else np.full_like(eye, -1)
     conditions = EyeConditions(*(column.copy() for both in (obs, eye, worlds, scale) for column in both.T))
     free = np.ones(len(eyes) + len(world_idx), dtype=np.bool_)
-    links = np.vstack([worlds, *([a, b] for a, b, _ in relations)])
-    free[[0, *_first_of_parts(len(free), links, len(eyes), [a for a, _, _ in relations])]] = False
-    start = _started((obs, eye, worlds), observed.matrices(), tree, free, relations, eyes)
-    told = tuple(_known(a, b, r, free) for a, b, r in relations)
-    problem = EyeProblem(observed, cov, conditions, Motions.of(start), free, told, len(scaled))
+    free[[0, *_first_of_parts(len(free), worlds, len(eyes))]] = False
+    start = _started((obs, eye, worlds), observed.matrices(), tree, free, eyes)
+    problem = EyeProblem(observed, cov, conditions, Motions.of(start), free, len(scaled))
     return EyeSetup(eyes, problem, names, moving, world_idx, scaled)
 
 
-def _known(a: int, b: int, relation: KnownWorlds, free: BoolArray) -> KnownMotion:
-    """A relation to the held world; between two free ones there is no datum that makes it one unknown's."""
-    motion = Motions.of(relation.a_from_b.matrix()[None])
-    if not free[a]:
-        return KnownMotion(b, motion, np.asarray(relation.cov))
-    if not free[b]:
-        Ad = motion.adjoint()[0]
-        return KnownMotion(a, motion.inverse(), np.asarray(Ad @ relation.cov @ Ad.T))
-    raise SurveyError(
-        f"the relation of the worlds {relation.a_id!r} and {relation.b_id!r} does not touch the world that the others "
-        "refer to; give relations to one and the same world"
-    )
-
-
 def _started(
-    pairs: tuple[IntArray, IntArray, IntArray], P: FloatArray, tree: Forest, free: BoolArray, relations: _Relations,
+    pairs: tuple[IntArray, IntArray, IntArray], P: FloatArray, tree: Forest, free: BoolArray,
     eyes: tuple[FrameRef, ...],
 ) -> FloatArray:  # fmt: skip
-    """Start values (u, 4, 4): one eye after the other, then worlds through the epochs and relations that join them.
+    """Start values (u, 4, 4): one eye after the other, then worlds through the epochs that join them.
 
     pairs: of each condition (m, 2) observations, eyes and worlds. P: (n, 4, 4) the observations.
     """
     U, (obs, eye, worlds) = np.tile(np.eye(4), (len(free), 1, 1)), pairs
-    related = {(a, b): r.a_from_b.matrix() for a, b, r in relations}
-    related |= {(b, a): inverse(Z) for (a, b), Z in related.items()}
     for b in tree.order[1:].tolist():
         a = int(tree.parent[b])
         rows = np.flatnonzero((np.sort(eye, axis=1) == sorted((a, b))).all(axis=1))
         order = np.where(eye[rows, :1] == a, [0, 1], [1, 0])
         A, B = P[np.take_along_axis(obs[rows], order, axis=1).T]
         seen = None if worlds is eye else np.take_along_axis(worlds[rows], order, axis=1)
-        U[b] = U[a] @ _eye_from_eye(A, B, seen, related, (eyes[a], eyes[b]))
+        U[b] = U[a] @ _eye_from_eye(A, B, seen, (eyes[a], eyes[b]))
     (P_k, P_l), (X_k, X_l) = P[obs.T], U[eye.T]
-    k_from_l = zip(worlds.tolist(), P_k @ inverse(X_k) @ X_l @ inverse(P_l), strict=True)
-    links = [*((tuple(both), Z) for both, Z in k_from_l), *related.items()]
+    links = list(zip(worlds.tolist(), P_k @ inverse(X_k) @ X_l @ inverse(P_l), strict=True))
     done = {i for i in np.flatnonzero(~free).tolist() if i >= len(eyes)}
     while reach := _reached(U, links, done):
         for world, found in reach.items():
@@ -113,7 +88,7 @@ def _started(
 
 
 def _reached(
-    U: FloatArray, links: Sequence[tuple[tuple[int, ...], FloatArray]], done: set[int]
+    U: FloatArray, links: Sequence[tuple[Sequence[int], FloatArray]], done: set[int]
 ) -> Mapping[int, list[FloatArray]]:
     """Worlds that links ``a_from_b`` (4, 4) join with those that are done, and where each link puts them."""
     reach: dict[int, list[FloatArray]] = {}
@@ -131,19 +106,16 @@ def _mean(poses: FloatArray) -> FloatArray:
 
 
 def _eye_from_eye(
-    A: FloatArray, B: FloatArray, worlds: IntArray | None, related: Mapping[tuple[int, int], FloatArray],
-    eyes: tuple[FrameRef, FrameRef],
-) -> FloatArray:  # fmt: skip
-    """``a_from_b`` (4, 4) of two eyes: directly where their worlds are the same or known, else from motions.
+    A: FloatArray, B: FloatArray, worlds: IntArray | None, eyes: tuple[FrameRef, FrameRef]
+) -> FloatArray:
+    """``a_from_b`` (4, 4) of two eyes: directly where their worlds are the same, else from motions.
 
     A, B: (n, 4, 4) at the same epochs: poses in worlds (n, 2), or motions where there are none.
     """
     motions = [(A, B)]
     if worlds is not None:
         at = {(a, b): np.flatnonzero((worlds == (a, b)).all(axis=1)) for a, b in np.unique(worlds, axis=0).tolist()}
-        known = {(a, a): np.eye(4) for a in worlds[:, 0].tolist()} | dict(related)
-        direct = [inverse(A[rows]) @ known[both] @ B[rows] for both, rows in at.items() if both in known]
-        if direct:
+        if direct := [inverse(A[rows]) @ B[rows] for (a, b), rows in at.items() if a == b]:
             return _mean(np.concatenate(direct))
         motions = [relative_motions(A[rows], B[rows]) for rows in at.values() if len(rows) > 1]
     if not motions:
@@ -210,8 +182,8 @@ def _tree(eyes: tuple[FrameRef, ...], pairs: IntArray) -> Forest:
     return forest
 
 
-def _first_of_parts(n: int, links: IntArray, n_eyes: int, preferred: list[int]) -> list[int]:
-    """One world of each part that links (l, 2) hold together; those with known relations first."""
+def _first_of_parts(n: int, links: IntArray, n_eyes: int) -> list[int]:
+    """One world of each part that links (l, 2) hold together."""
     part = connected_parts(n, *links.T).tolist()
-    first = {part[i]: i for i in reversed([*preferred, *range(n_eyes, n)])}
+    first = {part[i]: i for i in reversed(range(n_eyes, n))}
     return list(first.values())

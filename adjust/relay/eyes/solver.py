@@ -48,15 +48,6 @@ class EyeConditions:
 
 
 @dataclass(frozen=True, eq=False)
-class KnownMotion:
-    """Unknown ``idx`` is known as ``motion`` (one) with covariance (6, 6)."""
-
-    idx: int
-    motion: Motions
-    cov: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
 class EyeProblem:
     """observed: (n,) poses or motions. cov: (n, 6, 6), or the joint one (6n, 6n). free: which of the unknowns (u,) are.
 
@@ -68,7 +59,6 @@ class EyeProblem:
     conditions: EyeConditions
     start: Motions
     free: BoolArray
-    known: tuple[KnownMotion, ...] = ()
     n_scales: int = 0
 
 
@@ -95,14 +85,8 @@ class EyeSolution:
 
     def rows(self, idx: int) -> IntArray:
         """Rows of an unknown in ``cov``; empty where it is held."""
-        return unknown_rows(self.problem.free, idx)
-
-
-def unknown_rows(free: BoolArray, idx: int) -> IntArray:
-    """Rows (6,) of unknown ``idx`` among the free ones, (0,) where it is held."""
-    if not free[idx]:
-        return np.zeros(0, dtype=np.int64)
-    return np.asarray(6 * int(free[:idx].sum()) + np.arange(6), dtype=np.int64)
+        free = self.problem.free
+        return 6 * np.count_nonzero(free[:idx]) + np.arange(6 if free[idx] else 0, dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,7 +214,7 @@ class Weights:
 
 
 class _Normals:
-    """The normal equations N x = -right of the unknowns, what is known of them included, at a linearisation."""
+    """The normal equations N x = -right of the unknowns at a linearisation."""
 
     def __init__(self, problem: EyeProblem, U: Motions, scales: FloatArray, v: FloatArray) -> None:
         self.at = linearise(problem, U, scales, v)
@@ -238,14 +222,6 @@ class _Normals:
         self.w = self.at.f.ravel() - self.weights.across(v)
         self.MA = self.weights.solve(self.at.by)
         self.N, self.right = self.at.by.T @ self.MA, self.MA.T @ self.w
-        self.omega_known = 0.0
-        for known in problem.known:
-            r = (known.motion.inverse() @ U[np.array([known.idx])]).log()
-            J, P = right_jacobian_inverse(r)[0], np.linalg.inv(known.cov)
-            rows = unknown_rows(problem.free, known.idx)
-            self.N[np.ix_(rows, rows)] += J.T @ P @ J
-            self.right[rows] += J.T @ P @ r[0]
-            self.omega_known += float(r[0] @ P @ r[0])
 
 
 def solve_eyes(problem: EyeProblem, before: EyeSolution | None = None) -> EyeSolution:
@@ -287,10 +263,10 @@ def _solved(problem: EyeProblem, before: EyeSolution | None) -> EyeSolution:
 def _finish(problem: EyeProblem, U: Motions, scales: FloatArray, v: FloatArray, iterations: int) -> EyeSolution:
     normals = _Normals(problem, U, scales, v)
     at, cov, w = normals.at, np.asarray(np.linalg.inv(normals.N)), normals.w
-    omega = normals.omega_known + float(w @ normals.weights.solve(w))
+    omega = float(w @ normals.weights.solve(w))
     A, w = at.by.reshape(len(at.f), 6, -1), w.reshape(-1, 6)
     left = own_blocks(problem, at) - A @ cov @ np.swapaxes(A, -1, -2)
     test = np.einsum("mi,mij,mj->m", w, np.linalg.pinv(left, rcond=1e-9, hermitian=True), w)
     influence = np.asarray(-cov @ normals.weights.back(normals.MA).reshape(-1, len(cov)).T)
-    redundancy = 6 * len(at.f) + 6 * len(problem.known) - len(cov)
+    redundancy = 6 * len(at.f) - len(cov)
     return EyeSolution(problem, U, scales, cov, v, w, test, influence, omega, redundancy, iterations)

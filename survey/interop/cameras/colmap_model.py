@@ -133,7 +133,7 @@ class _Words:
     def parameters(self, model: str) -> FloatArray:
         return self.floats(len(self._words))
 
-    def is_camera(self, layout: str = "i") -> bool:
+    def is_camera(self) -> bool:
         return self._take(1) == ["CAMERA"]
 
     def name(self) -> str:
@@ -205,8 +205,8 @@ class _Bytes:
     def parameters(self, model: str) -> FloatArray:
         return self.floats(MODELS.get(model, 0))
 
-    def is_camera(self, layout: str = "i") -> bool:
-        return self.id(layout) == 0
+    def is_camera(self) -> bool:
+        return self.id("i") == 0
 
     def name(self) -> str:
         end = self.data.find(b"\0", self.at)

@@ -44,20 +44,20 @@ def read_ros(path: Path) -> ForeignNetwork:
     """A camera_info file, or a folder of them. Raises SurveyError with file and line for what cannot be read."""
     if not path.is_dir():
         root = read_yaml(path)
-        return rig_network(Rig("rig", (_camera(root, path.stem, None),)), path)
+        return rig_network(Rig("rig", (_camera(root, path.stem),)), path)
     files = sorted(p for p in path.glob("*.yaml") if p.name != EXTRINSICS)[:_MOST_FILES]
     if not files:
         raise SurveyError(f"{path}: holds no .yaml files; one camera_info per camera is expected")
     rig_id, poses = _extrinsics(path / EXTRINSICS) if (path / EXTRINSICS).is_file() else ("rig", {})
     cameras = []
     for file in files:
-        camera = _camera(read_yaml(file), file.stem, None)
+        camera = _camera(read_yaml(file), file.stem)
         pose = poses.get(f"{camera.camera_id}{FRAME}", poses.get(camera.camera_id))
         cameras.append(RigCamera(camera.camera_id, camera.image_size, camera.lens, pose))
     return rig_network(Rig(rig_id, tuple(cameras)), path)
 
 
-def _camera(root: Entry, stem: str, pose: Pose3 | None) -> RigCamera:
+def _camera(root: Entry, stem: str) -> RigCamera:
     size = (root.get("image_width").count(), root.get("image_height").count())
     model = root.get("distortion_model") if "distortion_model" in root else None
     distortion = root.get("distortion_coefficients")
@@ -69,7 +69,7 @@ def _camera(root: Entry, stem: str, pose: Pose3 | None) -> RigCamera:
         raise distortion.error(f"found {len(k)} coefficients for {name}; expected {_MODELS[name]}")
     k = k if len(k) in _MODELS[name] else k[:0]
     lens = opencv_lens(root.get("camera_matrix").matrix(3, 3), k, name == "equidistant", distortion.where)
-    return RigCamera(root.get("camera_name").text if "camera_name" in root else stem, size, lens, pose)
+    return RigCamera(root.get("camera_name").text if "camera_name" in root else stem, size, lens, None)
 
 
 def _extrinsics(path: Path) -> tuple[str, dict[str, Pose3]]:

@@ -4,7 +4,6 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
@@ -47,13 +46,8 @@ class Changed:
     kept: str
 
 
-def changed_files(
-    folder: Path, chosen: Hypothesis, texts: Mapping[str, str] = MappingProxyType({})
-) -> tuple[Changed, ...]:
-    """All files that the edits of a hypothesis change; nothing is written. Raises SurveyError.
-
-    texts: of files that are to be read instead.
-    """
+def changed_files(folder: Path, chosen: Hypothesis) -> tuple[Changed, ...]:
+    """All files that the edits of a hypothesis change; nothing is written. Raises SurveyError."""
     before: dict[str, str] = {}
     after: dict[str, str] = {}
     for edit in chosen.edits:
@@ -62,7 +56,7 @@ def changed_files(
         name = file_of(edit)
         path = folder / name
         if name not in before:
-            before[name] = texts[name] if name in texts else _text(path, chosen)
+            before[name] = _text(path, chosen)
         new = _edited(path, after.get(name, before[name]), edit, chosen)
         if new == after.get(name, before[name]):
             raise SurveyError(f"{path}: nothing there is concerned by this change; {chosen.change}")
