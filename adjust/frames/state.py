@@ -125,7 +125,8 @@ class State:
         else:
             shifted = [s for slot in slots if (s := self.unknowns.shifted_slots.get(slot)) is not None]
             asked = list(dict.fromkeys([*slots, *(n for s in shifted for n in s.nodes)]))
-            self._move_tables(values, [t for s, t in self.unknowns.table_slots.items() if s in asked])
+            tables = self.unknowns.table_slots
+            self._move_tables(values, [tables[slot] for slot in asked if slot in tables])
             for slot in asked:
                 found = self.unknowns.slot_key[slot]
                 if found is not None and self.unknowns.derived(slot) is None:
