@@ -239,9 +239,9 @@ def split_setup(survey: Survey, setup_id: str, late: Sequence[str]) -> tuple[Edi
     given, name = next((s for s in survey.setups if s.setup_id == setup_id), None), new_setup(survey, setup_id)
     if given is not None and (given.centring_sigma or given.height_sigma or not given.levelled):
         return ()
-    keys = () if given is None or given.instrument_id is None else (
-        SetKey(("setups", name, "instrument"), given.instrument_id),)  # fmt: skip
-    return SetReadings(tuple(late), "setup_id", name), *keys
+    instrument = None if given is None else given.instrument_id
+    key, value = ("levelled", True) if instrument is None else ("instrument", instrument)  # it is listed by one of them
+    return SetReadings(tuple(late), "setup_id", name), SetKey(("setups", name, key), value)
 
 
 def found_by(keys: Sequence[Edit], change: str) -> str:

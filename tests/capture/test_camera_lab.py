@@ -148,7 +148,7 @@ def test_three_cameras_through_two_makers_stacks_see_the_table_as_it_stands(
         for name, frame in frames.items():
             expected = lab.image(name, (pose.axis1_rad, pose.axis2_rad)).astype(float)
             assert np.std(frame.image - expected) == pytest.approx(np.sqrt(2.0) * 4.0, rel=0.1)
-        seen = {name for name, f in frames.items() if image_quality(f, {"board": BOARD}).found}
+        seen = {name for name, f in frames.items() if len(image_quality(f, {"board": BOARD}).points["board"])}
         assert seen == set(pose.camera_ids)
     cameras.disarm()
 

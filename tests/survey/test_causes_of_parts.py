@@ -6,6 +6,8 @@ from typing import Any
 
 import pytest
 
+from adjust.diagnosis.hypothesis import SetKey, split_setup
+from adjust.model.survey import Setup, Survey
 from survey.cli import FAILED, main
 from tests import labs
 
@@ -165,3 +167,9 @@ def test_table_to_be_added_that_has_a_header_only_is_named(tmp_path: Path, capsy
     table.write_text(table.read_text(encoding="utf-8").splitlines()[0] + "\n", encoding="utf-8")
     assert main(["add", str(lab), str(lab / "more"), "--quiet"]) == FAILED
     assert f"{table}: no row below its header" in capsys.readouterr().err
+
+
+def test_a_part_of_a_setup_without_instrument_is_listed_as_well() -> None:
+    """A set-up that nothing lists is none: the table would not be read."""
+    survey = Survey((), (), (), (), setups=(Setup("S"), Setup("S-2")))
+    assert split_setup(survey, "S", ["r7"])[1] == SetKey(("setups", "S-3", "levelled"), True)

@@ -88,4 +88,3 @@ def test_a_board_beside_its_charuco_twin_and_beacons_beside_both_are_told_apart(
         assert np.abs(detection.uv - camera.project(x)).max() < 0.05
     assert len(report.spots) == 2
     assert np.linalg.norm(report.spots.uv[:, None] - camera.project(leds)[None], axis=2).min(1).max() < 0.05
-    assert any("beside a target" in note for note in report.spots.notes)

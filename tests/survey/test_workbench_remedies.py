@@ -19,6 +19,7 @@ from adjust.diagnosis.hypothesis import (
     Rename,
     ScaleKey,
     SetKey,
+    SetReadings,
 )
 from survey.project import write_project
 from survey.project.exclusions import in_force, read_exclusions
@@ -35,10 +36,15 @@ MORE = """
 P1 = { treatment = "held", x_mm = [0, 0, 2000] }    # as the plan has it
 P2 = {}
 
+[setups]
+S = {}
+S-2 = {}
+
 [sigmas.scale]
 image = 1.0   # as the maker says
 """
 TOML, POINTS, DISTANCES = "survey.toml", "observations/image_points.csv", "observations/distances.csv"
+READINGS = "observations/terrestrial.csv"
 EDITS: tuple[tuple[Edit, str, str], ...] = (  # with the file that it changes and what then stands in it
     (ScaleKey(("sigmas", "scale", "image"), 1.25), TOML, "image = 1.25   # as the maker says\n"),
     (SetKey(("adjustment", "alpha"), 0.01), TOML, "alpha = 0.01\n"),
@@ -46,6 +52,7 @@ EDITS: tuple[tuple[Edit, str, str], ...] = (  # with the file that it changes an
     (ExchangeColumns("image_points", ("sigma_u_px", "sigma_v_px"), OF_IMAGE), POINTS, ",0.11,0.1,"),
     (Rename("image_points", "epoch_id", {"e05": "e05-late"}, OF_IMAGE), POINTS, "\ne05-late,left,board,"),
     (ChangeReadings(("tape",), 1.0, 1e-5, "distances"), DISTANCES, "\ntape,P1,P2,500.02,"),
+    (SetReadings(("sight",), "setup_id", "S-2"), READINGS, "\nsight,slope_distance,S-2,P1,P2,"),
     (LeaveOut(("image:left/e05",)), "observations/exclusions.csv", "\nimage,left/e05,excluded,"),
 )
 
@@ -69,6 +76,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with (out / TOML).open("a") as stream:
         stream.write(MORE)
     (out / DISTANCES).write_text("distance_id,from_id,to_id,value_mm,sigma_mm\ntape,P1,P2,500.01,0.05\n")
+    (out / READINGS).write_text(
+        "reading_id,kind,setup_id,from_id,to_id,value_m,sigma_mm\nsight,slope_distance,S,P1,P2,0.50001,0.05\n"
+    )
     (out / "observations/coordinates.csv").write_text(
         "point_id,x_mm,y_mm,z_mm,sigma_x_mm,sigma_y_mm,sigma_z_mm\nP2,500,0,2000,0.1,0.1,0.1\n"
     )
