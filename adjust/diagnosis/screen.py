@@ -3,7 +3,7 @@
 The closed forms of the start are robust: what one set-up or one pair says wrongly leaves the rest where it belongs.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -239,6 +239,12 @@ def screen(survey: Survey, start: StartValues | None = None) -> Screen | None:
         return None
     readings = np.zeros(0) if graph.terrestrial is None else graph.terrestrial.unweighted(graph.start)
     return Screen(_finite(readings**2), _others(graph, graph.start), graph, start)
+
+
+def screen_without(survey: Survey, rows: Collection[int]) -> Screen | None:
+    """The survey at the start that is found without some of its readings, which may have spoilt it; None as before."""
+    without = screen(replace(survey, readings=tuple(r for i, r in enumerate(survey.readings) if i not in rows)))
+    return None if without is None else screen(survey, without.start)
 
 
 @lru_cache(maxsize=2)

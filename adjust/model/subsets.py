@@ -1,6 +1,6 @@
 """Positions that observations name: other ones in their place, or a survey less what concerns some of them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
@@ -63,6 +63,13 @@ def only_between(survey: Survey, keep: Callable[[PositionRef], bool]) -> Survey:
         vertical = replace(vertical, tilt=replace(vertical.tilt, free=(), prior=None))
     some = tuple(c for c in covariances if len(c.reading_ids) > 1)
     return replace(survey, vertical=vertical, reading_covariances=some, **kept)
+
+
+def only_rows(survey: Survey, field: str, rows: Iterable[int]) -> Survey:
+    """These observations of a field and no others, independent of each other."""
+    observed = getattr(survey, field)
+    alone: Fields = {**dict.fromkeys(survey.others, ()), field: tuple(observed[i] for i in rows)}
+    return replace(survey, image_blocks=(), reading_covariances=(), **alone)
 
 
 def with_points(survey: Survey, kept: Sequence[int]) -> Survey:

@@ -15,8 +15,8 @@ from adjust.diagnosis.hypothesis import Edit, Hypothesis, Place, Rename
 from adjust.diagnosis.screen import Screen, at_best, improvement, screen
 from adjust.model.names import grouped
 from adjust.model.observations import Observation, PositionRef
-from adjust.model.rewriting import Fields, with_rows
-from adjust.model.subsets import positions_of, with_positions
+from adjust.model.rewriting import with_rows
+from adjust.model.subsets import only_rows, positions_of, with_positions
 from adjust.model.survey import FloatArray, IntArray, Survey
 
 _CLEARLY = 3.0
@@ -74,11 +74,8 @@ def _names(o: Observation) -> set[str]:
 
 def _evidence(survey: Survey, before: Screen, field: str, names: Names) -> float:
     """How much less those rows of a table that name one of the two miss, where all else stays where it is."""
-    observed = getattr(survey, field)
-    rows = _rows(observed, names)
-    alone: Fields = {**dict.fromkeys(survey.others, ()), field: tuple(observed[i] for i in rows)}
-    part = replace(survey, image_blocks=(), reading_covariances=(), **alone)
-    after = screen(renamed(part, field, names), before.start)
+    rows = _rows(getattr(survey, field), names)
+    after = screen(renamed(only_rows(survey, field, rows), field, names), before.start)
     if after is None:
         return 0.0
     was, now = (_squares(found, field, before.scale) for found in (before, after))

@@ -13,19 +13,20 @@ import numpy as np
 
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import ChangeReadings, Hypothesis, Place
-from adjust.diagnosis.screen import Screen, at_best, screen
+from adjust.diagnosis.screen import Screen, at_best, screen, screen_without
 from adjust.diagnosis.weights.impossible import SURE
 from adjust.model.errors import listed
 from adjust.model.observations import Reading, position_text
 from adjust.model.result import Adjustment
 from adjust.model.rewriting import Fields, with_rows
+from adjust.model.subsets import only_rows
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.observations.terrestrial.batch import TerrestrialBatch
 from adjust.statistics.score import LinearScores
 
 _CLEARLY = 3.0
 _FEWEST, _MOST = 3, 4
-SCALE, INSTRUMENT, _TARGET = "scale of distances", "instrument height", "target height"
+_SCALE, _INSTRUMENT, _TARGET = "scale of distances", "instrument height", "target height"
 _LARGEST = 10.0
 """m: what no height of an instrument or a target, and no reflector's constant, is wrong by."""
 _LARGEST_SCALE = 0.01
@@ -56,22 +57,22 @@ class _Constant:
     @property
     def field(self) -> str:
         """Of its readings that is changed."""
-        return {INSTRUMENT: "instrument_height", _TARGET: "target_height"}.get(self.name, "value")
+        return {_INSTRUMENT: "instrument_height", _TARGET: "target_height"}.get(self.name, "value")
 
     @property
     def largest(self) -> float:
         """What it is not wrong by."""
-        return _LARGEST_SCALE if self.name == SCALE else _LARGEST
+        return _LARGEST_SCALE if self.name == _SCALE else _LARGEST
 
     def amount(self, size: float) -> str:
         """The change of what stands there, in words."""
-        return f"{-1e6 * size:+.0f} ppm" if self.name == SCALE else \
+        return f"{-1e6 * size:+.0f} ppm" if self.name == _SCALE else \
             f"{1e3 * (-size if self.field == 'value' else size):+.1f} mm"  # fmt: skip
 
     def edit(self, survey: Survey, size: float) -> ChangeReadings:
         """The same of ``terrestrial.csv``."""
         ids = tuple(survey.readings[i].reading_id for i in self.rows.tolist())
-        if self.name == SCALE:
+        if self.name == _SCALE:
             return ChangeReadings(ids, 1.0 - size)
         return ChangeReadings(ids, 1.0, -size if self.field == "value" else size, field=self.field)
 
@@ -199,13 +200,13 @@ def _constants(survey: Survey, A: FloatArray) -> Iterator[_Constant]:
 
     for setup_id in dict.fromkeys(s for s in setups.tolist() if s):
         mine = setups == setup_id
-        yield from of(INSTRUMENT, f"the instrument's height at set-up {setup_id}",
+        yield from of(_INSTRUMENT, f"the instrument's height at set-up {setup_id}",
                       Place("setup", (setup_id,), "instrument_height_m"), mine & tilted, up_at,
                       "change instrument_height of its rows in terrestrial.csv")  # fmt: skip
         yield from of("prism constant", f"the reflector's constant at set-up {setup_id}",
                       Place("setup", (setup_id,), "value"), mine & lengths, along,
                       "change the distances of its rows in terrestrial.csv")  # fmt: skip
-        yield from of(SCALE, f"the scale of the distances of set-up {setup_id}",
+        yield from of(_SCALE, f"the scale of the distances of set-up {setup_id}",
                       Place("setup", (setup_id,), "value"), mine & lengths, values,
                       "change the distances of its rows in terrestrial.csv")  # fmt: skip
     for target in dict.fromkeys(targets.tolist()):
@@ -214,7 +215,7 @@ def _constants(survey: Survey, A: FloatArray) -> Iterator[_Constant]:
                       "change target_height of its rows in terrestrial.csv")  # fmt: skip
     yield from of("prism constant", "the reflector's constant of all distances", Place("instrument", (), ""), lengths,
                   along, "give an instrument's distance_offset, or change all distances")  # fmt: skip
-    yield from of(SCALE, "the scale of all distances", Place("instrument", (), ""), lengths, values,
+    yield from of(_SCALE, "the scale of all distances", Place("instrument", (), ""), lengths, values,
                   "give an instrument's distance_scale, or change all distances")  # fmt: skip
 
 
@@ -223,7 +224,7 @@ def _given(survey: Survey, constant: _Constant, metres: float) -> tuple[str, boo
     if constant.field == "value":
         return "", False
     heights = [getattr(survey.readings[i], constant.field) for i in constant.rows.tolist()]
-    none = constant.name == INSTRUMENT and not any(heights) and metres > 0.0
+    none = constant.name == _INSTRUMENT and not any(heights) and metres > 0.0
     return ": it stands there as 0, and was forgotten" if none else "", min(heights) + metres < -_BELOW
 
 
@@ -238,7 +239,7 @@ def _by_misses(
     of_targets = {c.place.ids[0]: j for c, j in zip(constants, judged, strict=True) if c.name == _TARGET}
     points = {r.setup_id: str(r.at.point_id) for r in case.survey.readings if r.at.frame is None}
     for i, c in enumerate(constants):
-        none = c.name == INSTRUMENT and not any(case.survey.readings[k].instrument_height for k in c.rows)
+        none = c.name == _INSTRUMENT and not any(case.survey.readings[k].instrument_height for k in c.rows)
         told = of_targets.get(points.get(c.place.ids[0], "")) if none else None
         judged[i] = judged[i] if told is None else max(judged[i], (told[0], -told[1]))
     if case.result is None:
@@ -254,13 +255,11 @@ def _apart(
 
     Of those that stand there as 0, then of those whose readings miss most.
     """
-    some = [i for i, c in enumerate(constants) if c.name == INSTRUMENT]
+    some = [i for i, c in enumerate(constants) if c.name == _INSTRUMENT]
     given = {i: any(survey.readings[k].instrument_height for k in constants[i].rows) for i in some}
     worst = {i: -float(np.median(before.readings[constants[i].rows])) for i in some}
     for i in sorted(some, key=lambda i: (given[i], worst[i]))[:_SUSPECTS]:
-        lost = {*constants[i].rows.tolist()}
-        without = screen(replace(survey, readings=tuple(r for k, r in enumerate(survey.readings) if k not in lost)))
-        apart = None if without is None else screen(survey, without.start)
+        apart = screen_without(survey, {*constants[i].rows.tolist()})
         if apart is not None and apart.graph.terrestrial is not None:
             own = replace(constants[i], by=apart.graph.terrestrial.A[constants[i].rows, 2])
             yield i, _evidence(apart, apart.graph.terrestrial, own)
@@ -277,16 +276,14 @@ def _evidence(before: Screen, batch: TerrestrialBatch, constant: _Constant) -> t
         return 0.0, 0.0
     metres, left = _one_step(scale, sigma, miss, constant.by)
     if constant.field != "value" and _LINEAR < abs(metres) < _LARGEST:
-        alone: Fields = dict.fromkeys(before.graph.survey.others, ())
-        alone["readings"] = tuple(before.graph.survey.readings[i] for i in rows)
-        part = replace(before.graph.survey, image_blocks=(), reading_covariances=(), **alone)
+        part = only_rows(before.graph.survey, "readings", rows)
         own = replace(constant, rows=np.arange(len(rows)))
         for _ in range(_ROUNDS):
             found = screen(_changed(part, own, metres), before.start)
             again = None if found is None else found.graph.terrestrial
             if again is None or not np.isfinite(again.residual).all():
                 break
-            by = again.A[:, 2 if constant.name == INSTRUMENT else 5]
+            by = again.A[:, 2 if constant.name == _INSTRUMENT else 5]
             more, left = _one_step(scale, sigma, -again.residual, by)
             metres += more
             if abs(more) < _EXACT:

@@ -12,7 +12,7 @@ import numpy as np
 
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import ChangeReadings, Hypothesis, Place
-from adjust.diagnosis.screen import Screen, at_best, improvement, screen
+from adjust.diagnosis.screen import Screen, at_best, improvement, screen, screen_without
 from adjust.diagnosis.units.conventions import (
     ANGLES,
     LENGTHS,
@@ -176,8 +176,7 @@ def _without(
     worst = sorted(every.values(), key=lambda scope: -float(np.median(before.readings[scope.rows])))
     for scope in worst[:_SUSPECTS]:
         lost = {i for i in scope.rows.tolist() if mine[i]}
-        without = screen(replace(survey, readings=tuple(r for i, r in enumerate(survey.readings) if i not in lost)))
-        apart = None if without is None else screen(survey, without.start)
+        apart = screen_without(survey, lost)
         if apart is not None:
             some = [i for i, (s, _) in enumerate(ways) if set(s.rows.tolist()) <= set(scope.rows.tolist())]
             yield from _in_place(apart, values, ways, some)

@@ -14,6 +14,7 @@ from scipy.optimize import minimize_scalar
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.observations.between_epochs import weights
 from adjust.spatial.rigid import rotation_exp, rotation_log
 from adjust.spatial.rigid_motions import Motions
 
@@ -60,14 +61,17 @@ class Trajectory:
         """Of each interval the four poses around, Lagrange's denominators of them, and turns (4, 3) to them."""
         t, R, i = self.times_s, self.world_from_eye.rotation, np.arange(len(self.times_s) - 1)
         around = np.clip(i, 1, len(t) - 3)[:, None] + np.arange(-1, 3)
-        return around, _below(t[around]), rotation_log(np.swapaxes(R[i], -1, -2)[:, None] @ R[around])
+        apart = t[around][:, :, None] - t[around][:, None] + np.eye(4)
+        return around, apart.prod(axis=2), rotation_log(np.swapaxes(R[i], -1, -2)[:, None] @ R[around])
 
     def _shares(self, times_s: FloatArray) -> tuple[IntArray, FloatArray]:
         """Intervals (k,) in which times are, and the shares (k, 4) of the poses around in what is there."""
         t = self.times_s
         i = np.clip(np.searchsorted(t, times_s, side="right") - 1, 0, len(t) - 2)
         around, below, _ = self._nodes
-        share = _above((times_s[:, None] - t[around[i]]).T) / below[i]
+        d = (times_s[:, None] - t[around[i]]).T
+        share = np.stack([d[1] * d[2] * d[3], d[0] * d[2] * d[3], d[0] * d[1] * d[3], d[0] * d[1] * d[2]], axis=1)
+        share /= below[i]
         uneven = np.flatnonzero((share**2).sum(axis=1) > _MOST_NOISE)
         j, at = i[uneven], times_s[uneven]
         after = ((at - t[j]) / (t[j + 1] - t[j]))[:, None]
@@ -94,7 +98,7 @@ class Trajectory:
         factors, squares = [], []
         for step in (1, 2):
             around = i[:, None] + step * np.array([-2, -1, 1, 2])
-            share = _above((t[i, None] - t[around]).T) / _below(t[around])
+            share, _ = weights(t[around], t[i])
             turn = np.einsum("kj,kji->ki", share, rotation_log(np.swapaxes(R[i], -1, -2)[:, None] @ R[around]))
             shift = np.einsum("kj,kji->ki", share, x[around])
             factors.append([1.0 + (share**2).sum(axis=1).mean(), np.square(_remainder(t[around], t[i])).mean()])
@@ -131,16 +135,6 @@ class TimeOffset:
     correlation: float
     drift_per_s: float
     drift_sigma_per_s: float
-
-
-def _above(d: FloatArray) -> FloatArray:
-    """(k, 4) Lagrange's numerators at times that are d (4, k) after four nodes."""
-    return np.stack([d[1] * d[2] * d[3], d[0] * d[2] * d[3], d[0] * d[1] * d[3], d[0] * d[1] * d[2]], axis=1)
-
-
-def _below(nodes: FloatArray) -> FloatArray:
-    """(k, 4) Lagrange's denominators of four nodes (k, 4)."""
-    return np.asarray((nodes[:, :, None] - nodes[:, None] + np.eye(4)).prod(axis=2))
 
 
 def _remainder(nodes: FloatArray, at: FloatArray) -> FloatArray:
