@@ -17,6 +17,8 @@ from adjust.spatial.rigid import skew
 from adjust.statistics.score import Score
 
 _FEWEST = 3
+_LARGEST = 0.05
+"""Of a scale, and of a constant over the lengths; a larger one is a unit."""
 _PPM = 1e6
 _COLUMNS = ("x_mm", "y_mm", "z_mm")
 Said = Callable[[FloatArray, FloatArray], str]
@@ -27,12 +29,15 @@ def common(case: Case, linear: Linear) -> Iterator[Effect]:
     survey = case.survey
     groups = grouped((d.group, i) for i, d in enumerate(survey.distances) if d.used)
     for group, rows in groups.items():
-        if len(rows) >= _FEWEST:
-            yield _of_distances(survey, linear, group, rows, scale=False)
-            yield _of_distances(survey, linear, group, rows, scale=True)
+        for scale in (False, True) if len(rows) >= _FEWEST else ():
+            effect = _of_distances(survey, linear, group, rows, scale)
+            length = 1.0 if scale else float(np.median([survey.distances[i].value for i in rows]))
+            if (abs(effect.first.theta) < _LARGEST * length).all():
+                yield effect
     rows = [i for i, c in enumerate(survey.coordinates) if c.used and np.isfinite(np.diag(c.cov)).all()]
     if len(rows) >= _FEWEST and all(len(survey.coordinates[i].positions) == 1 for i in rows):
-        yield _scaled(survey, linear, rows)
+        scaled = _scaled(survey, linear, rows)
+        yield from [scaled] if (abs(scaled.first.theta) < _LARGEST).all() else []
         yield _elsewhere(survey, linear, rows)
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, permutations, product
 
 import numpy as np
 
@@ -17,18 +17,28 @@ NORTH_FIRST = "have x and y exchanged (north first, or left-handed)"
 
 def ways() -> Iterator[tuple[str, str, FloatArray]]:
     """What the coordinates are instead, what mends it, and how (3, 3): right value = matrix @ value as read."""
+    known = [np.eye(3)]
+    for said, remedy, M in _common():
+        known.append(M)
+        yield said, remedy, M
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        M = np.diag(signs) @ np.eye(3)[list(order)]
+        if not any(np.array_equal(M, other) for other in known):
+            read = ", ".join("-" * (sign < 0) + "xyz"[i] for i, sign in zip(order, signs, strict=True))
+            yield f"have other axes: ({read}) of them are x, y and z", "write them so", M
+    for said, ratio in LENGTH_RATIOS.items():
+        yield said, f"multiply all of them by {ratio:g}", ratio * np.eye(3)
+
+
+def _common() -> Iterator[tuple[str, str, FloatArray]]:
     for i, j in combinations(range(3), 2):
         a, b, M = "xyz"[i], "xyz"[j], np.eye(3)
         M[[i, j]] = M[[j, i]]
         said = NORTH_FIRST if (a, b) == ("x", "y") else f"have {a} and {b} exchanged"
         yield said, f"exchange {a} and {b} of all of them", M
-    for said, by in (("have y, z and x in place of x, y and z", 1), ("have z, x and y in place of x, y and z", -1)):
-        yield said, "put them into their order", np.roll(np.eye(3), by, axis=0)
     for i, axis in enumerate("xyz"):
         M = np.diag(np.where(np.arange(3) == i, -1.0, 1.0))
         yield f"have {axis} in the opposite direction", f"change the sign of {axis}", M
-    for said, ratio in LENGTH_RATIOS.items():
-        yield said, f"multiply all of them by {ratio:g}", ratio * np.eye(3)
 
 
 def other_axes(survey: Survey) -> Iterator[Hypothesis]:
