@@ -100,7 +100,8 @@ class ChangeSearch:
         if s.structured is not None:
             self.rows, self.own = (SparseRows(x.indptr.astype(np.int64), x.indices.astype(np.int64), x.data)
                                    for x in (self.A, s.structured.own))  # fmt: skip
-            self.shared = np.ascontiguousarray(s.structured.U.T)
+            self.shared = np.zeros((len(s.columns), -(-len(s.structured.U) // 8) * 8))  # whole vectors
+            self.shared[:, : len(s.structured.U)] = s.structured.U.T
         elif columns > _MOST_COLUMNS:
             self.runs = max(self.runs * _MOST_COLUMNS // columns, 2)
             units = list(self._units(self.runs))

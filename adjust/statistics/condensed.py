@@ -15,6 +15,7 @@ from scipy import sparse
 
 from adjust.frames.tables import adjoint_of_inverse
 from adjust.graph.assembly import AdjustmentGraph
+from adjust.graph.singles import beside_images
 from adjust.model.boards import BENT, deformation
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.images import N_SHAPE
@@ -96,13 +97,11 @@ class CondensedSystem:
     def _own_links(self) -> IntArray:
         """In how many chains of image blocks each slot is; none where its unknown is held, or in anything else."""
         graph = self.system.precision.graph
-        unknowns, batches = graph.unknowns, (graph.images, *graph.bundles)
-        elsewhere = {k for item in graph.singles for k in item.factor.keys()} | set(unknowns.held) | {None}
-        elsewhere |= set() if graph.pairs is None else graph.pairs.keys()
-        elsewhere |= set() if graph.terrestrial is None else graph.terrestrial.keys
+        unknowns, chains = graph.unknowns, [graph.images.chains, *(b.chains for b in graph.bundles)]
+        elsewhere = beside_images(unknowns, graph.singles, graph.pairs, graph.terrestrial) | {None}
         elsewhere |= {k for slot in (*unknowns.table_slots, *unknowns.shifted_slots) for k in unknowns.link_keys(slot)}
         alone = np.array([key not in elsewhere for key in unknowns.slot_key], dtype=np.bool_)
-        return alone * np.bincount(np.concatenate([b.chains.slot for b in batches]), minlength=len(alone))
+        return alone * np.bincount(np.concatenate([c.slot for c in chains]), minlength=len(alone))
 
     @property
     def n_points(self) -> int:
