@@ -124,7 +124,8 @@ def tried_afresh(trial: Trial, case: Case, base: Misfit) -> Trial | None:
     From these values, where its own start was the first. None where that is no better, and of what is scored at these
     values. base: what the case leaves unexplained.
     """
-    near = trial.misfit.omega < base.omega and (case.is_near or trial.hypothesis.of_variances)
+    near = trial.misfit.omega < base.omega and case.is_near
+    near |= trial.hypothesis.of_variances and (trial.result is not None or case.is_near)
     if trial.result is not None and case.is_near and case.linear is not None:  # a minimum, if not a better one
         near |= trial.result.omega <= case.linear.result.omega
     if trial.survey is None or case.starts_afresh or near or trial.hypothesis.scored:
