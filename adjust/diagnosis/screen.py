@@ -243,8 +243,8 @@ def screen(survey: Survey, start: StartValues | None = None) -> Screen | None:
 
 def screen_without(survey: Survey, rows: Collection[int]) -> Screen | None:
     """The survey at the start that is found without some of its readings, which may have spoilt it; None as before."""
-    without = screen(replace(survey, readings=tuple(r for i, r in enumerate(survey.readings) if i not in rows)))
-    return None if without is None else screen(survey, without.start)
+    start = _start(replace(survey, readings=tuple(r for i, r in enumerate(survey.readings) if i not in rows)))
+    return None if start is None else screen(survey, start)
 
 
 @lru_cache(maxsize=2)
