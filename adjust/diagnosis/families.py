@@ -22,6 +22,7 @@ from adjust.diagnosis.time.forgotten_motion import forgotten_motion
 from adjust.diagnosis.time.synchronisation import unsynchronised
 from adjust.diagnosis.units.faces import other_kinds, second_faces, turned_circles
 from adjust.diagnosis.units.heights import misread_heights, wrong_heights
+from adjust.diagnosis.units.lengths import misread_lengths
 from adjust.diagnosis.units.pairs import misread_pairs
 from adjust.diagnosis.units.readings import misread_readings
 from adjust.diagnosis.weights.centring import missing_centring
@@ -39,7 +40,9 @@ NAMES: tuple[Family, ...] = (
 )  # fmt: skip
 VALUES: tuple[Family, ...] = (misread_heights, impossible_sigmas)
 """Told by the values alone: the first ones that are tried."""
-UNITS: tuple[Family, ...] = (misread_readings, second_faces, turned_circles, other_kinds, wrong_heights, misread_pairs)
+UNITS: tuple[Family, ...] = (
+    misread_readings, misread_lengths, second_faces, turned_circles, other_kinds, wrong_heights, misread_pairs,
+)  # fmt: skip
 IN_COMMON = (*VALUES, exchanged_points, exchanged_throughout, *UNITS, small_sigmas)
 """What several observations that were left out, with all others fitting, may have in common."""
 TIME: tuple[Family, ...] = (forgotten_motion, unsynchronised)

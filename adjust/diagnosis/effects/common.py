@@ -87,9 +87,10 @@ def _elsewhere(survey: Survey, linear: Linear, rows: list[int]) -> Effect:
     points = _points(survey, rows)
 
     def said(theta: FloatArray, sigmas: FloatArray) -> str:
-        turn, shift = (", ".join(f"{x:.4g}" for x in v) for v in (np.degrees(theta[:3]), 1e3 * theta[3:]))
-        by = f"turned by ({turn}) deg and shifted by ({shift}) mm"
-        return f"the coordinates in coordinates.csv stand in another frame, {by}"
+        turn, shift = ("(" + ", ".join(f"{x:.4g}" for x in v) + ")" for v in (np.degrees(theta[:3]), 1e3 * theta[3:]))
+        return (
+            f"the coordinates in coordinates.csv stand in another frame, turned by {turn} deg and shifted by {shift} mm"
+        )
 
     return _of_coordinates(
         survey, linear, rows, "frame of coordinates", "give them in the frame of the world, or let them define it and "

@@ -1,0 +1,96 @@
+"""Distances and coordinates without which an adjustment leads nowhere: all in another unit, or one that is far off.
+
+Evidence: what the rest says of them at its start, which none of them moves much.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from adjust.diagnosis.case import CAP, Case
+from adjust.diagnosis.hypothesis import ChangeReadings, Hypothesis, LeaveOut, Place
+from adjust.diagnosis.screen import Screen, at_best, improvement, screen
+from adjust.diagnosis.units.conventions import UNIT_OF_LENGTHS, Misreading, misreadings
+from adjust.diagnosis.units.readings import remedy
+from adjust.model.observations import Coordinates, Distance, position_text
+from adjust.model.rewriting import with_rows
+from adjust.model.subsets import with_only
+from adjust.model.survey import Survey
+
+_CLEARLY = 3.0
+_FAR = 1e4
+"""Mean square over sigmas, in variance factors of the start, from which a single one is looked at."""
+_MOST = 2
+
+
+def misread_lengths(case: Case) -> Iterator[Hypothesis]:
+    """Another unit of all distances, and single observations that miss most; where nothing could be adjusted."""
+    survey = case.survey
+    if case.result is not None or not (survey.distances or survey.coordinates):
+        return
+    before = at_best(case)
+    if before is None:
+        return
+    yield from _other_units(case, before)
+    yield from _alone(survey, before)
+
+
+def _other_units(case: Case, before: Screen) -> Iterator[Hypothesis]:
+    used = {i: d for i, d in enumerate(case.survey.distances) if d.used}
+    ways = [m for m in misreadings(case.written, "distances") if m.name == UNIT_OF_LENGTHS] if len(used) > 1 else []
+    changed = [replace(d, value=w.factor * d.value) for w in ways for d in used.values()]
+    after = screen(with_only(case.survey, "distances", changed), before.start) if changed else None
+    own = [i for i, o in enumerate(before.graph.others) if o.kind == "distance"]
+    if after is None or len(after.others) != len(changed) or len(own) != len(used):
+        return
+    was = float(np.minimum(before.others[own] / before.scale, CAP).sum())
+    for way, now in zip(ways, np.split(np.minimum(after.others / before.scale, CAP), len(ways)), strict=True):
+        evidence = improvement(was, float(now.sum()), len(used))
+        if evidence > _CLEARLY:
+            yield _read_by(case.survey, used, way, evidence, len(ways))
+
+
+def _read_by(survey: Survey, used: dict[int, Distance], way: Misreading, evidence: float, looked_at: int) -> Hypothesis:
+    ids = tuple(d.distance_id for d in used.values())
+    return Hypothesis(
+        way.name, f"all distances: {way.text('their')}", remedy(way, "distances"), Place("reading", ids, "value"),
+        with_rows(survey, "distances", {i: replace(d, value=way.factor * d.value) for i, d in used.items()}),
+        (ChangeReadings(ids, way.factor, table="distances"),), evidence, 1, looked_at,
+    )  # fmt: skip
+
+
+def _alone(survey: Survey, before: Screen) -> Iterator[Hypothesis]:
+    """Those without which all others fit much better, the worst first."""
+    bounded = np.minimum(before.others / before.scale, CAP)
+    for k in np.argsort(-before.others)[:_MOST].tolist():
+        other = before.graph.others[k]
+        evidence = improvement(float(bounded.sum()), float(bounded.sum() - bounded[k]), len(bounded))
+        found = _observed(survey, other.kind, other.ids)
+        if found is not None and before.others[k] > _FAR * before.scale and evidence > _CLEARLY:
+            yield _without(survey, *found, float(np.sqrt(before.others[k])), evidence, len(bounded))
+
+
+def _observed(survey: Survey, kind: str, ids: tuple[str, ...]) -> tuple[str, int, Distance | Coordinates] | None:
+    if kind == "distance":
+        return next((("distances", i, d) for i, d in enumerate(survey.distances) if d.distance_id == ids[0]), None)
+    if kind == "coordinates":
+        of = ((i, c) for i, c in enumerate(survey.coordinates) if len(c.positions) == 1)
+        return next((("coordinates", i, c) for i, c in of if position_text(c.positions[0]) == ids[0]), None)
+    return None
+
+
+def _without(
+    survey: Survey, field: str, row: int, observed: Distance | Coordinates, sigmas: float, evidence: float, among: int
+) -> Hypothesis:
+    if isinstance(observed, Distance):
+        name = observed.distance_id
+        what = f"distance {name} contradicts all else by {sigmas:.3g} sigmas at the start: its value or a name is wrong"
+    else:
+        name = position_text(observed.positions[0])
+        what = f"the coordinates of {name} contradict all else by {sigmas:.3g} sigmas at the start: a value is wrong"
+    return Hypothesis(
+        "gross error", what, f"correct it in {field}.csv, or leave it out", Place("reading", (name,), "value"),
+        with_rows(survey, field, {row: replace(observed, used=False)}), (LeaveOut((f"{field}:{name}",)),), evidence, 1,
+        among,
+    )  # fmt: skip
