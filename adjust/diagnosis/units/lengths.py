@@ -21,7 +21,6 @@ from adjust.model.survey import Survey
 _CLEARLY = 3.0
 _FAR = 1e4
 """Mean square over sigmas, in variance factors of the start, from which a single one is looked at."""
-_MOST = 2
 
 
 def misread_lengths(case: Case) -> Iterator[Hypothesis]:
@@ -61,14 +60,14 @@ def _read_by(survey: Survey, used: dict[int, Distance], way: Misreading, evidenc
 
 
 def _alone(survey: Survey, before: Screen) -> Iterator[Hypothesis]:
-    """Those without which all others fit much better, the worst first."""
-    bounded = np.minimum(before.others / before.scale, CAP)
-    for k in np.argsort(-before.others)[:_MOST].tolist():
-        other = before.graph.others[k]
-        evidence = improvement(float(bounded.sum()), float(bounded.sum() - bounded[k]), len(bounded))
-        found = _observed(survey, other.kind, other.ids)
-        if found is not None and before.others[k] > _FAR * before.scale and evidence > _CLEARLY:
-            yield _without(survey, *found, float(np.sqrt(before.others[k])), evidence, len(bounded))
+    """The one without which all others fit; none where several are far off, as one."""
+    squares = before.others / before.scale
+    far = np.flatnonzero(squares > _FAR)
+    found = _observed(survey, (other := before.graph.others[int(far[0])]).kind, other.ids) if len(far) == 1 else None
+    if found is not None:
+        k = int(far[0])  # not bounded: nothing else is so far off
+        evidence = float(squares[k]) / (1.0 + float(np.delete(squares, k).sum()))
+        yield _without(survey, *found, float(np.sqrt(before.others[k])), evidence, len(squares))
 
 
 def _observed(survey: Survey, kind: str, ids: tuple[str, ...]) -> tuple[str, int, Distance | Coordinates] | None:
