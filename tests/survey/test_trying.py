@@ -305,14 +305,19 @@ def test_an_edit_as_results_tell_it_is_the_same_edit(edit: Edit) -> None:
         np.testing.assert_array_equal(getattr(again, name), value)
 
 
-@pytest.fixture
-def swapped(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def adjusted_swapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An adjusted project with a mistake, of which its results tell the cause."""
-    lab = labs.example("relay", tmp_path / "lab")
+    lab = labs.example("relay", tmp_path_factory.mktemp("swapped") / "lab")
     labs.with_rows(lab / "observations" / "pairs.csv", lambda i, row: i % 3 == 0 and row.update(
         a_id=row["b_id"], b_id=row["a_id"]))  # fmt: skip
     assert main(["adjust", str(lab), "--quiet"]) == 3
     return lab
+
+
+@pytest.fixture
+def swapped(adjusted_swapped: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(adjusted_swapped, tmp_path / "lab"))
 
 
 def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
