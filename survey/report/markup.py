@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Iterable, Sequence
 from functools import cache
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -161,8 +162,10 @@ def table(
     columns: Sequence[str], rows: Iterable[Sequence[object]], caption: str = "", row_classes: Sequence[str] = ()
 ) -> Markup:
     """A table with columns as of :func:`heads`; a heading that is data is escaped first."""
-    rows = list(rows)
-    return part("table", heads(columns), rows, caption, [*row_classes, *[""] * (len(rows) - len(row_classes))])
+    named = heads(columns)
+    sides = [Markup(side) for _, side in named]
+    sided = (zip(sides, row, strict=True) for row in rows)
+    return part("table", named, zip_longest(row_classes, sided, fillvalue=""), caption)
 
 
 def section(anchor: str, title: str, body: Markup | str, note: str = "") -> Markup:

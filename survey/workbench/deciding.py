@@ -22,6 +22,7 @@ from survey.workbench.resident import Resident
 from survey.workbench.situation import CancelledError, ChangedError, Situation, Step, signature_of
 
 _NONE: Mapping[str, str] = MappingProxyType({})
+_MOST_KEPT = 300_000  # image points of all solutions that are kept to be there again at once
 
 
 def preview(bench: Resident, *names: str, excluded: bool = True) -> dict[str, object]:
@@ -89,9 +90,18 @@ def _decided(
         {name: _text(bench, name) for name in texts}, dict(texts), cold, now.adjustment is None,
     )  # fmt: skip
     changes = _apply(bench, step, rows)
-    bench.done.append(step)
+    bench.done = _kept(*bench.done, replace(step, beyond=now))
     bench.undone = []
     return changes
+
+
+def _kept(*steps: Step) -> list[Step]:
+    """The last decisions with their solutions, those before without."""
+    n_points, out = 0, list[Step]()
+    for step in reversed(steps):
+        n_points += 0 if step.beyond is None else sum(len(b.uv) for b in step.beyond.survey.image_blocks)
+        out.append(step if n_points <= _MOST_KEPT else replace(step, beyond=None))
+    return out[::-1]
 
 
 def _text(bench: Resident, name: str) -> str:
@@ -156,13 +166,14 @@ def _again(bench: Resident, source: list[Step], onto: list[Step], verb: str, bas
         bench.check(base)
         if not source:
             raise SurveyError(f"{bench.folder}: there is nothing to {verb}")
-        step = source[-1]
+        step, now = source[-1], bench.situation
         effect = step.reversed() if verb == "undo" else step
-        who = author_name(bench.situation.project.options.identification)
+        who = author_name(now.project.options.identification)
         rows = [Row(True, replace(one, author=one.author or who)) for one in effect.excluded]
         rows += [Row(False, replace(one, reason=verb, author=who)) for one in effect.included]
         changes = _apply(bench, effect, rows, step.unsolved and verb == "undo")
-        onto.append(source.pop())
+        source.pop()
+        onto[:] = _kept(*onto, replace(step, beyond=now))
         return changes
 
 
@@ -205,7 +216,7 @@ def _apply(bench: Resident, step: Step, rows: Sequence[Row], may_fail: bool = Fa
         trial = replace(trial, identified=(), known_spots=frozenset())
     failure = None
     try:
-        solved = bench.solved(trial, "cold" if step.cold else "warm")
+        solved = _known(step, trial) or bench.solved(trial, "cold" if step.cold else "warm")
     except SurveyError as error:
         if not may_fail or isinstance(error, CancelledError):
             raise
@@ -214,6 +225,14 @@ def _apply(bench: Resident, step: Step, rows: Sequence[Row], may_fail: bool = Fa
     changes = bench.take(replace(_as_written(bench, solved), signature=signature), failure)
     bench.n_unsaved += 1
     return changes
+
+
+def _known(step: Step, trial: Situation) -> Situation | None:
+    """With the solution that was there already, where it rests on the same files and the same is left out."""
+    there = step.beyond
+    if there is None or there.judgement is None or there.basis != trial.basis:
+        return None
+    return trial.solved_as(there)
 
 
 def _write(bench: Resident, step: Step, rows: Sequence[Row]) -> Mapping[str, tuple[int, int]]:

@@ -13,6 +13,7 @@ from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 from survey.folder.plain import plain
+from survey.jobs.excluding import FILE
 from survey.project import Project
 from survey.project.exclusions import Exclusion, Name
 from survey.project.observed import Hits, Observed, union
@@ -111,13 +112,26 @@ class Situation:
             raise SurveyError(f"{self.project.folder}: is not adjusted yet; adjust it first")
         return self.judgement
 
+    def solved_as(self, known: "Situation") -> "Situation":
+        """With the solution of another one that rests on the same."""
+        return replace(
+            self, judgement=known.judgement, identified=known.identified, known_spots=known.known_spots,
+            mode=known.mode, seconds=known.seconds,
+        )  # fmt: skip
+
+    @property
+    def basis(self) -> tuple[dict[str, str], set[tuple[Name, tuple[float, float] | None]]]:
+        """What a solution rests on: hashes of the files that were read, and what people left out."""
+        files = {name: digest for name, digest in self.everything.inputs.items() if name != FILE}
+        return files, {(one.name, one.at) for one in self.exclusions.values()}
+
 
 @dataclass(frozen=True, eq=False)
 class Step:
     """A decision that can be taken back: rows of exclusions.csv, and files (by path in the folder) before and after.
 
     cold: it is about what the values of before rest on, so that they are no good start. unsolved: there was no solution
-    before it, and there may be none once it is taken back.
+    before it, and there may be none once it is taken back. beyond: what there is once it is taken back (or done again).
     """
 
     label: str
@@ -127,10 +141,11 @@ class Step:
     after: Mapping[str, str] = field(default_factory=dict)
     cold: bool = False
     unsolved: bool = False
+    beyond: Situation | None = None
 
     def reversed(self) -> "Step":
         """What takes it back."""
-        return Step(self.label, self.included, self.excluded, self.after, self.before, self.cold, self.unsolved)
+        return replace(self, excluded=self.included, included=self.excluded, before=self.after, after=self.before)
 
 
 @dataclass(eq=False)

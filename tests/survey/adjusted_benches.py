@@ -1,7 +1,6 @@
 """Workbenches with a solution: projects whose files say the same are adjusted once for all tests of a process."""
 
 import hashlib
-from dataclasses import replace
 from pathlib import Path
 
 from survey.workbench.session import Workbench
@@ -20,8 +19,5 @@ def adjusted_bench(folder: Path, read_only: bool = False) -> Workbench:
         bench.adjust()
         _adjusted[files] = bench.situation
     else:
-        bench.take(replace(
-            bench.situation, judgement=known.judgement, identified=known.identified, known_spots=known.known_spots,
-            mode=known.mode, seconds=known.seconds,
-        ))  # fmt: skip
+        bench.take(bench.situation.solved_as(known))
     return bench

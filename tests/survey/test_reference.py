@@ -1,6 +1,5 @@
 """The declarations of ``survey.toml``: readers check what they name, page and schema follow from them."""
 
-import copy
 import json
 import tomllib
 from pathlib import Path
@@ -71,6 +70,7 @@ EVERYTHING: dict[str, Any] = {
     "identification": {"operator": "somebody"},
     "closures": {"plate": {"pairs": ["a-b", "b-a"], "sigma_arcsec": 10, "sigma_mm": 0.1}},
 }  # fmt: skip
+PLAIN = json.dumps(EVERYTHING)
 PLACES: dict[str, tuple[str, ...]] = {
     "root": (), "camera": ("cameras", "X"), "lens": ("cameras", "X", "lens"),
     "lens_values": ("cameras", "X", "lens", "values"), "lens_prior": ("cameras", "X", "lens", "prior", "fx"),
@@ -107,14 +107,14 @@ def _named(value: Any) -> str:
 
 def _toml(values: dict[str, Any], path: tuple[str, ...] = ()) -> str:
     plain = {k: v for k, v in values.items() if not isinstance(v, dict)}
-    lines = [f"[{'.'.join(json.dumps(p) for p in path)}]"] if path else []
-    lines += [f"{json.dumps(k)} = {json.dumps(v)}" for k, v in plain.items()]
+    lines = [f"[{'.'.join(path)}]"] if path else []
+    lines += [f"{k} = {json.dumps(v)}" for k, v in plain.items()]
     below = [_toml(v, (*path, k)) for k, v in values.items() if isinstance(v, dict)]
     return "\n".join([*lines, *below])
 
 
 def _project(folder: Path, change: dict[str, Any], place: tuple[str, ...] = ()) -> Any:
-    values = copy.deepcopy(EVERYTHING)
+    values = json.loads(PLAIN)
     at = values
     for name in place:
         at = at.setdefault(name, {})

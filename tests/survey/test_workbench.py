@@ -22,6 +22,7 @@ from survey.project import read
 from survey.report.anchors import anchors_in
 from survey.solution.earlier.changes import Snapshot, solution_changes
 from survey.solution.earlier.runs import MOST, list_runs, load_run
+from survey.workbench import deciding
 from survey.workbench.pictures import picture
 from survey.workbench.rows import BY_PEOPLE, IN_USE, columns, point_rows
 from survey.workbench.session import Workbench
@@ -87,19 +88,35 @@ def test_parameters_have_the_angles_of_the_results(bench):
     assert all(value is not None for value in columns["value"])
 
 
-def test_undone_is_as_before_and_redone_as_decided(bench, mine):
+@pytest.mark.parametrize("most_kept", [0, 300_000])
+def test_undone_is_as_before_and_redone_as_decided(bench, mine, monkeypatch, most_kept):
+    """Adjusted again, or as it was there already."""
+    monkeypatch.setattr(deciding, "_MOST_KEPT", most_kept)
     first = bench.adjustment
     epoch = bench.situation.survey.image_blocks[0].epoch_id
     bench.exclude(f"epoch:{epoch}", reason="table was touched")
     decided = bench.adjustment
     assert bench.undo() is not None
+    assert (bench.adjustment is first) == (most_kept > 0)
     assert same(first, bench.adjustment) < 1e-5
     bench.redo()
+    assert (bench.adjustment is decided) == (most_kept > 0)
     assert same(decided, bench.adjustment) < 1e-5
     assert [line.split(",")[2] for line in exclusions(mine)] == ["excluded", "included", "excluded"]
     assert exclusions(mine)[-1].split(",")[3] == "table was touched"
     with pytest.raises(SurveyError, match="nothing to redo"):
         bench.redo()
+
+
+def test_undone_is_adjusted_where_the_solution_of_before_rests_on_other_files(bench):
+    first = bench.adjustment
+    bench.exclude(f"epoch:{bench.situation.survey.image_blocks[0].epoch_id}", reason="table was touched")
+    there = bench.done[-1].beyond
+    files = {**there.everything.inputs, "survey.toml": "another"}
+    bench.done[-1] = replace(bench.done[-1], beyond=replace(there, everything=replace(there.everything, inputs=files)))
+    bench.undo()
+    assert bench.adjustment is not first
+    assert same(first, bench.adjustment) < 1e-5
 
 
 def test_a_planted_mistake_is_found_left_out_and_back(mine):

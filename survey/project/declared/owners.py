@@ -108,8 +108,8 @@ def _read_geometry(node: Node, n_axes: int) -> VectorParameter:
     sigma.allow(*(key_of(n, units) for n in known))
     free = geometry.references("free", known, "table parameter", base[:2] if n_axes == 2 else ())
     free = (*free, *(n for n in _harmonics(node.table("harmonics"), n_axes) if n not in free))
-    asked = in_order([n for n in known if n in base or n in free or geometry.number(key_of(n, units), 0.0)
-                      or sigma.has(key_of(n, units))])  # fmt: skip
+    asked = in_order([n for n in known if n in base or n in free or sigma.has(key := key_of(n, units))
+                      or (geometry.has(key) and geometry.number(key))])  # fmt: skip
     return read_vector(geometry, geometry_units(asked), (), 0.0, tuple(n for n in asked if n in free), sigma)
 
 

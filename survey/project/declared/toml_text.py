@@ -168,6 +168,10 @@ class KeyLines(Mapping[KeyPath, int]):
         return len(self._found)
 
 
+def _unquoted(text: str) -> str:
+    return str(tomllib.loads(f"k = {text}")["k"]) if "\\" in text else text[1:-1]
+
+
 class _Scanner:
     """Walks over the tokens of a valid document; it checks nothing, because ``tomllib`` has."""
 
@@ -228,7 +232,7 @@ class _Scanner:
         parts: list[str] = []
         while True:
             part = self._take()
-            parts.append(tomllib.loads(f"k = {part}")["k"] if part[0] in "\"'" else part)
+            parts.append(_unquoted(part) if part[0] in "\"'" else part)
             if self._next != ".":
                 return tuple(parts)
             self._take()
