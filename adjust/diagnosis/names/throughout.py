@@ -19,7 +19,8 @@ from adjust.model.rewriting import with_rows
 from adjust.model.subsets import only_rows, positions_of, with_positions
 from adjust.model.survey import FloatArray, IntArray, Survey
 
-_CLEARLY = 3.0
+_CLEARLY, _WORTH = 3.0, 1.5
+"""Mean squares of what misses; evidence of what is tried: one rough start value may leave half of the misfit."""
 _SUSPECTS, _MOST, _ALL = 6, 4, 60
 _LARGE = 2500
 _READINGS = "readings"
@@ -41,7 +42,7 @@ def exchanged_throughout(case: Case) -> Iterator[Hypothesis]:
     if before is None:
         return
     found = [(e, f, names, len(ways)) for f in fields for ways in [_ways(survey, before, f)] for names in ways
-             if (e := _evidence(survey, before, f, names)) > _CLEARLY]  # fmt: skip
+             if (e := _evidence(survey, before, f, names)) > _WORTH]  # fmt: skip
     for evidence, field, names, looked_at in sorted(found, key=lambda x: -x[0])[:_MOST]:
         yield in_table(survey, field, names, evidence, looked_at)
 
