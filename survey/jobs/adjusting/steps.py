@@ -17,7 +17,7 @@ from adjust.observations.copies import copied_observations
 from adjust.statistics.outliers.supported import lost_notes, supported, without_lost_points
 from adjust.statistics.screened_adjustment import CleanOptions
 from survey.jobs.adjusting.astray import cleaned
-from survey.jobs.adjusting.probable_causes import adjusted_or_explained, with_probable_causes
+from survey.jobs.adjusting.probable_causes import adjusted_or_explained, explaining, with_probable_causes
 from survey.jobs.adjusting.symmetric_boards import consistent_turns
 from survey.jobs.detecting.image_defects import blurred, defect_warnings
 from survey.jobs.identify import identified, identify_spots, without_points
