@@ -2,7 +2,6 @@
 #include "calibration.h"
 #include "chains.h"
 #include "changes.h"
-#include "means.h"
 #include "parallels.h"
 #include "planes.h"
 #include "point_tests.h"
@@ -22,7 +21,7 @@ extern "C" __attribute__((visibility("default"))) const Entry *images() {
         entry<solve_cliques>("solve_cliques"), entry<sets_room>("sets_room"), entry<sets_among>("sets_among"),
         entry<refine_views>("refine_views"), entry<errors_of_views>("errors_of_views"),
         entry<offsets_of_views>("offsets_of_views"), entry<homographies>("homographies"),
-        entry<plane_poses>("plane_poses"), entry<fit_lens>("fit_lens"), entry<turns_by>("turns_by"), entry<robust_means>("robust_means"),
+        entry<plane_poses>("plane_poses"), entry<fit_lens>("fit_lens"), entry<turns_by>("turns_by"),
         entry<turns_of>("turns_of"), entry<row_influences>("row_influences"), entry<residual_tests>("residual_tests"),
         entry<sums_of_blocks>("sums_of_blocks"), entry<farthest_points>("farthest_points"),
         entry<controlled_directions>("controlled_directions"), entry<point_tests>("point_tests"), entry<change_squares>("change_squares"),

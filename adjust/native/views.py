@@ -27,9 +27,6 @@ turns_by = Function("turns_by", "w[n,3] R[n,3,3]")
 """Rotations of rotation vectors (rad)."""
 turns_of = Function("turns_of", "R[n,3,3] w[n,3]")
 """Rotation vectors (rad) of rotations."""
-_robust_means = Function(
-    "robust_means", "poses[n,4,4] ptr[k+1] member[n] first[k] lever means[k,4,4] nearest[n] work[2,n]"
-)
 _ROWS, _LANES = 26, 8  # of a point's numbers; of the widest vectors
 
 
@@ -43,18 +40,6 @@ def _arrays(
     at, seen = (np.ascontiguousarray(a, dtype=np.float64) for a in (x, rays))
     sizes = np.diff(ends)
     return (which, ends, at, seen), np.concatenate([[0], np.cumsum(sizes[which])]), int(sizes.max(initial=0))
-
-
-def robust_means(poses: FloatArray, lever: float, ptr: IntArray, member: IntArray, first: IntArray) -> FloatArray:
-    """Means (k, 4, 4) of motions (n, 4, 4), those of each by ptr (k + 1,), from the motions first (k,).
-
-    lever: m, of turns. member: (n,) numbers in order; of neighbours of equal number the nearest counts.
-    """
-    means, n = np.empty((len(first), 4, 4)), len(poses)
-    given = (np.ascontiguousarray(a, dtype=np.int64) for a in (ptr, member, first))
-    at = np.ascontiguousarray(poses, dtype=np.float64)
-    _robust_means(at, *given, lever, means, np.empty(n, dtype=np.int64), np.empty((2, n)))
-    return means
 
 
 def view_errors(

@@ -3,10 +3,12 @@
 import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
-from adjust.native.views import robust_means
+from adjust.spatial.rigid import nearest_rotation, rigid
 
 _MEDOID_LIMIT = 40  # more candidates than this are thinned out for the quadratic search of the medoid
 _AT_ONCE = 1000  # means whose medoids are found together
+_STEPS = 20
+_SETTLED = 1e-4  # of the scale: a further step tells nothing that the motions do
 
 
 def wrapped(angles: FloatArray) -> FloatArray:
@@ -61,11 +63,29 @@ def mean_poses(poses: FloatArray, lever: float, ptr: IntArray, members: IntArray
     owner = np.repeat(np.arange(len(ptr) - 1), np.diff(ptr))
     new = np.ones(len(poses), dtype=np.bool_) if members is None else _begins(members) | _begins(owner)
     member = np.cumsum(new) - 1
-    medoids = np.concatenate([
-        _medoids(poses, lever, part, member)
+    mean = np.concatenate([
+        poses[_medoids(poses, lever, part, member)]
         for part in np.split(np.column_stack([ptr[:-1], ptr[1:]]), range(_AT_ONCE, len(ptr) - 1, _AT_ONCE))
     ])  # fmt: skip
-    return robust_means(poses, lever, ptr, member, medoids)
+    live, of, of_member, here = np.arange(len(mean)), owner, owner[new], poses
+    for _ in range(_STEPS):
+        distance = pose_distance(here, mean[live[of]], lever)
+        chosen = least(distance, member)
+        near, first = distance[chosen], np.searchsorted(of_member, np.arange(len(live)))
+        scale = np.maximum(3.0 * medians(near, of_member, len(live)), 1e-12)
+        weights = 1.0 / (1.0 + (near / scale[of_member]) ** 2) ** 2
+        total = np.add.reduceat(weights[:, None, None] * here[chosen, :3], first)
+        step = rigid(nearest_rotation(total[..., :3]), total[..., 3] / np.add.reduceat(weights, first)[:, None])
+        going = pose_distance(step, mean[live], lever) >= _SETTLED * scale
+        mean[live] = step
+        live = live[going]
+        if not len(live):
+            break
+        if not going.all():
+            rows, number = going[of], np.cumsum(going) - 1
+            of, here, member = number[of[rows]], here[rows], member[rows]
+            of_member = number[of_member[going[of_member]]]
+    return mean
 
 
 def _begins(numbers: IntArray) -> BoolArray:
