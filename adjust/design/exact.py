@@ -54,7 +54,7 @@ def exact(survey: Survey, start: StartValues) -> Survey:
 
 def _block(p: Predictor, block: ImageBlock) -> ImageBlock:
     camera = p.cameras[block.camera_id]
-    uv, q = p.image(block)
+    uv, q, _ = p.image(block)
     if np.isnan(uv).any():
         lens = p.lens(camera, block.epoch_id)
         uv = project(MODELS[camera.lens.model], lens, camera_constants(camera), q)  # says why there is none

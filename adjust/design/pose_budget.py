@@ -12,17 +12,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from gtsam import Pose3
 
-from adjust.lenses.models import MODELS, lens_residuals
+from adjust.lenses.compared import motion_derivatives
+from adjust.lenses.models import MODELS, lens_derivatives, lens_residuals
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, IntArray
-from adjust.navigation.fit import fit_pose, local
+from adjust.navigation.fit import local
 from adjust.navigation.model import Beacons, Head
-from adjust.navigation.system import evaluate, in_view, make_system, sightings_of
-from adjust.spatial.rigid import rotation_exp
+from adjust.navigation.system import evaluate, in_view, make_system
+from adjust.spatial.rigid import rigid, rotation_exp, transform
 
 SOURCES = ("spots", "beacons", "camera positions", "camera attitudes")
 UNITS = ("px", "m", "m", "rad")
 _OPEN = 1e-9
+_STEPS, _SETTLED = 20, 1e-6  # px, of all spots of a pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,13 +123,38 @@ def simulate_poses(found: PoseBudget, sigmas: FloatArray, n_trials: int, seed: i
         rng, true = np.random.default_rng([seed, k]), pose.matrix()
         camera, beacon = in_view(system, true)
         spots = _disturbed_spots(found, true, camera, beacon, sigmas, n_trials, rng)
-        for i, uv in enumerate(spots):
-            seen = sightings_of(system, camera, beacon, uv, 1.0)
-            fit = fit_pose(seen, np.arange(len(camera)), beacon, true)
-            if fit is None:
-                raise SurveyError(f"pose {k + 1}: spots with errors of these sizes lead to no pose; ask for less")
-            out[k, i] = local(true, fit.pose)
+        solved = _solved(found.head, found.x_in_world[beacon], true, camera, spots)
+        if solved is None:
+            raise SurveyError(f"pose {k + 1}: spots with errors of these sizes lead to no pose; ask for less")
+        out[k] = local(true, solved)
     return out
+
+
+def _solved(
+    head: Head, x: FloatArray, start: FloatArray, camera: IntArray, spots: FloatArray
+) -> FloatArray | None:
+    """Poses (t, 4, 4) by least squares of spots (t, n, 2) of points x (n, 3) with equal weights, all trials at once.
+
+    By Gauss-Newton from one start (4, 4); None where the steps of any trial do not settle.
+    """
+    pose, t = np.tile(start, (len(spots), 1, 1)), len(spots)
+    residual, H = np.empty(spots.shape), np.empty((*spots.shape, 6))
+    for _ in range(_STEPS):
+        q = (x - pose[:, None, :3, 3]) @ pose[:, :3, :3]
+        for k, own in enumerate(head.cameras):
+            rows = np.flatnonzero(camera == k)
+            flat, camera_from_station = q[:, rows].reshape(-1, 3), own.station_from_camera.inverse().matrix()
+            p, uv = transform(camera_from_station, flat), spots[:, rows].reshape(-1, 2)
+            e, _, by_point = lens_derivatives(MODELS[own.model], own.lens, own.constants, p, uv)
+            residual[:, rows] = e.reshape(t, -1, 2)
+            H[:, rows] = -motion_derivatives(by_point @ camera_from_station[:3, :3], flat).reshape(t, -1, 2, 6)
+        A = H.reshape(t, -1, 6)
+        At = A.swapaxes(1, 2)
+        step = -np.linalg.solve(At @ A, At @ residual.reshape(t, -1, 1))
+        pose = pose @ rigid(rotation_exp(step[:, :3, 0]), step[:, 3:, 0])
+        if np.linalg.norm(A @ step, axis=1).max() < _SETTLED:
+            return pose
+    return None
 
 
 def _disturbed_spots(

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from gtsam import Pose3
+from gtsam import Pose3, Rot3
 
 from adjust.frames.lens_times import LensTimes
 from adjust.graph.assembly import StartValues
@@ -15,7 +15,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, ImageBlock, PositionRef, Reading, TableReading
 from adjust.model.survey import BoolArray, Camera, FloatArray, Point, Survey, Target
 from adjust.native.lenses import FISHEYE
-from adjust.observations.factors import ChainPose
+from adjust.observations.images.batch import Chains
 
 _STEPS = np.linspace(1.0 / 16.0, 1.0, 16)
 _NEAREST_M = 1e-3
@@ -46,10 +46,13 @@ class Predictor:
         self.survey, self.graph, self.frames = survey, builder.build(start), builder.frames
         self.values, self.times = self.graph.start, LensTimes(survey)
         self.cameras, self.targets = survey.cameras_by_id, survey.targets_by_id
+        self.graph.state.load(self.values)
 
     def b_from_a(self, a: FrameRef, b: FrameRef) -> Pose3:
         """The motion between two frames."""
-        return ChainPose(self.graph.unknowns, self.graph.state, self.frames.relative(a, b))(self.values)[0]
+        chain = Chains([self.frames.relative(a, b)])
+        chain.evaluate(self.graph.state)
+        return Pose3(Rot3(chain.R[0]), chain.t[0])
 
     def lens(self, camera: Camera, epoch_id: str) -> FloatArray:
         """Full lens vector (n,) at an epoch."""
@@ -70,18 +73,19 @@ class Predictor:
         held = self.graph.unknowns.held_points.get(point.point_id)
         return np.asarray(held if unknown is None else self.values.atPoint3(unknown.key))
 
-    def image(self, block: ImageBlock) -> tuple[FloatArray, FloatArray]:
-        """Image points (n, 2) px of a block, nan where there is none, and the points (n, 3) m in the camera."""
+    def image(self, block: ImageBlock) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Image points (n, 2) px of a block, nan where there is none; in the camera the points (n, 3) m, and z (3,)."""
         camera = self.cameras[block.camera_id]
         ref = FrameRef("target", block.target_id, block.epoch_id) if block.target_id else FrameRef("world")
         pose = self.b_from_a(ref, FrameRef("camera", block.camera_id, block.epoch_id))
         x = self.points_in_frame(block.target_id, block.epoch_id)[block.point_idx]
-        q = x @ pose.rotation().matrix().T + pose.translation()
-        return projected(camera, self.lens(camera, block.epoch_id), q), q
+        R = pose.rotation().matrix()
+        q = x @ R.T + pose.translation()
+        return projected(camera, self.lens(camera, block.epoch_id), q), q, R[:, 2]
 
     def seen(self, block: ImageBlock, seeing: Seeing) -> ImageBlock | None:
         """The block with what is visible of it, at its predicted place; None where that is too little."""
-        uv, q = self.image(block)
+        uv, q, z = self.image(block)
         camera = self.cameras[block.camera_id]
         size = self.times.size(camera, block.epoch_id)
         keep = _inside(size, uv, seeing.margin_px)
@@ -89,24 +93,11 @@ class Predictor:
         if keep.any():
             keep[keep] = grows_outwards(camera, self.lens(camera, block.epoch_id), q[keep])
         if block.target_id is not None:
-            keep &= self._facing(block, seeing)
+            keep &= _facing(self.targets[block.target_id], q, z, seeing)
         fewest = seeing.fewest_points if block.target_id is not None else 1
         if int(keep.sum()) < fewest:
             return None
         return replace(block, uv=uv).part(keep)
-
-    def _facing(self, block: ImageBlock, seeing: Seeing) -> BoolArray:
-        target = self.targets[str(block.target_id)]
-        camera_in_target = self.b_from_a(
-            FrameRef("camera", block.camera_id, block.epoch_id), FrameRef("target", target.target_id, block.epoch_id)
-        )
-        if not _is_flat(target):
-            return np.ones(len(block.point_idx), dtype=np.bool_)
-        sight = self.points_in_frame(target.target_id, block.epoch_id)[block.point_idx] - camera_in_target.translation()
-        cosine = sight[:, 2] / np.linalg.norm(sight, axis=1)
-        if target.target_id in seeing.two_sided:
-            cosine = np.abs(cosine)
-        return np.asarray(cosine >= np.cos(seeing.widest_incidence))
 
     def angles(self, reading: TableReading) -> FloatArray:
         """Angles (k,) rad of a table at an epoch."""
@@ -181,6 +172,16 @@ def grows_outwards(camera: Camera, lens: FloatArray, q: FloatArray) -> BoolArray
 def _inside(size: tuple[int, int], uv: FloatArray, margin: float) -> BoolArray:
     with np.errstate(invalid="ignore"):
         return np.asarray(np.all((uv >= margin) & (uv <= np.array(size) - 1.0 - margin), axis=1))
+
+
+def _facing(target: Target, q: FloatArray, z: FloatArray, seeing: Seeing) -> BoolArray:
+    """Which of the points q (n, 3) m of a target, whose third axis is z (3,), both in the camera, it shows to it."""
+    if not _is_flat(target):
+        return np.ones(len(q), dtype=np.bool_)
+    cosine = q @ z / np.linalg.norm(q, axis=1)
+    if target.target_id in seeing.two_sided:
+        cosine = np.abs(cosine)
+    return np.asarray(cosine >= np.cos(seeing.widest_incidence))
 
 
 def _is_flat(target: Target) -> bool:

@@ -20,7 +20,7 @@ from adjust.graph.elimination import EXACT
 from adjust.graph.pair_normals import PairLinear
 from adjust.graph.rank import unobserved_unknowns
 from adjust.graph.system import System
-from adjust.model.errors import IndeterminateError, NotConvergedError
+from adjust.model.errors import GivenUpError, IndeterminateError, NotConvergedError
 
 _SIGMA_ROUNDS, _SIGMA_CHANGE = 3, 1e-6
 """Sigmas that depend on distances (target centring) follow the solution until they change by no more than this."""
@@ -34,6 +34,8 @@ _WORTH_QR = 0.1
 """Of the share that the weakest motion may lose: what it hardly moves may lose more, and GTSAM's QR takes but twice the
 time of its Cholesky."""
 _STATIONARY = 1e-2  # sigmas that a step moves at most where the rank of the system is judged
+_MANY = 40
+"""Steps that a right survey takes at most from closed forms on, nearly always."""
 _CLOSE = (1.0, 0.25), (10.0, 0.1)
 """Sigmas that a step moves at most, and its share of the one before, where one factor of pairs serves the next step.
 
@@ -52,7 +54,8 @@ class SolveOptions:
     Lemarechal, Pedersen and Powell 1982; Nocedal and Wright 2006, section 15.6). determined: what the observations
     determine was judged before; where GTSAM's Cholesky refuses, QR solves. settled: share of chi-square that two steps
     one after the other have to gain for the search to go on: of a survey that is only compared with others.
-    covariances: whether they are wanted; the tree of nothing but pairs may else be that of a step before.
+    covariances: whether they are wanted; the tree of nothing but pairs may else be that of a step before. hopeless:
+    chi-square above which the search is given up once it has taken many steps.
     """
 
     max_step: float = 1e-6
@@ -62,6 +65,7 @@ class SolveOptions:
     determined: bool = False
     settled: float = 0.0
     covariances: bool = True
+    hopeless: float = np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,6 +151,8 @@ class _Loop(System):
                 if isinstance(self.linear, PairLinear) or not self._turned_to_rows(solved.lost):
                     return solved
                 continue
+            if iteration >= _MANY and self.omega > self.options.hopeless:
+                raise self._stuck(iteration, GivenUpError)
             if self.idle > 1:
                 break
             self._relax(gain)
@@ -248,7 +254,7 @@ class _Loop(System):
             if self._prepared_here():
                 return
 
-    def _stuck(self, iteration: int) -> NotConvergedError:
+    def _stuck(self, iteration: int, kind: type[NotConvergedError] = NotConvergedError) -> NotConvergedError:
         blocks = sorted({f"{camera} at {epoch}" for camera, epoch, _ in self.behind})
         what = f"; points behind the camera in {', '.join(blocks[:5])}" if blocks else ""
         head = (
@@ -259,7 +265,7 @@ class _Loop(System):
             return NotConvergedError(head)
         said = [head, *describe_divergence(self.graph, self.start, self.at.values)]
         stopped = stopped_at(self.graph, self.start, self.at.values, iteration, self.omega, float(self.moved))
-        return NotConvergedError("\n  - ".join(said), stopped)
+        return kind("\n  - ".join(said), stopped)
 
     def _finish(self, iteration: int) -> Solved:
         if self.behind:

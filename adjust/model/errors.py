@@ -33,6 +33,10 @@ class NotConvergedError(SurveyError):
         self.stopped = stopped
 
 
+class GivenUpError(NotConvergedError):
+    """After many steps the observations still miss by more than was worth going on for: see ``SolveOptions``."""
+
+
 class Explanation(Protocol):
     """What explains that a survey does not fit: see :class:`adjust.diagnosis.diagnosis.Diagnosis`."""
 

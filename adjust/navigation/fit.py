@@ -85,9 +85,9 @@ class PoseFit:
 
 
 def local(a: FloatArray, b: FloatArray) -> FloatArray:
-    """The step (6,) with ``b = a * (Exp(step[:3]), step[3:])``: rotation and translation are stepped apart."""
+    """The step (..., 6) with ``b = a * (Exp(step[:3]), step[3:])``: rotation and translation are stepped apart."""
     step = inverse(a) @ b
-    return np.concatenate([rotation_log(step[:3, :3]), step[:3, 3]])
+    return np.concatenate([rotation_log(step[..., :3, :3]), step[..., :3, 3]], axis=-1)
 
 
 def local_derivative(step: FloatArray) -> FloatArray:

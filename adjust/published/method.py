@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from gtsam import Pose3, Rot3
@@ -98,31 +99,52 @@ class Calibration:
         return Pose3(Rot3(self.rotations[rotation].matrix), self.vectors[vector].value_mm / 1e3)
 
 
+@dataclass(frozen=True, eq=False)
+class _Table:
+    """What the main camera tells: C_tw (3, 3), the table's place (3,) and the body's height over it in m, by name."""
+
+    C_tw: FloatArray
+    r_wt: FloatArray
+    height: float
+    rotations: Mapping[str, PaperRotation]
+    vectors: Mapping[str, PaperVector]
+
+
 def calibrate(given: CpcInput) -> Calibration:
     """Equations A10 to A18 in the paper's order. Raises SurveyError naming what the images do not determine."""
-    main = given.main
+    table = _table(given.main, given.b_z_m, given.b_z_sigma_m)
+    rotations, vectors = dict(table.rotations), dict(table.vectors)
+    for images in given.others:
+        k = images.camera_id.lower()
+        rotations[f"C_{k}^b"], vectors[f"r_b{k}^b"] = _camera(table, images)
+    return Calibration(rotations, vectors, (given.main.camera_id, *(i.camera_id for i in given.others)))
+
+
+@lru_cache(maxsize=4)  # derivatives change one thing at a time
+def _table(main: TableImages, b_z: float, b_z_sigma: float) -> _Table:
     angles = table_and_main_camera(main)
     C_tw, C_zb = matrix_from_euler(angles.values[:3], "213"), matrix_from_euler(angles.values[3:], "213")
     lateral = lateral_offset(C_tw, main)
-    origin = body_origin(C_tw, main, lateral.values, given.b_z_m)
+    origin = body_origin(C_tw, main, lateral.values, b_z)
     r_bz = np.append(lateral.values, origin.values[2])
     table = table_origin(C_tw, main, r_bz)
-    z = main.camera_id.lower()
+    z, nan = main.camera_id.lower(), np.full(2, np.nan)
     rotations = {"C_t^w": _rotation(C_tw, angles.sigmas[:3]), f"C_{z}^b": _rotation(C_zb, angles.sigmas[3:])}
-    caliper, nan = [given.b_z_sigma_m], np.full(2, np.nan)
     vectors = {
-        "r_wb^w": _vector(np.append(origin.values[:2], given.b_z_m), np.append(origin.sigmas[:2], caliper)),
+        "r_wb^w": _vector(np.append(origin.values[:2], b_z), np.append(origin.sigmas[:2], b_z_sigma)),
         "r_wt^w": _vector(table.values[:3], table.sigmas[:3]),
         "r_tb^b": _vector(np.array([0.0, 0.0, table.values[3]]), np.append(nan, table.sigmas[3])),
         f"r_b{z}^b": _vector(r_bz, np.append(lateral.sigmas, origin.sigmas[2])),
     }
-    for images in given.others:
-        k = images.camera_id.lower()
-        rotation = camera_rotation(C_tw, images)
-        position = camera_position(C_tw, table.values[:3], float(table.values[3]), images)
-        rotations[f"C_{k}^b"] = _rotation(rotation.values.reshape(3, 3), rotation.sigmas)
-        vectors[f"r_b{k}^b"] = _vector(position.values, position.sigmas)
-    return Calibration(rotations, vectors, (main.camera_id, *(i.camera_id for i in given.others)))
+    return _Table(C_tw, table.values[:3], float(table.values[3]), rotations, vectors)
+
+
+@lru_cache(maxsize=16)
+def _camera(table: _Table, images: TableImages) -> tuple[PaperRotation, PaperVector]:
+    """Of another camera."""
+    rotation = camera_rotation(table.C_tw, images)
+    position = camera_position(table.C_tw, table.r_wt, table.height, images)
+    return _rotation(rotation.values.reshape(3, 3), rotation.sigmas), _vector(position.values, position.sigmas)
 
 
 def difference(a: Calibration, b: Calibration) -> tuple[tuple[tuple[str, str], ...], FloatArray]:

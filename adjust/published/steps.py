@@ -7,10 +7,11 @@ Rotations of small angles (a, b, c) are ``[[1, c, -b], [-c, 1, a], [b, -a, 1]]``
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from adjust.frames.tables import table_motions
+from adjust.frames.tables import turns
 from adjust.model.errors import SurveyError
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.spatial.rigid import nearest_rotation, rotation_log
@@ -52,9 +53,10 @@ class TableImages:
         """Positions ``r_wk^w`` (n, 3) m."""
         return self.world_from_camera[:, :3, 3]
 
+    @cached_property
     def turned(self) -> FloatArray:
         """``C_b'^b`` (n, 3, 3): how the table has turned the body (A5)."""
-        return table_motions(("x", "z"), {}, self.angles)[0]
+        return turns(0, self.angles[:, 0]) @ turns(2, self.angles[:, 1])
 
     def about_main(self) -> BoolArray:
         """Which images (n,) were taken with the main axis alone turned, or none."""
@@ -121,7 +123,7 @@ def camera_rotation(world_from_table: FloatArray, images: TableImages) -> Fit:
 
     values: (9,), the matrix row by row. cov: (3, 3) rad^2, about the camera's axes, from the scatter of the images.
     """
-    each = np.swapaxes(world_from_table @ images.turned(), -1, -2) @ images.R
+    each = np.swapaxes(world_from_table @ images.turned, -1, -2) @ images.R
     mean = nearest_rotation(each.sum(axis=0))
     return Fit(mean.ravel(), _scatter(rotation_log(mean.T @ each)))
 
@@ -132,7 +134,7 @@ def lateral_offset(world_from_table: FloatArray, images: TableImages) -> Fit:
     All differences between images weigh as much as the deviations from their mean, which are independent; hence those.
     """
     main = images.about_main()
-    C = (world_from_table @ images.turned()[main])[:, :, :2]
+    C = (world_from_table @ images.turned[main])[:, :, :2]
     A, y = C - C.mean(axis=0), images.r[main] - images.r[main].mean(axis=0)
     advice = f"camera {images.camera_id} needs images with the main axis turned to different angles"
     return fit(A.reshape(-1, 2), y.ravel(), ("z_x", "z_y"), advice, taken=3)
@@ -141,7 +143,7 @@ def lateral_offset(world_from_table: FloatArray, images: TableImages) -> Fit:
 def body_origin(world_from_table: FloatArray, images: TableImages, lateral: FloatArray, b_z: float) -> Fit:
     """``b_x, b_y`` of ``r_wb^w`` and ``z_z`` of ``r_bz^b``, equation A14, with ``b_z`` measured by caliper; m."""
     main = images.about_main()
-    C = world_from_table @ images.turned()[main]
+    C = world_from_table @ images.turned[main]
     y = images.r[main] - C[:, :, :2] @ lateral - (0.0, 0.0, b_z)
     A = np.zeros((len(C), 3, 3))
     A[:, 0, 0] = A[:, 1, 1] = 1.0
@@ -154,7 +156,7 @@ def table_origin(world_from_table: FloatArray, images: TableImages, r_bz: FloatA
 
     The body's origin is on the main axis by definition, or A14 would not hold; h shows when the auxiliary axis turns.
     """
-    C = world_from_table @ images.turned()
+    C = world_from_table @ images.turned
     A = np.zeros((len(C), 3, 4))
     A[:, :, :3], A[:, :, 3] = np.eye(3), C[:, :, 2]
     advice = f"camera {images.camera_id} needs images with the auxiliary axis turned to different angles"
@@ -163,7 +165,7 @@ def table_origin(world_from_table: FloatArray, images: TableImages, r_bz: FloatA
 
 def camera_position(world_from_table: FloatArray, r_wt: FloatArray, height: float, images: TableImages) -> Fit:
     """``r_bk^b`` of another camera, equations A17 and A18: the mean of its images; m."""
-    each = np.einsum("nji,nj->ni", world_from_table @ images.turned(), images.r - r_wt) - (0.0, 0.0, height)
+    each = np.einsum("nji,nj->ni", world_from_table @ images.turned, images.r - r_wt) - (0.0, 0.0, height)
     return Fit(each.mean(axis=0), _scatter(each - each.mean(axis=0)))
 
 

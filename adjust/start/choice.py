@@ -7,7 +7,7 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.graph.assembly import StartValues, values_of
-from adjust.model.errors import SurveyError, listed
+from adjust.model.errors import GivenUpError, NotConvergedError, SurveyError, listed
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 from adjust.start.given import GivenStarts, given_starts, without_starts
@@ -52,7 +52,8 @@ def _that_leads(
     """``run(find(survey))``; where that fails or fits badly, from starts found without the values given for them.
 
     find: start values of a survey; the given ones tell where a free datum belongs. Of several solutions that do not fit
-    the best is taken; a start other than the given one is told in the warnings. Raises what the first one raised.
+    the best is taken; a start other than the given one is told in the warnings. Raises what the first one raised,
+    where that did not converge what was given up.
     """
     given = given_starts(survey)
     first: SurveyError | None = None
@@ -64,7 +65,8 @@ def _that_leads(
         try:
             result = run(begun)
         except SurveyError as error:
-            first = error if number == 0 or first is None else first
+            given_up = isinstance(error, GivenUpError) and type(first) is NotConvergedError
+            first = error if number == 0 or first is None or given_up else first
             continue
         # a start that was put off, since the images did not fit it well, is mentioned where it was wrong indeed
         if number > 0 and (first is not None or best is not None or _turned_away(given, result)):

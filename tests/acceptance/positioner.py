@@ -114,9 +114,10 @@ def weights_from_residuals(
     Iterated until a sigma changes by less than one in ten thousand; the joints keep the sigma given, for a turn of the
     joints looks much like one of the target. Foerstner (1979): ``sigma^2 *= v'Pv / r`` of each group.
     """
-    weights = start
+    weights, begin = start, None
     for _ in range(_MOST_ROUNDS):
-        result = adjust(positioner_survey(joints, sensor_from_target, weights, perfect_axes))
+        result = adjust(positioner_survey(joints, sensor_from_target, weights, perfect_axes), begin)
+        begin = values_of(result)
         rotation, position = (_factor(_pairs(result), part) for part in (slice(0, 3), slice(3, 6)))
         if abs(rotation - 1.0) < _SETTLED and abs(position - 1.0) < _SETTLED:
             return result, weights

@@ -263,6 +263,25 @@ def test_mean_pose_ignores_a_minority_and_picks_among_alternatives():
     assert pose_distance(mean, truth, 1.0) < 2e-3
 
 
+@pytest.mark.parametrize("spread", [1e-3, 0.3])
+@pytest.mark.parametrize("n", [1, 2, 9, 30])
+def test_mean_pose_is_where_its_own_weights_leave_it(n, spread):
+    """Once more in plain lines, with SciPy's rotation nearest to the weighted sum; as near as its steps settle."""
+    rng, lever = np.random.default_rng(n), 1.3
+    truth = motion(rng)
+    poses = np.array([truth @ motion(rng, spread, spread) for _ in range(n)])
+    mean, _ = mean_pose(poses, lever)
+    turns = Rotation.from_matrix(poses[:, :3, :3])
+    away = np.hypot(np.linalg.norm(poses[:, :3, 3] - mean[:3, 3], axis=1),
+                    lever * (turns * Rotation.from_matrix(mean[:3, :3]).inv()).magnitude())  # fmt: skip
+    scale = max(3.0 * np.median(away), 1e-12)
+    weights = 1.0 / (1.0 + (away / scale) ** 2) ** 2
+    again = np.linalg.norm(weights @ poses[:, :3, 3] / weights.sum() - mean[:3, 3])
+    assert again <= 1e-3 * scale
+    left = turns.mean(weights) * Rotation.from_matrix(mean[:3, :3]).inv()
+    assert lever * left.magnitude() <= 1e-3 * scale + 1e-14
+
+
 def test_zhang_does_not_take_one_view_seen_three_times_for_three():
     one = seen_homographies(np.random.default_rng(7), 1, tilt=0.6, noise=0.05)
     assert pinhole_from_homographies(np.repeat(one, 3, axis=0), SIZE).variant != "full"

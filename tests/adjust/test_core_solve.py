@@ -9,21 +9,39 @@ import pytest
 from gtsam import Pose3, Rot3
 
 from adjust.graph.solver import SolveOptions, solve
-from adjust.model.errors import NotConvergedError, SurveyError
+from adjust.model.errors import GivenUpError, NotConvergedError, SurveyError
 from adjust.model.observations import Distance, PositionRef
 from adjust.model.survey import PoseParameter
 from survey.simulate import head_on_table, single_camera, stereo
 from tests.adjust import helpers as h
 
 
-def test_nonsense_does_not_converge() -> None:
-    """Image points that have nothing to do with the board, and a few steps only."""
+def nonsense() -> h.AdjustmentGraph:
+    """Image points that have nothing to do with the board."""
     survey, truth = single_camera(1, n_images=4)
     rng = np.random.default_rng(1)
     blocks = tuple(replace(b, uv=rng.uniform(0, 1000, b.uv.shape)) for b in survey.image_blocks)
-    graph = h.build(replace(survey, image_blocks=blocks), h.start_at(truth))
+    return h.build(replace(survey, image_blocks=blocks), h.start_at(truth))
+
+
+def test_nonsense_does_not_converge() -> None:
     with pytest.raises(NotConvergedError, match=r"did not converge in \d+ steps.*sigma"):
-        solve(graph, SolveOptions(max_iterations=8))
+        solve(nonsense(), SolveOptions(max_iterations=8))
+
+
+def test_what_is_hopeless_after_many_steps_is_given_up() -> None:
+    """Where it is now decides: as soon as it is better than that, all steps are taken."""
+    went: list[tuple[int, float]] = []
+    with pytest.raises(NotConvergedError) as caught:
+        solve(nonsense(), SolveOptions(), lambda *now: went.append(now))
+    steps, there = max(i for i, _ in went), next(omega for i, omega in went if i >= 40)
+    assert steps > 60
+    assert type(caught.value) is NotConvergedError
+    with pytest.raises(GivenUpError, match=r"did not converge in 4\d steps"):
+        solve(nonsense(), SolveOptions(hopeless=0.99 * there))
+    with pytest.raises(NotConvergedError) as caught:
+        solve(nonsense(), SolveOptions(hopeless=1.01 * there))
+    assert type(caught.value) is NotConvergedError
 
 
 def test_a_start_behind_the_camera_never_converges_there() -> None:

@@ -102,7 +102,7 @@ def test_our_frames():
     found = calibrate(given(truth))
     assert found.camera_ids == ("Z", "X", "Y")
     expected = given(truth).others[0]
-    body = found.world_from_table * Pose3(Rot3(expected.turned()[0]), np.zeros(3)) * found.mount_from_station
+    body = found.world_from_table * Pose3(Rot3(expected.turned[0]), np.zeros(3)) * found.mount_from_station
     camera = body * found.station_from_camera("X")
     np.testing.assert_allclose(camera.matrix(), expected.world_from_camera[0], atol=2e-6)
     np.testing.assert_allclose(

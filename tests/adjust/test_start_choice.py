@@ -8,7 +8,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.adjustment import adjust
 from adjust.graph.assembly import StartValues
-from adjust.model.errors import NotConvergedError, SurveyError
+from adjust.model.errors import GivenUpError, NotConvergedError, SurveyError
 from adjust.model.observations import Distance, PositionRef
 from adjust.model.result import Adjustment
 from adjust.model.survey import Datum, FloatArray, Point, PointParameter, PoseParameter, Survey
@@ -160,6 +160,25 @@ def test_the_first_failure_is_the_one_that_is_raised() -> None:
     with pytest.raises(SurveyError, match="failure 1"):
         adjusted_from_own_start(survey, find, run)
     assert tried == [0, 3]
+
+
+@pytest.mark.parametrize(("kinds", "raised"), [
+    ((NotConvergedError, GivenUpError), 1), ((GivenUpError, GivenUpError), 0), ((SurveyError, GivenUpError), 0),
+])  # fmt: skip
+def test_a_start_that_was_given_up_is_told_before_one_that_did_not_converge(
+    kinds: tuple[type[SurveyError], ...], raised: int
+) -> None:
+    """Who gives up early has to know, and to go on; what fails for another reason fails anyway."""
+    survey = trilateration(TOPS, {n: x + 0.2 for n, x in TOPS.items()})
+    errors = [kind(f"failure {i}") for i, kind in enumerate(kinds)]
+    left = iter(errors)
+
+    def run(_begun: Begun) -> Adjustment:
+        raise next(left)
+
+    with pytest.raises(SurveyError) as caught:
+        adjusted_from_own_start(survey, lambda trial, _: Begun(trial, StartValues({}, {}, {})), run)
+    assert caught.value is errors[raised]
 
 
 def test_held_and_known_values_are_no_start_values() -> None:

@@ -12,9 +12,13 @@ import pytest
 import survey.jobs.adjusting.steps as steps
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.solver import SolveOptions, solve
-from adjust.model.errors import NotConvergedError, SurveyError
+from adjust.model.errors import GivenUpError, NotConvergedError, SurveyError
+from adjust.model.result import Adjustment
 from adjust.model.stopped import Stopped, UnknownState
+from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
 from survey.cli import main
+from survey.jobs.adjusting.probable_causes import adjusted_or_explained
+from survey.project import read
 from survey.project.writing import write_project
 from survey.simulate import stereo
 from tests.acceptance.planted_mistakes import MISTAKES, survey_of
@@ -28,6 +32,24 @@ def stopped() -> tuple[NotConvergedError, gtsam.Values, AdjustmentGraph]:
     with pytest.raises(NotConvergedError) as raised:
         solve(graph, SolveOptions(max_iterations=2))
     return raised.value, graph.start, graph
+
+
+@pytest.mark.usefixtures("undiagnosed")
+def test_what_nothing_explains_is_not_given_up(tmp_path: Path) -> None:
+    """It is gone through once more, to the end."""
+    survey, _ = stereo(1, n_pairs=5)
+    write_project(tmp_path / "lab", survey)
+    hopes: list[float] = []
+
+    def run(how: CleanOptions) -> Adjustment:
+        hopes.append(how.adjust.solve.hopeless)
+        if np.isfinite(hopes[-1]):
+            raise GivenUpError("too far off")
+        return adjust_cleaned(survey, how)
+
+    assert adjusted_or_explained(survey, read(tmp_path / "lab"), CleanOptions(), run).global_test.passed
+    components = sum(2 * b.n_used for b in survey.image_blocks)
+    assert hopes == [1e5 * components, np.inf]
 
 
 def pull_of(graph: AdjustmentGraph, values: gtsam.Values, unknown: UnknownState) -> float:

@@ -1,15 +1,16 @@
 """Why an adjustment failed, or what contradicts in it, where the images can tell. Nothing is repaired."""
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from adjust.model.errors import DiagnosedError, IndeterminateError, NotConvergedError, SurveyError
+from adjust.model.errors import DiagnosedError, GivenUpError, IndeterminateError, NotConvergedError, SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
+from adjust.statistics.screened_adjustment import CleanOptions
 from adjust.testing.criteria import CAUTIOUS
 from adjust.testing.distributions import chi2
 from survey.project import Project
@@ -27,8 +28,29 @@ _PART = 0.8
 """Variance factor of a group below which a part of it may be far smaller."""
 _SEVERAL = 2
 """Observations that were left out from which on they may have one cause."""
+_HOPELESS = 1e5
+"""v'Pv of a component of a survey of images that no start of a right one leaves after many steps: 300 sigmas."""
 NOT_LOOKED_FOR = ("two mistakes at once", "bodies that bend or never rest", "refraction")
 """Told where nothing is named; the documentation says more."""
+
+
+def adjusted_or_explained(
+    survey: Survey, project: Project, how: CleanOptions, run: Callable[[CleanOptions], Adjustment]
+) -> Adjustment:
+    """``run(how)``, as :func:`explaining` has it; of what leads nowhere the causes are asked after a part of the steps.
+
+    Only what nothing explains is gone through to the end.
+    """
+    if survey.image_blocks:
+        components = 2 * sum(b.n_used for b in survey.image_blocks) + survey.n_others_used
+        solve = replace(how.adjust.solve, hopeless=_HOPELESS * components)
+        try:
+            with explaining(survey, project):
+                return run(replace(how, adjust=replace(how.adjust, solve=solve)))
+        except GivenUpError:
+            pass
+    with explaining(survey, project):
+        return run(how)
 
 
 @contextmanager

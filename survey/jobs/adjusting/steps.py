@@ -17,7 +17,7 @@ from adjust.observations.copies import copied_observations
 from adjust.statistics.outliers.supported import lost_notes, supported, without_lost_points
 from adjust.statistics.screened_adjustment import CleanOptions
 from survey.jobs.adjusting.astray import cleaned
-from survey.jobs.adjusting.probable_causes import explaining, with_probable_causes
+from survey.jobs.adjusting.probable_causes import adjusted_or_explained, explaining, with_probable_causes
 from survey.jobs.adjusting.symmetric_boards import consistent_turns
 from survey.jobs.detecting.image_defects import blurred, defect_warnings
 from survey.jobs.identify import identified, identify_spots, without_points
@@ -119,10 +119,11 @@ def _unobserved_left_out(work: Work) -> Work:
 
 def _adjusted(work: Work) -> Work:
     """Least squares without gross errors, with variance components where they are asked for."""
-    how = _options(work.project)
-    with explaining(work.survey, work.project):
-        result = without_lost_points(work.survey, lambda part: cleaned(part, how, work.progress, work.begin(part)))
-    return replace(work, adjustment=result)
+
+    def run(how: CleanOptions) -> Adjustment:
+        return without_lost_points(work.survey, lambda part: cleaned(part, how, work.progress, work.begin(part)))
+
+    return replace(work, adjustment=adjusted_or_explained(work.survey, work.project, _options(work.project), run))
 
 
 def _causes_named(work: Work) -> Work:
