@@ -19,7 +19,6 @@ from adjust.model.errors import SurveyError
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.observations.terrestrial import equations as k
 from adjust.observations.terrestrial.batch import TerrestrialBatch
-from adjust.observations.terrestrial.building import reading_refs
 from adjust.observations.terrestrial.layout import ReadingArrays
 from adjust.precision.precision import adjusted_motion, residual_of
 from adjust.spatial.averaging import circular_median, circular_medians
@@ -133,7 +132,7 @@ class Screen(Fit):
         None where there is no start. All are predicted together, as far as they are between points of the world.
         """
         batch, own = self.graph.terrestrial, self.graph.survey
-        refs = reading_refs(own)
+        refs = own.reading_refs
         others_move = bool(self.graph.others) and any(s.points is not own.points for s in surveys)
         poses = any(u.kind == "pose" for u in self.graph.unknowns.by_key.values())
         if batch is None or others_move or poses or own.image_blocks or any(r.frame is not None for r in refs):
