@@ -158,20 +158,21 @@ def _criteria(near: _Near, limits: FloatArray) -> tuple[IntArray, FloatArray]:
     R = np.block([[near.R, corner[:-1]], [corner.T]])[None]
     for i, (k, limit) in enumerate(zip(map(len, near.at), limits.tolist(), strict=True)):
         fine = _positive(R[:, :k, :k] - CONTROLLED * np.eye(k))
-        across, behind = R[fine, :k, k:], R[:, k:, k:]
-        less = across.transpose(0, 2, 1) @ np.linalg.solve(R[fine, :k, :k], across)
+        out, behind = R if fine.all() else R[fine], R[:, k:, k:]
+        own, across, back = out[:, :k, :k], out[:, :k, k:], out[:, k:, :k]
+        less = back @ np.linalg.solve(own, across) if k > 1 else back * (across / own)
         sets, J = np.concatenate([sets, sets[fine] + 2**i]), np.concatenate([J, J[fine] + limit])
-        R = np.concatenate([behind, behind[fine] - less])
+        R = np.concatenate([behind, out[:, k:, k:] - less])
     return sets, J + R[:, 0, 0]
 
 
 def _positive(M: FloatArray) -> BoolArray:
     """Which of symmetric matrices (s, k, k) are positive definite: all pivots of their elimination are positive."""
     fine = np.ones(len(M), dtype=np.bool_)
-    for i in range(M.shape[1]):
-        pivot = M[:, i, i]
-        fine &= pivot > 0.0
-        M = M - M[:, :, i, None] * (M[:, i] / np.where(pivot > 0.0, pivot, 1.0)[:, None])[:, None]
+    while M.shape[1]:
+        pivot = M[:, :1, :1]
+        fine &= pivot[:, 0, 0] > 0.0
+        M = M[:, 1:, 1:] - M[:, 1:, :1] * (M[:, :1, 1:] / np.where(pivot > 0.0, pivot, 1.0))
     return fine
 
 
