@@ -160,9 +160,9 @@ def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candi
     its trial has freed where a simpler change is told, at a level shared by all hypotheses that were looked at (Sidak).
     Compared with each other by v'Pv plus p ln n (Schwarz 1978), with variances of each group as they suit each best:
     else wrong sigmas would explain all that a cause leaves. A cause explains the misfit if half of it goes, or if what
-    is left is noise; it leaves no more observations out than before, and none where nothing was adjusted before, save
-    as few as noise hides. It is not named where another one, though it explains less than that, is a hundred times as
-    likely.
+    is left is noise, and was not before; it leaves no more observations out than before, and none where nothing was
+    adjusted before, save as few as noise hides. It is not named where another one, though it explains less than that,
+    is a hundred times as likely.
     """
     good = [t for t in trials if t.result is not None]
     if not good:
@@ -176,7 +176,8 @@ def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candi
         critical = float(chi2.isf(sidak(_ALPHA, number), freed))
         statistic = (base.omega - _cost(trial)) / scale
         share = (base.omega - _cost(trial)) / max(base.excess, 1e-9)
-        enough = share > _EXPLAINED or (trial.misfit.is_noise(_NOISE) and not trial.hypothesis.penalty)
+        all_noise = trial.misfit.is_noise(_NOISE) and not (base.is_diluted or trial.hypothesis.penalty)
+        enough = share > _EXPLAINED or all_noise
         most = base.unused if base.redundancy else 0  # where nothing was adjusted, any part that is explains much
         whole = trial.misfit.unused <= most or trial.misfit.is_noise(_NOISE)
         if statistic > critical and enough and whole and probability > _LIKELY:

@@ -11,8 +11,9 @@ from adjust.model.errors import SurveyError
 from adjust.model.names import numbered
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
+from adjust.testing.criteria import CLEARLY, contradicting, is_noise
 
-_NOISE, _CLEARLY = 5.0, 3.0
+_NOISE = 5.0
 """Sigmas of v'Pv up to which what is left is noise."""
 _SETTLED = 1.0
 """The same up to which a size that was found in a hurry is good enough."""
@@ -28,7 +29,8 @@ class Misfit:
     unused: components that take no part, or cannot be predicted. count: of all components. redundancy: of the
     adjustment, 0 where there is none. dropped: components that it does without. fitted: as omega, but with variances
     of each group multiplied by what suits them best, whose logarithms count: so causes are compared that explain most,
-    yet leave more than noise.
+    yet leave more than noise. contradicting: square sum and redundancy of all, or where these are noise, of the groups
+    that are not.
     """
 
     omega: float
@@ -37,6 +39,7 @@ class Misfit:
     redundancy: int
     dropped: int = 0
     fitted: float = np.inf
+    contradicting: tuple[float, float] = (0.0, 0.0)
 
     @property
     def cost(self) -> float:
@@ -45,18 +48,24 @@ class Misfit:
 
     def is_noise(self, sigmas: float = _NOISE) -> bool:
         """Whether what is left is within so many of its own sigmas of what is expected (chi-square)."""
-        r = max(self.redundancy, 1)
-        return self.omega < r + sigmas * float(np.sqrt(2.0 * r))
+        return is_noise(self.omega, self.redundancy, sigmas)
+
+    @property
+    def is_diluted(self) -> bool:
+        """Whether all together is noise, though some groups are not."""
+        return self.contradicting[0] < self.omega
 
     @property
     def excess(self) -> float:
-        """By how much the misfit is larger than noise makes it."""
-        return max(0.0, self.omega - self.redundancy)
+        """By how much what contradicts is larger than noise makes it."""
+        omega, redundancy = self.contradicting
+        return max(0.0, omega - redundancy)
 
     def times_less_than(self, other: "Misfit") -> float:
         """How many times less than another one it exceeds noise; noise itself is some of it."""
         noise = float(np.sqrt(2.0 * max(self.redundancy, 1)))
-        return (other.excess + noise) / (self.excess + noise)
+        beyond, left = (max(0.0, m.omega - m.redundancy) for m in (other, self))
+        return (beyond + noise) / (left + noise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,10 +86,11 @@ class Trial:
 
         Less what it pays for that: larger sigmas, or smaller numbers, could take away any.
         """
-        if base.is_noise(_CLEARLY):
+        if self.result is None or self.misfit.unused or (base.is_noise(CLEARLY) and not base.is_diluted):
             return False
+        others = base.omega - base.redundancy - base.excess
         left = self.misfit.cost + max(self.hypothesis.penalty, 0.0) - self.misfit.redundancy
-        return self.result is not None and self.misfit.unused == 0 and left <= (1.0 - share) * base.excess
+        return left <= others + (1.0 - share) * base.excess
 
     def explains_all_but(self, share: float, base: Misfit) -> bool:
         """The same, though all that it does without may have contradicted; save copies, which are no observations."""
@@ -114,7 +124,8 @@ def tried_afresh(trial: Trial, case: Case, base: Misfit) -> Trial | None:
     From these values, where its own start was the first. None where that is no better, and of what is scored at these
     values. base: what the case leaves unexplained.
     """
-    near = trial.misfit.omega < base.omega and (case.is_near or trial.hypothesis.of_variances)
+    near = trial.misfit.omega < base.omega and case.is_near
+    near |= trial.hypothesis.of_variances and (trial.result is not None or case.is_near)
     if trial.result is not None and case.is_near and case.linear is not None:  # a minimum, if not a better one
         near |= trial.result.omega <= case.linear.result.omega
     if trial.survey is None or case.starts_afresh or near or trial.hypothesis.scored:
@@ -143,7 +154,8 @@ def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:
     points = 2 * sum(b.n_used for b in survey.image_blocks)
     n_others = n_other_components(survey)
     if result is None:
-        return Misfit(CAP * (points + n_others), points + n_others, points + n_others, 0)
+        omega = CAP * (points + n_others)
+        return Misfit(omega, points + n_others, points + n_others, 0, contradicting=(omega, 0.0))
     arrays, out, single = result.other_arrays, _left_out(survey), result.single_residuals
     readings = () if result.reading_residuals is None else result.survey.readings
     ids: list[tuple[str, ...]] = [*(o.ids for o in single), *((r.reading_id,) for r in readings)]
@@ -160,7 +172,11 @@ def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:
     every = [np.concatenate(of) for of in groups.values()]
     omega = float(sum(np.minimum(s, CAP).sum() for s in every)) + CAP * gone
     fitted = sum(_at_best_scale(s) for s in every) + CAP * gone
-    return Misfit(omega, unused, points + max(n_adjusted, n_others), result.redundancy, fitted=fitted)
+    unknowns = {g.group: g.n_observations - g.redundancy for g in result.groups}  # by its share of the redundancy
+    sums = ((float(np.minimum(s, CAP).sum()), len(s), unknowns.get(n, 0.0)) for n, s in zip(groups, every, strict=True))
+    parts = [(total, max(0.0, n - taken)) for total, n, taken in sums]
+    return Misfit(omega, unused, points + max(n_adjusted, n_others), result.redundancy, fitted=fitted,
+                  contradicting=contradicting((omega, result.redundancy), parts))  # fmt: skip
 
 
 def _squares_of_others(result: Adjustment) -> FloatArray:

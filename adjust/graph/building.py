@@ -12,7 +12,7 @@ from adjust.frames.state import State, collect_vectors
 from adjust.frames.tree import FrameTree
 from adjust.frames.unknowns import Chain, Unknowns
 from adjust.graph.assembly import AdjustmentGraph, StartValues
-from adjust.graph.singles import Singles
+from adjust.graph.singles import Singles, beside_images
 from adjust.model.boards import deformation, warming_of
 from adjust.model.clocks import EpochTimes
 from adjust.model.errors import SurveyError
@@ -104,9 +104,7 @@ class GraphBuilder:
         singles.items += geometry.factors(state, at, values)
         singles.add_priors(self.terrestrial.priors)
         # unused observations too: they are predicted with the joint covariance of their unknowns
-        outside = {k for item in singles.items for k in list(item.factor.keys())} | set(self.unknowns.held)
-        outside |= set() if pairs is None else pairs.keys()
-        outside |= readings.keys if readings is not None else set()
+        outside = beside_images(self.unknowns, singles.items, pairs, readings)
         number, images, part_of, bundles = self._image_batches(state, seen, outside)
         for bundle in bundles:
             outside |= set(bundle.order) | set(bundle.point_key.values())

@@ -1,6 +1,7 @@
 """Observations that are in no batch, and what holds single components: each has a factor of its own."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
@@ -28,6 +29,10 @@ from adjust.observations.factors import (
     step_factor,
     vector_prior_factor,
 )
+
+if TYPE_CHECKING:
+    from adjust.observations.pairs import PairBatch
+    from adjust.observations.terrestrial.batch import TerrestrialBatch
 
 
 class Singles:
@@ -139,3 +144,13 @@ class Singles:
                 raise SurveyError(f"{' '.join(unknown.name)}: {names} held without a value; give it one")
             graph.add(hold_factor(unknown, held, value))
         return graph
+
+
+def beside_images(
+    unknowns: Unknowns, singles: Iterable[ObservationFactor], pairs: "PairBatch | None",
+    readings: "TerrestrialBatch | None",
+) -> set[int]:  # fmt: skip
+    """The unknowns that anything but image points touches, used or not, or that are held in part."""
+    keys = {k for item in singles for k in list(item.factor.keys())} | set(unknowns.held)
+    keys |= set() if pairs is None else pairs.keys()
+    return keys | (set() if readings is None else readings.keys)

@@ -65,10 +65,9 @@ def only_between(survey: Survey, keep: Callable[[PositionRef], bool]) -> Survey:
     return replace(survey, vertical=vertical, reading_covariances=some, **kept)
 
 
-def only_rows(survey: Survey, field: str, rows: Iterable[int]) -> Survey:
-    """These observations of a field and no others, independent of each other."""
-    observed = getattr(survey, field)
-    alone: Fields = {**dict.fromkeys(survey.others, ()), field: tuple(observed[i] for i in rows)}
+def with_only(survey: Survey, field: str, observed: Iterable[Observation]) -> Survey:
+    """The survey with these observations in a field and no others, independent of each other."""
+    alone: Fields = {**dict.fromkeys(survey.others, ()), field: tuple(observed)}
     return replace(survey, image_blocks=(), reading_covariances=(), **alone)
 
 

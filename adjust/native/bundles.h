@@ -291,21 +291,36 @@ template <class F> inline void by_columns(int64_t m, F f) {
     for (; c < m; ++c) f(c, 0.0);
 }
 
+// Of one point N vectors of columns from c on: so many sums are under way at a time.
+template <class S, int N>
+inline void follow(const Bundle &b, int64_t j, In<double, 3> Vi, In<double, 3> weights, In<double, 3> WL, In<double, 3> h, In<double, 2> d,
+                   Out<double, 3> dX, int64_t c) {
+    constexpr int64_t lanes = sizeof(S) / sizeof(double);
+    S s[3][N];
+    for (int a = 0; a < 3; ++a)
+        for (int i = 0; i < N; ++i) s[a][i] = loaded<S>(&h(j, a, c + lanes * i));
+    through_point(b, j, weights, WL, [&](const double *w, int64_t ld, int64_t at, int64_t n) {
+        for (int64_t q = 0; q < n; ++q)
+            for (int i = 0; i < N; ++i) {
+                const S x = loaded<S>(&d(at + q, c + lanes * i));
+                for (int a = 0; a < 3; ++a) s[a][i] += w[ld * a + q] * x;
+            }
+    });
+    for (int a = 0; a < 3; ++a)
+        for (int i = 0; i < N; ++i)
+            store(&dX(j, a, c + lanes * i), -(Vi(j, a, 0) * s[0][i] + Vi(j, a, 1) * s[1][i] + Vi(j, a, 2) * s[2][i]));
+}
+
 // Steps dX (P, 3, m) of the reduced points from steps d (n_local, m) of the local unknowns; h: their own part.
 inline void back_substitute(const Bundle &b, In<double, 3> Vi, In<double, 3> weights, In<double, 3> WL, In<double, 3> h, In<double, 2> d,
                             Out<double, 3> dX) {
-    for (int64_t j = 0; j < b.points(); ++j)
-        by_columns(d.n[1], [&](int64_t c, auto none) {
-            using S = decltype(none);
-            S s[3] = {loaded<S>(&h(j, 0, c)), loaded<S>(&h(j, 1, c)), loaded<S>(&h(j, 2, c))};
-            through_point(b, j, weights, WL, [&](const double *w, int64_t ld, int64_t at, int64_t n) {
-                for (int64_t q = 0; q < n; ++q) {
-                    const S x = loaded<S>(&d(at + q, c));
-                    for (int a = 0; a < 3; ++a) s[a] += w[ld * a + q] * x;
-                }
-            });
-            for (int a = 0; a < 3; ++a) store(&dX(j, a, c), -(Vi(j, a, 0) * s[0] + Vi(j, a, 1) * s[1] + Vi(j, a, 2) * s[2]));
-        });
+    constexpr int N = 4;
+    for (int64_t j = 0; j < b.points(); ++j) {
+        int64_t c = 0;
+        for (; c + N * W <= d.n[1]; c += N * W) follow<V, N>(b, j, Vi, weights, WL, h, d, dX, c);
+        for (; c + W <= d.n[1]; c += W) follow<V, 1>(b, j, Vi, weights, WL, h, d, dX, c);
+        for (; c < d.n[1]; ++c) follow<double, 1>(b, j, Vi, weights, WL, h, d, dX, c);
+    }
 }
 
 // Subtract W' v from out (n_local, m), for v (P, 3, m): what reduced points carry over to the others.

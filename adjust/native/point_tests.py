@@ -25,7 +25,7 @@ _point_tests = Function(
 _change_squares = Function(
     "change_squares",
     "first[J+1] rows[k] B[k,w] A_ptr[m+1] A_column[a] A_entry[a] e[m] own_ptr[n+1] own_column[o] own_entry[o] U[n,c] "
-    "x[n,w] s[n,w] mark[n] touched[n] left[w,w] shared[w,c] columns[2,w] squares[J,w] M[J,w,w] g[J,w]",
+    "x[n,w] s[n,w] mark[n] touched[n] left[q,w] shared[q,c] columns[2,w] squares[J,q] M[J,q,q] g[J,q]",
 )
 _parallel_pairs = Function("parallel_pairs", "first last end u[N,d] head[h,N+31] rest[N+31] least found[m,3]")
 _HEAD, _BEHIND = 16, 31
@@ -101,10 +101,10 @@ def change_squares(
     padded = np.zeros((k, w))
     padded[:, :q] = B
     later = np.zeros((n, w)), np.zeros((n, w)), np.full(n, -1), np.empty(n, dtype=np.int64)
-    sums = np.zeros((w, w)), np.zeros((w, c)), np.zeros((2, w))
-    out = np.empty((J, w)), np.empty((J, w, w)), np.empty((J, w))
+    sums = np.zeros((q, w)), np.zeros((q, c)), np.zeros((2, w))
+    out = np.empty((J, q)), np.empty((J, q, q)), np.empty((J, q))
     _change_squares(first, rows, padded, *A, e, *own, U, *later, *sums, *out)
-    return out[0][:, :q], out[1][:, :q, :q], out[2][:, :q]
+    return out
 
 
 class UnitVectors:

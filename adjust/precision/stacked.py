@@ -57,13 +57,13 @@ class Stacked:
         """Covariance, as solved, times columns (n, k)."""
         out = np.array(right, order="C")
         tree = out[: self.tree.n]
-        on_poses = [below.on_poses(out[mine]) if out[mine].any() else None for below, mine, _ in self._parts]
-        for (below, _, interface), some in zip(self._parts, on_poses, strict=True):
-            if some is not None:
-                tree[interface] += below.on_interface(some)
+        some = [np.flatnonzero(out[mine].any(axis=0)) for _, mine, _ in self._parts]
+        on_poses = [below.on_poses(out[mine, at]) for (below, mine, _), at in zip(self._parts, some, strict=True)]
+        for (below, _, interface), at, u in zip(self._parts, some, on_poses, strict=True):
+            tree[np.ix_(interface, at)] += below.on_interface(u)
         self.tree.multiply(tree)
-        for (below, mine, interface), some in zip(self._parts, on_poses, strict=True):
-            below.multiply(out[mine], tree[interface], some)
+        for (below, mine, interface), at, u in zip(self._parts, some, on_poses, strict=True):
+            below.multiply(out[mine], tree[interface], at, u)
         return out
 
     def times_in_datum(self, right: FloatArray) -> FloatArray:

@@ -60,16 +60,17 @@ def squares(half: Callable[[sparse.csr_array], Half], A: sparse.csr_array) -> Fl
 
 def squares_of_sums(half: Callable[[sparse.csr_array], Half], A: sparse.csr_array, n: int, q: int) -> FloatArray:
     """A_j Q A_j' (J, q, q) with A_j the sum of the J sets of q rows of A from the j-th on; n: rows of all of U."""
-    out, total, later = np.empty((A.shape[0] // q, q, q)), np.zeros((q, q)), np.zeros((n, q))
+    out, total, later = np.empty((A.shape[0] // q, q, q)), np.zeros((q, q)), np.zeros((q, n))
     some = max(_COLUMNS // q, 1)
     for end in range(len(out), 0, -some):
         first = max(end - some, 0)
         rows, U = half(A[first * q : end * q])
-        own = (U.T @ U).reshape(end - first, q, end - first, q)[::-1, :, ::-1].cumsum(axis=0).cumsum(axis=2)
-        across = (U.T @ later[rows]).reshape(-1, q, q)[::-1].cumsum(axis=0)
-        out[first:end] = (np.einsum("jajb->jab", own) + across + across.transpose(0, 2, 1) + total)[::-1]
-        later[rows] += U.reshape(len(rows), -1, q).sum(axis=1)
-        total = out[first]
+        each = np.ascontiguousarray(U.T).reshape(-1, q, len(rows))
+        sums = np.concatenate([each, later[None, :, rows]])[::-1].cumsum(axis=0)[::-1]
+        # (s + u) (s + u)' - s s' = u (s + u + s)', made symmetric
+        more = each @ (sums[:-1] + sums[1:]).transpose(0, 2, 1)
+        out[first:end] = total + 0.5 * (more + more.transpose(0, 2, 1))[::-1].cumsum(axis=0)[::-1]
+        later[:, rows], total = sums[0], out[first]
     return out
 
 

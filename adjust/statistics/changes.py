@@ -100,12 +100,14 @@ class ChangeSearch:
         if s.structured is not None:
             self.rows, self.own = (SparseRows(x.indptr.astype(np.int64), x.indices.astype(np.int64), x.data)
                                    for x in (self.A, s.structured.own))  # fmt: skip
-            self.shared = np.ascontiguousarray(s.structured.U.T)
+            self.shared = np.zeros((len(s.columns), -(-len(s.structured.U) // 8) * 8))  # whole vectors
+            self.shared[:, : len(s.structured.U)] = s.structured.U.T
         elif columns > _MOST_COLUMNS:
             self.runs = max(self.runs * _MOST_COLUMNS // columns, 2)
             units = list(self._units(self.runs))
-        self.candidates = side_by_side(lambda u: self._candidates(_by_runs(u)), units)
-        self.n_tests = sum(len(c.g) for c in self.candidates)
+        self.n_tests = sum(max(len(u.epochs) - 1, 1) for u in units)
+        open_ = [u for u in units if not self._taken_over(u)]
+        self.candidates = side_by_side(lambda u: self._candidates(_by_runs(u)), open_)
 
     def left_out(self) -> tuple[str, ...]:
         """For people: between which epochs no change was looked for."""
@@ -201,6 +203,11 @@ class ChangeSearch:
                 B = np.concatenate([w[:, axis, None] * wave for w, wave in zip(W, waves, strict=True)])
                 said = tuple((f"{name} {f} {k}a".replace(" 1a", " a"), "rad") for k in (1, 2) for f in ("sin", "cos"))
                 yield Unit("table", table.table_id, f"reading of {name}", rows, B, np.zeros_like(run), first[:1], said)
+
+    def _taken_over(self, u: Unit) -> bool:
+        """Whether unknowns take over all of it: it is a test like the others, and finds nothing."""
+        c = self.condensed
+        return u.what == "position" and c.has_own_poses(u.kind, u.name, np.unique(c.block[u.rows]))
 
     # -- tests -------------------------------------------------------------------------------------------------------
 

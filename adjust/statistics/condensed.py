@@ -15,6 +15,7 @@ from scipy import sparse
 
 from adjust.frames.tables import adjoint_of_inverse
 from adjust.graph.assembly import AdjustmentGraph
+from adjust.graph.singles import beside_images
 from adjust.model.boards import BENT, deformation
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.images import N_SHAPE
@@ -77,6 +78,30 @@ class CondensedSystem:
         columns = np.concatenate([self.key_columns[key] for key in images.keys[b]])
         kept = columns >= 0
         return columns[kept], (local @ images.local_from_keys(which)[0])[:, kept]
+
+    def has_own_poses(self, kind: str, name: str, blocks: IntArray) -> bool:
+        """Whether a camera's or target's image blocks have poses of its own, one an epoch, which nothing else touches.
+
+        These take over whatever the camera or target could have moved. blocks: all of it, by number.
+        """
+        graph, slot_of = self.system.precision.graph, self.system.precision.graph.unknowns.slot_of
+        survey = graph.survey
+        owner = ("carrier_from_target", name)
+        if kind == "camera":
+            owner = ("world_from_station", survey.cameras_by_id[name].station_id)
+        epochs = {survey.image_blocks[b].epoch_id for b in blocks.tolist()}
+        slots = [slot_of.get((*owner, epoch), -1) for epoch in epochs]
+        return min(slots) >= 0 and int(self._own_links[slots].sum()) == len(blocks)
+
+    @cached_property
+    def _own_links(self) -> IntArray:
+        """In how many chains of image blocks each slot is; none where its unknown is held, or in anything else."""
+        graph = self.system.precision.graph
+        unknowns, chains = graph.unknowns, [graph.images.chains, *(b.chains for b in graph.bundles)]
+        elsewhere = beside_images(unknowns, graph.singles, graph.pairs, graph.terrestrial) | {None}
+        elsewhere |= {k for slot in (*unknowns.table_slots, *unknowns.shifted_slots) for k in unknowns.link_keys(slot)}
+        alone = np.array([key not in elsewhere for key in unknowns.slot_key], dtype=np.bool_)
+        return alone * np.bincount(np.concatenate([c.slot for c in chains]), minlength=len(alone))
 
     @property
     def n_points(self) -> int:

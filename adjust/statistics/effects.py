@@ -220,9 +220,12 @@ def _squares(system: LinearSystem, index: IntArray, of_row: IntArray, n_sources:
     """Variance (sources, k) that every source makes; of the one with most rows what the others leave of the whole."""
     used = system.used[system.row_of]
     most = int(np.bincount(of_row[used], minlength=n_sources).argmax())
-    Q = covariance_columns(system, index)
     rows = np.flatnonzero(used & (of_row != most))
     squares = np.zeros((n_sources, len(index)))
+    if not len(rows):
+        squares[most] = system.sigmas[index] ** 2
+        return squares
+    Q = covariance_columns(system, index)
     np.add.at(squares, of_row[rows], np.asarray(system.A[rows] @ Q) ** 2)
     squares[most] = np.maximum(Q[index, np.arange(len(index))] - squares.sum(axis=0), 0.0)
     return squares

@@ -17,6 +17,7 @@ from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.statistics.normal import DENSE
 from adjust.statistics.system import LinearSystem, linear_system
+from adjust.testing.criteria import contradicting
 from adjust.testing.quadratic_forms import pseudo_half
 from adjust.testing.significance import Significance, significance
 
@@ -83,7 +84,13 @@ class LinearScores:
 
     def ratio(self, drop: float) -> float:
         """How many times smaller the misfit beyond noise becomes by a drop of v'Pv."""
-        return ratio(self.result.omega, max(self.result.redundancy, 1), drop)
+        return ratio(*self.contradicting, drop)
+
+    @property
+    def contradicting(self) -> tuple[float, float]:
+        """Square sum and redundancy of all, or where these are noise, of the groups that are not; redundancy >= 1."""
+        whole = self.result.omega, max(self.result.redundancy, 1)
+        return contradicting(whole, ((g.omega, max(g.redundancy, 1.0)) for g in self.result.groups))
 
     def columns(self, name: ParameterName, components: Sequence[str] = ()) -> IntArray:
         """Of an unknown, or of some of its components; none where it is held."""

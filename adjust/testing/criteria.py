@@ -22,6 +22,8 @@ CAUTIOUS = 0.5
 """Size of residuals over their sigmas, all together, below which no observation is left out."""
 MANY = 20
 """Tests from which the typical one of a group, by itself, says whether its sigmas are too small."""
+CLEARLY = 3.0
+"""Sigmas of v'Pv up to which it may be noise."""
 _OF_A_FACTOR = 0.001
 _CAUCHY = 2.385**2
 
@@ -146,6 +148,21 @@ def cauchy_weights(squares: FloatArray) -> FloatArray:
 def sidak(family_alpha: float, n_tests: int) -> float:
     """Level of one of ``n_tests`` independent tests that together have the level ``family_alpha``."""
     return float(-np.expm1(np.log1p(-family_alpha) / max(1, n_tests)))
+
+
+def is_noise(omega: float, redundancy: float, sigmas: float) -> bool:
+    """Whether a square sum is within so many of its own sigmas of what is expected of it (chi-square)."""
+    r = max(redundancy, 1.0)
+    return omega < r + sigmas * float(np.sqrt(2.0 * r))
+
+
+def contradicting(whole: tuple[float, float], parts: Iterable[tuple[float, float]]) -> tuple[float, float]:
+    """Square sum and redundancy of what contradicts: the whole, or where that is noise, its parts that are not, if any.
+
+    A part that many others dilute shows by itself: beside what theirs may be by chance, nothing would explain it.
+    """
+    clear = [part for part in parts if not is_noise(*part, CLEARLY)] if is_noise(*whole, CLEARLY) else []
+    return (sum(omega for omega, _ in clear), sum(r for _, r in clear)) if clear else whole
 
 
 def limits(family_alpha: float, freedom: IntArray, n_tests: int) -> FloatArray:

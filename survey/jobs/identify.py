@@ -14,7 +14,7 @@ from adjust.frames.lens_times import LensTimes
 from adjust.lenses.models import MODELS, camera_constants, project
 from adjust.model.observations import FrameRef, ImageBlock
 from adjust.model.result import Adjustment
-from adjust.model.subsets import only_between
+from adjust.model.subsets import only_between, with_points
 from adjust.model.survey import FloatArray, Survey
 from survey.project import SpotBlock
 from survey.solution.frames import AdjustedFrames
@@ -36,6 +36,26 @@ def without_points(survey: Survey) -> Survey:
     """The survey without its world points: what can be adjusted before the spots have names."""
     blocks = tuple(b for b in survey.image_blocks if b.target_id is not None)
     return replace(only_between(survey, lambda ref: ref.frame is not None), points=(), image_blocks=blocks)
+
+
+def identified(survey: Survey, found: Identification) -> Survey:
+    """The survey with the image points of its beacons, and without beacons that nothing observes."""
+    return seen_points(replace(survey, image_blocks=survey.image_blocks + found.blocks))
+
+
+def seen_points(survey: Survey) -> Survey:
+    """Leave out the beacons that nothing observes any more: a beacon may be hidden in all images."""
+    observed: set[str | None] = {
+        survey.points[int(i)].point_id for b in survey.image_blocks if b.target_id is None for i in b.point_idx
+    }
+    observed |= {r.point_id for c in survey.coordinates for r in c.positions if r.frame is None}
+    refs = [r for d in survey.coordinate_differences for r in (*d.at, *d.to)]
+    refs += [o.position for o in survey.on_surfaces]
+    refs += [r for x in survey.readings for r in (x.at, x.to, x.second) if r is not None]
+    observed |= {r.point_id for r in refs if r.frame is None}
+    return with_points(survey, [
+        i for i, p in enumerate(survey.points) if p.point_id in observed or p.x_in_world.treatment != "free"
+    ])  # fmt: skip
 
 
 def rough_positions(survey: Survey) -> dict[str, FloatArray]:

@@ -231,7 +231,8 @@ class Resident(Folder):
         project = situation.project
         if mode == "cold" or self.version == 0 or not spot_places(project.spots) <= situation.known_spots:
             return None, "cold"
-        from survey.jobs.adjusting.steps import adjust_project, seen_points
+        from survey.jobs.adjusting.steps import adjust_project
+        from survey.jobs.identify import seen_points
 
         survey = situation.now
         named = tuple(b.in_use() for b in survey.image_blocks[len(project.survey.image_blocks) :])

@@ -1,8 +1,9 @@
 """Plain ways to everything the numerical core computes: residuals by OpenCV and matrix lines, derivatives by
 differences, covariances by a dense inverse. Nothing here is fast, and nothing here is taken from the core."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -28,6 +29,7 @@ from adjust.model.survey import (
     Survey,
     Table,
     Target,
+    Tie,
     VectorParameter,
 )
 from adjust.precision.precision import Precision, other_residuals
@@ -194,29 +196,55 @@ def root(cov: FloatArray) -> FloatArray:
     return np.linalg.cholesky(np.linalg.inv(np.atleast_2d(cov))).T
 
 
-class _Poses(dict[ParameterName, Any]):
-    """Parameters that are not in ``Values``: poses that are held come from the survey."""
+def _held(survey: Survey) -> dict[ParameterName, PoseParameter]:
+    out: dict[ParameterName, PoseParameter] = {}
+    for c in survey.cameras:
+        out["station_from_camera", c.camera_id] = c.station_from_camera
+    for t in survey.tables:
+        out["world_from_table", t.table_id] = t.world_from_table
+    for s in survey.stations:
+        out["world_from_station", s.station_id] = s.world_from_station
+        out["mount_from_station", s.station_id] = s.mount_from_station
+        out.update({("world_from_station", s.station_id, e): p for e, p in s.epochs.items()})
+    for g in survey.targets:
+        out["carrier_from_target", g.target_id] = g.carrier_from_target
+        out.update({("carrier_from_target", g.target_id, e): p for e, p in g.epochs.items()})
+    return out
 
-    def __init__(self, survey: Survey) -> None:
-        super().__init__()
-        self.held: dict[ParameterName, PoseParameter] = {}
-        for c in survey.cameras:
-            self.held["station_from_camera", c.camera_id] = c.station_from_camera
-        for t in survey.tables:
-            self.held["world_from_table", t.table_id] = t.world_from_table
-        for s in survey.stations:
-            self.held["world_from_station", s.station_id] = s.world_from_station
-            self.held["mount_from_station", s.station_id] = s.mount_from_station
-            self.held.update({("world_from_station", s.station_id, e): p for e, p in s.epochs.items()})
-        for g in survey.targets:
-            self.held["carrier_from_target", g.target_id] = g.carrier_from_target
-            self.held.update({("carrier_from_target", g.target_id, e): p for e, p in g.epochs.items()})
+
+class _Poses(dict[ParameterName, Any]):
+    """Parameters that are not in ``Values``: poses that are held come from the survey.
+
+    in_camera: of image blocks that were asked for, their points in the camera.
+    """
+
+    def __init__(self, held: dict[ParameterName, PoseParameter], known: Mapping[ParameterName, Any]) -> None:
+        super().__init__(known)
+        self.held, self.in_camera = held, dict[tuple[str, str, str | None, str], FloatArray]()
 
     def __missing__(self, name: ParameterName) -> Pose3:
         parameter = self.held.get(name) or self.held[name[:2]]
         if parameter.treatment != "held":
             raise KeyError(name)
         return parameter.value or Pose3()
+
+    def with_other(self, name: ParameterName, value: Any) -> "_Poses":
+        """The same with another value of one parameter; a lens leaves the points where they are."""
+        out = _Poses(self.held, self)
+        out[name], out.in_camera = value, self.in_camera if name[0] == "lens" else {}
+        return out
+
+
+class _Read(_Poses):
+    """Notes which parameters are asked for."""
+
+    def __init__(self, found: _Poses) -> None:
+        super().__init__(found.held, found)
+        self.names: set[ParameterName] = set()
+
+    def __getitem__(self, name: ParameterName) -> Any:
+        self.names.add(name)
+        return super().__getitem__(name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,45 +254,62 @@ class Plain:
     graph: AdjustmentGraph
     lenses: dict[str, FloatArray]
 
-    def parameters(self, values: gtsam.Values) -> _Poses:
-        survey, by_name = self.graph.survey, self.graph.unknowns.by_name
-        out = _Poses(survey)
-        for name, unknown in by_name.items():
-            if unknown.kind == "pose":
-                out[name] = values.atPose3(unknown.key)
-            elif unknown.kind == "point":
-                out[name] = np.asarray(values.atPoint3(unknown.key))
-            elif name[0] == "table_angles":
-                out[name] = np.asarray(values.atVector(unknown.key))
-        vectors = {("lens", c.camera_id): (MODELS[c.lens.model].names, self.lenses[c.camera_id], c.lens.ties)
-                   for c in survey.cameras}  # fmt: skip
+    @cached_property
+    def _vectors(self) -> dict[ParameterName, tuple[Sequence[str], FloatArray, Sequence[Tie]]]:
+        """Names, values of what is held, and ties."""
+        survey = self.graph.survey
+        out: dict[ParameterName, tuple[Sequence[str], FloatArray, Sequence[Tie]]] = {
+            ("lens", c.camera_id): (MODELS[c.lens.model].names, self.lenses[c.camera_id], c.lens.ties)
+            for c in survey.cameras}  # fmt: skip
         for table in survey.tables:
-            vectors["table_geometry", table.table_id] = table.geometry.names, table.geometry.values, ()
+            out["table_geometry", table.table_id] = table.geometry.names, table.geometry.values, ()
         for target in survey.targets:
             if target.warp:
-                vectors["warp", target.target_id] = target.warp.names, target.warp.values, target.warp.ties
-        for name, (names, base, ties) in vectors.items():
+                out["warp", target.target_id] = target.warp.names, target.warp.values, target.warp.ties
+        return out
+
+    def _value(self, name: ParameterName, values: gtsam.Values) -> Any:
+        unknown = self.graph.unknowns.by_name.get(name)
+        if name in self._vectors:
+            names, base, ties = self._vectors[name]
             full = dict(zip(names, base, strict=True))
-            if name in by_name:
-                free = by_name[name]
-                full.update(zip(free.components, values.atVector(free.key), strict=True))
+            if unknown is not None:
+                full.update(zip(unknown.components, values.atVector(unknown.key), strict=True))
                 full.update({tie.name: tie.factor * full[tie.to] for tie in ties})
-            out[name] = np.array([full[n] for n in names])
+            return np.array([full[n] for n in names])
+        if unknown.kind == "pose":
+            return values.atPose3(unknown.key)
+        return np.asarray(values.atPoint3(unknown.key) if unknown.kind == "point" else values.atVector(unknown.key))
+
+    def parameters(self, values: gtsam.Values) -> _Poses:
+        survey, found = self.graph.survey, dict[ParameterName, Any]()
+        for name, unknown in self.graph.unknowns.by_name.items():
+            if unknown.kind in ("pose", "point") or name[0] == "table_angles":
+                found[name] = self._value(name, values)
+        found.update({name: self._value(name, values) for name in self._vectors})
         for point in survey.points:
             if point.x_in_world.treatment == "held":
-                out["point", point.point_id] = point.x_in_world.value
-        return out
+                found["point", point.point_id] = point.x_in_world.value
+        return _Poses(_held(survey), found)
+
+    def displaced(self, found: _Poses, name: ParameterName, values: gtsam.Values) -> _Poses:
+        """``found``, but for one parameter, which is that of ``values``."""
+        return found.with_other(name, self._value(name, values))
 
     def image(self, block: ImageBlock, found: _Poses) -> FloatArray:
         """Predicted minus observed (n, 2) px."""
+        camera = self.graph.survey.cameras_by_id[block.camera_id]
+        if block.place not in found.in_camera:
+            found.in_camera[block.place] = self._in_camera(block, found)
+        return image_residual(camera, found["lens", block.camera_id], found.in_camera[block.place], block.uv)
+
+    def _in_camera(self, block: ImageBlock, found: _Poses) -> FloatArray:
         scene = Scene(self.graph.survey, found)
         if block.target_id is None:
             x = np.array([found["point", self.graph.survey.points[i].point_id] for i in block.point_idx])
         else:
             x = scene.target_points(block.target_id, block.epoch_id)[block.point_idx]
-        camera = next(c for c in self.graph.survey.cameras if c.camera_id == block.camera_id)
-        q = transform(np.linalg.inv(scene.world_from_camera(block.camera_id, block.epoch_id)), x)
-        return image_residual(camera, found["lens", block.camera_id], q, block.uv)
+        return transform(np.linalg.inv(scene.world_from_camera(block.camera_id, block.epoch_id)), x)
 
     def other(self, item: Any, found: _Poses) -> tuple[FloatArray, FloatArray]:
         """Unwhitened residual (k,) and its covariance (k, k) of an observation that is not an image point."""
@@ -365,17 +410,34 @@ def dense(graph: AdjustmentGraph, lenses: dict[str, FloatArray], values: gtsam.V
     used = [np.repeat(b.used if b.used is not None else np.ones(len(b.uv), bool), 2) for b in blocks]
     used += [np.full(len(np.atleast_2d(c)), item.used) for item, c in zip(items, covs[n_image:], strict=True)]
 
-    def residuals(at: gtsam.Values) -> FloatArray:
-        p = plain.parameters(at)
-        parts = [plain.image(b, p).ravel() for b in blocks] + [plain.other(item, p)[0] for item in items]
-        return np.concatenate(parts)
+    parts: list[Callable[[_Poses], FloatArray]] = [
+        *(lambda p, b=b: plain.image(b, p).ravel() for b in blocks),
+        *(lambda p, item=item: plain.other(item, p)[0] for item in items),
+    ]  # fmt: skip
+    asked = [_Read(found) for _ in parts]
+    each = [part(p) for part, p in zip(parts, asked, strict=True)]
+    ends = np.cumsum([0, *map(len, each)])
+
+    def by(name: ParameterName, unknown: Any) -> FloatArray:
+        """Derivatives of all of them; zero of those that do not ask for it."""
+        some = [i for i, p in enumerate(asked) if name in p.names]
+        out = np.zeros((ends[-1], unknown.dim))
+        if some:
+            rows = np.concatenate([np.arange(ends[i], ends[i + 1]) for i in some])
+
+            def residuals(at: gtsam.Values) -> FloatArray:
+                p = plain.displaced(found, name, at)
+                return np.concatenate([parts[i](p) for i in some])
+
+            out[rows] = differences(residuals, values, unknown.key, steps_of(unknown, values))
+        return out
 
     place, n, columns = {}, 0, []
     for name, unknown in graph.unknowns.by_name.items():
         place[name] = slice(n, n + unknown.dim)
         n += unknown.dim
-        columns.append(differences(residuals, values, unknown.key, steps_of(unknown, values)))
-    v = residuals(values)
+        columns.append(by(name, unknown))
+    v = np.concatenate(each)
     return Dense(whiten(W, np.hstack(columns)), whiten(W, v), v, W, np.concatenate(used), place, n_image)
 
 

@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gtsam import Pose3
 from scipy.stats import chi2
 
 from adjust.adjustment import adjust
 from adjust.model.names import natural_key
 from adjust.model.result import GlobalTest
-from adjust.model.survey import FloatArray, Survey
+from adjust.model.survey import FloatArray, PoseParameter, Survey
 from adjust.precision.precision import precision_of
 from adjust.statistics.changes import ChangeSearch
 from adjust.statistics.condensed import condensed_system
@@ -21,7 +22,8 @@ from adjust.testing.quadratic_forms import upper_tail, upper_tail_bound
 from survey.simulate import head_on_table
 from tests.adjust import helpers as h
 from tests.adjust import statistics_networks as net
-from tests.benchmarks.data import calibration
+from tests.benchmarks import bundle
+from tests.benchmarks.data import calibration, rough_start
 from tests.benchmarks.data import survey as long_session
 
 ARCSEC = np.pi / 180.0 / 3600.0
@@ -181,6 +183,35 @@ def test_a_table_that_slips_and_one_whose_circle_is_eccentric() -> None:
     np.testing.assert_array_less(np.abs(amount - np.array([0.0, 90.0 * ARCSEC])), 4.0 * sigma)
     assert amount[1] > 4.0 * sigma[1]
     assert not consistency(adjustment, search.condensed).fits
+
+
+def with_a_prior(survey: Survey, pose: FloatArray) -> Survey:
+    """Where the board was at one epoch is known beforehand, to a centimetre and 10 mrad."""
+    (board,) = survey.targets
+    known = PoseParameter(Pose3(pose), "prior", 1e-4 * np.eye(6))
+    return replace(survey, targets=(replace(board, epochs={"e3": known}),))
+
+
+def test_a_change_of_place_is_left_out_where_poses_of_its_own_take_it_over_and_only_there() -> None:
+    """What all rows at once leave of a motion of each camera and target in the later epochs."""
+    boards, hall = calibration(2, 6, (4, 4)), bundle.simulated(8, 30, 6)
+    session, found = long_session(boards), []
+    for survey, start in ((session, rough_start(boards)), (bundle.survey(hall), bundle.start(hall)),
+                          (with_a_prior(session, boards.head_from_board[3]), rough_start(boards))):  # fmt: skip
+        adjustment = adjust(survey, start)
+        condensed = condensed_system(precision_of(adjustment))
+        A, seen = condensed.system.A.toarray(), [survey.image_blocks[b] for b in condensed.block]
+        search = {(c.unit.kind, c.unit.name) for c in ChangeSearch(adjustment, condensed).candidates
+                  if c.unit.what == "position"}  # fmt: skip
+        of_target = [("target", t.target_id, condensed.target) for t in survey.targets]
+        for kind, name, by_motion in [("camera", c.camera_id, condensed.camera) for c in survey.cameras] + of_target:
+            mine = [name in (b.camera_id, b.target_id) and int(b.epoch_id[1:]) > 2 for b in seen]
+            B = np.zeros((len(A), 6))
+            B[: len(seen)][mine] = by_motion[mine]
+            left = B - A @ np.linalg.lstsq(A, B, rcond=1e-12)[0]
+            found.append(bool(np.linalg.norm(left) > 1e-6 * np.linalg.norm(B)))
+            assert ((kind, name) in search) == found[-1]
+    assert found == [True, True, False, False, True, True, True]
 
 
 def test_the_status_of_a_global_test() -> None:

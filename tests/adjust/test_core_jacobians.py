@@ -30,12 +30,15 @@ def plain_rows(graph: AdjustmentGraph, start: StartValues, values: gtsam.Values,
     used = block.used if block.used is not None else np.ones(len(block.uv), bool)
     W = [h.root(c) for c in block.cov[used]]
 
-    def residual(at: gtsam.Values) -> FloatArray:
-        return plain.image(block, plain.parameters(at))[used].ravel()
+    found, by_key = plain.parameters(values), graph.unknowns.by_key
 
-    by_key = graph.unknowns.by_key
-    A = np.hstack([h.differences(residual, values, k, h.steps_of(by_key[k], values)) for k in keys])
-    return h.whiten(W, A), h.whiten(W, residual(values))
+    def by(key: int) -> FloatArray:
+        def residual(at: gtsam.Values) -> FloatArray:
+            return plain.image(block, plain.displaced(found, by_key[key].name, at))[used].ravel()
+
+        return h.differences(residual, values, key, h.steps_of(by_key[key], values))
+
+    return h.whiten(W, np.hstack([by(k) for k in keys])), h.whiten(W, plain.image(block, found)[used].ravel())
 
 
 def check_images(survey: Survey, start: StartValues, expected_links: set[str]) -> None:

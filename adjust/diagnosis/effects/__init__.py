@@ -10,6 +10,7 @@ import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.clocks import clocks
+from adjust.diagnosis.effects.common import common
 from adjust.diagnosis.effects.effect import Effect
 from adjust.diagnosis.effects.freed import bent_targets, unsteady_axes, untied
 from adjust.diagnosis.effects.pixels import pixels
@@ -36,9 +37,9 @@ def hypotheses(case: Case) -> Iterator[Hypothesis]:
 
 
 def _scored(case: Case, linear: Linear) -> Iterator[Hypothesis]:
-    effects = [e for make in (steps, zeros, pixels, clocks, shapes) for e in _formed(make, case, linear)]
-    excess = linear.result.omega - linear.result.redundancy
-    clear = [e for e in effects if e.first.seen and e.first.drop > _SHARE * excess]
+    effects = [e for make in (steps, zeros, common, pixels, clocks, shapes) for e in _formed(make, case, linear)]
+    omega, redundancy = linear.contradicting
+    clear = [e for e in effects if e.first.seen and e.first.drop > _SHARE * (omega - redundancy)]
     if not clear:
         return
     redundancy = max(linear.result.redundancy, 1)

@@ -1,6 +1,6 @@
 """Given coordinates that are those of another point, or slipped, or in other axes: each change tried at its own start.
 
-Held values and priors of points, which the readings of a network contradict.
+Held values and priors of points, which the readings of a network contradict; of observed ones axes and unit.
 """
 
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, SetKey
 from adjust.diagnosis.names.throughout import in_readings
 from adjust.diagnosis.screen import Fit, Screen, at_best, improvement, screen
-from adjust.diagnosis.units.conventions import LENGTH_RATIOS
+from adjust.diagnosis.units.axes import NORTH_FIRST, other_axes, ways
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, Survey
 
@@ -22,6 +22,7 @@ _MOST, _TRIALS = 4, 80
 _SLIPS = (10.0, 0.1, 100.0, 0.01, 1000.0, 0.001)
 _LARGE = 2500
 _EXCHANGED = "given points exchanged"
+_OF_GIVEN = (NORTH_FIRST, "are millimetres, read as metres", "are metres, read as millimetres")
 _SPOILT = 1e6
 """Variance factor of a start at which the typical reading misses by so much that no single one stands out."""
 
@@ -30,15 +31,18 @@ def wrong_given(case: Case) -> Iterator[Hypothesis]:
     """Changes of given coordinates after which the survey's own start fits its observations better."""
     survey = case.survey
     given = [p.point_id for p in survey.points if p.x_in_world.treatment != "free" and p.x_in_world.value is not None]
-    if not given or not survey.readings or not case.few("wrong given coordinates", len(survey.readings), _LARGE):
+    n = len(survey.readings)
+    if not (given or survey.coordinates) or not n or not case.few("wrong given coordinates", n, _LARGE):
         return
     before = at_best(case)
     lost = before is None or before.scale > _SPOILT
     some = [h for h in (*_exchanges(survey, given), *_slips(survey, given))
             if before is None or lost or _misses(survey, before, h.place.ids)]  # fmt: skip
     tried = [*_axes(survey, given), *some][:_TRIALS]  # the former concern all: where these are wrong all miss evenly
-    changed = [h.survey for h in tried if isinstance(h.survey, Survey)]
-    fits = map(screen, changed) if before is None else before.afresh(changed)
+    observed = [*other_axes(survey)]
+    changed, apart = ([h.survey for h in of if isinstance(h.survey, Survey)] for of in (tried, observed))
+    fits = [*(map(screen, changed) if before is None else before.afresh(changed)), *map(screen, apart)]
+    tried += observed
     found = [replace(h, evidence=e, looked_at=len(tried)) for h, fit in zip(tried, fits, strict=True)
              if (e := _evidence(before, fit)) > _CLEARLY]  # fmt: skip
     for h in sorted(found, key=lambda h: -h.evidence)[:_MOST]:
@@ -99,12 +103,9 @@ def _slips(survey: Survey, given: list[str]) -> Iterator[Hypothesis]:
 def _axes(survey: Survey, given: list[str]) -> Iterator[Hypothesis]:
     """All given coordinates in other axes or another unit."""
     x = _values(survey, given)
-    for said, remedy, M in (
-        ("have x and y exchanged (north first, or left-handed)", "exchange x and y of all of them",
-         np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]])),
-        *((said, f"multiply all of them by {LENGTH_RATIOS[said]:g}", LENGTH_RATIOS[said] * np.eye(3))
-          for said in ("are millimetres, read as metres", "are metres, read as millimetres")),
-    ):  # fmt: skip
+    for said, remedy, M in ways() if given else ():
+        if said not in _OF_GIVEN:
+            continue
         yield _changed(survey, "axes or unit of given coordinates", f"the given coordinates {said}",
                        f"{remedy} in survey.toml", "x_in_world", {n: M @ v for n, v in x.items()})  # fmt: skip
 

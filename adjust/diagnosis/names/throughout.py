@@ -16,10 +16,11 @@ from adjust.diagnosis.screen import Screen, at_best, improvement, screen
 from adjust.model.names import grouped
 from adjust.model.observations import Observation, PositionRef
 from adjust.model.rewriting import with_rows
-from adjust.model.subsets import only_rows, positions_of, with_positions
+from adjust.model.subsets import positions_of, with_only, with_positions
 from adjust.model.survey import FloatArray, IntArray, Survey
 
-_CLEARLY = 3.0
+_CLEARLY, _WORTH = 3.0, 1.5
+"""Mean squares of what misses; evidence of what is tried: one rough start value may leave half of the misfit."""
 _SUSPECTS, _MOST, _ALL = 6, 4, 60
 _LARGE = 2500
 _READINGS = "readings"
@@ -40,8 +41,8 @@ def exchanged_throughout(case: Case) -> Iterator[Hypothesis]:
     before = at_best(case)
     if before is None:
         return
-    found = [(e, f, names, len(ways)) for f in fields for ways in [_ways(survey, before, f)] for names in ways
-             if (e := _evidence(survey, before, f, names)) > _CLEARLY]  # fmt: skip
+    found = [(e, f, names, len(ways)) for f in fields for ways in [_ways(survey, before, f)]
+             for names, e in zip(ways, _evidence(survey, before, f, ways), strict=True) if e > _WORTH]  # fmt: skip
     for evidence, field, names, looked_at in sorted(found, key=lambda x: -x[0])[:_MOST]:
         yield in_table(survey, field, names, evidence, looked_at)
 
@@ -72,14 +73,22 @@ def _names(o: Observation) -> set[str]:
     return {str(r.point_id) for r in positions_of(o) if r.frame is None}
 
 
-def _evidence(survey: Survey, before: Screen, field: str, names: Names) -> float:
-    """How much less those rows of a table that name one of the two miss, where all else stays where it is."""
-    rows = _rows(getattr(survey, field), names)
-    after = screen(renamed(only_rows(survey, field, rows), field, names), before.start)
-    if after is None:
-        return 0.0
+def _evidence(survey: Survey, before: Screen, field: str, ways: Sequence[Names]) -> list[float]:
+    """How much less those rows of a table that name one of two points miss, where all else stays where it is."""
+    observed, of = getattr(survey, field), _rows_of(getattr(survey, field))
+    sets = [np.array(sorted({*of.get(a, ()), *of.get(b, ())}), dtype=np.int64) for a, b in ways]
+    changed = [o for rows, names in zip(sets, ways, strict=True) for o in _renamed(observed, rows, names)]
+    after = screen(with_only(survey, field, changed), before.start) if changed else None
+    if after is None or len(after.graph.others) != len(changed):
+        return [0.0] * len(ways)
     was, now = (_squares(found, field, before.scale) for found in (before, after))
-    return improvement(float(was[rows].sum()), float(now.sum()), len(rows)) if len(now) == len(rows) else 0.0
+    each = np.split(now, np.cumsum([len(rows) for rows in sets])[:-1])
+    return [improvement(float(was[r].sum()), float(x.sum()), len(r)) for r, x in zip(sets, each, strict=True)]
+
+
+def _rows_of(observed: Sequence[Observation]) -> dict[str, list[int]]:
+    """Of every point of the world the rows that name it."""
+    return grouped((name, i) for i, o in enumerate(observed) for name in _names(o))
 
 
 def _rows(observed: Sequence[Observation], names: Names) -> IntArray:
@@ -88,12 +97,19 @@ def _rows(observed: Sequence[Observation], names: Names) -> IntArray:
 
 def renamed(survey: Survey, field: str, names: Names) -> Survey:
     """The survey with two points called by each other's names in all observations of a field."""
-    other, observed = dict(zip(names, reversed(names), strict=True)), getattr(survey, field)
+    observed = getattr(survey, field)
+    rows = _rows(observed, names)
+    return with_rows(survey, field, dict(zip(rows.tolist(), _renamed(observed, rows, names), strict=True)))
+
+
+def _renamed(observed: Sequence[Observation], rows: IntArray, names: Names) -> list[Observation]:
+    """These rows with two points called by each other's names."""
+    other = dict(zip(names, reversed(names), strict=True))
 
     def named(ref: PositionRef) -> PositionRef:
         return replace(ref, point_id=other.get(str(ref.point_id), ref.point_id)) if ref.frame is None else ref
 
-    return with_rows(survey, field, {int(i): with_positions(observed[i], named) for i in _rows(observed, names)})
+    return [with_positions(observed[i], named) for i in rows.tolist()]
 
 
 def in_readings(survey: Survey, names: Names) -> Hypothesis | None:

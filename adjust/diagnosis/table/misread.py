@@ -15,18 +15,21 @@ from adjust.diagnosis.table.views import TableViews, table_views
 from adjust.model.survey import Survey
 
 _UNEXPLAINED_RAD = np.radians(1.0)
-_TORN = 100.0
-"""Scale of a fit's residuals from which most views contradict each other."""
+_TORN, _AGREE_RAD = 100.0, np.radians(0.1)
+"""Scale of a fit's residuals from which most views contradict each other, unless their turns agree with the readings.
+
+It is over the noise of image points, which may be far smaller than that of readings.
+"""
 
 
 def misread_tables(case: Case) -> Iterator[Hypothesis]:
     """Of every table the likeliest."""
     for views in table_views(case):
-        verdict, _ = shared_mistake(views)
+        verdict, as_given = shared_mistake(views)
         if verdict is not None:
             yield misread_throughout(case.survey, views, verdict)
             continue
-        fit = _fit(views)
+        fit = _fit(views, as_given)
         if fit is not None:
             yield from misread_epochs(case.survey, views, fit)
             yield from _signs(case.survey, views, fit)
@@ -44,7 +47,7 @@ def disagreeing_tables(survey: Survey) -> Iterator[Finding]:
     """Tables whose readings no way to read them brings together with the images; without them nothing can be tried."""
     for views in table_views(Case(survey)):
         verdict, as_given = shared_mistake(views)
-        if verdict is None and as_given > _UNEXPLAINED_RAD and _fit(views) is None:
+        if verdict is None and as_given > _UNEXPLAINED_RAD and _fit(views, as_given) is None:
             table_id = views.table.table_id
             found = (f"table {table_id}: the turns between images and between readings disagree by "
                      f"{np.degrees(as_given):.1f} deg (median), and no exchange of the axes, unit or shift by one "
@@ -53,8 +56,9 @@ def disagreeing_tables(survey: Survey) -> Iterator[Finding]:
                           "compare the epochs of table_angles.csv with those of the images")  # fmt: skip
 
 
-def _fit(views: TableViews) -> TableFit | None:
-    """Where most views agree; None where they do not."""
+def _fit(views: TableViews, as_given: float) -> TableFit | None:
+    """Where most views agree; None where they do not. as_given: by how much turns differ from those read, median."""
     fit = fit_table(views)
-    agree = fit is not None and fit.scale < _TORN and 2 * len(outlying(fit)) < len(views.poses)
-    return fit if agree else None
+    if fit is None or (fit.scale > _TORN and as_given > _AGREE_RAD):
+        return None
+    return fit if 2 * len(outlying(fit)) < len(views.poses) else None

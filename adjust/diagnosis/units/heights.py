@@ -19,7 +19,7 @@ from adjust.model.errors import listed
 from adjust.model.observations import Reading, position_text
 from adjust.model.result import Adjustment
 from adjust.model.rewriting import Fields, with_rows
-from adjust.model.subsets import only_rows
+from adjust.model.subsets import with_only
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.observations.terrestrial.batch import TerrestrialBatch
 from adjust.statistics.score import LinearScores
@@ -276,7 +276,7 @@ def _evidence(before: Screen, batch: TerrestrialBatch, constant: _Constant) -> t
         return 0.0, 0.0
     metres, left = _one_step(scale, sigma, miss, constant.by)
     if constant.field != "value" and _LINEAR < abs(metres) < _LARGEST:
-        part = only_rows(before.graph.survey, "readings", rows)
+        part = with_only(before.graph.survey, "readings", (before.graph.survey.readings[i] for i in rows.tolist()))
         own = replace(constant, rows=np.arange(len(rows)))
         for _ in range(_ROUNDS):
             found = screen(_changed(part, own, metres), before.start)

@@ -123,7 +123,7 @@ class BundleHidden:
         b = self.batch
         nh, k = b.n_hidden, right.shape[1]
         local = np.zeros((b.n_local, k))
-        points = right[nh:].reshape(-1, 3, k)
+        points = right[nh:].reshape(len(b.reduced), 3, k)
         seen, own = np.flatnonzero(points.any(axis=(1, 2))), np.zeros(points.shape)
         own[seen] = b.Vi[seen] @ points[seen]
         of_points(b.arrays, b.of_reduced, own, local)
@@ -136,20 +136,21 @@ class BundleHidden:
         nh = self.batch.n_hidden
         return on_poses[nh:] + self._hidden_poses_given_interface()[0].T @ on_poses[:nh] if nh else on_poses
 
-    def multiply(self, x: FloatArray, interface: FloatArray, on_poses: FloatArray | None) -> None:
+    def multiply(self, x: FloatArray, interface: FloatArray, some: IntArray, on_poses: FloatArray) -> None:
         """Covariance times right-hand sides x (n, k) of what is hidden, in place, and that of the interface (., k).
 
-        on_poses: what :meth:`on_poses` makes of x. The batch must be prepared.
+        on_poses: what :meth:`on_poses` makes of the columns ``some`` of x; the others are zero. The batch is prepared.
         """
         b = self.batch
-        nh, k = b.n_hidden, interface.shape[1]
-        d = np.concatenate([np.zeros((nh, k)), interface])
+        nh = b.n_hidden
+        d = np.concatenate([np.zeros((nh, interface.shape[1])), interface])
         if nh:
             T, P = self._hidden_poses_given_interface()
-            d[:nh] = T @ interface if on_poses is None else T @ interface + P @ on_poses[:nh]
+            d[:nh] = T @ interface
+            d[:nh, some] += P @ on_poses[:nh]
         x[:nh] = d[:nh]
         np.negative(x[nh:], out=x[nh:])
-        points = x[nh:].reshape(-1, 3, k)
+        points = x[nh:].reshape(len(b.reduced), 3, interface.shape[1])
         b.points_following(np.asarray(b.G @ d), points)
 
     def drawn(self, interface: FloatArray, w: FloatArray) -> FloatArray:

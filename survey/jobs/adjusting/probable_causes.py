@@ -11,6 +11,7 @@ from adjust.model.errors import DiagnosedError, IndeterminateError, NotConverged
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
 from adjust.testing.criteria import CAUTIOUS
+from adjust.testing.distributions import chi2
 from survey.project import Project
 
 if TYPE_CHECKING:
@@ -18,8 +19,9 @@ if TYPE_CHECKING:
 
 
 _LARGE = 1.15
-"""sigma0 from which a mistake is looked for by trial; below, sigmas that are a little small explain as much."""
-
+"""sigma0 of all or a group from which mistakes are looked for by trial; below, small sigmas explain as much."""
+_LEVEL = 1e-4
+"""Error probability of a group's test here: that of one among some hundred parts, which are tested together later."""
 
 _PART = 0.8
 """Variance factor of a group below which a part of it may be far smaller."""
@@ -115,7 +117,7 @@ def _diagnosis(
     Of what stops an adjustment otherwise, as a lack of start values, tables alone.
     """
     refused = error is not None and not isinstance(error, IndeterminateError | NotConvergedError)
-    fits = result is not None and result.sigma0 < _LARGE and not _images_refused(survey, result)
+    fits = result is not None and result.sigma0 < _LARGE and not _part_contradicted(survey, result)
     if fits or (refused and not survey.tables):
         return None
     from adjust.diagnosis.case import Case  # here: a survey that fits starts without them
@@ -200,16 +202,19 @@ def _disagreeing_tables(survey: Survey) -> tuple[str, ...]:
 
 
 def _contradicted(survey: Survey, result: Adjustment) -> bool:
-    """Whether residuals are too large, or whole images take no part."""
+    """Whether residuals are too large, of all or of a part, or whole images take no part."""
     test = result.global_test
     if test is not None and test.omega > test.upper:
         return True
-    return _images_refused(survey, result)
+    return _part_contradicted(survey, result)
 
 
-def _images_refused(survey: Survey, result: Adjustment) -> bool:
+def _part_contradicted(survey: Survey, result: Adjustment) -> bool:
+    """Whether whole images take no part, or the residuals of a group are far too large, which many others dilute."""
     taking_part = sum(1 for b in result.survey.image_blocks if b.n_used)
-    return taking_part < sum(1 for b in survey.image_blocks if b.n_used)
+    return taking_part < sum(1 for b in survey.image_blocks if b.n_used) or any(
+        g.factor > _LARGE**2 and g.omega > float(chi2.isf(_LEVEL, g.redundancy)) for g in result.groups
+    )
 
 
 def separate_epochs(survey: Survey) -> tuple[str, ...]:

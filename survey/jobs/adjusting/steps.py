@@ -13,7 +13,6 @@ from adjust.diagnosis.memory import remembering
 from adjust.graph.assembly import StartValues
 from adjust.model.errors import IndeterminateError, SurveyError, listed
 from adjust.model.result import Adjustment, ParameterName
-from adjust.model.subsets import with_points
 from adjust.model.survey import Survey
 from adjust.observations.copies import copied_observations
 from adjust.statistics.outliers.supported import lost_notes, supported, without_lost_points
@@ -22,7 +21,7 @@ from survey.jobs.adjusting.astray import cleaned
 from survey.jobs.adjusting.probable_causes import explaining, with_probable_causes
 from survey.jobs.adjusting.symmetric_boards import consistent_turns
 from survey.jobs.detecting.image_defects import blurred, defect_warnings
-from survey.jobs.identify import identify_spots, without_points
+from survey.jobs.identify import identified, identify_spots, without_points
 from survey.project import Project
 from survey.project.detected import DetectedImage
 from survey.project.project import DEFINITION_FILE
@@ -94,20 +93,24 @@ def _spots_identified(work: Work) -> Work:
     project = work.project
     gate = project.spots_request.gate_px if project.spots_request is not None else 15.0
     how = _options(project).adjust
+    part = supported(without_points(project.survey))[0]
     try:
-        part = supported(without_points(project.survey))[0]
-        first = adjust(part, work.begin(part), how, work.progress)
+        with explaining(part, project):
+            first = adjust(part, work.begin(part), how, work.progress)
     except IndeterminateError as error:
         raise SurveyError(
             f"{project.folder}/observations: the spots cannot be identified, because cameras and stations are not "
             f"determined without them; name the spots' beacons in image_points.csv, or hold a board\n({error})"
         ) from error
     found = identify_spots(project.survey, first, project.spots, gate)
+    if found.unidentified > found.identified:
+        from survey.jobs.adjusting.unnamed_spots import require_names  # here: spots mostly have names
+
+        require_names(project, first, found, gate)
     notes = found.notes
     if found.unidentified:
         notes += (f"{found.unidentified} of {found.identified + found.unidentified} spots are no known beacon",)
-    survey = project.survey
-    return work.of(seen_points(replace(survey, image_blocks=survey.image_blocks + found.blocks)), notes)
+    return work.of(identified(project.survey, found), notes)
 
 
 def _unobserved_left_out(work: Work) -> Work:
@@ -218,18 +221,3 @@ def image_warnings(
         for entry in images.values()
         if entry.status == "failed" or (entry.status == "nothing" and not entry.wrong_size)
     )  # fmt: skip
-
-
-def seen_points(survey: Survey) -> Survey:
-    """Leave out the beacons that nothing observes any more: a beacon may be hidden in all images."""
-    observed: set[str | None] = {
-        survey.points[int(i)].point_id for b in survey.image_blocks if b.target_id is None for i in b.point_idx
-    }
-    observed |= {r.point_id for c in survey.coordinates for r in c.positions if r.frame is None}
-    refs = [r for d in survey.coordinate_differences for r in (*d.at, *d.to)]
-    refs += [o.position for o in survey.on_surfaces]
-    refs += [r for x in survey.readings for r in (x.at, x.to, x.second) if r is not None]
-    observed |= {r.point_id for r in refs if r.frame is None}
-    return with_points(survey, [
-        i for i, p in enumerate(survey.points) if p.point_id in observed or p.x_in_world.treatment != "free"
-    ])  # fmt: skip

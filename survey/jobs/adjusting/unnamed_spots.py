@@ -1,0 +1,42 @@
+"""Spots that are no known beacon because the beacons' coordinates stand in other axes or in another unit."""
+
+from dataclasses import replace
+
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.diagnosis import diagnose
+from adjust.diagnosis.units.axes import other_axes
+from adjust.model.errors import DiagnosedError, SurveyError
+from adjust.model.result import Adjustment
+from survey.jobs.adjusting.places import located
+from survey.jobs.identify import Identification, identified, identify_spots
+from survey.project import Project
+
+_TIMES, _MORE = 2, 4
+"""How many times as many spots have to get a name, and how many more, for a change of coordinates to be tried."""
+
+
+def require_names(project: Project, first: Adjustment, found: Identification, gate_px: float) -> None:
+    """Nothing where most spots have names, or no change gives them. Raises DiagnosedError where one does, and fits.
+
+    first: of the cameras and stations, without the spots. found: the names by the coordinates as they stand.
+    """
+    if found.unidentified <= found.identified:
+        return
+    enough = max(_TIMES * found.identified, found.identified + _MORE)
+    changed = [(h, survey) for h in other_axes(project.survey) if (survey := h.changed()) is not None]
+    named = [(h, survey, identify_spots(survey, first, project.spots, gate_px)) for h, survey in changed]
+    most = max((again.identified for *_, again in named), default=0)
+    best = [
+        replace(h, survey=identified(survey, again), looked_at=len(named), cause=f"{h.cause}: so read, {_share(again)} "
+                f"are one of the beacons, as they stand {found.identified}")
+        for h, survey, again in named if again.identified == most >= enough
+    ]  # fmt: skip
+    diagnosis = diagnose(Case(identified(project.survey, found), None, SurveyError("")), [lambda _: best])
+    if diagnosis.candidates:
+        diagnosis = located(diagnosis, project)
+        lines = "\n  - ".join(["probable cause:", *diagnosis.lines])
+        raise DiagnosedError(f"{lines}\nmend that first: as it is, the spots have wrong names, or none", diagnosis)
+
+
+def _share(found: Identification) -> str:
+    return f"{found.identified} of {found.identified + found.unidentified} spots"

@@ -1,0 +1,115 @@
+"""Mistakes of a laboratory whose beacons are spots: named although the spots are given their names by what is wrong."""
+
+import csv
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from survey.cli import FAILED, main
+from survey.examples.folders import MAKERS
+from survey.project import read
+from tests import labs
+
+pytestmark = pytest.mark.slow
+_PX = 0.02
+
+
+@pytest.fixture(scope="module")
+def observed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The full laboratory with what its images show, by its truth and with noise: no image is rendered or searched."""
+    folder = tmp_path_factory.mktemp("lab")
+    draft, files = MAKERS["full-lab"](1)
+    for path, text in files.items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_text(text)
+    survey, scene, rng = read(folder).survey, draft.scene(), np.random.default_rng(3)
+    points, spots = list[list[Any]](), list[list[Any]]()
+    for shot in draft.shots:
+        own = shot.epoch_id, shot.camera_id
+        for target in shot.target_ids:
+            ids = survey.targets_by_id[target].point_ids
+            for name, uv in zip(ids, scene.project(*own[::-1], scene.target_points(target, own[0])), strict=True):
+                if scene.inside(own[1], uv[None], 5.0).all():
+                    points.append([*own, target, name, *(uv + _PX * rng.standard_normal(2)), _PX, _PX])
+        for number, uv in enumerate(scene.project(*own[::-1], scene.world_points())) if shot.beacons else ():
+            if scene.inside(own[1], uv[None], 5.0).all():
+                spots.append([*own, f"s{number}", *(uv + _PX * rng.standard_normal(2)), _PX, _PX])
+    _write(folder, "image_points", ("epoch_id", "camera_id", "target_id", "point_id"), points)
+    _write(folder, "spots", ("epoch_id", "camera_id", "spot_id"), spots)
+    assert main(["adjust", str(folder), "--quiet"]) == 0
+    return folder
+
+
+def _write(folder: Path, table: str, ids: tuple[str, ...], rows: list[list[Any]]) -> None:
+    with (folder / "observations" / f"{table}.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([[*ids, "u_px", "v_px", "sigma_u_px", "sigma_v_px"], *rows])
+
+
+Change = Callable[[int, dict[str, str]], object]
+
+
+def scaled(factor: float, *columns: str) -> Change:
+    return lambda _, row: row.update({c: repr(factor * float(row[c])) for c in columns})
+
+
+def exchanged(a: str, b: str) -> Change:
+    return lambda _, row: row.update({a: row[b], b: row[a]})
+
+
+def renamed(names: dict[str, str], *columns: str) -> Change:
+    return lambda _, row: row.update({c: names.get(row[c], row[c]) for c in columns})
+
+
+def turned(_: int, row: dict[str, str]) -> None:
+    """By a quarter about z."""
+    row.update(x_mm=repr(-float(row["y_mm"])), y_mm=row["x_mm"])
+
+
+XYZ = ("x_mm", "y_mm", "z_mm")
+
+
+@pytest.mark.parametrize(
+    ("table", "change", "name", "said"),
+    [
+        ("coordinates", exchanged("x_mm", "y_mm"), "axes or unit of coordinates", "have x and y exchanged"),
+        ("coordinates", scaled(-1.0, "z_mm"), "axes or unit of coordinates", "have z in the opposite direction"),
+        ("coordinates", scaled(1.0 / 25.4, *XYZ), "axes or unit of coordinates", "are inches, read as millimetres"),
+        ("coordinates", scaled(1.001, *XYZ), "scale of coordinates", "have a scale in common, by +1"),
+        ("table_angles", exchanged("axis1_deg", "axis2_deg"), "table misread", "axis1 and axis2 are exchanged"),
+        ("table_angles", scaled(1.0 / 0.9, "axis2_deg"), "table misread", "the readings of axis2 are in gon"),
+        ("table_angles", renamed({"t05": "t06", "t06": "t05"}, "epoch_id"), "readings exchanged", "epochs t05 and t06"),
+        ("coordinates", turned, "axes or unit of coordinates", "have other axes: (y, -x, z) of them are x, y and z"),
+        ("distances", renamed({"B01": "B03", "B03": "B01"}, "from_id", "to_id"), "points exchanged", "B01 and B03"),
+    ],
+)
+def test_what_is_wrong_in_a_table_is_named_and_mended(
+    table: str, change: Change, name: str, said: str, observed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Told as spots that "cannot be identified", as adjustments without end, as one distance in inches, or not."""
+    lab = Path(shutil.copytree(observed, tmp_path / "lab"))
+    shutil.rmtree(lab / "results")
+    labs.with_rows(lab / "observations" / f"{table}.csv", change)
+    assert main(["adjust", str(lab), "--quiet"]) in (0, FAILED, 3)
+    found = (lab / "results" / name for name in ("unsolved.json", "solution.json"))
+    first, *_ = next(json.loads(path.read_text(encoding="utf-8"))["diagnosis"] for path in found if path.exists())
+    assert (first["name"], said in first["cause"]) == (name, True), first["cause"]
+    assert main(["adjust", str(lab), "--quiet", "--try", "1"]) == 0
+    assert "PASSED" in capsys.readouterr().out
+
+
+def test_sigmas_of_few_coordinates_that_are_too_small_are_named(
+    observed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Among thousands of image points they do not move sigma0: no cause was asked for."""
+    lab = Path(shutil.copytree(observed, tmp_path / "lab"))
+    labs.with_rows(lab / "observations" / "coordinates.csv", scaled(0.25, *(f"sigma_{x}" for x in XYZ)))
+    assert main(["adjust", str(lab), "--quiet"]) == 3
+    solution = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))
+    assert "global test passed" in capsys.readouterr().out
+    first, *_ = solution["diagnosis"]
+    assert (first["name"], first["ids"]) == ("sigmas of a group", ["coordinates"])
