@@ -9,6 +9,7 @@ import numpy as np
 from adjust.adjustment import AdjustOptions
 from adjust.diagnosis.alone import completed, own_lenses, single_views
 from adjust.diagnosis.budget import REST, SCORES, START, STEP, Budget
+from adjust.diagnosis.memory import own_start
 from adjust.diagnosis.prediction import Altered, Linear, adjusted_values, started_values
 from adjust.diagnosis.units.conventions import UNKNOWN, Written
 from adjust.graph.assembly import StartValues, values_of
@@ -16,7 +17,6 @@ from adjust.graph.solver import SolveOptions
 from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
-from adjust.start import find_start
 from adjust.start.given import given_starts
 from adjust.start.views import View
 
@@ -57,7 +57,7 @@ class Case:
     def run(self, survey: Survey) -> Adjustment:
         """A survey like this one, or a part of it, adjusted from its own start. SurveyError where that fails."""
         n, whole = len(survey.image_blocks), len(self.survey.image_blocks)
-        share, start = n / whole if n and whole else 1.0, None if n or survey.pairs else find_start(survey)
+        share, start = n / whole if n and whole else 1.0, None if n or survey.pairs else own_start(survey)
         lost = _LOST * _nothing(survey)
         return self.budget.adjusted(survey, start, _OWN, (START + REST) * share, STEP * share, lost=lost)
 
@@ -112,7 +112,7 @@ class Case:
 
     def _started(self, survey: Survey) -> StartValues:
         self.budget.spend(START if survey.image_blocks else 0.1)
-        return find_start(survey)
+        return own_start(survey)
 
     @cached_property
     def views(self) -> Mapping[int, View]:

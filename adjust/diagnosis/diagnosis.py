@@ -9,11 +9,12 @@ import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, told_edit
+from adjust.diagnosis.memory import remembering
 from adjust.diagnosis.search import Search
 from adjust.diagnosis.trial import Misfit, Trial, misfit_of
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
-from adjust.start.lens.start import remembering
+from adjust.start.lens.start import remembering as remembering_lenses
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
 
@@ -102,7 +103,7 @@ def diagnose(case: Case, families: "Sequence[Family] | None" = None) -> Diagnosi
     waits, a few more. Nothing is repaired, nothing is written.
     """
     stages = [families] if families is not None else import_module("adjust.diagnosis.families").families(case)
-    with remembering():  # most of what is tried has most of its images in common
+    with remembering(), remembering_lenses():  # most of what is tried has most of its images in common
         return _diagnosed(case, stages)
 
 

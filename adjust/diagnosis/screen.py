@@ -3,7 +3,7 @@
 The closed forms of the start are robust: what one set-up or one pair says wrongly leaves the rest where it belongs.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -12,17 +12,16 @@ import gtsam
 import numpy as np
 
 from adjust.diagnosis.case import CAP, Case
+from adjust.diagnosis.memory import own_start, remembered
 from adjust.graph.assembly import AdjustmentGraph, StartValues, values_of
 from adjust.graph.building import GraphBuilder
 from adjust.model.errors import SurveyError
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.observations.terrestrial import equations as k
 from adjust.observations.terrestrial.batch import TerrestrialBatch
-from adjust.observations.terrestrial.building import reading_refs
 from adjust.observations.terrestrial.layout import ReadingArrays
 from adjust.precision.precision import adjusted_motion, residual_of
 from adjust.spatial.averaging import circular_median, circular_medians
-from adjust.start import find_start
 from adjust.start.positions import given_points
 
 _MEDIAN = 0.455  # of chi-square with one degree of freedom
@@ -133,7 +132,7 @@ class Screen(Fit):
         None where there is no start. All are predicted together, as far as they are between points of the world.
         """
         batch, own = self.graph.terrestrial, self.graph.survey
-        refs = reading_refs(own)
+        refs = own.reading_refs
         others_move = bool(self.graph.others) and any(s.points is not own.points for s in surveys)
         poses = any(u.kind == "pose" for u in self.graph.unknowns.by_key.values())
         if batch is None or others_move or poses or own.image_blocks or any(r.frame is not None for r in refs):
@@ -222,8 +221,8 @@ def _given(survey: Survey) -> StartValues | None:
 
 def _start(survey: Survey) -> StartValues | None:
     try:
-        return find_start(survey)
-    except (SurveyError, RuntimeError):  # GTSAM raises the latter where a convention that is not meant fits nothing
+        return own_start(survey)
+    except (SurveyError, RuntimeError):
         return None
 
 
@@ -241,10 +240,14 @@ def screen(survey: Survey, start: StartValues | None = None) -> Screen | None:
     return Screen(_finite(readings**2), _others(graph, graph.start), graph, start)
 
 
-def screen_without(survey: Survey, rows: Collection[int]) -> Screen | None:
+def screen_without(survey: Survey, rows: frozenset[int]) -> Screen | None:
     """The survey at the start that is found without some of its readings, which may have spoilt it; None as before."""
-    start = _start(replace(survey, readings=tuple(r for i, r in enumerate(survey.readings) if i not in rows)))
+    start = _start(remembered(_without, survey, rows))
     return None if start is None else screen(survey, start)
+
+
+def _without(survey: Survey, rows: frozenset[int]) -> Survey:
+    return replace(survey, readings=tuple(r for i, r in enumerate(survey.readings) if i not in rows))
 
 
 @lru_cache(maxsize=2)

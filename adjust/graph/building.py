@@ -32,7 +32,7 @@ from adjust.observations.images.bundle_layout import may_be_hidden
 from adjust.observations.images.bundles import BundleBatch
 from adjust.observations.images.helmert_blocks import helmert_blocks, runs_of_epochs
 from adjust.observations.images.reduction import reduction
-from adjust.observations.terrestrial.building import build_batch, reading_refs
+from adjust.observations.terrestrial.building import build_batch
 from adjust.observations.terrestrial.parameters import collect_terrestrial
 
 if TYPE_CHECKING:
@@ -200,7 +200,7 @@ class GraphBuilder:
         return self.frames.relative(ref.frame, FrameRef("world"))
 
     def _chains_of_others(self) -> tuple[dict[PositionRef, Chain | None], dict[int, Chain]]:
-        refs = position_refs(self.survey) + reading_refs(self.survey)
+        refs = [*position_refs(self.survey), *self.survey.reading_refs]
         positions = {ref: self._position_chain(ref) for ref in refs}
         if not self.survey.pairs:
             return positions, {}

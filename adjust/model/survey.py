@@ -30,6 +30,7 @@ from adjust.model.observations import (
     Observation,
     OnSurface,
     Pair,
+    PositionRef,
     Reading,
     ReadingCovariance,
     TableReading,
@@ -489,4 +490,10 @@ class Survey:
     def pair_frames(self) -> tuple[FrameRef, ...]:
         """The frames that the pairs join, each once, in order of appearance."""
         seen = {id(r): r for p in self.pairs for r in (p.a, p.b)}  # most are the same object: no hash of each
+        return tuple(dict.fromkeys(seen.values()))
+
+    @cached_property
+    def reading_refs(self) -> tuple[PositionRef, ...]:
+        """The positions that the readings need, likewise."""
+        seen = {id(ref): ref for r in self.readings for ref in (r.at, r.to, r.second) if ref is not None}
         return tuple(dict.fromkeys(seen.values()))

@@ -3,7 +3,7 @@
 A residual is predicted minus observed, unwhitened; the noise model alone whitens.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -19,7 +19,8 @@ from adjust.observations.images.batch import Chains
 from adjust.spatial.rigid import skew
 
 Jacobians = list[tuple[int, FloatArray]]
-Residual = Callable[[gtsam.Values], tuple[FloatArray, Jacobians]]
+Residual = Callable[[gtsam.Values], tuple[FloatArray, Iterable[tuple[int, FloatArray]]]]
+"""From values to a residual and its Jacobians by keys, which may be found as they are asked for."""
 PoseOf = Callable[[gtsam.Values], tuple[Pose3, Jacobians]]
 
 

@@ -152,12 +152,6 @@ def collect_vertical(survey: Survey, unknowns: Unknowns) -> VerticalMap:
     return VerticalMap(survey.vertical, survey.bearings.zero, unknowns.vectors.get(VERTICAL))
 
 
-def up_at(plumb_line: Plumb, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The unit vector upwards at a position x (3,) m, with its derivatives by x (3, 3) and by the tilts (3, 2)."""
-    v, curved, turned = plumb_line.upwards(np.asarray(x, dtype=float)[None])
-    return v[0], curved[0] * (np.eye(3) - np.outer(v[0], v[0])), turned[0]
-
-
 def tilted_frame(direction: FloatArray, tilt: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The axes of a unit ``direction`` (3,) turned by ``tilt`` (2,) rad about the first two of them.
 

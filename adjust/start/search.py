@@ -18,7 +18,6 @@ from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, Survey
 from adjust.observations.geometry.building import frame_refs, position_refs
-from adjust.observations.terrestrial.building import reading_refs
 from adjust.spatial.averaging import pose_distance, typical_distance
 from adjust.spatial.rigid import as_pose3
 from adjust.start.chains import ChainObservation, Chains
@@ -112,7 +111,7 @@ class _Search:
         self.motion_solved = self.scale_free = False
 
     def _register_positions(self, frames: FrameTree) -> None:
-        refs = position_refs(self.survey) + reading_refs(self.survey)
+        refs = [*position_refs(self.survey), *self.survey.reading_refs]
         for frame in [*frame_refs(self.survey), *(ref.frame for ref in refs if ref.frame is not None)]:
             frames.world_from(frame)
 

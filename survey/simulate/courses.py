@@ -2,15 +2,18 @@
 
 from collections.abc import Mapping
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from gtsam import Pose3
-from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from adjust.model.clocks import EpochTimes, epoch_times
 from adjust.model.result import ParameterName
 from adjust.model.survey import Camera, Clock, FloatArray, Survey
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
 
 Late = float | FloatArray
 """A time after an epoch, or (n,) times, at each of which something is somewhere else."""
@@ -64,6 +67,8 @@ class Courses:
         if poses:
             self._turns[body] = RotationSpline(t, Rotation.from_matrix([p.rotation().matrix() for p in poses]))
             values = [p.translation() for p in poses]
+        from scipy.interpolate import CubicSpline  # here: it takes long to load, and most examples have no clocks
+
         self._places[body] = CubicSpline(t, np.array(values))
 
 

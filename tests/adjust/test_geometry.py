@@ -233,6 +233,19 @@ def test_residuals_and_derivatives_of_every_kind() -> None:
             assert len(item.components) == len(item.units) == len(item.observed) == len(r)
 
 
+def test_what_all_are_served_is_what_each_says_alone() -> None:
+    survey, start = geometric(3)
+    graph = h.build(survey, start)
+    values = h.disturbed(graph.start, graph, 4)
+    alone = [item.factor.linearize(values).jacobian() for item in graph.others if item.used]
+    graph.prepare(values, jacobians=True)
+    with graph.state.serving():
+        served = [item.factor.linearize(values).jacobian() for item in graph.others if item.used]
+    for one, other in zip(alone, served, strict=True):
+        for a, b in zip(one, other, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-9)
+
+
 @pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.3, -0.2)])
 def test_tilted_direction(tilt: tuple[float, float]) -> None:
     """Against scipy's rotation and differences; of z, the first tilt turns about x and the second about y."""

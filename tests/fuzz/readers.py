@@ -228,11 +228,11 @@ def _planning(folder: Path) -> Read:
 
 @cache
 def _planned_lab() -> dict[str, bytes]:
-    """A project with values for everything and its plan, by name; simulating it takes seconds."""
+    """A project with values for everything and its plan, by name; simulating it takes a while."""
     from tests.survey.planning_lab import write_lab
 
     with tempfile.TemporaryDirectory() as folder:
-        write_lab(Path(folder) / "lab")
+        write_lab(Path(folder) / "lab", epochs=2)
         return _texts(Path(folder) / "lab")
 
 

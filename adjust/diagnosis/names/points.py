@@ -16,7 +16,6 @@ from adjust.model.names import grouped
 from adjust.model.observations import PositionRef, Reading
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import IntArray, Survey
-from adjust.observations.terrestrial.building import reading_refs
 
 _CLEARLY = 3.0
 _SUSPECTS, _MOST = 6, 4
@@ -47,7 +46,7 @@ def ends_exchanged(before: Screen, sets: Sequence[IntArray], names: Sequence[tup
     batch = before.graph.terrestrial
     if batch is None or not sets:
         return {}
-    number = {r.point_id: i for i, r in enumerate(reading_refs(before.graph.survey)) if r.frame is None}
+    number = {r.point_id: i for i, r in enumerate(before.graph.survey.reading_refs) if r.frame is None}
     a, b = (np.repeat([number.get(n[k], -2) for n in names], [len(rows) for rows in sets]) for k in (0, 1))
     rows, arrays = np.concatenate(sets), batch.layout.arrays
     old = np.stack([arrays.to[rows], arrays.second[rows]])

@@ -259,7 +259,7 @@ def _apart(
     given = {i: any(survey.readings[k].instrument_height for k in constants[i].rows) for i in some}
     worst = {i: -float(np.median(before.readings[constants[i].rows])) for i in some}
     for i in sorted(some, key=lambda i: (given[i], worst[i]))[:_SUSPECTS]:
-        apart = screen_without(survey, {*constants[i].rows.tolist()})
+        apart = screen_without(survey, frozenset(constants[i].rows.tolist()))
         if apart is not None and apart.graph.terrestrial is not None:
             own = replace(constants[i], by=apart.graph.terrestrial.A[constants[i].rows, 2])
             yield i, _evidence(apart, apart.graph.terrestrial, own)

@@ -12,6 +12,7 @@ import numpy as np
 
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import ChangeReadings, Hypothesis, Place
+from adjust.diagnosis.memory import remembered
 from adjust.diagnosis.screen import Screen, at_best, improvement, screen, screen_without
 from adjust.diagnosis.units.conventions import (
     ANGLES,
@@ -51,7 +52,7 @@ def misread_readings(case: Case) -> Iterator[Hypothesis]:
         return
     before, values = at_best(case), np.array([r.value for r in survey.readings])
     known = misreadings(case.written, "terrestrial")
-    ways = [(scope, m) for scope in scopes(survey) for m in _possible(survey, scope, values, known)]
+    ways = [(scope, m) for scope in remembered(_every_scope, survey) for m in _possible(survey, scope, values, known)]
     looked_at = len(ways)
     gains = _evidence(survey, before, values, ways)
     if before is not None and max(gains, default=0.0) < _CLEARLY:
@@ -81,7 +82,11 @@ def _slips(survey: Survey, before: Screen | None, values: FloatArray) -> list[_F
     return out
 
 
-def scopes(survey: Survey) -> Iterator[Scope]:
+def _every_scope(survey: Survey) -> tuple[Scope, ...]:
+    return tuple(_scopes(survey))
+
+
+def _scopes(survey: Survey) -> Iterator[Scope]:
     """All readings of a kind; of a set-up, by kind and all its angles; single ones."""
     kinds, setups = (np.array([getattr(r, of) for r in survey.readings]) for of in ("kind", "setup_id"))
 
@@ -119,6 +124,10 @@ def mended(survey: Survey, rows: IntArray, misreading: Misreading) -> Survey:
     return with_rows(survey, "readings", {i: replace(survey.readings[i], value=v) for i, v in new})
 
 
+def _mended(survey: Survey, scope: Scope, misreading: Misreading) -> Survey:
+    return mended(survey, scope.rows, misreading)
+
+
 def _evidence(survey: Survey, before: Screen | None, values: FloatArray, ways: Sequence[_Way]) -> list[float]:
     """How many times smaller the bounded misfit becomes by each way to read."""
     n, number = len(survey.readings), Counter(r.kind for r in survey.readings)
@@ -134,7 +143,7 @@ def _evidence(survey: Survey, before: Screen | None, values: FloatArray, ways: S
         anew, there = (misread, []) if n <= LARGE_START else ([], misread)
         # where all others fit, the start is not spoilt, and of a few readings it says more than a new one of all
         there += [i for i, w in enumerate(whole) if not w or (i in anew and _others_fit(before, ways[i][0].rows))]
-    surveys, out = [mended(survey, ways[i][0].rows, ways[i][1]) for i in anew], [0.0] * len(ways)
+    surveys, out = [remembered(_mended, survey, *ways[i]) for i in anew], [0.0] * len(ways)
     for i, after in zip(anew, before.afresh(surveys) if before else map(screen, surveys), strict=True):
         if after is not None:
             scale = after.scale if before is None else min(before.scale, after.scale)
@@ -175,8 +184,7 @@ def _without(
     every = {scope.place.ids: scope for scope, _ in ways if scope.place.kind == "setup" and mine[scope.rows[0]]}
     worst = sorted(every.values(), key=lambda scope: -float(np.median(before.readings[scope.rows])))
     for scope in worst[:_SUSPECTS]:
-        lost = {i for i in scope.rows.tolist() if mine[i]}
-        apart = screen_without(survey, lost)
+        apart = screen_without(survey, frozenset(i for i in scope.rows.tolist() if mine[i]))
         if apart is not None:
             some = [i for i, (s, _) in enumerate(ways) if set(s.rows.tolist()) <= set(scope.rows.tolist())]
             yield from _in_place(apart, values, ways, some)
@@ -197,10 +205,11 @@ def _others_fit(before: Screen, rows: IntArray) -> bool:
 
 def _hypothesis(survey: Survey, scope: Scope, misreading: Misreading, evidence: float, looked_at: int) -> Hypothesis:
     ids = tuple(survey.readings[i].reading_id for i in scope.rows)
+    changed = remembered(_mended, survey, scope, misreading)
+    edit = ChangeReadings(ids, misreading.factor, misreading.offset)
     return Hypothesis(
-        misreading.name, f"{scope.text}: {misreading.text('their')}", remedy(misreading), scope.place,
-        mended(survey, scope.rows, misreading), (ChangeReadings(ids, misreading.factor, misreading.offset),), evidence,
-        1, max(looked_at, 1), penalty=shrinking(misreading.factor, len(scope.rows)),
+        misreading.name, f"{scope.text}: {misreading.text('their')}", remedy(misreading), scope.place, changed, (edit,),
+        evidence, 1, max(looked_at, 1), penalty=shrinking(misreading.factor, len(scope.rows)),
     )  # fmt: skip
 
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
-from gtsam import Pose3
 
 from adjust.frames.state import State
 from adjust.frames.tree import FrameTree
@@ -22,7 +21,16 @@ from adjust.model.observations import (
     position_text,
 )
 from adjust.model.result import ParameterName
-from adjust.model.survey import SURFACES, Beam, BoolArray, FloatArray, Surface, Survey, VectorParameter
+from adjust.model.survey import (
+    SURFACES,
+    Beam,
+    BoolArray,
+    FloatArray,
+    Surface,
+    Survey,
+    VectorParameter,
+    tilt_axes,
+)
 from adjust.observations.factors import (
     ChainPose,
     ObservationFactor,
@@ -32,14 +40,9 @@ from adjust.observations.factors import (
     positions_factor,
 )
 from adjust.observations.geometry.fitting import fitted_beam, fitted_surface
-from adjust.observations.geometry.residuals import (
-    alignment_residual,
-    beam_axes,
-    level_residual,
-    spot_residual,
-    surface_residual,
-)
-from adjust.spatial.vertical import VerticalMap, collect_vertical, up_at
+from adjust.observations.geometry.poses import PoseBatch, aligned, beam_axes, inclined, spotted
+from adjust.observations.geometry.residuals import surface_residual
+from adjust.spatial.vertical import collect_vertical
 
 BEAM_UNITS = ("m", "m", "1", "1")
 SURFACE_UNITS: Mapping[str, tuple[str, ...]] = {
@@ -182,38 +185,53 @@ class GeometryFactors:
                                     d.used)  # fmt: skip
 
     def _levels(self, state: State, values: gtsam.Values) -> Iterator[ObservationFactor]:
-        for level, chain in zip(self.survey.levels, self.level_chains, strict=True):
-            if self.vertical is None:
-                break
-            pose = ChainPose(self.unknowns, state, chain)
-            keys = _keys(f"level {level.level_id!r}", pose.keys, self.vertical.key)
-            _check_level(level, pose(values)[0], self.vertical, values)
-            factor = custom(keys, np.array([[level.sigma**2]]), level_residual(level, pose, self.vertical))
+        levels, vertical = self.survey.levels, self.vertical
+        if vertical is None:
+            return
+        axes, observed = np.array([x.axis_in_frame for x in levels]), np.array([x.value for x in levels])
+        batch = PoseBatch(self.unknowns, state, self.level_chains, inclined(axes, observed, vertical),
+                          [vertical] * len(levels))  # fmt: skip
+        R, t = batch.poses(values)
+        up = vertical.at(values).upwards(t)[0]
+        for i, level in enumerate(levels):
+            keys = _keys(f"level {level.level_id!r}", batch.keys[i], vertical.key)
+            _check_level(level, float(up[i] @ R[i] @ level.axis_in_frame))
+            factor = custom(keys, np.array([[level.sigma**2]]), batch.residual(i))
             yield ObservationFactor(factor, "level", level.group, (level.level_id, frame_text(level.frame)),
                                     ("inclination",), ("rad",), np.array([level.value]), level.used)  # fmt: skip
 
     def _alignments(self, state: State, values: gtsam.Values) -> Iterator[ObservationFactor]:
-        for a, chain in zip(self.survey.alignments, self.alignment_chains, strict=True):
-            pose, known = ChainPose(self.unknowns, state, chain), known_components(a.cov)
-            keys = _keys(f"alignment {a.alignment_id!r}", pose.keys)
-            _check_alignment(a, np.asarray(pose(values)[0].rotation().matrix()))
-            factor = custom(keys, a.cov[np.ix_(known, known)], alignment_residual(a, pose, known))
+        every = self.survey.alignments
+        if not every:
+            return
+        axes, across = np.array([a.axis_in_a for a in every]), np.array([tilt_axes(a.axis_in_b) for a in every])
+        batch = PoseBatch(self.unknowns, state, self.alignment_chains,
+                          aligned(axes, across, np.array([a.value for a in every])))  # fmt: skip
+        for i, (a, R) in enumerate(zip(every, batch.poses(values)[0], strict=True)):
+            keys, known = _keys(f"alignment {a.alignment_id!r}", batch.keys[i]), known_components(a.cov)
+            _check_alignment(a, R)
+            factor = custom(keys, a.cov[np.ix_(known, known)], batch.residual(i, known))
             names = tuple(np.array(["across_1", "across_2"])[known])
             yield ObservationFactor(factor, "alignment", a.group, (a.alignment_id, frame_text(a.a), frame_text(a.b)),
                                     names, ("rad",) * len(names), a.value[known], a.used)  # fmt: skip
 
     def _spots(self, state: State, values: gtsam.Values) -> Iterator[ObservationFactor]:
-        for spot, chain in zip(self.survey.laser_spots, self.spot_chains, strict=True):
-            pose, beam = ChainPose(self.unknowns, state, chain), self.unknowns.vectors["beam", spot.beam_id]
-            axes = beam_axes(self.beams[spot.beam_id].axis)
-            along = pose(values)[0].rotation().matrix() @ axes @ np.array([*beam.full(values)[2:], 1.0])
+        spots = self.survey.laser_spots
+        if not spots:
+            return
+        axes = np.array([beam_axes(self.beams[s.beam_id].axis) for s in spots])
+        beams = [self.unknowns.vectors["beam", s.beam_id] for s in spots]
+        batch = PoseBatch(self.unknowns, state, self.spot_chains,
+                          spotted(axes, np.array([s.xy for s in spots]), beams), beams)  # fmt: skip
+        for i, (spot, R) in enumerate(zip(spots, batch.poses(values)[0], strict=True)):
+            along = R @ axes[i] @ np.array([*beams[i].full(values)[2:], 1.0])
             if abs(along[2]) < 0.02 * np.linalg.norm(along):
                 raise SurveyError(
                     f"laser spot {spot.spot_id!r}: beam {spot.beam_id!r} runs along target {spot.target_id!r} at epoch "
                     f"{spot.epoch_id!r} instead of meeting it; correct its axis or the start of the target's pose"
                 )
-            keys = _keys(f"laser spot {spot.spot_id!r}", pose.keys, beam.key)
-            factor = custom(keys, spot.cov, spot_residual(spot, pose, beam, axes))
+            keys = _keys(f"laser spot {spot.spot_id!r}", batch.keys[i], beams[i].key)
+            factor = custom(keys, spot.cov, batch.residual(i))
             ids = (spot.spot_id, spot.beam_id, frame_text(FrameRef("target", spot.target_id, spot.epoch_id)))
             yield ObservationFactor(factor, "laser", spot.group, ids, ("x", "y"), ("m", "m"), spot.xy, spot.used)
 
@@ -241,11 +259,9 @@ def _keys(what: str, own: Sequence[int], of_vector: int | None = None) -> list[i
     return keys
 
 
-def _check_level(level: Level, pose: Pose3, vertical: VerticalMap, values: gtsam.Values) -> None:
-    up = up_at(vertical.at(values), pose.translation())[0]
-    sine = abs(float(up @ pose.rotation().matrix() @ level.axis_in_frame))
-    if sine > 0.9:
-        angle = np.degrees(np.arcsin(min(1.0, sine)))
+def _check_level(level: Level, sine: float) -> None:
+    if abs(sine) > 0.9:
+        angle = np.degrees(np.arcsin(min(1.0, abs(sine))))
         raise SurveyError(
             f"level {level.level_id!r}: the axis of {frame_text(level.frame)} starts {angle:.0f} deg above or "
             "below the horizontal, where a level tells nothing; name the axis along which it was laid"

@@ -13,13 +13,6 @@ from adjust.observations.terrestrial.layout import LayoutBuilder, reading_arrays
 from adjust.observations.terrestrial.parameters import TerrestrialParameters
 
 
-def reading_refs(survey: Survey) -> list[PositionRef]:
-    """The positions that readings need."""
-    return list(dict.fromkeys(
-        ref for r in survey.readings for ref in (r.at, r.to, r.second) if ref is not None
-    ))  # fmt: skip
-
-
 def _body_refs(survey: Survey) -> list[PositionRef]:
     """Stations whose axes readings count in."""
     tilted = {s.setup_id for s in survey.setups if not s.levelled}
@@ -44,7 +37,7 @@ def build_batch(
     """The batch of all readings, None where there are none. Raises SurveyError for readings that cannot be."""
     if not survey.readings:
         return None
-    refs, bodies = reading_refs(survey), _body_refs(survey)
+    refs, bodies = survey.reading_refs, _body_refs(survey)
     held = height_holds(survey)
     flat = {ref: held.get(ref.point_id or "", 0) if ref.frame is None else 0 for ref in refs}
     arrays = reading_arrays(survey, parameters, {ref: i for i, ref in enumerate(refs)},

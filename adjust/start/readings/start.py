@@ -76,6 +76,8 @@ def _spread(
             height = spread_heights(sights, xy, height, heights_known)
             if len(xy) + len(height) == before:
                 break
+            if sights.nodes <= xy.keys() & height.keys():
+                return xy, height
     return xy, height
 
 

@@ -4,7 +4,6 @@ import numpy as np
 
 from adjust.frames.unknowns import Chain
 from adjust.model.survey import Survey
-from adjust.observations.terrestrial.building import reading_refs
 from adjust.start.positions import Positions, given_points
 from adjust.start.readings.sights import ties
 from adjust.start.readings.start import find_points
@@ -19,7 +18,7 @@ class Readings:
         self.given = given_points(survey)
         self.tilted = TiltedSetups(survey, positions)
         self._before: tuple[int, int] | None = None
-        refs = [*reading_refs(survey), *(ref for d in survey.distances for ref in (d.a, d.b))]
+        refs = [*survey.reading_refs, *(ref for d in survey.distances for ref in (d.a, d.b))]
         refs += [ref for a, b, _ in ties(survey) for ref in (a, b)]
         mentioned = {ref.point_id for ref in refs if ref.frame is None}
         self.concerned = np.array([p.point_id in mentioned for p in survey.points], dtype=np.bool_)

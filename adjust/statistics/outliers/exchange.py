@@ -10,7 +10,7 @@ size: two of nearly the same J cannot be told apart.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 
@@ -57,7 +57,7 @@ def better_set(snooping: Snooping, limits: FloatArray) -> Exchange | None:
     state = _state(snooping, limits)
     if state is None:
         return None
-    every = ([x for x in _exchanges(state, o) if x.more < -1e-6] for o in snooping.out)
+    every = ([x for x in found if x.more < -1e-6] for found in _exchanges(state))
     return next((min(found, key=lambda x: x.more) for found in every if found), None)
 
 
@@ -67,10 +67,9 @@ def equal_sets(snooping: Snooping, limits: FloatArray) -> list[Exchange]:
     if state is None:
         return []
     found: dict[tuple[frozenset[int], frozenset[int]], Exchange] = {}
-    for o in snooping.out:
-        for x in _exchanges(state, o):
-            if x.kept and x.instead and -1e-6 <= x.more < _EVEN:
-                found[frozenset(x.kept), frozenset(x.instead)] = x
+    for x in chain.from_iterable(_exchanges(state)):
+        if x.kept and x.instead and -1e-6 <= x.more < _EVEN:
+            found[frozenset(x.kept), frozenset(x.instead)] = x
     smallest = [
         x for (kept, instead), x in found.items()
         if not any((k, i) != (kept, instead) and k <= kept and i <= instead for k, i in found)
@@ -128,44 +127,53 @@ def _by_size(snooping: Snooping, wanted: BoolArray) -> Iterator[tuple[IntArray, 
             yield members[mine], snooping.rows(members[mine]), R[mine]
 
 
-def _exchanges(state: _State, o: int) -> list[Exchange]:
-    """All sets near a rejected observation, as exchanges with what is out now."""
-    pools = {frozenset(n.pool): n for most in _MINE if (n := _near(state, o, most)) is not None}
-    return [x for near in pools.values() for x in _exchanges_among(state, near)]
+def _exchanges(state: _State) -> Iterator[list[Exchange]]:
+    """Of every rejected observation all sets near it, as exchanges with what is out now, but for those before it."""
+    known = set[frozenset[int]]()
+    for o in state.snooping.out:
+        pools = {frozenset(n.pool): n for most in _MINE if (n := _near(state, o, most)) is not None}
+        yield [x for pool, near in pools.items() if pool not in known for x in _exchanges_among(state, near)]
+        known |= pools.keys()
 
 
 def _exchanges_among(state: _State, near: _Near) -> list[Exchange]:
-    J = _criteria(near, state.limits[near.pool])
-    n, here = near.n, 2**near.n - 1
-    if not np.isfinite(J[here]):
-        return []
-    more, out = J - J[here], []
-    for s in np.flatnonzero(more < _EVEN).tolist():
-        if s != here:
+    sets, J = _criteria(near, state.limits[near.pool])
+    n, here, out = near.n, sets == 2**near.n - 1, list[Exchange]()
+    if here.any():
+        more = J - J[here]
+        for s, by in zip(sets[more < _EVEN].tolist(), more[more < _EVEN].tolist(), strict=True):
             kept, instead = (tuple(x for i, x in enumerate(near.pool) if (s >> i & 1) == goes and (i < n) != goes)
                              for goes in (False, True))  # fmt: skip
-            out.append(Exchange(kept, instead, float(more[s])))
+            out += [Exchange(kept, instead, by)] if kept or instead else []
     return out
 
 
-def _criteria(near: _Near, limits: FloatArray) -> FloatArray:
-    """J (2^p,), less omega with all in use, of every set; observation i is in set s where bit i of s is.
+def _criteria(near: _Near, limits: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Sets that leave nothing open, and J of each, less omega with all in use; bit i: observation i of the pool is out.
 
     One observation after the other goes out of all sets of those before it, and takes its share off the R and g of
-    those behind it (as in :mod:`adjust.statistics.outliers.snooping`). inf where a set leaves something open.
+    those behind it (as in :mod:`adjust.statistics.outliers.snooping`), and off omega, in the corner of R and g.
     """
-    J, R, g = np.zeros(1), near.R[None], near.g[None]
-    for k, limit in zip(map(len, near.at), limits.tolist(), strict=True):
-        own, across, behind = R[:, :k, :k], R[:, :k, k:], R[:, k:, k:]
-        fine = (np.linalg.eigvalsh(own)[:, 0] if k > 1 else own[:, 0, 0]) > CONTROLLED
-        right = np.concatenate([across, g[:, :k, None]], axis=2)
-        divisor = np.where(fine[:, None, None], own, np.eye(k))
-        solved = np.linalg.solve(divisor, right) if k > 1 else right / divisor
-        share = np.einsum("si,si->s", g[:, :k], solved[..., -1])
-        less = across.transpose(0, 2, 1) @ solved if k > 1 else across.transpose(0, 2, 1) * solved
-        J = np.concatenate([J, np.where(fine, J + limit - share, np.inf)])
-        R, g = np.concatenate([behind, behind - less[..., :-1]]), np.concatenate([g[:, k:], g[:, k:] - less[..., -1]])
-    return J
+    sets, J, corner = np.zeros(1, dtype=np.int64), np.zeros(1), np.append(near.g, 0.0)[:, None]
+    R = np.block([[near.R, corner[:-1]], [corner.T]])[None]
+    for i, (k, limit) in enumerate(zip(map(len, near.at), limits.tolist(), strict=True)):
+        fine = _positive(R[:, :k, :k] - CONTROLLED * np.eye(k))
+        out, behind = R if fine.all() else R[fine], R[:, k:, k:]
+        own, across, back = out[:, :k, :k], out[:, :k, k:], out[:, k:, :k]
+        less = back @ np.linalg.solve(own, across) if k > 1 else back * (across / own)
+        sets, J = np.concatenate([sets, sets[fine] + 2**i]), np.concatenate([J, J[fine] + limit])
+        R = np.concatenate([behind, out[:, k:, k:] - less])
+    return sets, J + R[:, 0, 0]
+
+
+def _positive(M: FloatArray) -> BoolArray:
+    """Which of symmetric matrices (s, k, k) are positive definite: all pivots of their elimination are positive."""
+    fine = np.ones(len(M), dtype=np.bool_)
+    while M.shape[1]:
+        pivot = M[:, :1, :1]
+        fine &= pivot[:, 0, 0] > 0.0
+        M = M[:, 1:, 1:] - M[:, 1:, :1] * (M[:, :1, 1:] / np.where(pivot > 0.0, pivot, 1.0))
+    return fine
 
 
 def _near(state: _State, o: int, most: int) -> _Near | None:

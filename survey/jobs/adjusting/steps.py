@@ -9,6 +9,7 @@ from types import MappingProxyType
 from tqdm import tqdm
 
 from adjust.adjustment import AdjustOptions, adjust
+from adjust.diagnosis.memory import remembering
 from adjust.graph.assembly import StartValues
 from adjust.model.errors import IndeterminateError, SurveyError, listed
 from adjust.model.result import Adjustment, ParameterName
@@ -167,10 +168,11 @@ def adjust_project(
                 watch(iteration, omega)
 
         work = Work(project, begin, told_bar)
-        for step in STEPS:
-            if step.concerns(work):
-                with timed(step.name):
-                    work = step.run(work)
+        with remembering():
+            for step in STEPS:
+                if step.concerns(work):
+                    with timed(step.name):
+                        work = step.run(work)
     result = _result(work)
     tried = 0 if result.diagnosis is None else len(result.diagnosis.lines)
     said = result.warnings[:tried] + work.notes + result.warnings[tried:] + lost_notes(work.lost)
