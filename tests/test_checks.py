@@ -13,7 +13,7 @@ RUN = Path(__file__).parents[1] / ".ci" / "run"
 README = """python3 -m venv .venv && .venv/bin/pip install . && .venv/bin/pytest
 python3 -m venv .venv && .venv/bin/pip install . && .venv/bin/labsurvey adjust lab
 """
-TOOLS = ("pip", "pytest", "labsurvey", "ruff", "mypy", "lint-imports", "sphinx-build", "python")
+TOOLS = ("pip", "uv", "pytest", "labsurvey", "ruff", "mypy", "lint-imports", "sphinx-build", "python")
 _TOOL = """#!/bin/sh
 echo "called: ${0##*/} $*" >&2
 [ "${0##*/}" = python ] && case "$*" in *build_tools*) echo "clang++ one.cpp";; esac
