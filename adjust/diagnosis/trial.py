@@ -127,7 +127,7 @@ def tried_afresh(trial: Trial, case: Case, base: Misfit) -> Trial | None:
     near = trial.misfit.omega < base.omega and case.is_near
     near |= trial.hypothesis.of_variances and (trial.result is not None or case.is_near)
     if trial.result is not None and case.is_near and case.linear is not None:  # a minimum, if not a better one
-        near |= trial.hypothesis.of_variances or trial.result.omega <= case.linear.result.omega
+        near |= trial.result.omega <= case.linear.result.omega
     if trial.survey is None or case.starts_afresh or near or trial.hypothesis.scored:
         return None
     other = case.warm if _afresh_first(trial.hypothesis, case) else case.run

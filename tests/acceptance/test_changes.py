@@ -33,6 +33,13 @@ def test_a_table_group_that_a_large_survey_dilutes_is_named(tmp_path, capsys):
     out = capsys.readouterr().out
     assert "FAILED" in out
     assert "group table does not fit" in out
+    assert "encoder errs as it turns" in found["diagnosis"][0]["cause"]
+
+
+@pytest.mark.usefixtures("undiagnosed")
+def test_a_survey_that_fits_but_for_a_group_has_failed_in_all_that_tells(tmp_path, capsys):
+    assert adjusted("F200ecc12", tmp_path, 3)["summary"]["global_test"]["status"] == "passed"
+    capsys.readouterr()
     assert main(["runs", str(tmp_path / "F200ecc12")]) == 0
     assert "  failed  sigma0 " in capsys.readouterr().out  # as the results say, though the whole passes
     bench = survey.Workbench(tmp_path / "F200ecc12")

@@ -1,7 +1,7 @@
 """What is not observed at the same time: an offset or a drift between clocks, rows read one after the other; gears.
 
 The unit of time is the interval between epochs; speeds are those of the observations themselves, by differences of
-neighbouring epochs. What is tried are clocks as unknowns (:mod:`adjust.diagnosis.late`).
+neighbouring epochs. What is tried are clocks as unknowns (:mod:`adjust.diagnosis.time.clocks`).
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -15,9 +15,9 @@ from gtsam import Pose3, Rot3
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect, Shifts, of_others, of_shifts
 from adjust.diagnosis.hypothesis import Hypothesis, Place
-from adjust.diagnosis.late import Freed, as_unknowns, keyed, spoken
 from adjust.diagnosis.prediction import Linear
 from adjust.diagnosis.sequences import hand_poses
+from adjust.diagnosis.time.clocks import Freed, as_unknowns, keyed, spoken
 from adjust.model.names import grouped
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment, ParameterName

@@ -12,8 +12,8 @@ from gtsam import Pose3
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
-from adjust.diagnosis.late import Freed, as_unknowns
 from adjust.diagnosis.sequences import Link, links
+from adjust.diagnosis.time.clocks import Freed, as_unknowns
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import PoseParameter, Station, Survey
 from adjust.testing.criteria import sidak
