@@ -30,6 +30,7 @@ NO_READERS = {
     "survey/batch/worker.py:_listen": "a pipe",
     "survey/commands/common.py:run_command": "the null device",
     "survey/examples/simulated.py:_files": "tables that it has just written",
+    "survey/project/declared/toml_text.py:_unquoted": "a key of a document that tomllib has read before",
     "survey/project/merging.py:read_merged": "the copy of a project that was read before",
     "survey/jobs/starting.py:start_project": "copies images that read_image has read before",
     "survey/interop/cameras/colmap_writer.py:reconstruction": "an empty model of pycolmap, to be filled and written",
