@@ -43,7 +43,7 @@ VALUES: tuple[Family, ...] = (misread_heights, impossible_sigmas)
 UNITS: tuple[Family, ...] = (
     misread_readings, misread_lengths, second_faces, turned_circles, other_kinds, wrong_heights, misread_pairs,
 )  # fmt: skip
-IN_COMMON = (*VALUES, exchanged_points, exchanged_throughout, *UNITS, small_sigmas)
+IN_COMMON = (*VALUES, exchanged_points, exchanged_throughout, *UNITS, effects.of_tables, small_sigmas)
 """What several observations that were left out, with all others fitting, may have in common."""
 TIME: tuple[Family, ...] = (forgotten_motion, unsynchronised)
 WEIGHTS: tuple[Family, ...] = (odd_sigmas, wrong_factors, small_sigmas, correlated_readings, missing_centring)

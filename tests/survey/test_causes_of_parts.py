@@ -1,6 +1,7 @@
 """Mistakes of one table, one set-up, one axis: each is named as that part's, and mended by `--try`."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -158,6 +159,34 @@ def test_zero_of_an_axis_that_is_another_one_from_an_epoch_on(
     assert f"the zero of axis{axis} is another one" in first["cause"]
     assert "was turned about that axis: what was observed cannot tell" in first["cause"]
     assert mends(lab)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("of", "name", "said"),
+    [
+        (lambda x: [x[1], x[0], x[2]], "axes or unit of coordinates", "have x and y exchanged (north first"),
+        (lambda x: [x[0], x[2], x[1]], "axes or unit of coordinates", "have y and z exchanged"),
+        (lambda x: [v / 25.4 for v in x], "axes or unit of coordinates", "are inches, read as millimetres"),
+        (lambda x: [1.0005 * v for v in x], "scale of coordinates", "have a scale in common, by +5"),
+    ],
+)
+def test_coordinates_of_control_points(
+    of: Callable[[list[float]], list[float]], name: str, said: str, tmp_path: Path
+) -> None:
+    """Told as other bearings, or not; of a scale three of five were left out, and what was left passed."""
+    lab = labs.example("total-station", tmp_path / "lab")
+    hold(lab)
+    truth = json.loads((lab / "truth.json").read_text(encoding="utf-8"))["parameters"]
+    rows = [",".join([n, *(repr(v) for v in of([1e3 * x for x in truth[f"point/{n}"]])), "0.3,0.3,0.3"])
+            for n in ("B01", "B03", "B06", "B09", "B11")]  # fmt: skip
+    head = "point_id,x_mm,y_mm,z_mm,sigma_x_mm,sigma_y_mm,sigma_z_mm"
+    (lab / "observations" / "coordinates.csv").write_text("\n".join([head, *rows, ""]), encoding="utf-8")
+    told = [
+        (c["name"], said in c["cause"]) for c in named(lab)[:2]
+    ]  # mirrored: directions may count the other way round
+    assert (name, True) in told
+    assert main(["adjust", str(lab), "--quiet", "--try", str(told.index((name, True)) + 1)]) == 0
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ What shows only where the adjustment has lost its way altogether belongs to the 
 images and closed forms.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -26,6 +26,8 @@ from adjust.testing.distributions import chi2
 _ALPHA = 1e-4
 _SHARE = 0.2  # of the misfit beyond noise, by the linear score: less than a cause has to take away in the end
 _MOST = 6
+_Make = Callable[[Case, Linear], Iterator[Effect]]
+_EVERY: tuple[_Make, ...] = (steps, zeros, common, pixels, clocks, shapes)
 
 
 def hypotheses(case: Case) -> Iterator[Hypothesis]:
@@ -36,8 +38,14 @@ def hypotheses(case: Case) -> Iterator[Hypothesis]:
             yield from make(case, linear)
 
 
-def _scored(case: Case, linear: Linear) -> Iterator[Hypothesis]:
-    effects = [e for make in (steps, zeros, common, pixels, clocks, shapes) for e in _formed(make, case, linear)]
+def of_tables(case: Case) -> Iterator[Hypothesis]:
+    """What all distances of a group, or all observed coordinates, have in common."""
+    if case.linear is not None and (case.survey.distances or case.survey.coordinates):
+        yield from _scored(case, case.linear, (common,))
+
+
+def _scored(case: Case, linear: Linear, makes: Sequence[_Make] = _EVERY) -> Iterator[Hypothesis]:
+    effects = [e for make in makes for e in _formed(make, case, linear)]
     omega, redundancy = linear.contradicting
     clear = [e for e in effects if e.first.seen and e.first.drop > _SHARE * (omega - redundancy)]
     if not clear:
@@ -53,7 +61,7 @@ def _scored(case: Case, linear: Linear) -> Iterator[Hypothesis]:
         yield e.formed(case, linear, len(effects))
 
 
-def _formed(make: Callable[[Case, Linear], Iterator[Effect]], case: Case, linear: Linear) -> list[Effect]:
+def _formed(make: _Make, case: Case, linear: Linear) -> list[Effect]:
     try:
         with np.errstate(all="ignore"):
             return list(make(case, linear))

@@ -43,8 +43,9 @@ def wrong_given(case: Case) -> Iterator[Hypothesis]:
     changed, apart = ([h.survey for h in of if isinstance(h.survey, Survey)] for of in (tried, observed))
     fits = [*(map(screen, changed) if before is None else before.afresh(changed)), *map(screen, apart)]
     tried += observed
-    found = [replace(h, evidence=e, looked_at=len(tried)) for h, fit in zip(tried, fits, strict=True)
+    found = [replace(h, evidence=float(f"{e:.1e}"), looked_at=len(tried)) for h, fit in zip(tried, fits, strict=True)
              if (e := _evidence(before, fit)) > _CLEARLY]  # fmt: skip
+    # rounded: of mirror images that fit alike the first is the likeliest mistake
     for h in sorted(found, key=lambda h: -h.evidence)[:_MOST]:
         other = in_readings(survey, (h.place.ids[0], h.place.ids[1])) if h.name == _EXCHANGED else None
         if other is not None and isinstance(other.survey, Survey):
