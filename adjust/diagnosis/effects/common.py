@@ -10,6 +10,7 @@ from adjust.diagnosis.effects.effect import Effect, of_others
 from adjust.diagnosis.hypothesis import ChangeColumns, ChangeReadings, Edit, Hypothesis, Place
 from adjust.diagnosis.prediction import Linear
 from adjust.model.names import grouped
+from adjust.model.observations import position_text
 from adjust.model.result import Adjustment
 from adjust.model.rewriting import Fields, with_rows
 from adjust.model.survey import FloatArray, Survey
@@ -100,7 +101,7 @@ def _elsewhere(survey: Survey, linear: Linear, rows: list[int]) -> Effect:
 
 
 def _points(survey: Survey, rows: list[int]) -> dict[str, FloatArray]:
-    return {str(c.positions[0].point_id): c.values[0] for c in (survey.coordinates[i] for i in rows)}
+    return {position_text(c.positions[0]): c.values[0] for c in (survey.coordinates[i] for i in rows)}
 
 
 def _of_coordinates(

@@ -8,6 +8,7 @@ import numpy as np
 
 from adjust.diagnosis.hypothesis import ChangeColumns, Hypothesis, Place
 from adjust.diagnosis.units.conventions import LENGTH_RATIOS
+from adjust.model.observations import Coordinates, position_text
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, Survey
 
@@ -46,10 +47,10 @@ def other_axes(survey: Survey) -> Iterator[Hypothesis]:
     observed = survey.coordinates
     if not observed or any(len(c.positions) > 1 for c in observed):
         return
-    points = tuple(str(c.positions[0].point_id) for c in observed)
+    points = tuple(position_text(c.positions[0]) for c in observed)
     for said, remedy, M in ways():
         turned = np.sign(M)
-        rows = {i: replace(c, values=c.values @ M.T, cov=_turned(c.cov, turned)) for i, c in enumerate(observed)}
+        rows = {i: _changed(c, M) for i, c in enumerate(observed)}
         sigmas = tuple(f"sigma_{name}" for name in _COLUMNS)
         edits = [ChangeColumns("coordinates", _COLUMNS, M, np.zeros(3))]
         if any(np.ptp(np.diag(c.cov)) > 0 for c in observed) and not np.array_equal(abs(turned), np.eye(3)):
@@ -61,11 +62,10 @@ def other_axes(survey: Survey) -> Iterator[Hypothesis]:
         )  # fmt: skip
 
 
-def _turned(cov: FloatArray, M: FloatArray) -> FloatArray:
-    """(3, 3), infinite where nothing was observed."""
-    with np.errstate(invalid="ignore"):
-        out = M @ np.where(np.isfinite(cov), cov, 0.0) @ M.T
-    lost = abs(M) @ ~np.isfinite(np.diag(cov)) > 0
-    out[lost, :] = out[:, lost] = 0.0
-    out[lost, lost] = np.inf
-    return np.asarray(out)
+def _changed(observed: Coordinates, M: FloatArray) -> Coordinates:
+    """Sigmas go with their axes, in the unit in which they stand; what was not observed stays so."""
+    turned, known = np.sign(M), np.isfinite(np.diag(observed.cov))
+    lost = abs(M) @ ~known > 0
+    values = np.where(lost, np.nan, np.where(known, observed.values, 0.0) @ M.T)
+    cov = turned @ np.where(known & known[:, None], observed.cov, 0.0) @ turned.T
+    return replace(observed, values=values, cov=np.where(np.diag(lost), np.inf, cov))
