@@ -3,7 +3,7 @@
 Evidence: what the rest says of them at its start, which none of them moves much.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -47,10 +47,13 @@ def _other_units(case: Case, before: Screen) -> Iterator[Hypothesis]:
     for way, now in zip(ways, np.split(np.minimum(after.others / before.scale, CAP), len(ways)), strict=True):
         evidence = improvement(was, float(now.sum()), len(used))
         if evidence > _CLEARLY:
-            yield _read_by(case.survey, used, way, evidence, len(ways))
+            yield all_read_by(case.survey, used, way, evidence, len(ways))
 
 
-def _read_by(survey: Survey, used: dict[int, Distance], way: Misreading, evidence: float, looked_at: int) -> Hypothesis:
+def all_read_by(
+    survey: Survey, used: Mapping[int, Distance], way: Misreading, evidence: float = 1.0, looked_at: int = 1
+) -> Hypothesis:
+    """All distances that are used, by row, in another unit."""
     ids = tuple(d.distance_id for d in used.values())
     return Hypothesis(
         way.name, f"all distances: {way.text('their')}", remedy(way, "distances"), Place("reading", ids, "value"),

@@ -11,8 +11,8 @@ import numpy as np
 from adjust.diagnosis.diagnosis import Candidate
 from adjust.diagnosis.hypothesis import ChangeReadings, Edit, Hypothesis, Place
 from adjust.diagnosis.units.conventions import MISREADINGS, UNIT_OF_LENGTHS, Misreading, Written, misreadings, slips
+from adjust.diagnosis.units.lengths import all_read_by
 from adjust.diagnosis.units.motions import CONVENTIONS, edits_of, mended, miss
-from adjust.diagnosis.units.readings import remedy
 from adjust.model.observations import Distance, Reading
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.rewriting import with_rows
@@ -53,13 +53,8 @@ def _of_all_distances(survey: Survey, found: Sequence[Candidate]) -> tuple[Candi
     ways = [m for m in MISREADINGS if m.name == UNIT_OF_LENGTHS and factors == {m.factor}]
     if not ways or len(used) < 2 or edits.keys() != used.keys():
         return ()
-    way, every, first = ways[0], survey.distances, next(c for _, c in edits.values())
-    changed = with_rows(survey, "distances", {
-        i: replace(every[i], value=way.factor * every[i].value) for i in used.values()})  # fmt: skip
-    h = Hypothesis(
-        way.name, f"all distances: {way.text('their')}", remedy(way, "distances"),
-        Place("reading", tuple(used), "value"), changed, (ChangeReadings(tuple(used), way.factor, table="distances"),),
-    )  # fmt: skip
+    first = next(c for _, c in edits.values())
+    h = all_read_by(survey, {i: survey.distances[i] for i in used.values()}, ways[0])
     share = min(c.explained for _, c in edits.values())
     return (replace(first, hypothesis=h, explained=share, statistic=sum(c.statistic for _, c in edits.values())),)
 

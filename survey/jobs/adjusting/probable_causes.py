@@ -1,7 +1,7 @@
 """Why an adjustment failed, or what contradicts in it, where the images can tell. Nothing is repaired."""
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import replace
@@ -79,9 +79,13 @@ def explained(survey: Survey, error: SurveyError, project: Project) -> SurveyErr
         said = copy(error)
         said.args = ("\n  - ".join([str(error), *note]),)
         return said if note else error
-    lines = "\n  - ".join(["probable cause:", *apart, *tried, *note])
-    message = f"{lines}\n{_consequence(error) if tried else f'without that: {error}'}"
+    message = causes_first((*apart, *tried, *note), _consequence(error) if tried else f"without that: {error}")
     return SurveyError(message) if diagnosis is None else DiagnosedError(message, diagnosis)
+
+
+def causes_first(causes: Iterable[str], then: str) -> str:
+    """The message of an error: its causes, then what is to be done, or what was raised."""
+    return "\n".join(["\n  - ".join(["probable cause:", *causes]), then])
 
 
 def with_probable_causes(survey: Survey, result: Adjustment, project: Project) -> Adjustment:

@@ -8,6 +8,7 @@ from adjust.diagnosis.units.axes import other_axes
 from adjust.model.errors import DiagnosedError, SurveyError
 from adjust.model.result import Adjustment
 from survey.jobs.adjusting.places import located
+from survey.jobs.adjusting.probable_causes import causes_first
 from survey.jobs.identify import Identification, identified, identify_spots
 from survey.project import Project
 
@@ -16,12 +17,10 @@ _TIMES, _MORE = 2, 4
 
 
 def require_names(project: Project, first: Adjustment, found: Identification, gate_px: float) -> None:
-    """Nothing where most spots have names, or no change gives them. Raises DiagnosedError where one does, and fits.
+    """For spots most of which have no name. Raises DiagnosedError where a change gives them names, and fits.
 
     first: of the cameras and stations, without the spots. found: the names by the coordinates as they stand.
     """
-    if found.unidentified <= found.identified:
-        return
     enough = max(_TIMES * found.identified, found.identified + _MORE)
     changed = [(h, survey) for h in other_axes(project.survey) if (survey := h.changed()) is not None]
     named = [(h, survey, identify_spots(survey, first, project.spots, gate_px)) for h, survey in changed]
@@ -34,8 +33,8 @@ def require_names(project: Project, first: Adjustment, found: Identification, ga
     diagnosis = diagnose(Case(identified(project.survey, found), None, SurveyError("")), [lambda _: best])
     if diagnosis.candidates:
         diagnosis = located(diagnosis, project)
-        lines = "\n  - ".join(["probable cause:", *diagnosis.lines])
-        raise DiagnosedError(f"{lines}\nmend that first: as it is, the spots have wrong names, or none", diagnosis)
+        then = "mend that first: as it is, the spots have wrong names, or none"
+        raise DiagnosedError(causes_first(diagnosis.lines, then), diagnosis)
 
 
 def _share(found: Identification) -> str:
