@@ -56,7 +56,9 @@ def scene(values: CameraValues) -> Scene:
             focal = focal_length_px(MODELS[camera.lens.model], lens, camera_constants(camera))
             cameras[camera.camera_id] = (camera, pose, focal)
     if not (beacons or targets or cameras):
-        raise SurveyError("nothing of the project has a place yet; adjust it first")
+        has_any = values.survey.points or values.survey.targets or values.survey.cameras
+        raise SurveyError("nothing of the project has a place yet; adjust it first" if has_any else
+                          "the project has no points, targets or cameras; scenes hold nothing else")  # fmt: skip
     ellipsoids = {}
     for name, x in beacons.items():
         cov = values.cov("point", name)

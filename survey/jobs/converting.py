@@ -30,7 +30,7 @@ from survey.interop.networks.krumm import read_krumm
 from survey.interop.networks.lgc import read_lgc
 from survey.interop.networks.plain_csv import correlated, plain_csv, read_plain_csv
 from survey.interop.networks.sinex import sinex_text
-from survey.interop.networks.values import NetworkValues, left_out, require_network
+from survey.interop.networks.values import NetworkValues, counted, left_out, require_network
 from survey.interop.photogrammetry.aicon import ENDINGS as AICON_ENDINGS
 from survey.interop.photogrammetry.aicon import read_aicon
 from survey.interop.photogrammetry.dbat import read_dbat
@@ -211,12 +211,12 @@ def _to_file(
         return ConvertOutcome(source, target, format, counts, said, notes)
     require_network(project.survey, str(source), format)
     network = _adjusted(project) if format == "sinex" else _as_it_stands(project)
-    rest = left_out(project.survey)
+    rest = left_out(project.survey, unused=format != "json")
     if format == "csv":
         rest += correlated(network)
     text = {"gama": gama_text, "csv": plain_csv, "json": network_json, "sinex": sinex_text}[format](network)
     atomic_write(target, text)
-    counts = {"points": len(project.survey.points), "readings": len(project.survey.readings)}
+    counts = {"points": len(project.survey.points)} if format == "sinex" else counted(project.survey)
     said = "adjusted" if network.adjusted else "start values, not adjusted"
     return ConvertOutcome(source, target, format, counts, said, () if format == "sinex" else rest)
 

@@ -170,3 +170,32 @@ def test_wrong_ways_are_refused(project, tmp_path, capsys, source, target, messa
     (tmp_path / "net.txt").write_text("x")
     assert main(["convert", str(tmp_path / source), str(tmp_path / target)]) == 1
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("format", ["gama", "csv", "json"])
+def test_what_is_written_is_counted_and_what_is_not_is_said(project, tmp_path, capsys, format):
+    with (project / "survey.toml").open("a", encoding="utf-8") as file:
+        file.write('\n[stations.head]\nworld_from_station = { treatment = "held" }\n')
+    a, b, *_ = (p.point_id for p in read(project).survey.points)
+    rows = f"distance_id,from_id,to_id,value_mm,sigma_mm\nd1,station:head,{a},1000,1\nd2,{a},{b},2000,1\n"
+    (project / "observations" / "distances.csv").write_text(rows, encoding="utf-8")
+    survey = read(project).survey
+    assert main(["convert", str(project), str(tmp_path / "out"), "--format", format, "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert "left out, distances on stations, cameras or targets: 1" in said["left_out"]
+    assert (said["points"], said["readings"]) == (len(survey.points), len(survey.readings) + 1)
+    assert (said["baselines"], said["coordinates"]) == (2, 2)
+    if format != "json":
+        (tmp_path / "out").rename(tmp_path / ("out.gkf" if format == "gama" else "out.csv"))
+        back = (read_gama(tmp_path / "out.gkf") if format == "gama" else read_plain_csv(tmp_path / "out.csv")).survey
+        assert len(back.readings) == said["readings"]
+
+
+@pytest.mark.parametrize("name", ["net.ply", "net.glb", "net.json"])
+def test_a_network_of_pairs_is_no_scene_and_no_cameras(name, tmp_path, capsys):
+    assert main(["example", "relay", str(tmp_path / "relay")]) == 0
+    capsys.readouterr()
+    how = ["--format", "nerf"] if name.endswith("json") else []
+    assert main(["convert", str(tmp_path / "relay"), str(tmp_path / name), *how]) == 1
+    assert "the project has no " in capsys.readouterr().err
+    assert not (tmp_path / name).exists()

@@ -13,7 +13,7 @@ from adjust.model.observations import FrameRef
 from adjust.model.survey import LensParameter, PoseParameter, Survey
 from survey.folder.text import id_problem, json_text
 from survey.interop.cameras.rig import lens_of, moving_camera, pose_of
-from survey.interop.cameras.values import BROWN_5, FISHEYE_4, CameraValues, MappedLens, mapped_lens
+from survey.interop.cameras.values import BROWN_5, FISHEYE_4, CameraValues, MappedLens, mapped_lens, stations_of_cameras
 from survey.interop.networks.foreign import ForeignNetwork
 from survey.interop.safe_yaml import Entry, read_yaml
 
@@ -94,7 +94,8 @@ def _lens(root: Entry, frame: Entry) -> tuple[LensParameter, tuple[int, int]]:
 
 def nerf_files(values: CameraValues, station: str | None) -> tuple[dict[str, str], tuple[str, ...]]:
     """All images with image points, or those of one station; what was approximated."""
-    cameras = {c.camera_id: c for c in values.survey.cameras if station in (None, c.station_id)}
+    carriers = stations_of_cameras(values, station, "nerf")
+    cameras = {c.camera_id: c for c in values.survey.cameras if c.station_id in carriers}
     lenses = {k: mapped_lens(c, values.lens(c), CHOICES) for k, c in cameras.items()}
     seen = dict.fromkeys((b.camera_id, b.epoch_id) for b in values.blocks() if b.camera_id in cameras)
     if not seen:  # poses alone, as from another file

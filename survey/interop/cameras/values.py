@@ -195,16 +195,22 @@ def camera_values(project: Project, result: Adjustment | None = None) -> CameraV
     )
 
 
-def one_station(values: CameraValues, station_id: str | None, format: str) -> Station:
-    """The station whose cameras go into a format that holds one rig. Raises SurveyError where it is not clear."""
+def stations_of_cameras(values: CameraValues, station_id: str | None, format: str) -> list[str]:
+    """The stations that carry cameras, or the one chosen. Raises SurveyError where there is none."""
     ids = list(dict.fromkeys(c.station_id for c in values.survey.cameras))
     if not ids:
         raise SurveyError(f"the project has no cameras; {format} holds nothing else")
     if station_id is not None and station_id not in ids:
         raise SurveyError(f"station {station_id!r} carries no camera; choose one of {', '.join(ids)}")
-    if station_id is None and len(ids) > 1:
+    return ids if station_id is None else [station_id]
+
+
+def one_station(values: CameraValues, station_id: str | None, format: str) -> Station:
+    """The station whose cameras go into a format that holds one rig. Raises SurveyError where it is not clear."""
+    ids = stations_of_cameras(values, station_id, format)
+    if len(ids) > 1:
         raise SurveyError(f"{format} holds the cameras of one station; choose with --station: {', '.join(ids)}")
-    return values.survey.stations_by_id[station_id or ids[0]]
+    return values.survey.stations_by_id[ids[0]]
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,16 +28,16 @@ def network_json(network: NetworkValues) -> str:
         "distances": [
             {"id": d.distance_id, "from": point_of(d.a), "to": point_of(d.b), "value_m": d.value, "sigma_m": d.sigma,
              "used": d.used}
-            for d in survey.distances if point_of(d.a) is not None and point_of(d.b) is not None
+            for d in survey.distances if between_points(d)
         ],
         "coordinate_differences": [
             {"from": _ids(o.at), "to": _ids(o.to), "values_m": plain(o.values), "covariance_m2": plain(o.cov),
              "used": o.used}
-            for o in survey.coordinate_differences
+            for o in survey.coordinate_differences if between_points(o)
         ],
         "coordinates": [
             {"points": _ids(o.positions), "values_m": plain(o.values), "covariance_m2": plain(o.cov), "used": o.used}
-            for o in survey.coordinates
+            for o in survey.coordinates if between_points(o)
         ],
         "adjusted": _adjusted(network),
     }  # fmt: skip

@@ -6,12 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from adjust.model.errors import SurveyError
-from adjust.model.observations import PositionRef, Reading
+from adjust.model.observations import CoordinateDifferences, Coordinates, Distance, PositionRef, Reading
 from adjust.model.survey import FloatArray, Survey
 from survey.solution.quantities import SigmaKind
-
-_HELD = ("readings", "coordinate_differences", "coordinates", "distances")
-"""Observations that formats of networks hold."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,14 +40,25 @@ def point_of(position: PositionRef) -> str | None:
     return position.point_id if position.frame is None else None
 
 
-def between_points(reading: Reading) -> bool:
-    """Whether all ends of a reading are world points."""
-    return all(point_of(e) is not None for e in ends_of(reading))
+Observed = Reading | Distance | CoordinateDifferences | Coordinates
 
 
-def ends_of(reading: Reading) -> list[PositionRef]:
-    """Where a reading stands, and what it sights."""
-    return [e for e in (reading.at, reading.to, reading.second) if e is not None]
+def between_points(observation: Observed) -> bool:
+    """Whether all ends of an observation are world points."""
+    return all(point_of(e) is not None for e in ends_of(observation))
+
+
+def ends_of(observation: Observed) -> list[PositionRef]:
+    """The positions that an observation is of: where a reading stands, and what it sights."""
+    match observation:
+        case Reading():
+            return [e for e in (observation.at, observation.to, observation.second) if e is not None]
+        case Distance():
+            return [observation.a, observation.b]
+        case CoordinateDifferences():
+            return [*observation.at, *observation.to]
+        case Coordinates():
+            return list(observation.positions)
 
 
 def readings_of(survey: Survey) -> list[Reading]:
@@ -77,13 +85,11 @@ def triples_of(survey: Survey, priors: bool = False) -> tuple[list[Triples], lis
     """Baselines and coordinates in use of world points; priors: those of points among the latter."""
     differences, coordinates = [], []
     for d in survey.coordinate_differences:
-        at, to = _world(d.at), _world(d.to)
-        if d.used and len(at) == len(to) == len(d.values):
-            differences.append(Triples(at, to, d.values, d.cov))
+        if d.used and between_points(d):
+            differences.append(Triples(_world(d.at), _world(d.to), d.values, d.cov))
     for c in survey.coordinates:
-        to = _world(c.positions)
-        if c.used and len(to) == len(c.values):
-            coordinates.append(Triples((), to, c.values, c.cov))
+        if c.used and between_points(c):
+            coordinates.append(Triples((), _world(c.positions), c.values, c.cov))
     for point in survey.points if priors else ():
         x = point.x_in_world
         if x.treatment == "prior" and x.value is not None and x.prior_cov is not None:
@@ -95,8 +101,26 @@ def _world(positions: Iterable[PositionRef]) -> tuple[str, ...]:
     return tuple(name for p in positions if (name := point_of(p)) is not None)
 
 
-def left_out(survey: Survey) -> tuple[str, ...]:
-    """What formats of networks cannot hold, for people."""
+def _held(survey: Survey) -> dict[str, tuple[Observed, ...]]:
+    """Observations that formats of networks hold, by kind."""
+    return {
+        "readings": survey.readings, "coordinate_differences": survey.coordinate_differences,
+        "coordinates": survey.coordinates, "distances": survey.distances,
+    }  # fmt: skip
+
+
+def counted(survey: Survey) -> dict[str, int]:
+    """How much formats of networks hold of a survey, by what it is called."""
+    baselines, coordinates = triples_of(survey)
+    counts = {
+        "readings": len(readings_of(survey)), "baselines": sum(len(t.to) for t in baselines),
+        "coordinates": sum(len(t.to) for t in coordinates),
+    }  # fmt: skip
+    return {"points": len(survey.points)} | {what: n for what, n in counts.items() if n}
+
+
+def left_out(survey: Survey, unused: bool = True) -> tuple[str, ...]:
+    """What formats of networks cannot hold, for people; unused: observations that are not in use are among it."""
     counts = {
         "cameras": len(survey.cameras),
         "stations": len(survey.stations),
@@ -110,8 +134,11 @@ def left_out(survey: Survey) -> tuple[str, ...]:
         "levels": len(survey.levels),
         "alignments": len(survey.alignments),
         "free parameters of instruments": sum(len(i.parameters.free) for i in survey.instruments),
-        "readings on stations, cameras or targets": sum(not between_points(r) for r in survey.readings),
-        "observations not in use": sum(not o.used for kind in _HELD for o in survey.others[kind]),
+        **{
+            f"{kind.replace('_', ' ')} on stations, cameras or targets": sum(not between_points(o) for o in every)
+            for kind, every in _held(survey).items()
+        },
+        "observations not in use": unused * sum(not o.used for every in _held(survey).values() for o in every),
         "centring errors": sum(r.target_centring_sigma > 0.0 for r in survey.readings)
         + sum(s.centring_sigma > 0.0 or s.height_sigma > 0.0 for s in survey.setups),
         "tilts or curvature of the level surface": int(
