@@ -111,3 +111,18 @@ def test_the_older_list_of_cameras(tmp_path):
     inverse = camera.station_from_camera.value.inverse()
     np.testing.assert_allclose(inverse.translation(), [0.1, 0.2, 1.5], atol=1e-15)
     np.testing.assert_allclose(inverse.rotation().matrix(), Rotation.from_rotvec([0, 0, 0.5]).as_matrix())
+
+
+def test_files_of_industrial_cameras_come_back_from_their_folder(lab, there_and_back, tmp_path):
+    _, values = lab
+    same_rig(values, there_and_back("ros-industrial", "ros-industrial"), {"left": "left", "right": "right"})
+
+
+@pytest.mark.parametrize("read", [read_ros, read_industrial])
+def test_a_folder_of_very_many_cameras_is_refused_and_not_cut(read, tmp_path, monkeypatch):
+    for n in range(3):
+        text = _INFO.format("plumb_bob", 5, "0, 0, 0, 0, 0").replace("narrow_stereo", f"c{n}")
+        (tmp_path / f"c{n}.yaml").write_text(text, encoding="utf-8")
+    monkeypatch.setattr("survey.interop.cameras.rig.MOST_FILES", 2)
+    with pytest.raises(SurveyError, match=r"holds 3 \.yaml files; one per camera is expected, 2 at most"):
+        read(tmp_path)

@@ -19,7 +19,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
 from adjust.spatial.rigid import skew
 from survey.folder.text import decode, read_bytes
-from survey.interop.cameras.rig import Rig, RigCamera, lens_of, pose_of, rig_network
+from survey.interop.cameras.rig import Rig, RigCamera, camera_files, joined, lens_of, pose_of, rig_network
 from survey.interop.cameras.values import BROWN_8, MappedLens, RigValues
 from survey.interop.networks.foreign import ForeignNetwork, Where
 from survey.interop.safe_yaml import Entry
@@ -36,20 +36,12 @@ _NAMES = {
 }
 _MAX_BYTES = 256_000_000
 _NO_MODEL = "is no dictionary; give a camera model of mrcal"
-_MOST_FILES = 1000
 
 
 def read_mrcal(path: Path) -> ForeignNetwork:
     """One model, or a folder of them. Raises SurveyError with file and line for what cannot be read."""
-    if not path.is_dir():
-        camera, notes = _read(path)
-        return rig_network(Rig("reference", (camera,), notes), path)
-    files = sorted(path.glob(f"*{ENDING}"))[:_MOST_FILES]
-    if not files:
-        raise SurveyError(f"{path}: holds no {ENDING} files")
-    read = [_read(file) for file in files]
-    notes = tuple(dict.fromkeys(note for _, own in read for note in own))
-    return rig_network(Rig("reference", tuple(camera for camera, _ in read), notes), path)
+    read = map(_read, camera_files(path, ENDING))
+    return rig_network(joined([Rig("reference", (camera,), notes) for camera, notes in read]), path)
 
 
 def _read_model(path: Path) -> Entry:

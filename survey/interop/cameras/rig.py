@@ -1,5 +1,6 @@
 """What most calibration files of other programs hold: cameras fixed to each other, or one that moves, with lenses."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
@@ -15,6 +16,7 @@ from adjust.model.survey import Camera, FloatArray, LensParameter, Point, PosePa
 from adjust.spatial.rigid import nearest_rotation
 from survey.interop.networks.foreign import ForeignNetwork, Where, safe_ids
 
+MOST_FILES = 1000
 _ROTATION_TOLERANCE = 1e-3
 """What a written rotation matrix may miss orthonormality by: files round to four digits and fewer."""
 
@@ -113,6 +115,26 @@ def quaternion_xyzw(pose: Pose3) -> FloatArray:
     """The rotation as a unit quaternion, real part last and not negative."""
     q = np.asarray(Rotation.from_matrix(pose.rotation().matrix()).as_quat())
     return -q if q[3] < 0.0 else q
+
+
+def camera_files(path: Path, ending: str, but: str = "") -> list[Path]:
+    """The file of a camera, or all with this ending of a folder of them, without the one called ``but``.
+
+    Raises SurveyError for a folder with none or with very many.
+    """
+    if not path.is_dir():
+        return [path]
+    files = sorted(p for p in path.glob(f"*{ending}") if p.name != but)
+    if not files or len(files) > MOST_FILES:
+        raise SurveyError(f"{path}: holds {len(files) or 'no'} {ending} files; one per camera is expected, "
+                          f"{MOST_FILES} at most")  # fmt: skip
+    return files
+
+
+def joined(rigs: Sequence[Rig]) -> Rig:
+    """Cameras of several files as one rig, named as in the first; each note once."""
+    notes = dict.fromkeys(note for rig in rigs for note in rig.notes)
+    return Rig(rigs[0].rig_id, tuple(c for rig in rigs for c in rig.cameras), tuple(notes))
 
 
 def rig_network(rig: Rig, path: Path) -> ForeignNetwork:

@@ -20,6 +20,8 @@ from survey.interop.cameras.opencv_files import camera_matrix
 from survey.interop.cameras.rig import (
     Rig,
     RigCamera,
+    camera_files,
+    joined,
     lens_of,
     opencv_lens,
     pose_of,
@@ -37,20 +39,13 @@ CHOICES = {"brown": BROWN_8, "fisheye": FISHEYE_4}
 INDUSTRIAL_CHOICES = {"brown": BROWN_5}
 _MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
 _DISTORTION = ("k1", "k2", "p1", "p2", "k3")
-_MOST_FILES = 1000
 
 
 def read_ros(path: Path) -> ForeignNetwork:
     """A camera_info file, or a folder of them. Raises SurveyError with file and line for what cannot be read."""
-    if not path.is_dir():
-        root = read_yaml(path)
-        return rig_network(Rig("rig", (_camera(root, path.stem),)), path)
-    files = sorted(p for p in path.glob("*.yaml") if p.name != EXTRINSICS)[:_MOST_FILES]
-    if not files:
-        raise SurveyError(f"{path}: holds no .yaml files; one camera_info per camera is expected")
     rig_id, poses = _extrinsics(path / EXTRINSICS) if (path / EXTRINSICS).is_file() else ("rig", {})
     cameras = []
-    for file in files:
+    for file in camera_files(path, ".yaml", but=EXTRINSICS):
         camera = _camera(read_yaml(file), file.stem)
         pose = poses.get(f"{camera.camera_id}{FRAME}", poses.get(camera.camera_id))
         cameras.append(RigCamera(camera.camera_id, camera.image_size, camera.lens, pose))
@@ -128,11 +123,15 @@ def _named(names: Iterable[str], values: FloatArray) -> dict[str, float]:
 
 
 def read_industrial(path: Path) -> ForeignNetwork:
-    """ROS-Industrial's calibration. Raises SurveyError with file and line for what cannot be read."""
+    """ROS-Industrial's calibration, or a folder of them. Raises SurveyError, with file and line, as all readers do."""
+    return rig_network(joined([_industrial_rig(file) for file in camera_files(path, ".yaml")]), path)
+
+
+def _industrial_rig(path: Path) -> Rig:
     root = read_yaml(path)
     listed = [e for key in ("static_cameras", "moving_cameras") if key in root for e in _industrial_list(root.get(key))]
     if listed:
-        return rig_network(Rig("rig", tuple(_industrial_camera(e) for e in listed)), path)
+        return Rig("rig", tuple(_industrial_camera(e) for e in listed))
     own = root.get("intrinsics")
     values = {ours: own.get(key).number for ours, key in _PINHOLE}
     if "distortions" in root:
@@ -142,7 +141,7 @@ def read_industrial(path: Path) -> ForeignNetwork:
     size = _industrial_size(root, values)
     name = root.get("camera_name").text if "camera_name" in root else path.stem
     camera = RigCamera(name, size[0], lens_of("brown", own, **values), pose)
-    return rig_network(Rig("camera_mount", (camera,), size[1]), path)
+    return Rig("camera_mount", (camera,), size[1])
 
 
 _PINHOLE = (("fx", "fx"), ("fy", "fy"), ("u0", "cx"), ("v0", "cy"))
