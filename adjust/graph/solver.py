@@ -20,7 +20,7 @@ from adjust.graph.elimination import EXACT
 from adjust.graph.pair_normals import PairLinear
 from adjust.graph.rank import unobserved_unknowns
 from adjust.graph.system import System
-from adjust.model.errors import GivenUpError, IndeterminateError, NotConvergedError
+from adjust.model.errors import GivenUpError, IndeterminateError, NotConvergedError, listed
 
 _SIGMA_ROUNDS, _SIGMA_CHANGE = 3, 1e-6
 """Sigmas that depend on distances (target centring) follow the solution until they change by no more than this."""
@@ -256,7 +256,7 @@ class _Loop(System):
 
     def _stuck(self, iteration: int, kind: type[NotConvergedError] = NotConvergedError) -> NotConvergedError:
         blocks = sorted({f"{camera} at {epoch}" for camera, epoch, _ in self.behind})
-        what = f"; points behind the camera in {', '.join(blocks[:5])}" if blocks else ""
+        what = f"; points behind the camera in {listed(blocks, 5)}" if blocks else ""
         head = (
             f"the adjustment did not converge in {iteration} steps: the last step moved an unknown by "
             f"{self.moved:.2g} sigma{what}; look for gross errors in the observations or a wrong start value"

@@ -17,7 +17,7 @@ from adjust.frames.unknowns import Unknowns
 from adjust.graph.assembly import AdjustmentGraph, values_of
 from adjust.graph.building import GraphBuilder
 from adjust.graph.datum import InnerDatum, datum_rows, inner_datum, survey_motions
-from adjust.model.errors import SurveyError
+from adjust.model.errors import SurveyError, listed
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.rewriting import Rewriting
 from adjust.model.survey import Datum, FloatArray, PointParameter, PoseParameter, Survey
@@ -119,7 +119,7 @@ def _fitted(
     names = {key: graph.unknowns.by_key[key].name for key in inner.keys}
     lost = [name[1] for name in names.values() if name[0] != "point" or name[1] not in reference]
     if lost:
-        raise SurveyError(f"no reference coordinates for {', '.join(lost[:5])}; give them for every point of the datum")
+        raise SurveyError(f"no reference coordinates for {listed(lost, 5)}; give them for every point of the datum")
     values, turn, scale = graph.start, np.eye(3), 1.0
     for _ in range(_ROUNDS):
         motions = survey_motions(graph, values, inner.directions)

@@ -65,6 +65,8 @@ class Counts:
         if self.uncontrolled_pairs:
             lines.append(f"uncontrolled (close no loop): {listed(self.uncontrolled_pairs, _NAMED)}")
         lines += [f"errors seen but not told apart: {listed(group, _NAMED)}" for group in self.inseparable_pairs[:10]]
+        left_out = len(self.inseparable_pairs) - 10
+        lines += [f"and {left_out} more such groups"] if left_out > 0 else []
         return "\n".join(lines)
 
 

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from adjust.model.errors import IndeterminateError, SurveyError
+from adjust.model.errors import IndeterminateError, SurveyError, listed
 from adjust.model.result import ParameterName
 from adjust.model.survey import Survey
 from adjust.statistics.outliers.supported import supported
@@ -77,7 +77,7 @@ def _require_nothing_lost(survey: Survey, reduced: Survey, names: Sequence[Name]
     lost = [name for name in lost if name[1] not in named | stations]
     if lost:
         texts = tuple(" ".join(name) for name in lost)
-        raise IndeterminateError(f"nothing would observe {', '.join(texts[:8])} any more", texts)
+        raise IndeterminateError(f"nothing would observe {listed(texts, 8)} any more", texts)
 
 
 def _is_declared(survey: Survey, name: ParameterName) -> bool:

@@ -7,6 +7,7 @@ from gtsam import Pose3
 from markupsafe import Markup
 
 from adjust.design import group_redundancy
+from adjust.model.errors import listed
 from survey.planning.navigation import NavigationOutcome
 from survey.planning.summary import (
     PlanResult,
@@ -202,7 +203,7 @@ def _navigation(n: NavigationOutcome) -> Markup:
     open_poses = [i + 1 for i, e in enumerate(n.precision) if e.undetermined]
     facts = [("Poses as precise as required", f"{int(good.sum())} of {len(good)}")]
     if open_poses:
-        facts.append(("Not determined", ", ".join(map(str, open_poses[:20]))))
+        facts.append(("Not determined", listed([*map(str, open_poses)], 20)))
     body = m.definition(facts) + body
     if n.placement is not None:
         body += _placement(n)

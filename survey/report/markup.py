@@ -138,6 +138,11 @@ def count(value: int) -> str:
     return f"{value:,}".replace(",", "\u2009")
 
 
+def more(n: int) -> Markup:
+    """How many more ``solution.json`` holds than are shown, after a space; nothing where it is none."""
+    return " " + t("{n} more in solution.json.", n=count(n)) if n > 0 else Markup()
+
+
 def code(text: object) -> Markup:
     """A name as it stands in files."""
     return element("code", text)

@@ -3,6 +3,7 @@ import re
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ from gtsam import Pose3, Rot3
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ImageResiduals
 from adjust.model.survey import Survey
+from survey.jobs.adjusting.steps import adjust_project
+from survey.project import read
 from survey.project.detected import DetectedImage
 from survey.report import drawing, markup
 from survey.report import page as page_module
@@ -20,10 +23,12 @@ from survey.report.language import esc
 from survey.report.page import report_html
 from survey.report.picture import HEIGHT, WIDTH, perspective, pictures, plan
 from survey.report.scene import Scene, Spot, enlargement, scene_of
-from survey.report.sections import every_observation, unknowns
+from survey.report.sections import every_observation, statistics, unknowns
 from survey.report.terminal import summary_text
 from survey.solution.dictionary import RunInfo, solution_dict
 from survey.solution.quantities import scale_of
+from survey.solution.statistics import statistics_of
+from tests.labs import example
 from tests.survey.adjustments import Lab, correlate, lab_adjustment
 
 RUN = RunInfo(
@@ -479,3 +484,24 @@ def test_of_very_many_cameras_and_images_the_page_says_what_it_leaves_out(
     assert "images/X/e499.png" in words
     assert "images/X/e500.png" not in words
     assert "10 more in solution.json." in words
+
+
+def test_what_tables_of_statistics_leave_out_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    project = read(example("total-station", tmp_path / "lab"))
+    adjusted = adjust_project(project, progress=False)
+    found = statistics_of(adjusted, project.options, scale_of(adjusted, RUN.sigmas))
+
+    def told() -> dict[str, str]:
+        html = report_html(adjusted, RUN, None, found)
+        return {name: text for text, name in re.findall(r'(<section id="(\w+)".*?</section>)', html, re.S)}
+
+    whole = told()
+    for limit in ("_MOST_ROWS", "_MOST_WEAK", "_MOST_DRAWN"):
+        monkeypatch.setattr(statistics, limit, 1)
+    cut = told()
+    influences = len(found.reliability.influences)
+    for name, every in (("reliability", influences), ("relative", len(found.relative)), ("budget", len(found.budget))):
+        assert f" {every - 1} more in solution.json." in cut[name]
+        assert (f" {influences - 30} more in solution.json." in whole[name]) == (name == "reliability")
+    assert re.search("The first 1 of [2-9] groups are drawn", cut["normality"])
+    assert "groups are drawn" not in whole["normality"]

@@ -13,7 +13,7 @@ import numpy as np
 from gtsam import Pose3, Rot3
 from scipy.spatial.transform import Rotation
 
-from adjust.model.errors import SurveyError
+from adjust.model.errors import SurveyError, listed
 from adjust.model.observations import FrameRef
 from adjust.model.survey import FloatArray, PoseParameter, Station, Survey
 from survey.folder.text import id_problem
@@ -108,7 +108,7 @@ def _network(path: Path, links: list[Link], notes: tuple[str, ...]) -> ForeignNe
             places[each.name] = places.get(each.parent, Pose3()) * each.pose
     roots = list(dict.fromkeys(link.parent for link in links if link.parent not in by_name))
     if len(roots) > 1:
-        raise links[0].where.error(f"found several roots, {', '.join(roots[:5])}; join them by fixed joints")
+        raise links[0].where.error(f"found several roots, {listed(roots, 5)}; join them by fixed joints")
     stations = tuple(Station(n, world_from_station=PoseParameter(p)) for n, p in places.items() if n != _WORLD)
     return ForeignNetwork(Survey(stations=stations), path.stem, notes=notes)
 

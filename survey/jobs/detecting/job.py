@@ -145,6 +145,7 @@ def _nothing_found(
 ) -> SurveyError:
     each = (*defect_warnings(bad), *(f"{r.path}: {r.message}" for r in reports[:10]))
     lines = "\n".join(f"  {line}" for line in each)
+    lines += f"\n  and {len(reports) - 10} more images" if len(reports) > 10 else ""
     said = f"{folder}: no target and no spot was found in {len(reports)} images:\n{lines}"
     return SurveyError("\n".join(wrong.values()) if wrong else said)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from adjust.model.errors import SurveyError
+from adjust.model.errors import SurveyError, listed
 from adjust.model.names import natural_key
 from adjust.model.observations import ImageBlock
 from adjust.model.subsets import in_use, points_read, with_points
@@ -102,7 +102,7 @@ def chosen_times(epochs: Sequence[str], request: NavigateRequest) -> list[float]
     found = _times(request.times)
     missing = [e for e in epochs if e not in found]
     if missing:
-        raise SurveyError(f"{request.times}: no time for epoch {', '.join(missing[:5])}; add it, or leave it out")
+        raise SurveyError(f"{request.times}: no time for epoch {listed(missing, 5)}; add it, or leave it out")
     times = [found[e] for e in epochs]
     if len(set(times)) < len(times):
         raise SurveyError(f"{request.times}: two of the epochs to navigate have the same time; times must differ")

@@ -46,6 +46,8 @@ def _weak(n: dict[str, Any]) -> list[Markup]:
     out = []
     for i, names in enumerate(n["parts"][:10]):
         out.append(t("Part {i}: {names}", i=i + 1, names=_named(names)))
+    if len(n["parts"]) > 10:
+        out.append(t("{n} more parts in solution.json", n=m.count(len(n["parts"]) - 10)))
     if n["uncontrolled_pairs"]:
         out.append(t("Close no loop: {names}", names=_named(n["uncontrolled_pairs"])))
     groups = n["inseparable_pairs"]
@@ -88,8 +90,7 @@ def loops(c: Context) -> Markup:
         form=t("all loops closed as conditions" if found["solved_by"] == "conditions" else
                "each by the poses of its frames"),
     )
-    if len(rows) < found["n_loops"]:
-        note += " " + t("{n} more in solution.json.", n=m.count(found["n_loops"] - len(rows)))
+    note += m.more(found["n_loops"] - len(rows))
     classes = ["" if e["closes"] else "suspect" for e in entries]
     return m.section("loops", "Loop closures", m.table(columns, rows, "", classes), note) + _mounts(c)
 

@@ -16,6 +16,7 @@ from survey.report.markup import (
     fixed,
     general,
     joined,
+    more,
     pill,
     section,
     sigma_text,
@@ -128,8 +129,7 @@ def excluded(c: Context) -> Markup:
         "determine it: a small residual says that it would fit now.",
         people=count(out["by_people"]), files=count(out["in_files"]), run=count(out["in_this_run"]),
     )  # fmt: skip
-    if len(found) > _MOST_OTHER:
-        note += " " + t("{n} more in solution.json.", n=count(len(found) - _MOST_OTHER))
+    note += more(len(found) - _MOST_OTHER)
     return section("excluded", "Excluded by people", rows or element("p", t("Nothing is excluded by people.")), note)
 
 

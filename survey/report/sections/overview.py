@@ -177,13 +177,13 @@ def tolerances(c: Context) -> Markup:
     found = sorted(c.found.verdicts, key=lambda v: -v.found / v.allowed)
     rows = [_verdict_row(v) for v in found[:_MOST_VERDICTS]]
     columns = ("<Demand", "<Result", "<Quantity", "<", "Found", "Allowed", "<Unit", "Used [%]", "<")
-    classes = ["" if v.met else "suspect" for v in found[:_MOST_VERDICTS]]
+    classes, more = ["" if v.met else "suspect" for v in found[:_MOST_VERDICTS]], m.more(len(found) - len(rows))
     said = t(
         "U: expanded uncertainty at 95 % (k = {k}), in the worst direction. |Δ| + U: deviation from nominal with its "
         "uncertainty; what is not proven is not met (ISO 14253-1).",
         k=m.fixed(coverage(c.adjustment, c.scale), 2),
     )
-    return m.section("tolerances", "Tolerances", m.table(columns, rows, "", classes), said)
+    return m.section("tolerances", "Tolerances", m.table(columns, rows, "", classes), said + more)
 
 
 def _verdict_row(v: Verdict) -> tuple[str, ...]:
@@ -220,7 +220,7 @@ def inputs(c: Context) -> Markup:
         shown = list(i["images"].values())[:_MOST_IMAGES]
         rows = [(e["file"], m.code(e["sha256"]), m.count(e["n_image_points"] + e["n_spots"])) for e in shown]
         images, left_out = m.table(("<Image", "<Hash", "Points"), rows), len(i["images"]) - len(rows)
-        images += m.note(t("{n} more in solution.json.", n=m.count(left_out))) if left_out else Markup()
+        images += m.note(m.more(left_out)) if left_out else Markup()
         said = t("{n} images, each with the hash of the file that its points come from", n=m.count(len(i["images"])))
         parts.append(m.part("details", said, images, False))
     for title, entries in (("Options", i["options"]), ("Versions", i["versions"])):

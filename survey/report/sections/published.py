@@ -70,7 +70,8 @@ def _pairs(found: Mapping[str, Any]) -> Markup:
         m.element("p", _steps(t(text), found["steps"][name]))
         for name, text in (("weighted", "Weighted"), ("equal_weights", "Equal weights"))
     )
-    return m.element("h3", t(_TITLES["pairs"])) + said + m.table(columns, rows)
+    more = m.more(len(found["pairs"]) - _MOST_PAIRS)
+    return m.element("h3", t(_TITLES["pairs"])) + said + m.table(columns, rows) + (m.note(more) if more else more)
 
 
 def _steps(name: Markup, steps: Mapping[str, Any]) -> Markup:

@@ -16,6 +16,7 @@ from survey.solution.quantities import sigma_unit_for_people
 
 _MOST_ROWS = 120
 _MOST_WEAK = 30
+_MOST_DRAWN = 12
 _MOST_PARTS = 6
 
 
@@ -68,7 +69,8 @@ def reliability(c: Context) -> Markup:
         "{level}) of an observation would do to the unknowns if it stayed undetected. Worst first.",
         power=m.fixed(100 * o.power, 0), method=method, level=m.general(float(r.criteria.alpha[0]), 2),
     )  # fmt: skip
-    return m.section("reliability", "Reliability", uncontrolled + (m.table(columns, rows) if rows else Markup()), said)
+    return m.section("reliability", "Reliability", uncontrolled + (m.table(columns, rows) if rows else Markup()),
+                     said + m.more(len(r.influences) - len(rows)))  # fmt: skip
 
 
 def _influence_row(c: Context, x: Influence) -> tuple[str, ...]:
@@ -106,7 +108,7 @@ def relative(c: Context) -> Markup:
         "relative {level} % ellipsoid, and of stations the largest sigma of their relative rotation.",
         level=level,
     )
-    return m.section("relative", "Relative precision", m.table(columns, rows), said)
+    return m.section("relative", "Relative precision", m.table(columns, rows), said + m.more(len(found) - len(rows)))
 
 
 def _relative_row(r: RelativePrecision) -> list[str]:
@@ -128,15 +130,13 @@ def budget(c: Context) -> Markup:
     rows = [_budget_row(e, sources) for e in entries[:_MOST_ROWS]]
     heads = [esc(f"{group_name(s)} ({kinds[s]}) [%]") for s in sources]
     columns = ["<Result", "<", "u", "<Unit", *heads, "ν", "k", "U"]
-    left_out = len(entries) - _MOST_ROWS
-    more = " " + t("{n} more in solution.json.", n=m.count(left_out)) if left_out > 0 else Markup()
     said = t(
         "Standard uncertainty u of every result and the share of each source in its variance (GUM, JCGM 100:2008). "
         "Type A: from the scatter of this survey's own residuals; type B: given. ν: effective degrees of freedom; "
         "U = k u is the expanded uncertainty at {level} %.",
         level=m.general(100 * entries[0].level),
     )
-    return m.section("budget", "Uncertainty budget", m.table(columns, rows), said + more)
+    return m.section("budget", "Uncertainty budget", m.table(columns, rows), said + m.more(len(entries) - len(rows)))
 
 
 def _budget_row(e: BudgetEntry, sources: list[str]) -> list[str]:
@@ -167,8 +167,7 @@ def _titled(title: str, items: Sequence[str]) -> Markup:
 
 def _most(first: Sequence[str], n: int) -> list[str]:
     """The first of ``n``, and how many more there are."""
-    more = n - len(first)
-    return [*first, *([t("{n} more in solution.json.", n=m.count(more))] if more else [])]
+    return [*first, *filter(None, [m.more(n - len(first))])]
 
 
 def _correlated(x: Correlation) -> Markup:
@@ -194,7 +193,9 @@ def normality(c: Context) -> Markup:
         "Standardized residuals of each group in order, against the quantiles that as many normally distributed ones "
         "would have. The band holds 95 % of such points one by one."
     )
-    return m.section("normality", "Distribution of residuals", m.figures(drawn[:12]), note)
+    if len(drawn) > _MOST_DRAWN:
+        note += " " + t("The first {shown} of {n} groups are drawn.", shown=_MOST_DRAWN, n=m.count(len(drawn)))
+    return m.section("normality", "Distribution of residuals", m.figures(drawn[:_MOST_DRAWN]), note)
 
 
 def standardized_by_group(adjustment: Adjustment) -> dict[str, FloatArray]:

@@ -66,7 +66,7 @@ def _limited(columns: Sequence[str], things: Sequence[T], row: Callable[[T], lis
 
 
 def _more(n: int) -> Markup:
-    return m.note(t("{n} more in solution.json.", n=m.count(n))) if n > 0 else Markup()
+    return m.note(m.more(n)) if n > 0 else Markup()
 
 
 def cameras(c: Context) -> Markup:
