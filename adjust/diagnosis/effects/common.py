@@ -14,7 +14,7 @@ from adjust.model.observations import position_text
 from adjust.model.result import Adjustment
 from adjust.model.rewriting import Fields, with_rows
 from adjust.model.survey import FloatArray, Survey
-from adjust.spatial.rigid import skew
+from adjust.spatial.rigid import inverse, rotation_exp, rotation_log, skew
 from adjust.statistics.score import Score
 
 _FEWEST = 3
@@ -22,6 +22,8 @@ _LARGEST = 0.05
 """Of a scale, and of a constant over the lengths; a larger one is a unit."""
 _PPM = 1e6
 _COLUMNS = ("x_mm", "y_mm", "z_mm")
+_FRAME = "frame of coordinates"
+_IN_WORLD = "give them in the frame of the world, or let them define it and hold nothing else"
 Said = Callable[[FloatArray, FloatArray], str]
 
 
@@ -86,17 +88,29 @@ def _scaled(survey: Survey, linear: Linear, rows: list[int]) -> Effect:
 def _elsewhere(survey: Survey, linear: Linear, rows: list[int]) -> Effect:
     """Columns: turns about the axes of the world, then shifts."""
     points = _points(survey, rows)
-
-    def said(theta: FloatArray, sigmas: FloatArray) -> str:
-        turn, shift = ("(" + ", ".join(f"{x:.4g}" for x in v) + ")" for v in (np.degrees(theta[:3]), 1e3 * theta[3:]))
-        return (
-            f"the coordinates in coordinates.csv stand in another frame, turned by {turn} deg and shifted by {shift} mm"
-        )
-
     return _of_coordinates(
-        survey, linear, rows, "frame of coordinates", "give them in the frame of the world, or let them define it and "
-        "hold nothing else", {n: np.hstack([-skew(x), np.eye(3)]) for n, x in points.items()}, said,
-        lambda theta: (np.eye(3) - skew(theta[:3]), -theta[3:]),
+        survey, linear, rows, _FRAME, _IN_WORLD, {n: np.hstack([-skew(x), np.eye(3)]) for n, x in points.items()},
+        lambda theta, _: _elsewhere_text(theta), lambda theta: (rotation_exp(-theta[:3]), -theta[3:]),
+    )  # fmt: skip
+
+
+def _elsewhere_text(theta: FloatArray) -> str:
+    turn = "(" + ", ".join(f"{x:.4g}" for x in np.degrees(theta[:3])) + ")"
+    shift = "(" + ", ".join(f"{x:.6g}" for x in 1e3 * theta[3:]) + ")"
+    return f"the coordinates in coordinates.csv stand in another frame, turned by {turn} deg and shifted by {shift} mm"
+
+
+def in_another_frame(survey: Survey, rows: list[int], world_from_given: FloatArray, exchanged: bool) -> Hypothesis:
+    """Coordinates ``rows``, one point each, in a frame that is known (4, 4); exchanged: their x and y first."""
+    given_from_world, columns = inverse(world_from_given), [1, 0, 2] if exchanged else [0, 1, 2]
+    matrix, offset = world_from_given[:3, :3][:, columns], world_from_given[:3, 3]
+    said = _elsewhere_text(np.concatenate([rotation_log(given_from_world[:3, :3]), given_from_world[:3, 3]]))
+    moved = {i: replace(c, values=c.values @ matrix.T + offset) for i in rows for c in [survey.coordinates[i]]}
+    points = tuple(_points(survey, rows))
+    return Hypothesis(
+        _FRAME, f"{said}, their x and y exchanged besides" if exchanged else said, _IN_WORLD,
+        Place("point", points, "x_mm"), with_rows(survey, "coordinates", moved),
+        (ChangeColumns("coordinates", _COLUMNS, matrix, 1e3 * offset, {"point_id": points}),),
     )  # fmt: skip
 
 

@@ -1,12 +1,15 @@
-"""Spots that are no known beacon because the beacons' coordinates stand in other axes or in another unit."""
+"""Spots that are no known beacon because the coordinates stand in other axes, in another unit or in another frame."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.diagnosis import diagnose
+from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.units.axes import other_axes
 from adjust.model.errors import DiagnosedError, SurveyError
 from adjust.model.result import Adjustment
+from survey.jobs.adjusting.frame_of_coordinates import in_other_frames
 from survey.jobs.adjusting.places import located
 from survey.jobs.adjusting.probable_causes import causes_first
 from survey.jobs.identify import Identification, identified, identify_spots
@@ -21,15 +24,19 @@ def require_names(project: Project, first: Adjustment, found: Identification, ga
 
     first: of the cameras and stations, without the spots. found: the names by the coordinates as they stand.
     """
+    def named(hypotheses: Iterable[Hypothesis]) -> list[Hypothesis]:
+        """Those that name most spots, if these are many more."""
+        changed = [(h, survey) for h in hypotheses if (survey := h.changed()) is not None]
+        again = [(h, survey, identify_spots(survey, first, project.spots, gate_px)) for h, survey in changed]
+        most = max((names.identified for *_, names in again), default=0)
+        return [
+            replace(h, survey=identified(survey, names), looked_at=len(again), cause=f"{h.cause}: so read, "
+                    f"{_share(names)} are one of the beacons, as they stand {found.identified}")
+            for h, survey, names in again if names.identified == most >= enough
+        ]  # fmt: skip
+
     enough = max(_TIMES * found.identified, found.identified + _MORE)
-    changed = [(h, survey) for h in other_axes(project.survey) if (survey := h.changed()) is not None]
-    named = [(h, survey, identify_spots(survey, first, project.spots, gate_px)) for h, survey in changed]
-    most = max((again.identified for *_, again in named), default=0)
-    best = [
-        replace(h, survey=identified(survey, again), looked_at=len(named), cause=f"{h.cause}: so read, {_share(again)} "
-                f"are one of the beacons, as they stand {found.identified}")
-        for h, survey, again in named if again.identified == most >= enough
-    ]  # fmt: skip
+    best = named(other_axes(project.survey)) or named(in_other_frames(project, first, gate_px))[:1]
     diagnosis = diagnose(Case(identified(project.survey, found), None, SurveyError("")), [lambda _: best])
     if diagnosis.candidates:
         diagnosis = located(diagnosis, project)
