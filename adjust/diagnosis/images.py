@@ -17,7 +17,6 @@ from adjust.model.names import numbered
 from adjust.model.observations import ImageBlock
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, Survey
-from adjust.start.views import View
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
 
@@ -77,7 +76,7 @@ def turned(
 
 
 def edits_of(survey: Survey, camera_id: str, epochs: tuple[str, ...], how: ImageMap) -> tuple[Edit, ...]:
-    """The same as a change of the rows of ``image_points.csv``."""
+    """The same as a change of the rows of ``image_points.csv``, by which sigmas are changed too."""
     offset = how.offset(survey.cameras_by_id[camera_id].image_size)
     where = {"camera_id": (camera_id,), "epoch_id": epochs}
     return (ChangeColumns("image_points", ("u_px", "v_px"), how.matrix, offset, where),)
@@ -93,9 +92,9 @@ def mirrored_images(case: Case) -> Iterator[Hypothesis]:
     seen: dict[str, int] = {}
     for i, view in case.views.items():
         camera = case.survey.image_blocks[i].camera_id
-        if _is_flat(view.x):
+        if is_flat(view.x):
             seen[camera] = seen.get(camera, 0) + 1
-            if _from_behind(view):
+            if from_behind(view.poses[0], view.x):
                 behind.setdefault(camera, []).append(i)
     for camera, blocks in behind.items():
         if len(blocks) < _LEAST:
@@ -110,7 +109,7 @@ def _mirrored(case: Case, camera: str, blocks: list[int], whole: bool, how: Imag
     mine = [i for i, b in enumerate(survey.image_blocks) if b.camera_id == camera]
     first = min(blocks)
     # images of other things than flat targets are as those around them
-    onwards = all(i in bad for i in mine if i >= first and i in case.views and _is_flat(case.views[i].x))
+    onwards = all(i in bad for i in mine if i >= first and i in case.views and is_flat(case.views[i].x))
     chosen = [i for i in mine if whole or i in bad or (onwards and i >= first)]
     epochs = tuple(dict.fromkeys(survey.image_blocks[i].epoch_id for i in chosen))
     which = "all its images" if whole else f"{len(epochs)} of its {len(mine)} images ({epochs[0]} ... {epochs[-1]})"
@@ -125,15 +124,17 @@ def _mirrored(case: Case, camera: str, blocks: list[int], whole: bool, how: Imag
     )
 
 
-def _is_flat(x: FloatArray) -> bool:
+def is_flat(x: FloatArray) -> bool:
+    """Whether points (n, 3) of a target lie in its x and y."""
     s = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
     across = float(np.ptp(x[:, :2], axis=0).max())
     return len(x) >= 4 and s[2] < _FLAT * s[1] and float(np.ptp(x[:, 2])) < _FLAT * across
 
 
-def _from_behind(view: View) -> bool:
-    pose = view.poses[0]
-    return float(pose[:3, 2] @ (pose[:3, :3] @ view.x.mean(axis=0) + pose[:3, 3])) < 0.0
+def from_behind(camera_from_target: FloatArray, x: FloatArray) -> bool:
+    """Whether a camera (4, 4) looks at points (n, 3) of a flat target against its z: at its back."""
+    R, t = camera_from_target[:3, :3], camera_from_target[:3, 3]
+    return float(R[:, 2] @ (R @ x.mean(axis=0) + t)) < 0.0
 
 
 def turned_alone(case: Case) -> Iterator[Hypothesis]:

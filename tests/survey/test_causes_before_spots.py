@@ -123,3 +123,48 @@ def test_sigmas_of_few_coordinates_that_are_too_small_are_named(
     assert "global test passed" in capsys.readouterr().out
     first, *_ = solution["diagnosis"]
     assert (first["name"], first["ids"]) == ("sigmas of a group", ["coordinates"])
+
+
+def from_the_bottom(camera_id: str = "") -> Change:
+    def change(_: int, row: dict[str, str]) -> None:
+        if camera_id in ("", row["camera_id"]):
+            row["v_px"] = repr(1023.0 - float(row["v_px"]))
+
+    return change
+
+
+def test_image_points_that_count_from_the_bottom_are_named_and_mended(
+    observed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All of it is a mirror image, which contradicts coordinates alone: they were said to have z upside down."""
+    lab = Path(shutil.copytree(observed, tmp_path / "lab"))
+    for table in ("image_points", "spots"):
+        labs.with_rows(lab / "observations" / f"{table}.csv", from_the_bottom())
+    assert main(["adjust", str(lab), "--quiet"]) == FAILED
+    first, *_ = json.loads((lab / "results" / "unsolved.json").read_text(encoding="utf-8"))["diagnosis"]
+    assert first["name"] == "images mirrored"
+    assert main(["adjust", str(lab), "--quiet", "--try", "1"]) == 0
+    assert "PASSED" in capsys.readouterr().out
+
+
+def test_a_camera_that_sees_targets_from_behind_is_named(observed: Path, tmp_path: Path) -> None:
+    """Nothing but the names of its spots contradicts: another place of the camera was named."""
+    lab = Path(shutil.copytree(observed, tmp_path / "lab"))
+    for table in ("image_points", "spots"):
+        labs.with_rows(lab / "observations" / f"{table}.csv", from_the_bottom("R2"))
+    assert main(["adjust", str(lab), "--quiet"]) != FAILED
+    said = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))
+    assert "images of R2 are mirrored" in said["warnings"][0]
+
+
+def test_a_survey_whose_targets_show_their_backs_is_no_pass_without_a_word(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lab = labs.example("stereo", tmp_path / "lab")
+    assert main(["adjust", str(lab), "--quiet"]) == 0
+    assert "PASSED" in capsys.readouterr().out
+    labs.with_rows(lab / "observations" / "image_points.csv", from_the_bottom())
+    assert main(["adjust", str(lab), "--quiet"]) == 0
+    out = capsys.readouterr().out
+    assert "NEEDS A LOOK" in out
+    assert "24 images of flat targets that were looked at show them from behind" in out

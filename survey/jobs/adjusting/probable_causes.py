@@ -115,8 +115,19 @@ def with_probable_causes(survey: Survey, result: Adjustment, project: Project) -
     if diagnosis is None or diagnosis.candidates[0].hypothesis.place.key not in ("sigma", "instrument_height"):
         meant = survey if diagnosis is None else diagnosis.candidates[0].hypothesis.survey
         doubtful = doubtful_values(survey if callable(meant) else meant, project)  # a size is not looked for again
+    if diagnosis is None or diagnosis.candidates[0].hypothesis.name != "images mirrored":
+        certain, possible = _mirrored(project, result)
+        lines, doubtful = (*(f"probable cause: {c}" for c in certain), *lines), doubtful + possible
     warnings = (*lines, *doubtful, *alone, *result.warnings, *note)
     return replace(result, warnings=warnings, diagnosis=diagnosis, doubtful=doubtful)
+
+
+def _mirrored(project: Project, result: Adjustment) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    if not project.target_kinds:
+        return (), ()
+    from survey.jobs.adjusting.mirrored_survey import mirrored_warnings  # here: as above
+
+    return mirrored_warnings(project, result)
 
 
 def doubtful_values(survey: Survey, project: Project) -> tuple[str, ...]:

@@ -3,16 +3,20 @@
 from collections.abc import Iterable
 from dataclasses import replace
 
+from adjust.adjustment import adjust
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.diagnosis import diagnose
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.units.axes import other_axes
 from adjust.model.errors import DiagnosedError, SurveyError
 from adjust.model.result import Adjustment
+from adjust.model.survey import Survey
+from adjust.statistics.outliers.supported import supported
 from survey.jobs.adjusting.frame_of_coordinates import in_other_frames
+from survey.jobs.adjusting.mirrored_survey import mirrored_back, sides
 from survey.jobs.adjusting.places import located
 from survey.jobs.adjusting.probable_causes import causes_first
-from survey.jobs.identify import Identification, identified, identify_spots
+from survey.jobs.identify import Identification, identified, identify_spots, without_points
 from survey.project import Project
 
 _TIMES, _MORE = 2, 4
@@ -24,24 +28,44 @@ def require_names(project: Project, first: Adjustment, found: Identification, ga
 
     first: of the cameras and stations, without the spots. found: the names by the coordinates as they stand.
     """
+
     def named(hypotheses: Iterable[Hypothesis]) -> list[Hypothesis]:
         """Those that name most spots, if these are many more."""
         changed = [(h, survey) for h in hypotheses if (survey := h.changed()) is not None]
         again = [(h, survey, identify_spots(survey, first, project.spots, gate_px)) for h, survey in changed]
         most = max((names.identified for *_, names in again), default=0)
-        return [
-            replace(h, survey=identified(survey, names), looked_at=len(again), cause=f"{h.cause}: so read, "
-                    f"{_share(names)} are one of the beacons, as they stand {found.identified}")
-            for h, survey, names in again if names.identified == most >= enough
-        ]  # fmt: skip
+        return [_told(h, survey, names, len(again), found.identified) for h, survey, names in again
+                if names.identified == most >= enough]  # fmt: skip
 
     enough = max(_TIMES * found.identified, found.identified + _MORE)
-    best = named(other_axes(project.survey)) or named(in_other_frames(project, first, gate_px))[:1]
+    best = (
+        _mirrored(project, first, gate_px, enough, found.identified)
+        or named(other_axes(project.survey)) or named(in_other_frames(project, first, gate_px))[:1]
+    )  # fmt: skip
     diagnosis = diagnose(Case(identified(project.survey, found), None, SurveyError("")), [lambda _: best])
     if diagnosis.candidates:
         diagnosis = located(diagnosis, project)
         then = "mend that first: as it is, the spots have wrong names, or none"
         raise DiagnosedError(causes_first(diagnosis.lines, then), diagnosis)
+
+
+def _mirrored(project: Project, first: Adjustment, gate_px: float, enough: int, before: int) -> list[Hypothesis]:
+    """All image points mirrored back, if far more spots have names then."""
+    seen = sides(project, first)
+    if not seen.behind or seen.some_from_front:
+        return []
+    back, hypothesis = mirrored_back(project)
+    try:
+        again = adjust(supported(without_points(back.survey))[0])
+    except SurveyError:
+        return []
+    names = identify_spots(back.survey, again, back.spots, gate_px)
+    return [_told(hypothesis, back.survey, names, 1, before)] if names.identified >= enough else []
+
+
+def _told(h: Hypothesis, survey: Survey, names: Identification, looked_at: int, before: int) -> Hypothesis:
+    cause = f"{h.cause}: so read, {_share(names)} are one of the beacons, as they stand {before}"
+    return replace(h, survey=identified(survey, names), looked_at=looked_at, cause=cause)
 
 
 def _share(found: Identification) -> str:
