@@ -162,9 +162,10 @@ class Case:
     def linear(self) -> Linear | None:
         """The adjustment with all images in use, as a linear system; None where there is none.
 
-        One that did not converge may have settled: what it still changes is nothing to v'Pv.
+        One that did not converge may have settled: what it still changes is nothing to v'Pv. Where the search for gross
+        errors left out what others need, all observations together may still determine everything.
         """
-        if self.result is None and not isinstance(self.error, NotConvergedError):
+        if self.result is None and not isinstance(self.error, NotConvergedError | IndeterminateError):
             return None
         if self.result is not None and not self.result.redundancy > 0:
             return None

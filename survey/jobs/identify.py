@@ -4,7 +4,7 @@ A spot and a beacon belong together when each is the other's nearest within the 
 half as near again; everything else is left unidentified and reported.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from gtsam import Pose3
 
 from adjust.frames.lens_times import LensTimes
 from adjust.lenses.models import MODELS, camera_constants, project
+from adjust.model.names import natural_key
 from adjust.model.observations import FrameRef, ImageBlock
 from adjust.model.result import Adjustment
 from adjust.model.subsets import only_between, with_points
@@ -32,15 +33,31 @@ class Identification:
     notes: tuple[str, ...]
 
 
-def without_points(survey: Survey) -> Survey:
-    """The survey without its world points: what can be adjusted before the spots have names."""
+def without_points(survey: Survey, spots: Iterable[SpotBlock]) -> Survey:
+    """The survey without its world points: what can be adjusted before the spots have names.
+
+    Images that hold nothing else stay, empty, of cameras whose lenses change: one may do so there.
+    """
+    changing = {c.camera_id for c in survey.cameras if c.lens.drift is not None or c.lens.crops}
     blocks = tuple(b for b in survey.image_blocks if b.target_id is not None)
+    known = {(b.camera_id, b.epoch_id) for b in blocks}
+    images = [(b.camera_id, b.epoch_id) for b in survey.image_blocks] + [(b.camera_id, b.epoch_id) for b in spots]
+    empty = [_empty(*key) for key in dict.fromkeys(images) if key not in known and key[0] in changing]
+    blocks = _in_order((*blocks, *empty)) if empty else blocks
     return replace(only_between(survey, lambda ref: ref.frame is not None), points=(), image_blocks=blocks)
 
 
+def _empty(camera_id: str, epoch_id: str) -> ImageBlock:
+    return ImageBlock(camera_id, epoch_id, None, np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+
+
 def identified(survey: Survey, found: Identification) -> Survey:
-    """The survey with the image points of its beacons, and without beacons that nothing observes."""
-    return seen_points(replace(survey, image_blocks=survey.image_blocks + found.blocks))
+    """The survey with the image points of its beacons, ordered as in a table, without beacons that nothing observes."""
+    return seen_points(replace(survey, image_blocks=_in_order((*survey.image_blocks, *found.blocks))))
+
+
+def _in_order(blocks: Iterable[ImageBlock]) -> tuple[ImageBlock, ...]:
+    return tuple(sorted(blocks, key=lambda b: (natural_key(b.camera_id), natural_key(b.epoch_id))))
 
 
 def seen_points(survey: Survey) -> Survey:
@@ -113,7 +130,7 @@ def predict(
     camera = survey.cameras_by_id[camera_id]
     if not positions:
         return {}
-    model, times = MODELS[camera.lens.model], LensTimes(survey)
+    model, times = MODELS[camera.lens.model], LensTimes(adjustment.survey)
     values = {n: np.asarray(e.value) for n, e in adjustment.estimates.items() if n[0].startswith("lens")}
     lens = times.lens(camera, epoch_id, values.get)
     names = list(positions)

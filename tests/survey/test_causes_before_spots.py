@@ -168,3 +168,35 @@ def test_a_survey_whose_targets_show_their_backs_is_no_pass_without_a_word(
     out = capsys.readouterr().out
     assert "NEEDS A LOOK" in out
     assert "24 images of flat targets that were looked at show them from behind" in out
+
+
+def test_spots_that_count_from_the_corner_are_named_and_mended(
+    observed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Their images were left out until nothing saw a beacon any more; a camera was said to have been exchanged."""
+    lab = Path(shutil.copytree(observed, tmp_path / "lab"))
+    labs.with_rows(lab / "observations" / "spots.csv",
+                   lambda _, row: row.update({c: repr(float(row[c]) + 0.5) for c in ("u_px", "v_px")}))  # fmt: skip
+    assert main(["adjust", str(lab), "--quiet"]) in (FAILED, 3)
+    found = (lab / "results" / name for name in ("unsolved.json", "solution.json"))
+    first, *_ = next(json.loads(path.read_text(encoding="utf-8"))["diagnosis"] for path in found if path.exists())
+    assert (first["name"], first["edits"][0]["table"]) == ("pixel origin", "spots")
+    assert main(["adjust", str(lab), "--quiet", "--try", "1"]) == 0
+    assert "PASSED" in capsys.readouterr().out
+
+
+def test_a_lens_may_change_where_its_camera_sees_spots_alone(observed: Path, tmp_path: Path) -> None:
+    """Said to have no image there, as before the spots have names; the cause that was named could not be tried."""
+    lab, definition = Path(shutil.copytree(observed, tmp_path / "lab")), tmp_path / "lab" / "survey.toml"
+    text = definition.read_text(encoding="utf-8")
+    definition.write_text(f"{text}\n[cameras.X.lens.crops.n01]\nleft_px = 0.5\ntop_px = 0.5\n", encoding="utf-8")
+
+    def cropped(_: int, row: dict[str, str]) -> None:
+        if row["camera_id"] == "X" and row["epoch_id"] >= "n01":
+            row.update({c: repr(float(row[c]) - 0.5) for c in ("u_px", "v_px")})
+
+    for table in ("image_points", "spots"):
+        labs.with_rows(lab / "observations" / f"{table}.csv", cropped)
+    assert main(["adjust", str(lab), "--quiet"]) == 0
+    summary = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))["summary"]
+    assert summary["sigma0"] < 1.05

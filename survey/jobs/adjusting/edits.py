@@ -32,7 +32,8 @@ TableEdit = ChangeColumns | ExchangeColumns | ChangeReadings | SetReadings | Ren
 _UNITS = ("deg", "gon", "m", "mm", "arcsec", "mgon", "cc")
 _NUMBERED = "reading_id"
 """The column that rows may leave blank: their id is then that of their number."""
-_OF_IMAGE = ("u_px", "v_px")
+OF_IMAGE = ("u_px", "v_px")
+"""Columns with which sigmas of image points change."""
 _SIGMAS_OF_IMAGE = ("sigma_u_px", "sigma_v_px", "rho_uv")
 
 
@@ -155,7 +156,7 @@ def _changed(row: Mapping[str, str], edit: TableEdit) -> dict[str, str]:
         return {column: f"{float(from_si(si, unit)):.12g}"}
     values = edit.matrix @ np.array([float(row[name]) for name in edit.columns]) + edit.offset
     new = {name: f"{value:.12g}" for name, value in zip(edit.columns, values, strict=True)}
-    if edit.columns == _OF_IMAGE and all(row.get(name) for name in _SIGMAS_OF_IMAGE[:2]):
+    if edit.columns == OF_IMAGE and all(row.get(name) for name in _SIGMAS_OF_IMAGE[:2]):
         new |= _mapped_sigmas(row, edit.matrix)
     return new
 

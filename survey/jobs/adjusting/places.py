@@ -10,6 +10,7 @@ import numpy as np
 
 from adjust.diagnosis.diagnosis import Diagnosis
 from adjust.diagnosis.hypothesis import (
+    ChangeColumns,
     ChangeReadings,
     Edit,
     Hypothesis,
@@ -21,6 +22,7 @@ from adjust.diagnosis.hypothesis import (
     SetReadings,
 )
 from survey.folder.text import read_text
+from survey.jobs.adjusting.edits import OF_IMAGE
 from survey.project.declared.editing import LENGTHS
 from survey.project.declared.toml_text import key_lines
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER, Project
@@ -48,8 +50,24 @@ _WHOLE = {"reading": "terrestrial", "pair": "pairs", "setup": "terrestrial"}
 def located(found: Diagnosis, project: Project) -> Diagnosis:
     """The diagnosis with the place in the project's files beside every candidate."""
     files = ProjectFiles(project.files or project.folder, project.origins)
-    candidates = tuple(replace(c, where=files.of(c.hypothesis)) for c in found.candidates)
-    return replace(found, candidates=candidates)
+    candidates = []
+    for candidate in found.candidates:
+        hypothesis = replace(candidate.hypothesis, edits=tuple(_of_spots(candidate.hypothesis.edits, files)))
+        candidates.append(replace(candidate, hypothesis=hypothesis, where=files.of(hypothesis)))
+    return replace(found, candidates=tuple(candidates))
+
+
+def _of_spots(edits: Sequence[Edit], files: "ProjectFiles") -> Iterator[Edit]:
+    """Changes of image points, in the table of spots too, or there alone: points of beacons may come from it."""
+    told = any(isinstance(e, ChangeColumns) and e.table == "spots" for e in edits)
+    for edit in edits:
+        if told or not isinstance(edit, ChangeColumns) or edit.columns != OF_IMAGE:
+            yield edit
+            continue
+        where = {k: v for k, v in edit.where.items() if k != "target_id"}
+        of_beacons = "" in edit.where.get("target_id", ("",))
+        both = (edit, *([replace(edit, table="spots", where=where)] if of_beacons else []))
+        yield from [e for e in both if files.rows(e.table, e.where)] or [edit]
 
 
 class ProjectFiles:

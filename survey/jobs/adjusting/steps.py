@@ -93,7 +93,7 @@ def _spots_identified(work: Work) -> Work:
     project = work.project
     gate = project.spots_request.gate_px if project.spots_request is not None else 15.0
     how = _options(project).adjust
-    part = supported(without_points(project.survey))[0]
+    part = supported(without_points(project.survey, project.spots))[0]
     try:
         with explaining(part, project):
             first = adjust(part, work.begin(part), how, work.progress)

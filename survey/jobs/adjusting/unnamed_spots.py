@@ -56,7 +56,7 @@ def _mirrored(project: Project, first: Adjustment, gate_px: float, enough: int, 
         return []
     back, hypothesis = mirrored_back(project)
     try:
-        again = adjust(supported(without_points(back.survey))[0])
+        again = adjust(supported(without_points(back.survey, back.spots))[0])
     except SurveyError:
         return []
     names = identify_spots(back.survey, again, back.spots, gate_px)
