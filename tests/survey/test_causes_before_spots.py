@@ -91,7 +91,7 @@ XYZ = ("x_mm", "y_mm", "z_mm")
         ("table_angles", scaled(1.0 / 0.9, "axis2_deg"), "table misread", "the readings of axis2 are in gon"),
         ("table_angles", renamed({"t05": "t06", "t06": "t05"}, "epoch_id"), "readings exchanged", "epochs t05 and t06"),
         ("coordinates", turned, "axes or unit of coordinates", "have other axes: (y, -x, z) of them are x, y and z"),
-        ("coordinates", elsewhere, "frame of coordinates", "mm, their x and y exchanged besides"),
+        ("coordinates", elsewhere, "frame of coordinates", "stand, with x and y exchanged, in another frame"),
         ("distances", scaled(1e-3, "value_mm"), "unit of lengths", "their values are metres, read as millimetres"),
         ("distances", renamed({"B06": "B07"}, "to_id"), "gross error", "distance B05-B06 contradicts all else by"),
         ("distances", renamed({"B01": "B03", "B03": "B01"}, "from_id", "to_id"), "points exchanged", "B01 and B03"),

@@ -94,22 +94,25 @@ def _elsewhere(survey: Survey, linear: Linear, rows: list[int]) -> Effect:
     )  # fmt: skip
 
 
-def _elsewhere_text(theta: FloatArray) -> str:
+def _elsewhere_text(theta: FloatArray, exchanged: bool = False) -> str:
     turn = "(" + ", ".join(f"{x:.4g}" for x in np.degrees(theta[:3])) + ")"
     shift = "(" + ", ".join(f"{x:.6g}" for x in 1e3 * theta[3:]) + ")"
-    return f"the coordinates in coordinates.csv stand in another frame, turned by {turn} deg and shifted by {shift} mm"
+    where = f"in another frame, turned by {turn} deg and shifted by {shift} mm"
+    if exchanged:
+        return f"the coordinates in coordinates.csv stand, with x and y exchanged, {where}"
+    return f"the coordinates in coordinates.csv stand {where}"
 
 
 def in_another_frame(survey: Survey, rows: list[int], world_from_given: FloatArray, exchanged: bool) -> Hypothesis:
     """Coordinates ``rows``, one point each, in a frame that is known (4, 4); exchanged: their x and y first."""
     given_from_world, columns = inverse(world_from_given), [1, 0, 2] if exchanged else [0, 1, 2]
     matrix, offset = world_from_given[:3, :3][:, columns], world_from_given[:3, 3]
-    said = _elsewhere_text(np.concatenate([rotation_log(given_from_world[:3, :3]), given_from_world[:3, 3]]))
+    theta = np.concatenate([rotation_log(given_from_world[:3, :3]), given_from_world[:3, 3]])
     moved = {i: replace(c, values=c.values @ matrix.T + offset) for i in rows for c in [survey.coordinates[i]]}
     points = tuple(_points(survey, rows))
     return Hypothesis(
-        _FRAME, f"{said}, their x and y exchanged besides" if exchanged else said, _IN_WORLD,
-        Place("point", points, "x_mm"), with_rows(survey, "coordinates", moved),
+        _FRAME, _elsewhere_text(theta, exchanged), _IN_WORLD, Place("point", points, "x_mm"),
+        with_rows(survey, "coordinates", moved),
         (ChangeColumns("coordinates", _COLUMNS, matrix, 1e3 * offset, {"point_id": points}),),
     )  # fmt: skip
 
