@@ -31,6 +31,13 @@ class PairArrays:
         out.__dict__.update({n: v for n, v in self.__dict__.items() if n not in out.__dict__})
         return out
 
+    def with_sigmas_times(self, by: FloatArray) -> "PairArrays":
+        """The same with all sigmas times ``by`` (E, 6); what is known of the motions is not computed again."""
+        out = replace(self, cov=by[:, :, None] * self.cov * by[:, None, :])
+        kept = {n: v for n, v in self.__dict__.items() if n in ("is_pose", "shifts", "motions", "poses", "logs")}
+        out.__dict__.update(kept, whitening=self.whitening / by[:, None, :])
+        return out
+
     @cached_property
     def is_pose(self) -> BoolArray:
         """Which pairs (E,) measured a translation too."""

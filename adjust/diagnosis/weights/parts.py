@@ -82,13 +82,14 @@ def _hypothesis(survey: Survey, rows: list[int], group: str, part: str, unit: fl
             "in pairs.csv multiply tx_mm, ty_mm, tz_mm by 1000", Place("group", (group,)),
             with_rows(survey, "pairs", new), (), _EVIDENCE, 0, penalty=penalty,
         )  # fmt: skip
-    times = f"{1.0 / unit:.0f} times too large"
+    times, by = f"{1.0 / unit:.0f} times too large", np.ones((len(survey.pairs), 6))
+    by[rows, slice(0, 3) if part == "rotation" else slice(3, 6)] = unit
     return Hypothesis(
         "unit of sigmas",
         f"the sigmas of the {part} of the pairs of group {group} are about {times}: they {said}",
         f"multiply these sigmas by {unit:.4g}, or name their column by their unit",
-        Place("group", (group,), "sigma"), with_part(survey, "pairs", rows, part, unit), (), _EVIDENCE, 0,
-        penalty=penalty, of_variances=True,
+        Place("group", (group,), "sigma"), lambda: with_part(survey, "pairs", rows, part, unit), (), _EVIDENCE, 0,
+        penalty=penalty, of_variances=True, pair_sigmas=by,
     )  # fmt: skip
 
 
