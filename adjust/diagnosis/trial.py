@@ -10,7 +10,7 @@ from adjust.diagnosis.case import CAP, Case, block_squares
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.model.errors import SurveyError
 from adjust.model.names import numbered
-from adjust.model.result import Adjustment, groups_of
+from adjust.model.result import Adjustment, names_of
 from adjust.model.survey import FloatArray, Survey
 from adjust.testing.criteria import CLEARLY, contradicting, is_noise
 
@@ -179,10 +179,10 @@ def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:
         return Misfit(omega, points + n_others, points + n_others, 0, contradicting=(omega, 0.0))
     arrays, out, single = result.other_arrays, _left_out(survey), result.single_residuals
     readings = () if result.reading_residuals is None else result.survey.readings
-    names, number = numbered([*groups_of(single), *(r.group for r in readings)])
+    names, number = numbered([*(group for _, group, *_ in names_of(single)), *(r.group for r in readings)])
     kept = np.ones(len(number), dtype=np.bool_)
     if out:
-        ids: list[tuple[str, ...]] = [*(o.ids for o in single), *((r.reading_id,) for r in readings)]
+        ids: list[tuple[str, ...]] = [*(n[2] for n in names_of(single)), *((r.reading_id,) for r in readings)]
         kept = arrays.used | np.array([not out & {i, i[:1]} for i in ids], dtype=np.bool_)
     of_others = _squares_of_others(result)
     groups = {name: [of_others[(kept & (number == k))[arrays.observation]]] for k, name in enumerate(names)}

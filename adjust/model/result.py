@@ -205,11 +205,11 @@ class Residuals(Sequence[ObservationResidual]):
 
 
 @lru_cache(2)
-def groups_of(residuals: Sequence[ObservationResidual]) -> tuple[str, ...]:
-    """The group of each; none of ``Residuals`` is made for that."""
+def names_of(residuals: Sequence[ObservationResidual]) -> tuple[Named, ...]:
+    """What each is called; none of ``Residuals`` is made for that."""
     if isinstance(residuals, Residuals):
-        return tuple(residuals.named(i)[1] for i in range(len(residuals)))
-    return tuple(o.group for o in residuals)
+        return tuple(map(residuals.named, range(len(residuals))))
+    return tuple((o.kind, o.group, o.ids, o.components, o.units) for o in residuals)
 
 
 @lru_cache(2)  # those of an adjustment that is given another warning are the same

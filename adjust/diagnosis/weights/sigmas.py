@@ -14,7 +14,7 @@ from adjust.diagnosis.hypothesis import Hypothesis, Place, ScaleKey
 from adjust.model.errors import listed
 from adjust.model.names import grouped
 from adjust.model.observations import Distance, Level, OnSurface, Reading
-from adjust.model.result import Adjustment
+from adjust.model.result import Adjustment, names_of
 from adjust.model.rewriting import Fields
 from adjust.model.survey import FloatArray, Survey
 from adjust.statistics.group_sums import scaled_survey
@@ -75,8 +75,9 @@ def _standardized(result: Adjustment, group: str) -> FloatArray:
     images = result.image_residuals
     of_block = np.array([b.group == group for b in result.survey.image_blocks], dtype=bool)
     rows = np.repeat(of_block, np.diff(images.block_ptr)) & images.used
-    others = [o.standardized for o in result.other_residuals if o.group == group and o.used]
-    every = np.concatenate([images.standardized[rows].ravel(), *others])
+    others = result.other_arrays
+    mine = others.used & np.array([of == group for _, of, *_ in names_of(result.other_residuals)], dtype=np.bool_)
+    every = np.concatenate([images.standardized[rows].ravel(), others.standardized[mine[others.observation]]])
     return np.asarray(every[np.isfinite(every)])
 
 

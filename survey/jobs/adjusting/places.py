@@ -60,10 +60,14 @@ class ProjectFiles:
         self._tables: dict[str, Table | None] = {}
 
     @cached_property
+    def text(self) -> str:
+        """``survey.toml``."""
+        return read_text(self.folder / DEFINITION_FILE)
+
+    @cached_property
     def keys(self) -> dict[tuple[str | int, ...], int]:
-        """Lines of the keys of ``survey.toml``."""
-        path = self.folder / DEFINITION_FILE
-        return key_lines(read_text(path))
+        """Lines of its keys."""
+        return key_lines(self.text)
 
     def table(self, name: str) -> Table | None:
         """A table, None where the project has none."""
@@ -93,6 +97,8 @@ class ProjectFiles:
 
     def key(self, *path: str | Collection[str]) -> str:
         """The line of a key, or of the nearest table above it; the last part of the path may be one of several."""
+        if str(path[0]) not in self.text and "\\" not in self.text:
+            return DEFINITION_FILE  # of thousands of stations the keys need not be told apart for that
         *above, last = path
         names = [last] if isinstance(last, str) else list(last)
         known = [p for name in names if (p := (*map(str, above), name)) in self.keys]
