@@ -111,6 +111,9 @@ class Entries(PlainEntries):
         rows = range(self._n)[index]
         return _entry(self._tree, rows) if isinstance(rows, int) else [_entry(self._tree, row) for row in rows]
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Sequence) and list(self) == list(other)
+
     def lines(self, depth: int) -> str:
         """As JSON, a list that begins in a line indented by so many spaces."""
         if not self._n:
