@@ -167,8 +167,10 @@ class _Writer:
             self.of_row.append(number[at])
             self.part(WORD, len(self.of_row) - 1)
             return
-        said = [encode_basestring(x) if isinstance(x, str) else _lines(x, depth) for x in
-                (of.tolist() if isinstance(of, np.ndarray) else of)]  # fmt: skip
+        if isinstance(of, np.ndarray):
+            said = [_lines(x, depth) for x in of.tolist()]
+        else:
+            said = [encode_basestring(x) if isinstance(x, str) else _words(x, depth) for x in of]
         self.of_row.append(np.array([self.number(x) for x in said], dtype=np.int64))
         self.part(WORD, len(self.of_row) - 1)
 
@@ -230,13 +232,16 @@ def _lines(value: Any, depth: int) -> str:
     if kinds == _FLOATS and "n" not in (text := ", ".join(map(float.__repr__, value))):  # not even of nan or inf
         return f"[{text}]"
     if kinds == _WORDS:
-        before = " " * (depth + 1)
-        inner = ",\n".join([before + encode_basestring(v) for v in value])
-        return f"[\n{inner}\n{' ' * depth}]"
+        return _words(value, depth)
     if dict in kinds or str in kinds:
         inner = ",\n".join([" " * (depth + 1) + _lines(v, depth + 1) for v in value])
         return f"[\n{inner}\n{' ' * depth}]"
     return f"[{', '.join(map(_one, value))}]"
+
+
+def _words(value: list[str], depth: int) -> str:
+    before = "\n" + " " * (depth + 1)
+    return f"[{','.join([before + encode_basestring(word) for word in value])}\n{' ' * depth}]" if value else "[]"
 
 
 def _one(value: Any) -> str:

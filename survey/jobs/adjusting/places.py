@@ -21,7 +21,6 @@ from adjust.diagnosis.hypothesis import (
     SetReadings,
 )
 from survey.folder.text import read_text
-from survey.project.declared.editing import LENGTHS
 from survey.project.declared.toml_text import key_lines
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER, Project
 from survey.project.tables.files import read_table
@@ -84,6 +83,8 @@ class ProjectFiles:
 
     def _edited(self, edit: Edit) -> str:
         if isinstance(edit, ScaleKey):
+            from survey.project.declared.editing import LENGTHS  # here: few causes are mended by a key
+
             return self.key(*edit.path, LENGTHS) if edit.path[0] == "targets" else self.key(*edit.path)
         if isinstance(edit, SetKey):
             return self.key(*edit.path)

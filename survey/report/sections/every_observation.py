@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from markupsafe import Markup
 
+from adjust.model.names import numbered
 from adjust.model.result import names_of
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.text import NUMBERS, TEXT, Words, record_rows
@@ -142,11 +143,12 @@ def _every_other(c: Context, observation: IntArray, component: IntArray) -> _Row
     seen, of = np.unique(observation, return_inverse=True)
     some = [every[k] for k in seen.tolist()]
     said = [(known(kind.replace("_", " ")), group_name(group), " · ".join(ids)) for kind, group, ids, *_ in some]
-    each = zip((some[k] for k in of.tolist()), component.tolist(), strict=True)
-    named = [(components[i], units[i]) for (*_, components, units), i in each]
-    units_of = {(name, inside): (name, *units_for_people(name, inside)) for name, inside in set(named)}
-    units = [units_of[x] for x in named]
-    own, unit, factor, small_unit, small = zip(*units, strict=True) if units else ((),) * 5
+    alike, number = numbered((components, units) for *_, components, units in some)
+    most = max((len(components) for components, _ in alike), default=1)
+    cells, cell = np.unique(number[of] * most + component, return_inverse=True)
+    named = ((alike[k // most][0][k % most], alike[k // most][1][k % most]) for k in cells.tolist())
+    units = [(name, *units_for_people(name, inside)) for name, inside in named]
+    own, unit, factor, small_unit, small = (np.array([u[i] for u in units], dtype=object)[cell] for i in range(5))
     texts = np.empty((len(_NAMES), len(at)), dtype=object)
     texts[:3], texts[3] = np.array(said, dtype=object).reshape(-1, 3)[of].T, ""
     texts[4], texts[5], texts[6] = own, unit, small_unit
@@ -154,7 +156,7 @@ def _every_other(c: Context, observation: IntArray, component: IntArray) -> _Row
     suspect = np.abs(w) > c.solution["summary"]["suspects"]["standardized_limit"]
     values = np.stack([
         arrays.observed[at], arrays.adjusted[at], arrays.sigma[at], arrays.residual[at], arrays.redundancies[at], w,
-        used, np.array(factor), np.array(small), np.where(used, suspect, 2),
+        used, factor.astype(float), small.astype(float), np.where(used, suspect, 2),
         len(c.adjustment.image_residuals.test) + observation, component,
     ])  # fmt: skip
     return texts, values
