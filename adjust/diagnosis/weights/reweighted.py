@@ -14,9 +14,7 @@ from adjust.pose_network.solve import NetworkOptions, solve_options
 from adjust.precision.precision import Precision
 
 
-def reweighted(
-    result: Adjustment, by: FloatArray, settled: float, paid: Callable[[], Progress]
-) -> Adjustment | None:  # fmt: skip
+def reweighted(result: Adjustment, by: FloatArray, settled: float, paid: Callable[[], Progress]) -> Adjustment | None:
     """What residuals, v'Pv and sigma0 become where the sigmas of all pairs (n, 6) are multiplied by ``by``.
 
     A common factor changes no value; else it is solved from the values that are there, for which ``paid`` gives the
