@@ -6,6 +6,7 @@ import numpy as np
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.graph.assembly import StartValues
+from adjust.graph.solver import Progress
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
@@ -49,7 +50,13 @@ class Budget:
         self, survey: Survey, start: StartValues | None, options: AdjustOptions, first: float, step: float = STEP,
         most: float = np.inf, lost: float = np.inf,
     ) -> Adjustment:  # fmt: skip
-        """Adjust, and pay as it goes: it begins where something is left, and every step costs.
+        """Adjust, and pay as it goes: see :meth:`paying`."""
+        if any(o.clock is not None for of in (survey.cameras, survey.tables, survey.stations) for o in of):
+            first, step = _CLOCKS * first, _CLOCKS * step
+        return adjust(survey, start, options, self.paying(first, step, most, lost))
+
+    def paying(self, first: float, step: float = STEP, most: float = np.inf, lost: float = np.inf) -> Progress:
+        """The progress of an adjustment that pays as it goes: it begins where something is left, and every step costs.
 
         most: v'Pv that it has to come below in the end; lost: soon after it began.
         """
@@ -59,7 +66,5 @@ class Budget:
             if (iteration >= _HOPELESS and omega > most) or (iteration >= _BEGUN and omega > lost):
                 raise SurveyError("it leads away")
 
-        if any(o.clock is not None for of in (survey.cameras, survey.tables, survey.stations) for o in of):
-            first, step = _CLOCKS * first, _CLOCKS * step
         self.spend(first)
-        return adjust(survey, start, options, went)
+        return went

@@ -81,6 +81,18 @@ class Case:
         self._last[:] = [*self._last[-1:], (survey, result)]
         return result
 
+    def reweighted(self, by: FloatArray) -> Adjustment | None:
+        """The same with the sigmas of its pairs (n, 6) multiplied, as far as a misfit says of it.
+
+        None where it takes a graph of its own. SurveyError where that fails.
+        """
+        if not self.survey.pairs or self.linear is None:
+            return None
+        from adjust.diagnosis.weights.reweighted import reweighted  # here: most surveys have no pairs
+
+        result = self.linear.result
+        return reweighted(result, by, _NEAR.solve.settled, lambda: self.budget.paying(START + REST, most=result.omega))
+
     @cached_property
     def _last(self) -> list[tuple[Survey, Adjustment]]:
         """The two surveys that were adjusted last, and how."""

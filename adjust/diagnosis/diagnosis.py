@@ -11,7 +11,7 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, told_edit
 from adjust.diagnosis.memory import remembering
 from adjust.diagnosis.search import Search
-from adjust.diagnosis.trial import Misfit, Trial, misfit_of
+from adjust.diagnosis.trial import NEVER, Misfit, Trial, misfit_of
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
 from adjust.start.lens.start import remembering as remembering_lenses
@@ -29,7 +29,6 @@ _NOISE = 3.0  # sigmas
 _EXPLAINED = 0.5  # share of the excess that a cause takes away at least
 _LIKELY = 0.01
 """Probability among all that were tried, and the survey as it stands, below which a cause is not named."""
-_LOG_LARGEST = 600.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +119,7 @@ def _diagnosed(case: Case, stages: "Sequence[Sequence[Family]]") -> Diagnosis:
             cut += [family] * case.budget.refused
         looked_at += sum(h.looked_at for h in formed)
         search.over(formed, 0.0 if search.done() else kept)
-    found = ranked(search.base, search.told, looked_at)
+    found = ranked(search.base, search.told, looked_at, search.outdone)
     again = not found and (search.promising or cut)
     if again or (found and search.refines(found[0].hypothesis)):
         case.budget.left, case.budget.kept = max(case.budget.left, 0.0) + _AGAIN * given, 0.0
@@ -131,7 +130,7 @@ def _diagnosed(case: Case, stages: "Sequence[Sequence[Family]]") -> Diagnosis:
             formed = [h for h in _formed(family, case) if search.is_new(h)]
             looked_at += sum(h.looked_at for h in formed)
             search.over(formed, 0.0)
-        found = ranked(search.base, search.told, looked_at)
+        found = ranked(search.base, search.told, looked_at, search.outdone)
     return Diagnosis(found, tuple(dict.fromkeys(search.names)), search.base, search.untried, tuple(case.passed_over))
 
 
@@ -153,7 +152,7 @@ def _text(number: int, candidate: Candidate) -> str:
     )
 
 
-def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candidate, ...]:
+def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int, outdone: bool = False) -> tuple[Candidate, ...]:
     """The trials that explain the misfit by test, the best first.
 
     Each drop of v'Pv is tested against chi-square with as many degrees of freedom as the change has parameters, or as
@@ -162,12 +161,13 @@ def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candi
     else wrong sigmas would explain all that a cause leaves. A cause explains the misfit if half of it goes, or if what
     is left is noise, and was not before; it leaves no more observations out than before, and none where nothing was
     adjusted before, save as few as noise hides. It is not named where another one, though it explains less than that,
-    is a hundred times as likely.
+    is a hundred times as likely. outdone: whether something was not tried that could not be: it may leave nothing.
     """
     good = [t for t in trials if t.result is not None]
     if not good:
         return ()
-    scale = max(1.0, min(t.misfit.omega / max(t.misfit.redundancy, 1) for t in good))
+    left = 0.0 if outdone else min(t.misfit.omega / max(t.misfit.redundancy, 1) for t in good)
+    scale = max(1.0, left)
     number = max(looked_at, len(trials), 1)
     weight = _probabilities(base, good)
     out = []
@@ -198,9 +198,7 @@ def _cost(trial: Trial) -> float:
 
 def _probabilities(base: Misfit, trials: Sequence[Trial]) -> FloatArray:
     """(k,) of the trials, with the survey as it stands as one more explanation."""
-    n = max(base.count, 2)
-    fitted = [t.misfit.fitted + 2.0 * t.misfit.dropped + t.hypothesis.penalty for t in trials]
-    score = [base.omega, *(f + t.hypothesis.parameters * np.log(n) for f, t in zip(fitted, trials, strict=True))]
+    score = [base.omega, *(t.score(base) for t in trials)]
     half = -0.5 * (np.array(score) - min(score))
-    likelihood = np.exp(np.maximum(half, -_LOG_LARGEST))
+    likelihood = np.exp(np.maximum(half, -0.5 * NEVER))
     return np.asarray((likelihood / likelihood.sum())[1:])

@@ -147,7 +147,7 @@ class Hypothesis:
     tried. penalty: what the change adds to minus twice the log likelihood beside v'Pv, where it changes variances: the
     sum of the logarithms of their factors. scored: the evidence is how many times less the misfit beyond noise becomes
     by the score at the solution. of_variances: nothing else is changed, so that the values there are as good a start as
-    any.
+    any. pair_sigmas: (n, 6) by what the sigmas of all pairs are multiplied, where that is all that is changed.
     """
 
     name: str
@@ -163,6 +163,7 @@ class Hypothesis:
     penalty: float = 0.0
     scored: bool = False
     of_variances: bool = False
+    pair_sigmas: FloatArray | None = None
 
     def told(self, words: Callable[[Adjustment], str]) -> "Hypothesis":
         """With its cause as the adjustment that shows it says it; as it stands where that has no words."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
-from adjust.diagnosis.trial import Misfit, Trial, tried, tried_afresh
+from adjust.diagnosis.trial import NEVER, Misfit, Trial, tried, tried_afresh
 
 _FAINT, _FAINT_TO_NOISE = 0.2, 0.7
 """Evidence over that of a trial that leaves little below which nothing is tried; of scores, where it leaves noise."""
@@ -18,13 +18,17 @@ _AFRESH = 2
 
 @dataclass
 class Search:
-    """base: what the case leaves unexplained. names: of all kinds that were tried. queue: what is still to be tried."""
+    """base: what the case leaves unexplained. names: of all kinds that were tried. queue: what is still to be tried.
+
+    outdone: whether something was not tried because it could not be named, however little it left.
+    """
 
     case: Case
     base: Misfit
     trials: list[Trial] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
     queue: list[Hypothesis] = field(default_factory=list)
+    outdone: bool = False
 
     def over(self, formed: Iterable[Hypothesis], kept: float) -> None:
         """Try these and what is left, the likeliest first, as long as the budget lasts. kept: of it for later ones.
@@ -37,6 +41,10 @@ class Search:
         self.queue = _in_turn(queue, any(h.scored for h in queue) and self.case.is_spoilt)
         self.case.budget.kept = kept
         while self.queue and self.case.budget.lasts:
+            if self._outdone(self.queue[0]):
+                self.names.append(self.queue.pop(0).name)
+                self.outdone = True
+                continue
             before, trial = self.case.budget.kept, tried(self.queue.pop(0), self.case)
             clear = trial.hypothesis.evidence > _CLEAR and not trial.explains(_ENOUGH, self.base)
             if not trial.untimely and (clear or trial.misfit.omega >= self.base.omega):
@@ -112,6 +120,11 @@ class Search:
         self.queue = [h for h in (*more, *self.queue) if h.survey is not first.survey and not self._beaten(h)]
         if self.explained(_ENOUGH):
             self.case.budget.kept = 0.0
+
+    def _outdone(self, h: Hypothesis) -> bool:
+        """Whether its variances alone cost so much more than all that another one leaves that it cannot be named."""
+        solved = (t for t in self.trials if t.result is not None)
+        return h.of_variances and any(h.penalty - t.score(self.base) > NEVER for t in solved)
 
     def _all_told(self, parameters: int) -> bool:
         """Whether something that was not scored leaves nothing but noise with no more parameters than these."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -9,7 +10,7 @@ from adjust.diagnosis.case import CAP, Case, block_squares
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.model.errors import SurveyError
 from adjust.model.names import numbered
-from adjust.model.result import Adjustment
+from adjust.model.result import Adjustment, names_of
 from adjust.model.survey import FloatArray, Survey
 from adjust.testing.criteria import CLEARLY, contradicting, is_noise
 
@@ -19,6 +20,8 @@ _SETTLED = 1.0
 """The same up to which a size that was found in a hurry is good enough."""
 _LAST = 0.3
 """Adjustments that finding the size of a change leaves for the one that shows what it explains."""
+NEVER = 1200.0
+"""Difference of scores from which the likelihood of one is nothing to that of the other."""
 _FACTORS = 2.0 ** np.arange(24.0)
 
 
@@ -81,6 +84,11 @@ class Trial:
     survey: Survey | None = None
     untimely: bool = False
 
+    def score(self, base: Misfit) -> float:
+        """Minus twice the log likelihood, with what its parameters cost (Schwarz 1978): the less, the likelier."""
+        left = self.misfit.fitted + 2.0 * self.misfit.dropped + self.hypothesis.penalty
+        return left + self.hypothesis.parameters * float(np.log(max(base.count, 2)))
+
     def explains(self, share: float, base: Misfit) -> bool:
         """Whether it takes away this share of the misfit beyond noise, where there is any, with all observations.
 
@@ -102,6 +110,10 @@ class Trial:
 def tried(hypothesis: Hypothesis, case: Case) -> Trial:
     """The survey of a hypothesis adjusted from the values of its case, where there are none from its own start."""
     case.budget.refused = False
+    if hypothesis.pair_sigmas is not None:
+        again = _again(hypothesis, hypothesis.pair_sigmas, case)
+        if again is not None:
+            return again
     case.budget.kept += _LAST
     survey = hypothesis.changed()
     case.budget.kept -= _LAST
@@ -110,6 +122,15 @@ def tried(hypothesis: Hypothesis, case: Case) -> Trial:
     cut, case.budget.refused = case.budget.refused, False
     trial = _adjusted(hypothesis, survey, case, case.run if _afresh_first(hypothesis, case) else case.warm)
     return replace(trial, untimely=trial.untimely or (cut and not trial.misfit.is_noise(_SETTLED)))
+
+
+def _again(hypothesis: Hypothesis, by: FloatArray, case: Case) -> Trial | None:
+    """With other sigmas of pairs in the graph of the case; None where that takes another one."""
+    try:
+        result = case.reweighted(by)
+    except (SurveyError, RuntimeError):  # the latter as below
+        return Trial(hypothesis, misfit_of(None, case.survey), None, None, case.budget.refused)
+    return None if result is None else Trial(hypothesis, misfit_of(result, case.survey), result)
 
 
 def _afresh_first(hypothesis: Hypothesis, case: Case) -> bool:
@@ -158,9 +179,11 @@ def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:
         return Misfit(omega, points + n_others, points + n_others, 0, contradicting=(omega, 0.0))
     arrays, out, single = result.other_arrays, _left_out(survey), result.single_residuals
     readings = () if result.reading_residuals is None else result.survey.readings
-    ids: list[tuple[str, ...]] = [*(o.ids for o in single), *((r.reading_id,) for r in readings)]
-    names, number = numbered([*(o.group for o in single), *(r.group for r in readings)])
-    kept = arrays.used | np.array([not (out and out & {i, i[:1]}) for i in ids], dtype=np.bool_)
+    names, number = numbered([*(group for _, group, *_ in names_of(single)), *(r.group for r in readings)])
+    kept = np.ones(len(number), dtype=np.bool_)
+    if out:
+        ids: list[tuple[str, ...]] = [*(n[2] for n in names_of(single)), *((r.reading_id,) for r in readings)]
+        kept = arrays.used | np.array([not out & {i, i[:1]} for i in ids], dtype=np.bool_)
     of_others = _squares_of_others(result)
     groups = {name: [of_others[(kept & (number == k))[arrays.observation]]] for k, name in enumerate(names)}
     n_adjusted = sum(len(s) for of in groups.values() for s in of)
@@ -200,6 +223,7 @@ def _at_best_scale(squares: FloatArray) -> float:
     return float((total[within] / _FACTORS + CAP * (n - within) + n * np.log(_FACTORS)).min())
 
 
+@lru_cache(4)  # of the survey of a case, and of what is tried
 def n_other_components(survey: Survey, used_only: bool = True) -> int:
     """Observed components in use, or all, that are no image points: the finite variances of covariances, else one."""
     observed = [o for kind in survey.others.values() for o in kind if o.used or not used_only]

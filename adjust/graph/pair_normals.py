@@ -46,7 +46,10 @@ class PairLinear:
         """Of the normal matrix (N, 6)."""
         diagonal = np.einsum("nii->ni", self.own).copy()
         for nodes, J in ((self.normals.b, self.by_b), (self.normals.a, self.by_a)):
-            np.add.at(diagonal, nodes[nodes >= 0], (J[nodes >= 0] ** 2).sum(axis=1))
+            free = nodes >= 0
+            at = (6 * nodes[free, None] + np.arange(6)).ravel()
+            squares = np.einsum("eij,eij->ej", J[free], J[free]).ravel()
+            diagonal += np.bincount(at, squares, diagonal.size).reshape(-1, 6)
         return np.asarray(diagonal)
 
     def square(self, x: FloatArray) -> float:

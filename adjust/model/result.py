@@ -169,7 +169,7 @@ class Residuals(Sequence[ObservationResidual]):
     """Observations of which the ``arrays`` (M) are known; each is made when it is asked for, the first ones once."""
 
     def __init__(self, arrays: OtherArrays, named: Callable[[int], Named], n_kept: int) -> None:
-        self.arrays, self._named = arrays, named
+        self.arrays, self.named = arrays, named
         self._ptr = np.concatenate([[0], np.cumsum(arrays.n_components)])
         self._made: list[ObservationResidual | None] = [None] * n_kept
 
@@ -196,12 +196,20 @@ class Residuals(Sequence[ObservationResidual]):
         if found is None:
             a, of = self.arrays, slice(self._ptr[i], self._ptr[i + 1])
             found = ObservationResidual(
-                *self._named(i), a.observed[of], a.adjusted[of], a.residual[of], a.sigma[of], a.redundancies[of],
+                *self.named(i), a.observed[of], a.adjusted[of], a.residual[of], a.sigma[of], a.redundancies[of],
                 a.standardized[of], a.test[i].item(), a.used[i].item(),
             )  # fmt: skip
             if i < len(self._made):
                 self._made[i] = found
         return found
+
+
+@lru_cache(2)
+def names_of(residuals: Sequence[ObservationResidual]) -> tuple[Named, ...]:
+    """What each is called; none of ``Residuals`` is made for that."""
+    if isinstance(residuals, Residuals):
+        return tuple(map(residuals.named, range(len(residuals))))
+    return tuple((o.kind, o.group, o.ids, o.components, o.units) for o in residuals)
 
 
 @lru_cache(2)  # those of an adjustment that is given another warning are the same

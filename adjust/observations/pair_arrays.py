@@ -31,6 +31,13 @@ class PairArrays:
         out.__dict__.update({n: v for n, v in self.__dict__.items() if n not in out.__dict__})
         return out
 
+    def with_sigmas_times(self, by: FloatArray) -> "PairArrays":
+        """The same with all sigmas times ``by`` (E, 6); what is known of the motions is not computed again."""
+        out = replace(self, cov=by[:, :, None] * self.cov * by[:, None, :])
+        kept = {n: v for n, v in self.__dict__.items() if n in ("is_pose", "shifts", "motions", "poses", "logs")}
+        out.__dict__.update(kept, whitening=self.whitening / by[:, None, :])
+        return out
+
     @cached_property
     def is_pose(self) -> BoolArray:
         """Which pairs (E,) measured a translation too."""
@@ -55,7 +62,9 @@ class PairArrays:
             correlation = C / scale[:, :, None] / scale[:, None, :]
             finite = np.asarray(np.isfinite(correlation).all(axis=(1, 2)), dtype=np.bool_)
             whole = np.where(finite[:, None, None], correlation, -1.0)
-            fine = np.asarray(np.linalg.eigvalsh(whole).min(axis=1, initial=1.0) > 1e-12)
+            fine = np.full(len(whole), _all_above(whole, 1e-12))
+            if not fine.all():
+                fine = np.asarray(np.linalg.eigvalsh(whole).min(axis=1, initial=1.0) > 1e-12)
             fine = fine & (np.abs(whole - np.swapaxes(whole, 1, 2)).max(axis=(1, 2), initial=0.0) < 1e-6)
             wrong[np.flatnonzero(rows)[~fine]] = True
         return wrong
@@ -79,6 +88,15 @@ class PairArrays:
     def logs(self) -> FloatArray:
         """Logarithms (E, 6), of rotations the first three components."""
         return self.motions.log()
+
+
+def _all_above(matrices: FloatArray, least: float) -> bool:
+    """Whether all eigenvalues of all matrices (n, k, k) are clearly above: those that are not have no such Cholesky."""
+    try:
+        np.linalg.cholesky(matrices - 2.0 * least * np.eye(matrices.shape[-1]))
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def whitening(cov: FloatArray) -> FloatArray:

@@ -70,9 +70,7 @@ def minimize(
     at = np.zeros_like(t) if network.rotation_only else t
     graph = builder.build(StartValues({}, {n: Pose3(Rot3(a), b) for n, a, b in zip(names, R, at, strict=True)}, {}))
     try:
-        how = SolveOptions(options.max_step, options.max_iterations, 1e-5, options.patience, True, options.settled,
-                           options.covariances)  # fmt: skip
-        solved = solve(graph, how, progress)
+        solved = solve(graph, solve_options(options), progress)
     except NotConvergedError as error:
         raise NotConvergedError(
             f"{str(error).splitlines()[0].split(';')[0].replace('adjustment', 'network')}; look for wrong pairs, or "
@@ -86,6 +84,12 @@ def minimize(
         solved = _anchored(graph, solved, names[network.anchor], Pose3(Rot3(R[network.anchor]), at[network.anchor]))
     _take(R, t, network, graph, solved)
     return Minimum(R, t, graph, solved)
+
+
+def solve_options(options: NetworkOptions) -> SolveOptions:
+    """The same for the one solver; what the pairs join was seen before."""
+    return SolveOptions(options.max_step, options.max_iterations, 1e-5, options.patience, True, options.settled,
+                        options.covariances)  # fmt: skip
 
 
 def _anchored(graph: AdjustmentGraph, solved: Solved, anchor: ParameterName, place: Pose3) -> Solved:

@@ -1,6 +1,9 @@
 """Independent loops of a network, and their misclosures one by one (:mod:`adjust.pose_network.loops`)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -36,13 +39,26 @@ class LoopBasis(Loops):
 
     def pairs(self, loop: int) -> tuple[str, ...]:
         """Ids of the pairs of a loop, in the order of the walk."""
-        return tuple(self.topology.pair_ids[e] for e in self.pair_idx[self.ptr[loop] : self.ptr[loop + 1]])
+        return self.all_pairs[loop]
 
     def stations(self, loop: int) -> tuple[str, ...]:
         """Ids of the stations of a loop, in the order of the walk."""
-        rows = slice(self.ptr[loop], self.ptr[loop + 1])
-        a, b = self.topology.a_idx[self.pair_idx[rows]], self.topology.b_idx[self.pair_idx[rows]]
-        return tuple(self.topology.station_ids[i] for i in np.where(self.sense[rows] > 0, a, b))
+        return self.all_stations[loop]
+
+    @cached_property
+    def all_pairs(self) -> list[tuple[str, ...]]:
+        """:meth:`pairs` of every loop."""
+        return self._told(self.topology.pair_ids, self.pair_idx)
+
+    @cached_property
+    def all_stations(self) -> list[tuple[str, ...]]:
+        """:meth:`stations` of every loop."""
+        a, b = self.topology.a_idx[self.pair_idx], self.topology.b_idx[self.pair_idx]
+        return self._told(self.topology.station_ids, np.where(self.sense > 0, a, b))
+
+    def _told(self, ids: Sequence[str], rows: IntArray) -> list[tuple[str, ...]]:
+        every, ptr = tuple([ids[i] for i in rows.tolist()]), self.ptr.tolist()
+        return [every[first:last] for first, last in pairwise(ptr)]
 
 
 def loop_basis(topology: Topology, kind: LoopKind = "shortest", budget: int = SEARCH_BUDGET) -> LoopBasis:

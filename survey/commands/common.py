@@ -19,7 +19,7 @@ from survey.folder.kept import require_project as require_project
 from survey.folder.messages import message, shown
 
 DONE, FAILED, USAGE, TEST_FAILED, INTERRUPTED = 0, 1, 2, 3, 130
-_OBJECTS = 250_000  # new ones before Python looks for cycles: loading modules makes many and no cycles
+_OBJECTS = 400_000  # new ones before Python looks for cycles: loading modules makes 150,000 and no cycles
 _MALLOC = {-3: 2**30, -1: 2**30, -2: 2**26, -8: 1}  # M_MMAP_THRESHOLD, _TRIM_THRESHOLD, _TOP_PAD (bytes), _ARENA_MAX
 _OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)  # writing does not say which file
 

@@ -1,7 +1,7 @@
 """Values as JSON knows them; loads nothing that a list of runs does not need."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,10 @@ _FLOATS = {float}
 
 class PlainRecords(Mapping[str, dict[str, object]]):
     """Entries by name whose values are what JSON knows already."""
+
+
+class PlainEntries(Sequence[dict[str, object]]):
+    """The same one after the other, without names."""
 
 
 def attributes(thing: object, *names: str) -> dict[str, Any]:
@@ -27,7 +31,7 @@ def differing(a: Mapping[str, object], b: Mapping[str, object]) -> list[str]:
 def plain(value: Any) -> Any:
     """Only what JSON knows: mappings and sequences kept, numbers as Python's, None for what is not finite."""
     kind = type(value)
-    if kind in _AS_IT_IS or isinstance(value, PlainRecords):
+    if kind in _AS_IT_IS or isinstance(value, PlainRecords | PlainEntries):
         return value
     if kind is float:
         return value if math.isfinite(value) else None

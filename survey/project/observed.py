@@ -202,9 +202,14 @@ def _frame(ref: Ref) -> FrameRef:
 
 def name_of_residual(residual: ObservationResidual) -> str:
     """The name of an observation of ``Adjustment.other_residuals``: ``table:id``."""
-    whole = residual.kind in ("table", "coordinates", "surface")  # the others carry their id in front of what they join
-    table = CALLED[residual.kind].layout.name if residual.kind in CALLED else residual.kind
-    return f"{table}:{'/'.join(residual.ids) if whole else residual.ids[0]}"
+    return name_of_observation(residual.kind, residual.ids)
+
+
+def name_of_observation(kind: str, ids: Sequence[str]) -> str:
+    """The same by its kind and ids."""
+    whole = kind in ("table", "coordinates", "surface")  # the others carry their id in front of what they join
+    table = CALLED[kind].layout.name if kind in CALLED else kind
+    return f"{table}:{'/'.join(ids) if whole else ids[0]}"
 
 
 def _rows(item: Observation) -> list[list[Ref]]:

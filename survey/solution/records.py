@@ -10,18 +10,18 @@ from dataclasses import dataclass
 from functools import lru_cache
 from json.encoder import encode_basestring
 from math import isfinite
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.text import NUMBERS, TEXT, WORD, Words, record_rows
-from survey.folder.plain import PlainRecords
+from survey.folder.plain import PlainEntries, PlainRecords
 
-Column = np.ndarray[Any, Any] | Sequence[str]
-"""Of n records: floats, whole numbers or truths (n,), lists of floats (n, k), or n words."""
+Column = np.ndarray[Any, Any] | Sequence[str] | Sequence[list[str]]
+"""Of n records: floats, whole numbers or truths (n,), lists of floats (n, k), n words, or n lists of words."""
 Tree = Mapping[str, "Column | Tree"]
-_FLOATS = {float}
+_FLOATS, _WORDS = {float}, {str}
 _JSON = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
 
 
@@ -92,6 +92,36 @@ class Records(PlainRecords):
         return f"{{\n{b''.join(parts)[:-2].decode()}\n{' ' * depth}}}"
 
 
+class Entries(PlainEntries):
+    """n entries with the same keys, each made when it is asked for. tree: columns by key, nested as they are."""
+
+    def __init__(self, tree: Tree, n: int) -> None:
+        self._tree, self._n = tree, n
+
+    def __len__(self) -> int:
+        return self._n
+
+    @overload
+    def __getitem__(self, index: int) -> dict[str, Any]: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[dict[str, Any]]: ...
+
+    def __getitem__(self, index: int | slice) -> dict[str, Any] | list[dict[str, Any]]:
+        rows = range(self._n)[index]
+        return _entry(self._tree, rows) if isinstance(rows, int) else [_entry(self._tree, row) for row in rows]
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Sequence) and list(self) == list(other)
+
+    def lines(self, depth: int) -> str:
+        """As JSON, a list that begins in a line indented by so many spaces."""
+        if not self._n:
+            return "[]"
+        text, _ = _json_rows(Form(np.arange(self._n), self._tree), None, depth + 1)
+        return f"[\n{text[:-2].decode()}\n{' ' * depth}]"
+
+
 def _entry(tree: Tree, row: int) -> dict[str, Any]:
     return {key: _entry(of, row) if isinstance(of, Mapping) else _value(of, row) for key, of in tree.items()}
 
@@ -124,7 +154,7 @@ class _Writer:
             self.text = ""
         self.parts.append((kind, which))
 
-    def column(self, of: Column) -> None:
+    def column(self, of: Column, depth: int = 0) -> None:
         if isinstance(of, np.ndarray) and of.dtype == np.float64:
             self.text += "[" * (of.ndim == 2)
             self.values.append(of.reshape(len(of), -1))
@@ -137,8 +167,10 @@ class _Writer:
             self.of_row.append(number[at])
             self.part(WORD, len(self.of_row) - 1)
             return
-        said = [encode_basestring(x) if isinstance(x, str) else _JSON.encode(x) for x in
-                (of.tolist() if isinstance(of, np.ndarray) else of)]  # fmt: skip
+        if isinstance(of, np.ndarray):
+            said = [_lines(x, depth) for x in of.tolist()]
+        else:
+            said = [encode_basestring(x) if isinstance(x, str) else _words(x, depth) for x in of]
         self.of_row.append(np.array([self.number(x) for x in said], dtype=np.int64))
         self.part(WORD, len(self.of_row) - 1)
 
@@ -148,16 +180,17 @@ class _Writer:
             if isinstance(value, Mapping):
                 self.tree(value, depth + 1)
             else:
-                self.column(value)
+                self.column(value, depth + 1)
         self.text += f"\n{' ' * depth}}}"
 
 
-def _json_rows(form: Form, names: Sequence[str], depth: int) -> tuple[bytes, IntArray]:
+def _json_rows(form: Form, names: Sequence[str] | None, depth: int) -> tuple[bytes, IntArray]:
     """The records one after the other, each with a comma and a line's end, and where each ends."""
-    writer, n = _Writer(), len(names)
+    writer, n = _Writer(), len(form.rows)
     writer.text = " " * depth
-    writer.column(names)
-    writer.text += ": "
+    if names is not None:
+        writer.column(names)
+        writer.text += ": "
     writer.tree(form.tree, depth)
     writer.text += ",\n"
     writer.parts.append((TEXT, writer.number(writer.text)))
@@ -191,17 +224,24 @@ def _lines(value: Any, depth: int) -> str:
         before = " " * (depth + 1)
         inner = ",\n".join([f"{before}{_key(k)}: {_lines(v, depth + 1)}" for k, v in value.items()])
         return f"{{\n{inner}\n{' ' * depth}}}"
-    if kind is Records:
+    if kind is Records or kind is Entries:
         return str(value.lines(depth))
     if kind is not list:
         return _one(value)
     kinds = set(map(type, value))
     if kinds == _FLOATS and "n" not in (text := ", ".join(map(float.__repr__, value))):  # not even of nan or inf
         return f"[{text}]"
+    if kinds == _WORDS:
+        return _words(value, depth)
     if dict in kinds or str in kinds:
         inner = ",\n".join([" " * (depth + 1) + _lines(v, depth + 1) for v in value])
         return f"[\n{inner}\n{' ' * depth}]"
     return f"[{', '.join(map(_one, value))}]"
+
+
+def _words(value: list[str], depth: int) -> str:
+    before = "\n" + " " * (depth + 1)
+    return f"[{','.join([before + encode_basestring(word) for word in value])}\n{' ' * depth}]" if value else "[]"
 
 
 def _one(value: Any) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from adjust.model.observations import Reading
-from adjust.model.result import Adjustment, ImageResiduals, ObservationResidual
+from adjust.model.result import Adjustment, ImageResiduals, Named, names_of
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.parallel import side_by_side, workers
 from adjust.native.text import NUMBERS, TEXT, WORD, Words, number_rows, record_rows
@@ -137,9 +137,10 @@ def other_residuals_csv(adjustment: Adjustment) -> bytes:
     out, first, at = [OTHER_COLUMNS.encode() + b"\n"], 0, 0
     columns = np.column_stack([arrays.observed, arrays.adjusted, arrays.residual, arrays.sigma, arrays.redundancies,
                                arrays.standardized, arrays.test[arrays.observation]])  # fmt: skip
-    for _, alike in groupby(adjustment.other_residuals[:n], lambda o: (o.kind, o.components, o.units)):
+    names = names_of(adjustment.other_residuals)[:n]
+    for (_, components, _), alike in groupby(names, lambda named: (named[0], *named[3:])):
         some = list(alike)
-        end = at + len(some) * len(some[0].components)
+        end = at + len(some) * len(components)
         out.append(_other_rows(some, columns[at:end], arrays.used[first : first + len(some)]))
         first, at = first + len(some), end
     if readings is not None:
@@ -147,11 +148,11 @@ def other_residuals_csv(adjustment: Adjustment) -> bytes:
     return b"".join(out)
 
 
-def _other_rows(some: Sequence[ObservationResidual], columns: FloatArray, used: BoolArray) -> bytes:
+def _other_rows(some: Sequence[Named], columns: FloatArray, used: BoolArray) -> bytes:
     """Of observations with the same components."""
-    kind, components, k = some[0].kind, some[0].components, len(some[0].components)
-    names, factor, small_names, small = zip(*map(units_for_people, components, some[0].units), strict=True)
-    heads = [_cells(kind, o.group, " ".join(o.ids)) for o in some]
+    (kind, *_, components, units), k = some[0], len(some[0][3])
+    names, factor, small_names, small = zip(*map(units_for_people, components, units), strict=True)
+    heads = [_cells(kind, group, " ".join(ids)) for _, group, ids, *_ in some]
     own = np.tile(np.arange(k), len(some))
     which = np.repeat(np.arange(len(some)), k), own, own
     return _rows(heads, list(map(_cells, components, names)), small_names, which, (np.array(factor), np.array(small)),

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from gtsam import Pose3
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import ChangeColumns, ChangeReadings, Edit, Hypothesis, Place, ScaleKey
@@ -18,7 +17,8 @@ from adjust.model.errors import listed
 from adjust.model.names import grouped
 from adjust.model.observations import Distance, Reading
 from adjust.model.rewriting import with_rows
-from adjust.model.survey import FloatArray, Survey
+from adjust.model.survey import Survey
+from adjust.observations.pair_arrays import pair_arrays
 
 SURE = 1e6
 """Evidence: these values cannot be right, so that what they should be is tried before all else."""
@@ -147,20 +147,19 @@ def _of_values(survey: Survey) -> Iterator[Sigmas]:
 
 def _of_pairs(survey: Survey) -> Iterator[Sigmas]:
     """Of the rotations and of the shifts of pairs, where all sigmas of one are too small."""
-    used = [i for i, p in enumerate(survey.pairs) if p.used]
-    for group, rows in grouped((survey.pairs[i].group, i) for i in used).items():
-        largest = {i: _largest(survey.pairs[i].cov) for i in rows}
-        shifts = {i: float(np.linalg.norm(m.translation())) for i in rows
-                  if isinstance(m := survey.pairs[i].b_from_a, Pose3)}  # fmt: skip
-        for part, what, odd in (
-            ("rotation", "the rotation of pairs", [i for i in rows if largest[i][0] < _ANGLE]),
-            ("translation", "the translation of pairs",
-             [i for i, t in shifts.items() if largest[i][1] < max(_LENGTH, _PART * t)]),
-        ):  # fmt: skip
+    if not survey.pairs:
+        return
+    measured = pair_arrays(survey.pairs)
+    sigmas = np.sqrt(np.diagonal(measured.cov, axis1=1, axis2=2))
+    least = np.maximum(_LENGTH, _PART * np.linalg.norm(measured.shifts, axis=1))
+    turn, shift = sigmas[:, :3].max(axis=1), sigmas[:, 3:].max(axis=1)
+    parts = (("rotation", turn, turn < _ANGLE), ("translation", shift, measured.is_pose & (shift < least)))
+    for group, rows in grouped((p.group, i) for i, p in enumerate(survey.pairs) if p.used).items():
+        for part, largest, small in parts:
+            odd = np.array(rows)[small[rows]].tolist()
             if odd:
-                ids = tuple(survey.pairs[i].pair_id for i in odd)
-                size = max(largest[i][part == "translation"] for i in odd)
-                yield Sigmas("pairs", what, group, tuple(odd), ids, size, False, part)
+                ids, size = tuple(survey.pairs[i].pair_id for i in odd), float(largest[odd].max())
+                yield Sigmas("pairs", f"the {part} of pairs", group, tuple(odd), ids, size, False, part)
 
 
 def _of_tables(survey: Survey) -> Iterator[Sigmas]:
@@ -171,12 +170,6 @@ def _of_tables(survey: Survey) -> Iterator[Sigmas]:
         rows, ids = tuple(i for i, _, _ in found), tuple(r.epoch_id for _, r, _ in found)
         yield Sigmas("table_readings", f"the angles of table {table_id} at", found[0][1].group, rows, ids,
                    max(sigma for _, _, sigma in found), False, "rotation")  # fmt: skip
-
-
-def _largest(cov: FloatArray) -> tuple[float, float]:
-    """Of a pair's sigmas, that of its rotation (rad) and that of its shift (m)."""
-    sigma = np.sqrt(np.diagonal(cov))
-    return float(sigma[:3].max()), float(sigma[3:].max(initial=0.0))
 
 
 def _least(o: Reading | Distance) -> float:

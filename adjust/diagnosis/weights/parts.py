@@ -13,10 +13,10 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.weights.impossible import with_part
 from adjust.model.names import grouped
-from adjust.model.observations import Pair
 from adjust.model.result import Adjustment
 from adjust.model.rewriting import with_rows
-from adjust.model.survey import Survey
+from adjust.model.survey import FloatArray, Survey
+from adjust.observations.pair_arrays import pair_arrays
 from adjust.precision.precision import precision_of
 
 _TURNS = {1.0 / 3600.0: "are arcseconds, read as degrees", 9e-4: "are milligon, read as degrees"}
@@ -62,17 +62,18 @@ def _sums(result: Adjustment) -> dict[tuple[str, str], tuple[float, float]]:
     found, pairs = precision.pairs, precision.graph.survey.pairs
     for part, columns in (("rotation", slice(0, 3)), ("translation", slice(3, 6))):
         square, redundancy = ((found.whitened[:, columns] ** 2).sum(axis=1), found.redundancy[:, columns].sum(axis=1))
-        known = [i for i, row in enumerate(batch.rows.tolist()) if pairs[row].used and np.isfinite(square[i])]
-        for group, mine in grouped((pairs[int(batch.rows[i])].group, i) for i in known).items():
+        known = np.isfinite(square).tolist()
+        of = ((pairs[row], i) for i, row in enumerate(batch.rows.tolist()) if known[i])
+        for group, mine in grouped((pair.group, i) for pair, i in of if pair.used).items():
             out[group, part] = float(square[mine].sum()), float(redundancy[mine].sum())
     return out
 
 
 def _hypothesis(survey: Survey, rows: list[int], group: str, part: str, unit: float, said: str) -> Hypothesis:
-    pairs = [survey.pairs[i] for i in rows]
-    poses = [p for p in pairs if isinstance(p.b_from_a, Pose3)] if part == "translation" else pairs
-    penalty = 6.0 * len(poses) * float(np.log(unit))
-    if part == "translation" and _short(poses):
+    measured = pair_arrays(survey.pairs)
+    of = np.array(rows)[measured.is_pose[rows]] if part == "translation" else np.array(rows)
+    penalty = 6.0 * len(of) * float(np.log(unit))
+    if part == "translation" and _short(measured.shifts[of], np.sqrt(measured.cov[of, 3, 3])):
         moved = {i: m for i in rows if isinstance(m := survey.pairs[i].b_from_a, Pose3)}
         new = {i: replace(survey.pairs[i], b_from_a=Pose3(m.rotation(), m.translation() / unit))
                for i, m in moved.items()}  # fmt: skip
@@ -82,19 +83,18 @@ def _hypothesis(survey: Survey, rows: list[int], group: str, part: str, unit: fl
             "in pairs.csv multiply tx_mm, ty_mm, tz_mm by 1000", Place("group", (group,)),
             with_rows(survey, "pairs", new), (), _EVIDENCE, 0, penalty=penalty,
         )  # fmt: skip
-    times = f"{1.0 / unit:.0f} times too large"
+    times, by = f"{1.0 / unit:.0f} times too large", np.ones((len(survey.pairs), 6))
+    by[rows, slice(0, 3) if part == "rotation" else slice(3, 6)] = unit
     return Hypothesis(
         "unit of sigmas",
         f"the sigmas of the {part} of the pairs of group {group} are about {times}: they {said}",
         f"multiply these sigmas by {unit:.4g}, or name their column by their unit",
-        Place("group", (group,), "sigma"), with_part(survey, "pairs", rows, part, unit), (), _EVIDENCE, 0,
-        penalty=penalty, of_variances=True,
+        Place("group", (group,), "sigma"), lambda: with_part(survey, "pairs", rows, part, unit), (), _EVIDENCE, 0,
+        penalty=penalty, of_variances=True, pair_sigmas=by,
     )  # fmt: skip
 
 
-def _short(pairs: list[Pair]) -> bool:
-    """Whether most shifts are hardly longer than their sigmas, which are none of another unit by their size."""
-    poses = [(p.b_from_a, np.sqrt(p.cov[3, 3])) for p in pairs if isinstance(p.b_from_a, Pose3)]
-    lengths = np.array([np.linalg.norm(m.translation()) for m, _ in poses])
-    sigmas = np.array([sigma for _, sigma in poses])
-    return bool(len(poses) and np.median(lengths / sigmas) < _SHORT and np.median(sigmas) < _COARSE)
+def _short(shifts: FloatArray, sigmas: FloatArray) -> bool:
+    """Whether most shifts (n, 3) are hardly longer than their sigmas, which are none of another unit by their size."""
+    lengths = np.linalg.norm(shifts, axis=1)
+    return bool(len(sigmas) and np.median(lengths / sigmas) < _SHORT and np.median(sigmas) < _COARSE)

@@ -14,9 +14,9 @@ from adjust.diagnosis.hypothesis import Hypothesis, Place, ScaleKey
 from adjust.model.errors import listed
 from adjust.model.names import grouped
 from adjust.model.observations import Distance, Level, OnSurface, Reading
-from adjust.model.result import Adjustment
+from adjust.model.result import Adjustment, names_of
 from adjust.model.rewriting import Fields
-from adjust.model.survey import FloatArray
+from adjust.model.survey import FloatArray, Survey
 from adjust.statistics.group_sums import scaled_survey
 from adjust.testing.distributions import chi2
 
@@ -60,8 +60,14 @@ def wrong_factors(case: Case) -> Iterator[Hypothesis]:
             "sigmas that the instrument has", Place("group", (group.group,), "sigmas.scale"),
             scaled_survey(case.survey, {group.group: factor}), (ScaleKey(("sigmas", "scale", group.group), k),),
             min(max(factor, 1.0 / factor), _LAST), 1, len(tested), penalty=group.n_observations * float(np.log(factor)),
-            of_variances=True,
+            of_variances=True, pair_sigmas=_of_every_pair(case.survey, group.group, k),
         )  # fmt: skip
+
+
+def _of_every_pair(survey: Survey, group: str, k: float) -> FloatArray | None:
+    """``k`` for the sigmas of all pairs (n, 6), None where they are not all of the group."""
+    alone = bool(survey.pairs) and all(p.group == group for p in survey.pairs)
+    return np.full((len(survey.pairs), 6), k) if alone else None
 
 
 def _standardized(result: Adjustment, group: str) -> FloatArray:
@@ -69,8 +75,9 @@ def _standardized(result: Adjustment, group: str) -> FloatArray:
     images = result.image_residuals
     of_block = np.array([b.group == group for b in result.survey.image_blocks], dtype=bool)
     rows = np.repeat(of_block, np.diff(images.block_ptr)) & images.used
-    others = [o.standardized for o in result.other_residuals if o.group == group and o.used]
-    every = np.concatenate([images.standardized[rows].ravel(), *others])
+    others = result.other_arrays
+    mine = others.used & np.array([of == group for _, of, *_ in names_of(result.other_residuals)], dtype=np.bool_)
+    every = np.concatenate([images.standardized[rows].ravel(), others.standardized[mine[others.observation]]])
     return np.asarray(every[np.isfinite(every)])
 
 

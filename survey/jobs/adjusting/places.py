@@ -23,7 +23,6 @@ from adjust.diagnosis.hypothesis import (
 )
 from survey.folder.text import read_text
 from survey.jobs.adjusting.edits import OF_IMAGE
-from survey.project.declared.editing import LENGTHS
 from survey.project.declared.toml_text import key_lines
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER, Project
 from survey.project.tables.files import read_table
@@ -78,10 +77,14 @@ class ProjectFiles:
         self._tables: dict[str, Table | None] = {}
 
     @cached_property
+    def text(self) -> str:
+        """``survey.toml``."""
+        return read_text(self.folder / DEFINITION_FILE)
+
+    @cached_property
     def keys(self) -> dict[tuple[str | int, ...], int]:
-        """Lines of the keys of ``survey.toml``."""
-        path = self.folder / DEFINITION_FILE
-        return key_lines(read_text(path))
+        """Lines of its keys."""
+        return key_lines(self.text)
 
     def table(self, name: str) -> Table | None:
         """A table, None where the project has none."""
@@ -98,6 +101,8 @@ class ProjectFiles:
 
     def _edited(self, edit: Edit) -> str:
         if isinstance(edit, ScaleKey):
+            from survey.project.declared.editing import LENGTHS  # here: few causes are mended by a key
+
             return self.key(*edit.path, LENGTHS) if edit.path[0] == "targets" else self.key(*edit.path)
         if isinstance(edit, SetKey):
             return self.key(*edit.path)
@@ -111,6 +116,8 @@ class ProjectFiles:
 
     def key(self, *path: str | Collection[str]) -> str:
         """The line of a key, or of the nearest table above it; the last part of the path may be one of several."""
+        if str(path[0]) not in self.text and "\\" not in self.text:
+            return DEFINITION_FILE  # of thousands of stations the keys need not be told apart for that
         *above, last = path
         names = [last] if isinstance(last, str) else list(last)
         known = [p for name in names if (p := (*map(str, above), name)) in self.keys]

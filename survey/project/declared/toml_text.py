@@ -58,7 +58,7 @@ def in_units(**values: Any) -> dict[str, object]:
 
 
 _HEADER = re.compile(r"\[([A-Za-z0-9_-]+(?:\.[A-Za-z0-9_-]+)*)\]")
-_INLINE_KEY = re.compile(r"([A-Za-z0-9_-]+) = ")
+_INLINE_KEY = re.compile(r"(?<![A-Za-z0-9_-])(?=[A-Za-z0-9_-]+ = )")
 _TEXTS = re.compile(r'("[^"]*")')
 
 
@@ -109,7 +109,7 @@ def _plain_value(text: str) -> Any:
     if ":" in "".join(parts[::2]):
         raise ValueError(text)
     if " = " in text:
-        parts[::2] = [_INLINE_KEY.sub(r'"\1": ', part) for part in parts[::2]]
+        parts[::2] = [_INLINE_KEY.sub('"', part).replace(" = ", '": ') for part in parts[::2]]
         text = "".join(parts)
     value, end = _JSON.raw_decode(text)
     if end < len(text):

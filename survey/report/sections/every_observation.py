@@ -11,9 +11,11 @@ import numpy as np
 import numpy.typing as npt
 from markupsafe import Markup
 
+from adjust.model.names import numbered
+from adjust.model.result import names_of
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.text import NUMBERS, TEXT, Words, record_rows
-from survey.project.observed import name_of_residual
+from survey.project.observed import name_of_observation
 from survey.report.context import Context, Listed, other_components, worst
 from survey.report.language import group_name, known, t
 from survey.report.markup import count, fixed, json_of, json_script, part, section
@@ -53,7 +55,8 @@ def listed(c: Context) -> Listed:
     columns |= _numeric(_numbers(values), values)
     n_images = len(c.adjustment.image_residuals.test)
     seen, of = np.unique(values[10].astype(int), return_inverse=True)
-    each = ["" if k < n_images else name_of_residual(c.adjustment.other_residuals[k - n_images]) for k in seen.tolist()]
+    others = [(kind, ids) for kind, _, ids, *_ in names_of(c.adjustment.other_residuals)]
+    each = ["" if k < n_images else name_of_observation(*others[k - n_images]) for k in seen.tolist()]
     places = _coded([each[i] for i in of.tolist()])
     rest = {"rows": len(chosen), "flags": values[9].astype(int).tolist(), "places": places,
             "at": [COLUMNS.index("Where"), COLUMNS.index("Point")]}  # fmt: skip
@@ -135,16 +138,17 @@ def _every_image(c: Context, k: IntArray, i: IntArray) -> _Rows:
 
 def _every_other(c: Context, observation: IntArray, component: IntArray) -> _Rows:
     """Of these components of other observations."""
-    arrays, every = c.adjustment.other_arrays, c.adjustment.other_residuals
+    arrays, every = c.adjustment.other_arrays, names_of(c.adjustment.other_residuals)
     at = (np.cumsum(arrays.n_components) - arrays.n_components)[observation] + component
     seen, of = np.unique(observation, return_inverse=True)
     some = [every[k] for k in seen.tolist()]
-    said = [(known(o.kind.replace("_", " ")), group_name(o.group), " · ".join(o.ids)) for o in some]
-    each = zip((some[k] for k in of.tolist()), component.tolist(), strict=True)
-    named = [(o.components[i], o.units[i]) for o, i in each]
-    units_of = {(name, inside): (name, *units_for_people(name, inside)) for name, inside in set(named)}
-    units = [units_of[x] for x in named]
-    own, unit, factor, small_unit, small = zip(*units, strict=True) if units else ((),) * 5
+    said = [(known(kind.replace("_", " ")), group_name(group), " · ".join(ids)) for kind, group, ids, *_ in some]
+    alike, number = numbered((components, units) for *_, components, units in some)
+    most = max((len(components) for components, _ in alike), default=1)
+    cells, cell = np.unique(number[of] * most + component, return_inverse=True)
+    named = ((alike[k // most][0][k % most], alike[k // most][1][k % most]) for k in cells.tolist())
+    units = [(name, *units_for_people(name, inside)) for name, inside in named]
+    own, unit, factor, small_unit, small = (np.array([u[i] for u in units], dtype=object)[cell] for i in range(5))
     texts = np.empty((len(_NAMES), len(at)), dtype=object)
     texts[:3], texts[3] = np.array(said, dtype=object).reshape(-1, 3)[of].T, ""
     texts[4], texts[5], texts[6] = own, unit, small_unit
@@ -152,7 +156,7 @@ def _every_other(c: Context, observation: IntArray, component: IntArray) -> _Row
     suspect = np.abs(w) > c.solution["summary"]["suspects"]["standardized_limit"]
     values = np.stack([
         arrays.observed[at], arrays.adjusted[at], arrays.sigma[at], arrays.residual[at], arrays.redundancies[at], w,
-        used, np.array(factor), np.array(small), np.where(used, suspect, 2),
+        used, factor.astype(float), small.astype(float), np.where(used, suspect, 2),
         len(c.adjustment.image_residuals.test) + observation, component,
     ])  # fmt: skip
     return texts, values

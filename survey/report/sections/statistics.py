@@ -1,11 +1,12 @@
 """Sections on the statistics: variance components, reliability, relative precision, budget, correlations."""
 
 from collections.abc import Sequence
+from itertools import compress
 
 import numpy as np
 from markupsafe import Markup
 
-from adjust.model.result import Adjustment, Component, ParameterName
+from adjust.model.result import Adjustment, Component, ParameterName, names_of
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.statistics.result import BudgetEntry, Correlation, Influence, RelativePrecision, WeakDirection
 from survey.report import markup as m
@@ -211,9 +212,11 @@ def standardized_by_group(adjustment: Adjustment) -> dict[str, FloatArray]:
                 out.setdefault(name, []).append(standardized[mine].ravel())
 
     add([b.group for b in adjustment.survey.image_blocks], np.diff(found.block_ptr), found.used, found.standardized)
-    for o in adjustment.single_residuals:
-        if o.used:
-            out.setdefault(o.group, []).append(o.standardized)
+    others, n = adjustment.other_arrays, len(adjustment.single_residuals)
+    used = others.used & (np.arange(len(others.used)) < n)
+    groups = [group for _, group, *_ in compress(names_of(adjustment.other_residuals), used.tolist())]
+    mine = used[others.observation]
+    add(groups, others.n_components[used], mine[mine], others.standardized[mine])
     if readings is not None:
         add([r.group for r in adjustment.survey.readings], 1, readings.used, readings.standardized)
     joint = {name: np.concatenate(parts) for name, parts in out.items()}

@@ -18,7 +18,9 @@ from adjust.relay.loops import LoopMisclosures, loop_misclosures
 from adjust.relay.network import MeasuredPairs, topology
 from adjust.spatial.rigid_motions import Motions
 from survey.solution.network.counts import ends_of, links_of, measured_only, tied
+from survey.solution.network.pairs import pair_rows
 from survey.solution.quantities import ARCSEC_PER_RAD
+from survey.solution.records import Column, Entries
 
 ALPHA = 0.001
 """Error probability of the test of all loops together."""
@@ -65,15 +67,15 @@ def loops_after(adjustment: Adjustment, loops: LoopMisclosures) -> FloatArray:
             estimate = adjustment.estimates.get(link.parameter)
             now = None if estimate is None else estimate.value
             given.append(now if isinstance(now, Pose3) else link.given.value or Pose3())
-    found = {o.ids[0]: o.residual for o in adjustment.other_residuals if o.kind == "pair"}
+    row, found = pair_rows(adjustment), adjustment.other_arrays
     mounts = {closure.pair_ids[-1] for closure in survey.closures}
     moved, lost = np.zeros((top.n_pairs, dim)), np.zeros(top.n_pairs, dtype=np.bool_)
-    for e, pair in enumerate(survey.pairs):
-        v = found.get(pair.pair_id)
-        if v is None:
-            lost[e] = True
-        else:
-            moved[e] = (v - play(survey.closures, pair, v) if pair.pair_id in mounts else v)[:dim]
+    lost[:n] = row < 0
+    there, first = np.flatnonzero(row >= 0), np.cumsum(found.n_components) - found.n_components
+    moved[there] = found.residual[first[row[there], None] + np.arange(dim)]
+    for e in (e for e in there.tolist() if survey.pairs[e].pair_id in mounts):
+        v = found.residual[first[row[e]] : first[row[e]] + found.n_components[row[e]]]
+        moved[e] -= play(survey.closures, survey.pairs[e], v)[:dim]
     w = loop_vectors(basis, _with_given(pair_arrays(survey.pairs), given, dim).retract(moved))
     w[np.logical_or.reduceat(lost[basis.pair_idx], basis.ptr[:-1])] = np.nan
     return w
@@ -90,12 +92,13 @@ def loops_dict(
     """
     failed = np.zeros(len(loops.test), dtype=np.bool_)
     failed[loops.failed(ALPHA)] = True
-    order, out = np.argsort(loops.p_value, kind="stable"), set(left_out)
+    order = np.argsort(loops.p_value, kind="stable")
     columns = misclosure_columns(loops.vector, loops.cov)
     columns |= {"test": loops.test, "p_value": loops.p_value}
     if after is not None:
         columns |= {key: size for key, _, size in _lengths("misclosure_after", after)}
-    rows = zip(*(column[order].tolist() for column in columns.values()), strict=True)
+    tree: dict[str, Column] = {**_walks(loops, order.tolist(), left_out), "closes": ~failed[order]}
+    tree |= {key: column[order] for key, column in columns.items()}
     return {
         "n_loops": len(order),
         "n_failed": int(failed.sum()),
@@ -105,12 +108,8 @@ def loops_dict(
         "alpha": ALPHA,
         "form": form,
         "solved_by": solved_by,
-        "worst_first": [
-            _walk(loops, k, out) | {"freedom": loops.vector.shape[1], "closes": not failed[k]}
-            | dict(zip(columns, row, strict=True))
-            for k, row in zip(order.tolist(), rows, strict=True)
-        ],
-    }  # fmt: skip
+        "worst_first": Entries(tree, len(order)),
+    }
 
 
 def closures_dict(adjustment: Adjustment) -> dict[str, Any]:
@@ -142,10 +141,17 @@ def closures_dict(adjustment: Adjustment) -> dict[str, Any]:
     return out
 
 
-def _walk(loops: LoopMisclosures, k: int, left_out: set[str]) -> dict[str, Any]:
-    pairs = measured_only(loops.basis.pairs(k))
-    return {"stations": list(loops.basis.stations(k)), "pairs": list(pairs),
-            "pairs_not_used": [p for p in pairs if p in left_out]}  # fmt: skip
+def _walks(loops: LoopMisclosures, order: Sequence[int], left_out: Sequence[str]) -> dict[str, Column]:
+    """What loops lead through, in this order, and of how many components each is."""
+    out = frozenset(left_out)
+    stations, pairs = loops.basis.all_stations, loops.basis.all_pairs
+    measured = [list(measured_only(pairs[k])) for k in order]
+    return {
+        "stations": [list(stations[k]) for k in order],
+        "pairs": measured,
+        "pairs_not_used": [[p for p in ids if p in out] for ids in measured] if out else [[]] * len(measured),
+        "freedom": np.full(len(measured), loops.vector.shape[1]),
+    }
 
 
 def _lengths(name: str, w: FloatArray) -> Iterator[tuple[str, slice, FloatArray]]:

@@ -1,12 +1,10 @@
 """Measured pairs after the adjustment: adjusted value, sigma, residual and test of each."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from gtsam import Pose3
 
 from adjust.model.observations import frame_text
-from adjust.model.result import Adjustment, ObservationResidual
+from adjust.model.result import Adjustment, names_of
 from adjust.model.survey import FloatArray, IntArray
 from adjust.observations.pair_arrays import pair_arrays
 from adjust.precision.precision import Precision
@@ -79,20 +77,25 @@ def _covariances(adjustment: Adjustment) -> tuple[FloatArray, IntArray]:
 
 def _tests(adjustment: Adjustment) -> tuple[dict[str, FloatArray], IntArray]:
     """Residuals, redundancy numbers and tests (E, ...) of all pairs, and how many components they have (E,)."""
-    pairs = adjustment.survey.pairs
-    found: dict[str, ObservationResidual] = {o.ids[0]: o for o in adjustment.other_residuals if o.kind == "pair"}
-    of: Sequence[ObservationResidual | None] = [found.get(p.pair_id) for p in pairs]
-    size = np.array([0 if o is None else len(o.residual) for o in of], dtype=np.int64)
-    out = {name: np.zeros((len(pairs), 6)) for name in ("residual", "redundancy", "standardized")}
+    found, row = adjustment.other_arrays, pair_rows(adjustment)
+    size, ends = np.append(found.n_components, 0)[row], np.cumsum(found.n_components)
+    columns = {"residual": found.residual, "redundancy": found.redundancies, "standardized": found.standardized}
+    out = {name: np.zeros((len(row), 6)) for name in columns}
     for dim in (3, 6):
         rows = np.flatnonzero(size == dim)
-        for name, into in out.items():
-            into[rows, :dim] = np.array([getattr(of[i], name) for i in rows.tolist()]).reshape(-1, dim)
-    test = np.array([np.nan if o is None else o.test for o in of], dtype=float)
-    used = np.array([o is not None and o.used for o in of])
+        of = ends[row[rows], None] - np.arange(dim, 0, -1)
+        for name, column in columns.items():
+            out[name][rows, :dim] = column[of]
+    test, used = np.append(found.test, np.nan)[row], np.append(found.used, False)[row]
     controlled = ~used | (out["redundancy"].max(axis=1, initial=-np.inf) > UNCONTROLLED)
     p = np.where(controlled, chi2.sf(test, np.maximum(size, 1)), np.nan)
     return out | {"controlled": controlled, "test": np.where(controlled, test, np.nan), "p_value": p}, size
+
+
+def pair_rows(adjustment: Adjustment) -> IntArray:
+    """Of every pair (E,) which of ``other_residuals`` it is, -1 where it is none."""
+    row = {name[2][0]: i for i, name in enumerate(names_of(adjustment.other_residuals)) if name[0] == "pair"}
+    return np.array([row.get(p.pair_id, -1) for p in adjustment.survey.pairs], dtype=np.int64)
 
 
 def _tested(found: dict[str, FloatArray], rows: IntArray, size: int) -> dict[str, Column]:
