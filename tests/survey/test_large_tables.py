@@ -165,9 +165,9 @@ from survey.project.tables.files import read_table, write_table
 from survey.project.tables.image_points import _distinct, one_code
 from survey.project.tables.reading import Layout
 layout = Layout("t", ("a_id",), ("x_mm",), ("group",), ("sigma_mm",))
-for name, seldom in (("small", "pyarrow"), ("large", "pandas")):
+for name, seldom, parquet in (("small", "pyarrow", False), ("large", "pandas", False), ("large", "pandas", True)):
     table = read_table(Path(sys.argv[1]) / f"{name}.csv", layout)
-    write_table(Path(sys.argv[1]) / "out", name, {**table.text_columns, **table.number_columns})
+    write_table(Path(sys.argv[1]) / "out", name, {**table.text_columns, **table.number_columns}, parquet=parquet)
     assert seldom not in sys.modules
 assert "pyarrow" in sys.modules
 """
