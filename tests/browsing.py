@@ -15,6 +15,9 @@ from survey.workbench.live import Listening
 from survey.workbench.server import Server
 
 SECONDS = 120.0  # the machine may be busy
+UNASKED = ("AimEnabled", "MediaRouter", "NetworkTimeServiceQuerying", "OptimizationHints", "PaintHolding",
+           "PreconnectToSearch", *printing.UNSEEN)  # fmt: skip
+"""What a browser is not to do: ask others when it starts, or prepare what no page shows."""
 LEFT = "about:blank"
 READY = "document.body.dataset.ready !== undefined"
 """Of the workbench."""
@@ -75,7 +78,8 @@ def need_playwright() -> Any:
 def launched() -> Iterator[Any]:
     """Debian's Chromium; nothing is downloaded."""
     with need_playwright().sync_playwright() as playwright:
-        args = ["--no-sandbox", "--disable-gpu", "--window-size=1280,800"]  # of most pages: no tab has to grow
+        args = ["--no-sandbox", "--disable-gpu", "--process-per-site", f"--disable-features={','.join(UNASKED)}",
+                "--window-size=1280,800"]  # fmt: skip  # of most pages: no tab has to grow
         found = playwright.chromium.launch(executable_path=need_browser(), args=args)
         yield found
         found.close()

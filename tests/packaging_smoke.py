@@ -140,7 +140,7 @@ def _checked(dist: Path) -> Path:
 
 def _tests(pip: list[str], bin: Path, folder: Path, arguments: argparse.Namespace) -> None:
     """The tests stand alone in a folder, so that they meet what is installed."""
-    _step([*pip, "install", "-c", str(folder / "constraints.txt"), "pytest", "hypothesis"], folder)
+    _step([*pip, "install", "-c", str(folder / "constraints.txt"), "pytest"], folder)
     shutil.copytree(ROOT / "tests", folder / "tests", ignore=shutil.ignore_patterns("__pycache__", "benchmarks"))
     shutil.copy2(ROOT / "setup.cfg", folder / "setup.cfg")
     out = _step([str(bin / "python"), "-m", "pytest", "-q", "-p", "no:cacheprovider", *arguments.tests], folder)

@@ -6,6 +6,7 @@ that were declared is looked for too: another dictionary, inverted print, mirror
 """
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -24,10 +25,13 @@ _BORDER = 0.01  # of that side, within which of the image's end a marker may be 
 
 
 class SeenMarkers:
-    """The markers of an image, sought once for all targets of a dictionary; of each only the first ones if so said."""
+    """The markers of an image, sought once for all targets of a dictionary; of each only the first ones if so said.
 
-    def __init__(self, gray8: Gray8, first: int | None = None) -> None:
-        self._full, self._first = gray8, first
+    together: dictionaries of which markers are sought in one pass.
+    """
+
+    def __init__(self, gray8: Gray8, first: int | None = None, together: Sequence[str] = ()) -> None:
+        self._full, self._first, self._together = gray8, first, together
         self._found: dict[tuple[str, bool], tuple[IntArray, FloatArray]] = {}
 
     @cached_property
@@ -46,7 +50,9 @@ class SeenMarkers:
     def _in(self, dictionary: str, full: bool) -> tuple[IntArray, FloatArray]:
         if (dictionary, full) not in self._found:
             image = self._full if full else self._reduced[0]
-            self._found[dictionary, full] = _markers_in(image, dictionary, self._first)
+            sought = self._together if dictionary in self._together else (dictionary,)
+            for name, found in zip(sought, _markers_in(image, sought, self._first), strict=True):
+                self._found[name, full] = found
         return self._found[dictionary, full]
 
 
@@ -113,19 +119,17 @@ def _first_indices(target: MarkerGrid | MarkerBlock) -> dict[int, int]:
     return {marker: 4 * k for k, marker in enumerate(sorted(target.corners))}
 
 
-def _markers_in(gray8: Gray8, dictionary: str, first: int | None) -> tuple[IntArray, FloatArray]:
-    """Ids (n,) and corners (n, 4, 2) px of the markers of a dictionary, in ascending id."""
-    whole = marker_dictionary(dictionary)
-    sought = cv2.aruco.Dictionary(whole.bytesList[:first], whole.markerSize, whole.maxCorrectionBits)
+def _markers_in(gray8: Gray8, names: Sequence[str], first: int | None) -> list[tuple[IntArray, FloatArray]]:
+    """Of each dictionary ids (n,) and corners (n, 4, 2) px of its markers, in ascending id."""
+    whole = [marker_dictionary(name) for name in names]
+    sought = [cv2.aruco.Dictionary(d.bytesList[:first], d.markerSize, d.maxCorrectionBits) for d in whole]
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
-    corners, ids, _ = cv2.aruco.ArucoDetector(sought, parameters).detectMarkers(gray8)
-    if ids is None or len(np.ravel(ids)) == 0:
-        return np.zeros(0, np.int64), np.zeros((0, 4, 2))
-    markers = np.ravel(ids).astype(np.int64)
-    quads = np.stack([np.reshape(quad, (4, 2)) for quad in corners]).astype(float)
-    order = np.argsort(markers, kind="stable")
-    return markers[order], quads[order]
+    corners, ids, _, of = cv2.aruco.ArucoDetector(sought, parameters).detectMarkersMultiDict(gray8)
+    markers, of = (np.ravel([] if found is None else found).astype(np.int64) for found in (ids, of))
+    quads = np.array(corners, dtype=float).reshape(-1, 4, 2)
+    orders = [np.flatnonzero(of == k)[np.argsort(markers[of == k], kind="stable")] for k in range(len(names))]
+    return [(markers[order], quads[order]) for order in orders]
 
 
 def _fit_quads(gray: Gray32, quads: FloatArray, cells: int, gap_cells: float) -> CornerFit:
@@ -201,12 +205,12 @@ def other_markers(gray8: Gray8, target: Markers) -> OtherMarkers | None:
     wanted = set(marker_ids(target))
     enough = max(_FEWEST, int(np.ceil(_SHARE * len(wanted)))) if len(wanted) > _FEWEST else len(wanted)
     own = target.dictionary.upper().removeprefix("DICT_")
-    found = []
+    names, found = (own, *(n for n in _LARGEST if n in dictionary_names() and n != own)), []
     for inverted, mirrored in ((False, False), (True, False), (False, True), (True, True)):
         image = 255 - gray8 if inverted else gray8
         image = np.ascontiguousarray(image[:, ::-1]) if mirrored else image
-        seen = SeenMarkers(image, max(wanted) + 1)
-        for name in (own, *(n for n in _LARGEST if n in dictionary_names() and n != own)):
+        seen = SeenMarkers(image, max(wanted) + 1, names)
+        for name in names:
             if name == own and not (inverted or mirrored):
                 continue
             n = len(wanted & set(seen.of(name, wanted)[0].tolist()))

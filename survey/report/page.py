@@ -134,6 +134,8 @@ def _words() -> dict[str, object]:
 
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
+UNSEEN = ("WebUIOmniboxPopup", "WebUIOmniboxAimPopup")
+"""Parts of a browser's own window, for which it would start a process without a window too."""
 _TIMEOUT_S = 180.0
 
 
@@ -162,6 +164,7 @@ def _by_browser(browser: str, html: str) -> bytes:
         command = [
             browser, "--headless", "--disable-gpu", "--no-first-run", "--disable-background-networking",
             "--disable-component-update", "--disable-sync", "--disable-quic", "--no-pdf-header-footer",
+            f"--disable-features={','.join(UNSEEN)}",
             f"--user-data-dir={scratch}/profile", f"--print-to-pdf={out}", page.as_uri(),
         ]  # fmt: skip
         if hasattr(os, "geteuid") and os.geteuid() == 0:

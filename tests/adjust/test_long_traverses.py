@@ -100,7 +100,9 @@ def augmented(graph: AdjustmentGraph, values: gtsam.Values, name: tuple[str, ...
 
     From ``r + A x = f, A'r = g`` (Bjoerck 1967), refined with residuals in extended precision.
     """
-    linear = graph.graph.linearize(values)
+    graph.prepare(values, jacobians=True, reduced=False)
+    with graph.state.serving():
+        linear = graph.graph.linearize(values)
     stack = stacking(graph, [u.key for u in graph.unknowns.by_name.values()])
     A = sparse.csc_array(whitened_rows(linear, stack))
     (m, n), place = A.shape, stack.at[graph.unknowns.by_name[name].key]

@@ -47,6 +47,13 @@ def ask(server, method, path, headers=None, body=None):
         connection.close()
 
 
+@pytest.fixture(scope="module")
+def quiet(tmp_path_factory):
+    """The server of a session that has not begun, which is only asked."""
+    with served(SessionView(read_plan(write_plan(tmp_path_factory.mktemp("quiet"))))) as server:
+        yield server
+
+
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.7", "::", "10.0.0.1", "laboratory", "8.8.8.8"])
 def test_only_loopback_is_served(host):
     with pytest.raises(SurveyError, match=r"loopback only|127\.0\.0\.1 or ::1"):
@@ -68,13 +75,12 @@ def test_moving_needs_live(tmp_path, capsys):
     assert "--allow-move needs --live" in capsys.readouterr().err
 
 
-def test_other_addresses_of_this_machine_do_not_answer(tmp_path):
+def test_other_addresses_of_this_machine_do_not_answer(quiet):
     """127.0.0.2 is this machine too, but the socket is bound to 127.0.0.1 alone."""
-    with served(SessionView(read_plan(write_plan(tmp_path)))) as server:
-        assert server.hostname == "127.0.0.1"
-        other = ("127.0.0.2", server.port)
-        with pytest.raises(ConnectionRefusedError), socket.create_connection(other, 1.0):
-            pass
+    assert quiet.hostname == "127.0.0.1"
+    other = ("127.0.0.2", quiet.port)
+    with pytest.raises(ConnectionRefusedError), socket.create_connection(other, 1.0):
+        pass
 
 
 def test_page_before_during_and_after_a_session(tmp_path):
@@ -111,9 +117,8 @@ _OTHER = ["/../plan.toml", "/image/..%2f..%2fplan.png", "/image/%2e%2e/x.png", "
 
 
 @pytest.mark.parametrize("path", _OTHER)
-def test_no_other_file_is_served(tmp_path, path):
-    with served(SessionView(read_plan(write_plan(tmp_path)))) as server:
-        assert ask(server, "GET", path)[0] == 404
+def test_no_other_file_is_served(quiet, path):
+    assert ask(quiet, "GET", path)[0] == 404
 
 
 @pytest.mark.parametrize(
@@ -131,30 +136,27 @@ def test_no_other_file_is_served(tmp_path, path):
         {"Origin": "null"},
     ],
 )
-def test_other_sites_are_kept_out(tmp_path, headers):
+def test_other_sites_are_kept_out(quiet, headers):
     """DNS rebinding shows in the Host header, a foreign page in Origin."""
-    with served(SessionView(read_plan(write_plan(tmp_path)))) as server:
-        for path in ("/", "/status.json", "/image/X.png"):
-            assert ask(server, "GET", path, headers)[0] == 403
-        assert ask(server, "POST", "/stop", headers, {})[0] == 403
+    for path in ("/", "/status.json", "/image/X.png"):
+        assert ask(quiet, "GET", path, headers)[0] == 403
+    assert ask(quiet, "POST", "/stop", headers, {})[0] == 403
 
 
 @pytest.mark.parametrize("host", ["localhost:9000", "127.0.0.1", "127.0.0.1:8780", "[::1]:22"])
-def test_page_answers_through_a_forwarded_port(tmp_path, host):
+def test_page_answers_through_a_forwarded_port(quiet, host):
     """The browser knows the port at its own end; an origin must still be the page itself."""
-    with served(SessionView(read_plan(write_plan(tmp_path)))) as server:
-        assert ask(server, "GET", "/status.json", {"Host": host})[0] == 200
-        assert ask(server, "GET", "/status.json", {"Host": host, "Origin": f"http://{host}"})[0] == 200
-        assert ask(server, "GET", "/status.json", {"Host": host, "Origin": "http://localhost:1"})[0] == 403
+    assert ask(quiet, "GET", "/status.json", {"Host": host})[0] == 200
+    assert ask(quiet, "GET", "/status.json", {"Host": host, "Origin": f"http://{host}"})[0] == 200
+    assert ask(quiet, "GET", "/status.json", {"Host": host, "Origin": "http://localhost:1"})[0] == 403
 
 
-def test_head_is_answered_without_a_body(tmp_path):
-    with served(SessionView(read_plan(write_plan(tmp_path)))) as server:
-        status, body, headers = ask(server, "HEAD", "/")
-        assert (status, body) == (200, b"")
-        assert int(headers["Content-Length"]) == len(ask(server, "GET", "/")[1])
-        assert ask(server, "HEAD", "/image/X.png")[0] == 404
-        assert ask(server, "HEAD", "/", {"Host": "evil.example"})[0] == 403
+def test_head_is_answered_without_a_body(quiet):
+    status, body, headers = ask(quiet, "HEAD", "/")
+    assert (status, body) == (200, b"")
+    assert int(headers["Content-Length"]) == len(ask(quiet, "GET", "/")[1])
+    assert ask(quiet, "HEAD", "/image/X.png")[0] == 404
+    assert ask(quiet, "HEAD", "/", {"Host": "evil.example"})[0] == 403
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 import random
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 _WORD = re.compile(rb"[^\s<>=\"',:;{}\[\]()/]+")
 WORDS = [
@@ -93,3 +93,13 @@ class Mutator:
     def _repeat(self, data: bytes) -> bytes:
         a, b = sorted(self._random.randint(0, len(data)) for _ in range(2))
         return data[:b] + data[a:b] + data[b:]
+
+
+def nonsense(seed: int, marks: str = "<>[]{}(),;:=*#\"' \n01.-eE") -> Iterator[bytes]:
+    """Endless short files of no format: any bytes, characters of any script, characters of the ``marks``."""
+    of = random.Random(seed)
+    scripts = [chr(code) for code in (*range(0x3000), *range(0x1F600, 0x1F650))]
+    while True:
+        for kind in (range(256), scripts, marks):
+            drawn = of.choices(kind, k=of.randrange(201))
+            yield bytes(drawn) if isinstance(kind, range) else "".join(drawn).encode()

@@ -15,8 +15,6 @@ from survey.workbench.pages import capturing
 from survey.workbench.pages.capturing import FolderView
 from survey.workbench.server import Server
 from survey.workbench.session import Workbench
-from tests import labs
-from tests.browsing import opened
 from tests.survey.test_workbench_server import BASE, HERE, TOKEN
 
 
@@ -124,23 +122,3 @@ def test_the_workbench_says_it_under_its_guard(lab, folder):
         assert answer.headers["content-type"] == "image/jpeg"
         for name in ("Y", "..%2f..%2fetc", "%00"):
             assert client.get(f"/api/capture/{name}", headers=HERE).status_code in (404, 409)
-
-
-@pytest.mark.browser
-@pytest.mark.slow
-@pytest.mark.parametrize("width", [1280, 390])
-def test_a_session_is_watched_in_the_workbench(browser, tmp_path, width):
-    labs.example("head", tmp_path / "lab")
-    (tmp_path / "lab/images/X").mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(tmp_path / "lab/images/X/live1.png"), np.full((80, 100), 90, np.uint8))
-    bench = Workbench(tmp_path / "lab")
-    bench.adjust()
-    with opened(browser, bench, width, "&view=findings,capture") as page:
-        page.wait("document.querySelector('#right .state')?.textContent === 'not started'")
-        said(tmp_path / "lab", "live1")
-        seen(tmp_path / "lab", "live1", [[10.0, 20.0], [60.0, 50.0]])
-        page.wait("document.querySelector('#right .camera') !== null")
-        page.wait("document.querySelector('#right .camera .bar output').textContent.includes('2')")
-        assert "X · live1" in page.page.evaluate("document.querySelector('#right .camera').textContent")
-        assert "1 of 4 epochs" in page.page.evaluate("document.querySelector('#right .capture').textContent")
-        assert page.page.evaluate("document.documentElement.scrollWidth") <= width

@@ -259,9 +259,9 @@ def test_targets_of_one_dictionary_share_the_search_for_its_markers(monkeypatch)
     asked = []
     search = markers._markers_in
 
-    def counted(gray8, dictionary, first):
-        asked.append(dictionary)
-        return search(gray8, dictionary, first)
+    def counted(gray8, names, first):
+        asked.extend(names)
+        return search(gray8, names, first)
 
     monkeypatch.setattr(markers, "_markers_in", counted)
     together = detect_targets(image, targets)

@@ -9,8 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from adjust.model.errors import SurveyError
 from survey.project.tables import arrow as arrow_columns
@@ -19,6 +17,7 @@ from survey.project.tables.arrow import csv_bytes, csv_columns
 from survey.project.tables.files import read_table, write_table
 from survey.project.tables.image_points import _distinct, one_code
 from survey.project.tables.reading import Layout, Table, TextColumn
+from tests.fuzz.mutate import nonsense
 
 LAYOUT = Layout("t", ("a_id",), ("x_mm",), ("group",), ("sigma_mm",))
 HEADER = "a_id,x_mm,group,sigma_mm\n"
@@ -113,12 +112,19 @@ def test_odd_files_are_taken_or_refused_as_row_by_row(
     assert _same(_read(path), _by_rows(path, monkeypatch))
 
 
-@settings(deadline=None)  # Arrow loads in the first one
-@given(
-    st.lists(st.floats(), min_size=1, max_size=30),
-    st.lists(st.text(st.characters(exclude_categories=["Cs"])), min_size=1, max_size=5),
-)
-def test_arrow_writes_what_the_csv_module_writes(numbers: list[float], words: list[str]) -> None:
+def test_arrow_writes_what_the_csv_module_writes() -> None:
+    """Doubles of any bits, everyday ones and special ones; words of any characters, and of those that matter."""
+    rng, scraps = np.random.default_rng(6), nonsense(6, ",\"'\r\n\t =+-@;0e")
+    for _ in range(200):
+        n = int(rng.integers(1, 31))
+        drawn = np.stack([rng.integers(0, 2**64, n, dtype=np.uint64).view(float), rng.integers(-9999, 9999, n) / 8.0,
+                          rng.choice([*CELLS, 0.0, np.nan, np.inf, -np.inf], n)])  # fmt: skip
+        numbers = drawn[rng.integers(0, 3, n), np.arange(n)].tolist()
+        words = [next(scraps).decode(errors="ignore")[: rng.integers(0, 9)] for _ in range(rng.integers(1, 6))]
+        _written_alike(numbers, words)
+
+
+def _written_alike(numbers: list[float], words: list[str]) -> None:
     texts = [words[i % len(words)] for i in range(len(numbers))]
     index = dict.fromkeys(texts)
     coded = TextColumn(tuple(index), np.array([list(index).index(t) for t in texts]))
@@ -165,9 +171,9 @@ from survey.project.tables.files import read_table, write_table
 from survey.project.tables.image_points import _distinct, one_code
 from survey.project.tables.reading import Layout
 layout = Layout("t", ("a_id",), ("x_mm",), ("group",), ("sigma_mm",))
-for name, seldom in (("small", "pyarrow"), ("large", "pandas")):
+for name, seldom, parquet in (("small", "pyarrow", False), ("large", "pandas", False), ("large", "pandas", True)):
     table = read_table(Path(sys.argv[1]) / f"{name}.csv", layout)
-    write_table(Path(sys.argv[1]) / "out", name, {**table.text_columns, **table.number_columns})
+    write_table(Path(sys.argv[1]) / "out", name, {**table.text_columns, **table.number_columns}, parquet=parquet)
     assert seldom not in sys.modules
 assert "pyarrow" in sys.modules
 """

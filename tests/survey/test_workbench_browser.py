@@ -33,6 +33,7 @@ from tests.survey.accessible import FAULTS
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 WRONG = ("tX05", "X", "board", "c40")  # an image point that is moved by 4 px
 NAME = "X/tX05/board/c40"
+ODD = '"><img src=x onerror=window.ran=1><script>window.ran=1</script>'
 VIEWS = ("scene", "plan", "south", "east", "camera", "compare", "history", "angles", "loops", "correlations",
          "settings", "network", "jobs", "capture")  # fmt: skip
 # before and after of every parameter with the widest numbers: by how much its table is wider than its place
@@ -259,6 +260,42 @@ def test_nothing_of_a_project_becomes_markup(desk: Page) -> None:
     assert p.inner_text("#title") == "<img src=x onerror=window.ran=1>"
     assert p.locator("header img").count() == 0
     assert p.evaluate("window.ran") is None
+
+
+def harmful(folder: Path) -> None:
+    """A project with markup in everything that people write: title, comments, reasons, names of what is left out."""
+    labs.example("head", folder)
+    toml = folder / "survey.toml"
+    text = toml.read_text().replace('title = "', f'title = \'{ODD}\' # {ODD}\n# "', 1)
+    toml.write_text(f"# {ODD}\n{text}\n[identification]\nsurveyor = '{ODD}'\nnotes = '{ODD}'\n")
+    (folder / "observations/exclusions.csv").write_text("")
+    with (folder / "observations/exclusions.csv").open("w", newline="") as stream:
+        out = csv.writer(stream, lineterminator="\n")
+        out.writerow(["what", "id", "state", "reason", "author", "time"])
+        out.writerow(["image", "X/tX05", "excluded", ODD, ODD, "2026-11-22T14:35:11+00:00"])
+    (folder / "images/X").mkdir(parents=True, exist_ok=True)
+    (folder / "images/X/tX05.png").write_bytes(b"<script>window.ran=1</script>")
+
+
+def test_markup_in_a_project_is_text_in_every_view(browser: Any, tmp_path: Path) -> None:
+    harmful(tmp_path / "lab")
+    bench = Workbench(tmp_path / "lab")
+    bench.adjust()
+    with opened(browser, bench, place=f"&image={ODD}") as found:
+        p = found.page
+        seen = p.inner_text("body")
+        for k in range(p.locator("#tables [role=tab]").count()):
+            p.locator("#tables [role=tab]").nth(k).click()
+            seen += p.inner_text("#tables")
+        for view in ("findings", "image", *VIEWS):
+            p.locator("#right .chooser select").select_option(view)
+            found.wait("!document.querySelector('#right [aria-busy=true]')")
+            seen += p.inner_text("#right")
+        p.evaluate("location.hash = '#camera=' + encodeURIComponent(`<img src=x onerror=window.ran=1>`)")
+        found.wait("document.querySelector('#inspector').textContent.includes('onerror')")
+        assert found.drawn("window.ran === undefined && !document.querySelector('img, body script, i')")
+        assert seen.count(ODD) >= 3
+        found.complaints[:] = [text for text in found.complaints if "404" not in text and "409" not in text]
 
 
 @pytest.fixture(scope="module", params=[1280, 390])

@@ -182,8 +182,9 @@ def test_the_socket_needs_origin_and_token(mine):
             assert "progress" in kinds
 
 
-def test_a_page_that_joins_late_hears_what_others_wrote_before(mine):
+def test_a_page_that_joins_late_hears_what_others_wrote_before(mine, monkeypatch):
     """What was said while nobody listened is said again; what holds no more is not."""
+    monkeypatch.setattr("survey.workbench.work._LOOK_S", 0.1)
     known = {"Origin": "http://127.0.0.1:8790", "Cookie": f"labsurvey={TOKEN}"}
     with page(mine) as client:
         post(client, "/api/adjust", {"mode": "cold"})

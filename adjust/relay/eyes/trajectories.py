@@ -72,7 +72,7 @@ class Trajectory:
         d = (times_s[:, None] - t[around[i]]).T
         share = np.stack([d[1] * d[2] * d[3], d[0] * d[2] * d[3], d[0] * d[1] * d[3], d[0] * d[1] * d[2]], axis=1)
         share /= below[i]
-        uneven = np.flatnonzero((share**2).sum(axis=1) > _MOST_NOISE)
+        uneven = np.flatnonzero(np.einsum("ki,ki->k", share, share) > _MOST_NOISE)
         j, at = i[uneven], times_s[uneven]
         after = ((at - t[j]) / (t[j + 1] - t[j]))[:, None]
         share[uneven] = (around[j] == j[:, None]) * (1.0 - after) + (around[j] == j[:, None] + 1) * after
@@ -119,8 +119,9 @@ class Trajectory:
         both = np.concatenate([times_s - _HALF_S, times_s + _HALF_S])
         self._refuse_outside(both)
         before, after = np.split(self._attitudes(*self._shares(both)), 2)
-        turn = rotation_log(np.swapaxes(before, -1, -2) @ after)
-        return np.asarray(np.linalg.norm(turn, axis=1) / (2.0 * _HALF_S))
+        chord = (after - before).reshape(-1, 9)  # of a turn by w its square is 8 sin^2(w/2)
+        square = np.minimum(np.einsum("ki,ki->k", chord, chord) / 8.0, 1.0)
+        return np.asarray(2.0 * np.arcsin(np.sqrt(square)) / (2.0 * _HALF_S))
 
 
 @dataclass(frozen=True, eq=False)

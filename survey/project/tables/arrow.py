@@ -170,9 +170,9 @@ def parquet_bytes(columns: Columns) -> bytes:
     import pyarrow.parquet as pq
 
     arrays = {
-        name: pa.array(column, from_pandas=True)
+        name: _array(column, pa.from_numpy_dtype(column.dtype), np.isnan(column))
         if isinstance(column, np.ndarray)
-        else pa.array(column.names, pa.string()).take(pa.array(column.codes)).dictionary_encode()
+        else _strings(column.names).take(_array(column.codes, pa.int64())).dictionary_encode()
         for name, column in zip(columns, map(_coded, columns.values()), strict=True)
     }
     stream = io.BytesIO()
