@@ -134,8 +134,8 @@ def _without(survey: Survey, wrong: Disagreeing) -> Survey:
 
 
 def distances_in_the_way(survey: Survey) -> Disagreeing | None:
-    """Distances that stand out at the start values of a survey without images; None where none do."""
-    if survey.image_blocks or not survey.distances:
+    """Distances that stand out at the start values of a survey; None where none do."""
+    if not survey.distances:
         return None
     from adjust.statistics.outliers.standing_out import distances_that_stand_out  # here: where something fails
 
