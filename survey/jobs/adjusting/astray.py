@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 Progress = Callable[[int, float], None]
 _STEPS = 40
 """What right readings never take, from closed forms on."""
+_MOST = 2 * _STEPS
+"""What is not worth more: a solution that what is misread spoils anyway."""
 _FAR = 1e6
 """v'Pv of a component after these steps that no single gross error is worth."""
 _TRIED = 4
@@ -49,7 +51,10 @@ def cleaned(
     try:
         return adjust_cleaned(survey, options, watched, start)
     except _AstrayError:
-        how = replace(options, reject_pairs=not _misread(survey, _PART * most))
+        if not _misread(survey, _PART * most):
+            return adjust_cleaned(survey, options, progress, start)
+        solve = replace(options.adjust.solve, max_iterations=_MOST)
+        how = replace(options, reject_pairs=False, adjust=replace(options.adjust, solve=solve))
         return adjust_cleaned(survey, how, progress, start)
 
 
