@@ -70,22 +70,26 @@ def _alone(survey: Survey, before: Screen) -> Iterator[Hypothesis]:
         return
     k, other = int(far[0]), before.graph.others[int(far[0])]
     evidence = float(squares[k]) / (1.0 + float(np.delete(squares, k).sum()))  # not bounded: nothing else is so far off
-    found = gross_error(survey, other.kind, other.ids, f"{np.sqrt(before.others[k]):.3g} sigmas at the start")
+    found = gross_error(survey, other.kind, other.ids, float(np.sqrt(before.others[k])), at_start=True)
     yield from [] if found is None else [replace(found, evidence=evidence, looked_at=len(squares))]
 
 
-def gross_error(survey: Survey, kind: str, ids: tuple[str, ...], by: str) -> Hypothesis | None:
-    """A distance or coordinates of one position to be left out; None of other kinds. by: how much it contradicts."""
+def gross_error(
+    survey: Survey, kind: str, ids: tuple[str, ...], sigmas: float, at_start: bool = False
+) -> Hypothesis | None:
+    """A distance or coordinates of one position, so far off, to be left out; None of other kinds."""
     found = _observed(survey, kind, ids)
     if found is None:
         return None
     field, row, observed = found
     if isinstance(observed, Distance):
         name = observed.distance_id
-        what = f"distance {name} contradicts all else by {by}: its value or a name is wrong"
+        what = f"distance {name} contradicts all else by {sigmas:.3g} sigmas{' at the start' * at_start}: " \
+               "its value or a name is wrong"  # fmt: skip
     else:
         name = position_text(observed.positions[0])
-        what = f"the coordinates of {name} contradict all else by {by}: a value is wrong"
+        what = f"the coordinates of {name} contradict all else by {sigmas:.3g} sigmas{' at the start' * at_start}: " \
+               "a value is wrong"  # fmt: skip
     return Hypothesis(
         "gross error", what, f"correct it in {field}.csv, or leave it out", Place("reading", (name,), "value"),
         with_rows(survey, field, {row: replace(observed, used=False)}), (LeaveOut((f"{field}:{name}",)),),

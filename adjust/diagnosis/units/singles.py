@@ -14,7 +14,7 @@ from adjust.diagnosis.hypothesis import ChangeReadings, Edit, Hypothesis, Place
 from adjust.diagnosis.units.conventions import MISREADINGS, UNIT_OF_LENGTHS, Misreading, Written, misreadings, slips
 from adjust.diagnosis.units.lengths import all_read_by, gross_error
 from adjust.diagnosis.units.motions import CONVENTIONS, edits_of, mended, miss
-from adjust.model.observations import Distance, Reading
+from adjust.model.observations import Distance, Reading, position_text
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, Survey
@@ -54,12 +54,15 @@ def far_off(survey: Survey, result: Adjustment) -> tuple[Candidate, ...]:
     """
     if survey.readings:
         return ()
-    sigmas = [(float(np.max(np.abs(o.standardized), initial=0.0)), o) for o in result.other_residuals if not o.used]
-    far = [(s, o) for s, o in sigmas if np.isfinite(s) and s > _FAR * max(1.0, result.sigma0)]
-    found = gross_error(survey, far[0][1].kind, far[0][1].ids, f"{far[0][0]:.3g} sigmas") if len(far) == 1 else None
+    given = {("distance", d.distance_id) for d in survey.distances if d.used}
+    given |= {("coordinates", position_text(c.positions[0])) for c in survey.coordinates if c.used}
+    out = [o for o in result.other_residuals if not o.used and (o.kind, *o.ids[:1]) in given]
+    sigmas = [float(np.nan_to_num(np.max(np.abs(o.standardized), initial=0.0), posinf=0.0)) for o in out]
+    far = [(s, o) for s, o in zip(sigmas, out, strict=True) if s > _FAR * max(1.0, result.sigma0)]
+    found = gross_error(survey, far[0][1].kind, far[0][1].ids, far[0][0]) if len(far) == 1 else None
     if found is None:
         return ()
-    limit = float(chi2.isf(sidak(_ALPHA, len(sigmas)), 1))
+    limit = float(chi2.isf(sidak(_ALPHA, len(out)), 1))
     return (Candidate(found, 1.0, far[0][0] ** 2, limit, 1.0, result.sigma0),)
 
 
