@@ -1,4 +1,4 @@
-"""Observed coordinates in other axes, as the diagnosis tries them."""
+"""Observed coordinates in other axes, as the diagnosis tries them; what is thousands of sigmas off."""
 
 from dataclasses import replace
 
@@ -8,8 +8,10 @@ from adjust.diagnosis.hypothesis import ChangeColumns
 from adjust.diagnosis.names.nearer import nearer
 from adjust.diagnosis.units.axes import other_axes
 from adjust.diagnosis.units.conventions import LENGTH_RATIOS
-from adjust.model.observations import Coordinates, PositionRef
-from adjust.model.survey import Datum, PointParameter, Survey
+from adjust.diagnosis.units.singles import far_off
+from adjust.model.observations import Coordinates, Distance, PositionRef
+from adjust.model.survey import Datum, Point, PointParameter, Survey
+from adjust.statistics.screened_adjustment import adjust_cleaned
 from tests.adjust.terrestrial_networks import measured, polar_network
 
 
@@ -54,3 +56,24 @@ def test_all_axes_get_one_where_readings_do_not_tell() -> None:
     tilted = replace(survey, setups=tuple(replace(s, levelled=False) for s in survey.setups))
     for unknown in (tilted, in_other_axes(2)):
         assert len(nearer(unknown, every := [*other_axes(unknown)])) == len(every)
+
+
+def test_a_distance_that_was_left_out_thousands_of_sigmas_off_is_told_once_and_not_if_people_left_it_out() -> None:
+    """Nothing was said of it; two of them may have one cause."""
+    x = np.random.default_rng(1).uniform(-3.0, 3.0, (6, 3))
+    known = tuple(Coordinates((PositionRef(f"P{i}"),), x[i][None], 1e-8 * np.eye(3)) for i in range(6))
+    points = tuple(Point(f"P{i}") for i in range(6))
+
+    def told(off: dict[int, float], used: bool = True) -> list[tuple[str, tuple[str, ...]]]:
+        lengths = (float(np.linalg.norm(x[i] - x[i + 1])) for i in range(5))
+        distances = tuple(
+            Distance(f"D{i}", PositionRef(f"P{i}"), PositionRef(f"P{i + 1}"), s, 1e-4, used=used or i > 0)
+            for i, s in enumerate(length + off.get(i, 0.0) for i, length in enumerate(lengths))
+        )
+        survey = Survey(points=points, coordinates=known, distances=distances)
+        found = far_off(survey, adjust_cleaned(survey))
+        return [(c.hypothesis.name, c.hypothesis.place.ids) for c in found]
+
+    assert told({2: 2.0}) == [("gross error", ("D2",))]
+    assert told({2: 0.05}) == told({2: 2.0, 4: -1.0}) == told({}) == []
+    assert told({0: 2.0}, used=False) == []
