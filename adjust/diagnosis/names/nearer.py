@@ -26,7 +26,7 @@ _SIDED = "direction", "angle", "azimuth"
 def nearer(survey: Survey, tried: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Those of the hypotheses, of surveys with other coordinates, that do; all where readings alone do not tell."""
     mine = [(h, h.survey) for h in tried if isinstance(h.survey, Survey)]
-    alone = _from_readings(survey)
+    alone = _from_readings(survey) if mine else {}
     names = [n for n in _known(survey) if n in alone]
     if len(names) < _FEWEST:
         return list(tried)
