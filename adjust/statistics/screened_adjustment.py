@@ -7,7 +7,7 @@ import numpy as np
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.graph.assembly import StartValues, values_of
-from adjust.model.errors import NotConvergedError, SurveyError, listed
+from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError, listed
 from adjust.model.result import Adjustment, Component, VarianceComponents
 from adjust.model.subsets import positions_of
 from adjust.model.survey import Survey
@@ -70,19 +70,7 @@ def _cleaned(
     survey: Survey, options: CleanOptions, progress: Callable[[int, float], None] | None, start: StartValues | None
 ) -> Adjustment:
     """Image points are screened before all others."""
-    search, wrong = None, None
-    if options.reject_pairs and start is None:
-        wrong = disagreeing_pairs(survey, only_large=True)
-    try:
-        first = None if wrong is not None else adjust(survey, start, _soon(survey, options), progress)
-    except NotConvergedError:
-        wrong = disagreeing_pairs(survey) or distances_in_the_way(survey) if options.reject_pairs else None
-        if wrong is None and _soon(survey, options) is options.adjust:
-            raise
-        first = adjust(survey, start, options.adjust, progress) if wrong is None else None
-    if first is None:
-        search = search_outliers(survey, None, _how(options), progress, wrong=wrong)
-        first = search.adjustment
+    first, search = _first(survey, options, progress, start)
     now, scaled, factors = first, None, dict[str, float]()
     rejected: set[tuple[str, ...]] | None = None
     for _ in range(_PASSES):
@@ -102,9 +90,31 @@ def _cleaned(
     return _told(now, first, search, scaled, factors, _unsearched(now, options))
 
 
+def _first(
+    survey: Survey, options: CleanOptions, progress: Callable[[int, float], None] | None, start: StartValues | None
+) -> tuple[Adjustment, OutlierSearch | None]:
+    """The first adjustment; without what is in the way of one, where something is, and then the search it began."""
+    wrong = disagreeing_pairs(survey, only_large=True) if options.reject_pairs and start is None else None
+    try:
+        if wrong is None:
+            return adjust(survey, start, _soon(survey, options), progress), None
+    except NotConvergedError:
+        wrong = disagreeing_pairs(survey) or distances_in_the_way(survey) if options.reject_pairs else None
+        if wrong is None and _soon(survey, options) is options.adjust:
+            raise
+    if wrong is not None:
+        try:
+            search = search_outliers(survey, None, _how(options), progress, wrong=wrong)
+            return search.adjustment, search
+        except (IndeterminateError, NotConvergedError):
+            if wrong.field != "distances":
+                raise
+    return adjust(survey, start, options.adjust, progress), None
+
+
 def _soon(survey: Survey, options: CleanOptions) -> AdjustOptions:
     """With few steps, where distances may be in the way of more."""
-    if survey.image_blocks or not survey.distances or not options.reject_pairs:
+    if not survey.distances or not options.reject_pairs:
         return options.adjust
     solve = options.adjust.solve
     return replace(options.adjust, solve=replace(solve, max_iterations=min(_FEW_STEPS, solve.max_iterations)))

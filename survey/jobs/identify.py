@@ -6,6 +6,7 @@ half as near again; everything else is left unidentified and reported.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from gtsam import Pose3
@@ -14,9 +15,9 @@ from adjust.frames.lens_times import LensTimes
 from adjust.lenses.models import MODELS, camera_constants, project
 from adjust.model.names import natural_key
 from adjust.model.observations import FrameRef, ImageBlock
-from adjust.model.result import Adjustment
+from adjust.model.result import Adjustment, ParameterName
 from adjust.model.subsets import only_between, with_points
-from adjust.model.survey import FloatArray, Survey
+from adjust.model.survey import Camera, FloatArray, Survey
 from survey.project import SpotBlock
 from survey.solution.frames import AdjustedFrames
 
@@ -86,65 +87,80 @@ def rough_positions(survey: Survey) -> dict[str, FloatArray]:
     return known
 
 
-def identify_spots(
-    survey: Survey, adjustment: Adjustment, spots: Sequence[SpotBlock], gate_px: float
-) -> Identification:
-    """Name the spots. ``adjustment`` gives cameras and frames, ``survey`` the beacons with rough positions."""
-    frames, positions = AdjustedFrames(adjustment), rough_positions(survey)
+@dataclass(frozen=True, eq=False)
+class SpotView:
+    """Spots of one image and what its camera is by the adjustment; pose: world_from_camera, None where not known."""
+
+    spots: SpotBlock
+    camera: Camera
+    pose: Pose3 | None
+    times: LensTimes
+    adjustment: Adjustment
+
+    @cached_property
+    def lens(self) -> FloatArray:
+        """(n,) of the epoch. Raises SurveyError where it has no values."""
+        estimates = self.adjustment.estimates
+
+        def value(name: ParameterName) -> FloatArray | None:
+            return np.asarray(estimates[name].value) if name in estimates else None
+
+        return self.times.lens(self.camera, self.spots.epoch_id, value)
+
+    def predict(self, positions: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        """Image points (2,) px of the world points that are in front of the camera and inside its image."""
+        if not positions or self.pose is None:
+            return {}
+        names = list(positions)
+        R, t = self.pose.rotation().matrix(), self.pose.translation()
+        q = (np.array([positions[n] for n in names]) - t) @ R
+        # half the picture beyond 60 degrees off the axis says nothing about a lens that was calibrated inside its image
+        front = q[:, 2] > 0.3 * np.linalg.norm(q, axis=1)
+        if not front.any():
+            return {}
+        uv = project(MODELS[self.camera.lens.model], self.lens, camera_constants(self.camera), q[front])
+        width, height = self.times.size(self.camera, self.spots.epoch_id)
+        inside = np.all((uv > -0.5) & (uv < np.array([width, height]) - 0.5), axis=1)
+        seen = [n for n, ok in zip(names, front, strict=True) if ok]
+        return {n: x for n, x, ok in zip(seen, uv, np.atleast_1d(inside), strict=True) if ok}
+
+
+def spot_views(survey: Survey, adjustment: Adjustment, spots: Sequence[SpotBlock]) -> list[SpotView]:
+    """The spots with their cameras, as the adjustment of a part of the survey has them."""
+    frames, times = AdjustedFrames(adjustment), LensTimes(adjustment.survey)
+    return [
+        SpotView(s, survey.cameras_by_id[s.camera_id], frames.world_from(FrameRef("camera", s.camera_id, s.epoch_id)),
+                 times, adjustment)
+        for s in spots
+    ]  # fmt: skip
+
+
+def identify_spots(survey: Survey, views: Sequence[SpotView], gate_px: float) -> Identification:
+    """Name the spots as the beacons of the survey, with rough positions."""
+    positions = rough_positions(survey)
     index = {p.point_id: i for i, p in enumerate(survey.points)}
     blocks, notes, identified, total = [], [], 0, 0
-    for spot_block in spots:
-        total += len(spot_block.uv)
-        pose = frames.world_from(FrameRef("camera", spot_block.camera_id, spot_block.epoch_id))
-        where = f"camera {spot_block.camera_id} at epoch {spot_block.epoch_id}"
-        if pose is None:
+    for view in views:
+        spots = view.spots
+        total += len(spots.uv)
+        where = f"camera {spots.camera_id} at epoch {spots.epoch_id}"
+        if view.pose is None:
             notes.append(f"{where}: its pose is not known without the spots; name them in image_points")
             continue
-        predicted = predict(survey, adjustment, spot_block.camera_id, pose, positions, spot_block.epoch_id)
-        pairs, ambiguous = match(spot_block.uv, predicted, gate_px)
+        pairs, ambiguous = match(spots.uv, view.predict(positions), gate_px)
         if ambiguous:
             notes.append(f"{where}: {ambiguous} spots lie near more than one beacon and are left out")
         identified += len(pairs)
         if pairs:
-            rows = [i for i, _ in pairs]
+            rows, named = [i for i, _ in pairs], np.array([index[p] for _, p in pairs])
             blocks.append(
-                ImageBlock(spot_block.camera_id, spot_block.epoch_id, None, np.array([index[p] for _, p in pairs]),
-                           spot_block.uv[rows], spot_block.cov[rows])
+                ImageBlock(spots.camera_id, spots.epoch_id, None, named, spots.uv[rows], spots.cov[rows])
             )  # fmt: skip
     seen = {survey.points[int(i)].point_id for b in blocks for i in b.point_idx}
     missing = sorted(set(index) - seen)
     if missing:
         notes.append(f"beacons seen by no camera: {', '.join(missing)}")
     return Identification(tuple(blocks), identified, total - identified, tuple(notes))
-
-
-def predict(
-    survey: Survey,
-    adjustment: Adjustment,
-    camera_id: str,
-    world_from_camera: Pose3,
-    positions: Mapping[str, FloatArray],
-    epoch_id: str | None = None,
-) -> dict[str, FloatArray]:
-    """Image points (2,) px of the world points that are in front of a camera and inside its image of an epoch."""
-    camera = survey.cameras_by_id[camera_id]
-    if not positions:
-        return {}
-    model, times = MODELS[camera.lens.model], LensTimes(adjustment.survey)
-    values = {n: np.asarray(e.value) for n, e in adjustment.estimates.items() if n[0].startswith("lens")}
-    lens = times.lens(camera, epoch_id, values.get)
-    names = list(positions)
-    R, t = world_from_camera.rotation().matrix(), world_from_camera.translation()
-    q = (np.array([positions[n] for n in names]) - t) @ R
-    # half the picture beyond 60 degrees off the axis says nothing about a lens that was calibrated inside its image
-    front = q[:, 2] > 0.3 * np.linalg.norm(q, axis=1)
-    if not front.any():
-        return {}
-    uv = project(model, lens, camera_constants(camera), q[front])
-    width, height = times.size(camera, epoch_id)
-    inside = np.all((uv > -0.5) & (uv < np.array([width, height]) - 0.5), axis=1)
-    seen = [n for n, ok in zip(names, front, strict=True) if ok]
-    return {n: x for n, x, ok in zip(seen, uv, np.atleast_1d(inside), strict=True) if ok}
 
 
 def match(uv: FloatArray, predicted: Mapping[str, FloatArray], gate_px: float) -> tuple[list[tuple[int, str]], int]:

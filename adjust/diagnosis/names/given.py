@@ -11,6 +11,7 @@ import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, SetKey
+from adjust.diagnosis.names.nearer import nearer
 from adjust.diagnosis.names.throughout import in_readings
 from adjust.diagnosis.screen import Fit, Screen, at_best, improvement, screen
 from adjust.diagnosis.units.axes import NORTH_FIRST, other_axes, ways
@@ -40,17 +41,19 @@ def wrong_given(case: Case) -> Iterator[Hypothesis]:
             if before is None or lost or _misses(survey, before, h.place.ids)]  # fmt: skip
     tried = [*_axes(survey, given), *some][:_TRIALS]  # the former concern all: where these are wrong all miss evenly
     observed = [*other_axes(survey)]
+    looked_at = len(tried) + len(observed)
+    tried, observed = nearer(survey, tried), nearer(survey, observed)
     changed, apart = ([h.survey for h in of if isinstance(h.survey, Survey)] for of in (tried, observed))
     fits = [*(map(screen, changed) if before is None else before.afresh(changed)), *map(screen, apart)]
     tried += observed
-    found = [replace(h, evidence=float(f"{e:.1e}"), looked_at=len(tried)) for h, fit in zip(tried, fits, strict=True)
+    found = [replace(h, evidence=float(f"{e:.1e}"), looked_at=looked_at) for h, fit in zip(tried, fits, strict=True)
              if (e := _evidence(before, fit)) > _CLEARLY]  # fmt: skip
     # rounded: of mirror images that fit alike the first is the likeliest mistake
     for h in sorted(found, key=lambda h: -h.evidence)[:_MOST]:
         other = in_readings(survey, (h.place.ids[0], h.place.ids[1])) if h.name == _EXCHANGED else None
         if other is not None and isinstance(other.survey, Survey):
             e = _evidence(before, screen(other.survey))
-            yield from [replace(other, evidence=e, looked_at=len(tried))] if e > _CLEARLY else []
+            yield from [replace(other, evidence=e, looked_at=looked_at)] if e > _CLEARLY else []
         yield h
 
 

@@ -66,11 +66,34 @@ def _alone(survey: Survey, before: Screen) -> Iterator[Hypothesis]:
     """The one without which all others fit; none where several are far off, as one."""
     squares = before.others / before.scale
     far = np.flatnonzero(squares > _FAR)
-    found = _observed(survey, (other := before.graph.others[int(far[0])]).kind, other.ids) if len(far) == 1 else None
-    if found is not None:
-        k = int(far[0])  # not bounded: nothing else is so far off
-        evidence = float(squares[k]) / (1.0 + float(np.delete(squares, k).sum()))
-        yield _without(survey, *found, float(np.sqrt(before.others[k])), evidence, len(squares))
+    if len(far) != 1:
+        return
+    k, other = int(far[0]), before.graph.others[int(far[0])]
+    evidence = float(squares[k]) / (1.0 + float(np.delete(squares, k).sum()))  # not bounded: nothing else is so far off
+    found = gross_error(survey, other.kind, other.ids, float(np.sqrt(before.others[k])), at_start=True)
+    yield from [] if found is None else [replace(found, evidence=evidence, looked_at=len(squares))]
+
+
+def gross_error(
+    survey: Survey, kind: str, ids: tuple[str, ...], sigmas: float, at_start: bool = False
+) -> Hypothesis | None:
+    """A distance or coordinates of one position, so far off, to be left out; None of other kinds."""
+    found = _observed(survey, kind, ids)
+    if found is None:
+        return None
+    field, row, observed = found
+    if isinstance(observed, Distance):
+        name = observed.distance_id
+        what = f"distance {name} contradicts all else by {sigmas:.3g} sigmas{' at the start' * at_start}: " \
+               "its value or a name is wrong"  # fmt: skip
+    else:
+        name = position_text(observed.positions[0])
+        what = f"the coordinates of {name} contradict all else by {sigmas:.3g} sigmas{' at the start' * at_start}: " \
+               "a value is wrong"  # fmt: skip
+    return Hypothesis(
+        "gross error", what, f"correct it in {field}.csv, or leave it out", Place("reading", (name,), "value"),
+        with_rows(survey, field, {row: replace(observed, used=False)}), (LeaveOut((f"{field}:{name}",)),),
+    )  # fmt: skip
 
 
 def _observed(survey: Survey, kind: str, ids: tuple[str, ...]) -> tuple[str, int, Distance | Coordinates] | None:
@@ -80,19 +103,3 @@ def _observed(survey: Survey, kind: str, ids: tuple[str, ...]) -> tuple[str, int
         of = ((i, c) for i, c in enumerate(survey.coordinates) if len(c.positions) == 1)
         return next((("coordinates", i, c) for i, c in of if position_text(c.positions[0]) == ids[0]), None)
     return None
-
-
-def _without(
-    survey: Survey, field: str, row: int, observed: Distance | Coordinates, sigmas: float, evidence: float, among: int
-) -> Hypothesis:
-    if isinstance(observed, Distance):
-        name = observed.distance_id
-        what = f"distance {name} contradicts all else by {sigmas:.3g} sigmas at the start: its value or a name is wrong"
-    else:
-        name = position_text(observed.positions[0])
-        what = f"the coordinates of {name} contradict all else by {sigmas:.3g} sigmas at the start: a value is wrong"
-    return Hypothesis(
-        "gross error", what, f"correct it in {field}.csv, or leave it out", Place("reading", (name,), "value"),
-        with_rows(survey, field, {row: replace(observed, used=False)}), (LeaveOut((f"{field}:{name}",)),), evidence, 1,
-        among,
-    )  # fmt: skip

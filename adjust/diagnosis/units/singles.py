@@ -1,6 +1,7 @@
 """Observations that the search for gross errors left out: those that fit as soon as they are read as they were meant.
 
-The rest of the survey predicts them, with the sigma of that; nothing is adjusted.
+The rest of the survey predicts them, with the sigma of that; nothing is adjusted. Of one that fits in no way, and is
+much too far off for noise or a wrong sigma, that is said.
 """
 
 from collections.abc import Iterator, Sequence
@@ -11,9 +12,9 @@ import numpy as np
 from adjust.diagnosis.diagnosis import Candidate
 from adjust.diagnosis.hypothesis import ChangeReadings, Edit, Hypothesis, Place
 from adjust.diagnosis.units.conventions import MISREADINGS, UNIT_OF_LENGTHS, Misreading, Written, misreadings, slips
-from adjust.diagnosis.units.lengths import all_read_by
+from adjust.diagnosis.units.lengths import all_read_by, gross_error
 from adjust.diagnosis.units.motions import CONVENTIONS, edits_of, mended, miss
-from adjust.model.observations import Distance, Reading
+from adjust.model.observations import Distance, Reading, position_text
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, Survey
@@ -25,6 +26,8 @@ from adjust.testing.distributions import chi2
 _ALPHA, _FITS = 1e-4, 1e-3
 """Levels at which an observation is wrong as it stands, shared by all ways to read it, and at which it fits."""
 _MOST = 3
+_FAR = 1e3
+"""Sigmas, as the rest predicts it, from which an observation is between other points, or its value is another one's."""
 
 
 def misread_singles(survey: Survey, result: Adjustment, written: Written) -> tuple[Candidate, ...]:
@@ -42,6 +45,25 @@ def misread_singles(survey: Survey, result: Adjustment, written: Written) -> tup
             found += _best(survey, result, o, row, written)
     common = _of_all_distances(survey, found)
     return common or tuple(sorted(found, key=lambda c: -c.statistic)[:_MOST])
+
+
+def far_off(survey: Survey, result: Adjustment) -> tuple[Candidate, ...]:
+    """The distance, or coordinates of one point, left out by the adjustment that alone is thousands of sigmas off.
+
+    Not beside readings, whose names may be the wrong ones.
+    """
+    if survey.readings:
+        return ()
+    given = {("distance", d.distance_id) for d in survey.distances if d.used}
+    given |= {("coordinates", position_text(c.positions[0])) for c in survey.coordinates if c.used}
+    out = [o for o in result.other_residuals if not o.used and (o.kind, *o.ids[:1]) in given]
+    sigmas = [float(np.nan_to_num(np.max(np.abs(o.standardized), initial=0.0), posinf=0.0)) for o in out]
+    far = [(s, o) for s, o in zip(sigmas, out, strict=True) if s > _FAR * max(1.0, result.sigma0)]
+    found = gross_error(survey, far[0][1].kind, far[0][1].ids, far[0][0]) if len(far) == 1 else None
+    if found is None:
+        return ()
+    limit = float(chi2.isf(sidak(_ALPHA, len(out)), 1))
+    return (Candidate(found, 1.0, far[0][0] ** 2, limit, 1.0, result.sigma0),)
 
 
 def _of_all_distances(survey: Survey, found: Sequence[Candidate]) -> tuple[Candidate, ...]:

@@ -37,11 +37,12 @@ _Leave = Callable[[tuple[int, ...], Adjustment], Adjustment]
 class Disagreeing:
     """Pairs (E,) of a network that do not agree with the others, and where these put the stations.
 
-    field: of a survey that holds them, where they are no pairs.
+    start: None where what is left is to be started by itself. field: of a survey that holds them, where they are no
+    pairs.
     """
 
     pairs: BoolArray
-    start: StartValues
+    start: StartValues | None
     field: str = "pairs"
 
 
@@ -134,13 +135,16 @@ def _without(survey: Survey, wrong: Disagreeing) -> Survey:
 
 
 def distances_in_the_way(survey: Survey) -> Disagreeing | None:
-    """Distances that stand out at the start values of a survey without images; None where none do."""
-    if survey.image_blocks or not survey.distances:
+    """Distances that stand out at the start values of a survey; None where none do.
+
+    With images the rest is started anew: blocks that contradict it are left out then.
+    """
+    if not survey.distances:
         return None
     from adjust.statistics.outliers.standing_out import distances_that_stand_out  # here: where something fails
 
     found = distances_that_stand_out(survey)
-    return None if found is None else Disagreeing(found[0], found[1], "distances")
+    return None if found is None else Disagreeing(found[0], None if survey.image_blocks else found[1], "distances")
 
 
 def _left_out(

@@ -11,7 +11,8 @@ from adjust.model.survey import BoolArray, Survey
 from adjust.start import Start, find_start
 
 _BY_FAR = 1e4
-"""Square over its sigma, over that of the worst of all others: a hundred times as many sigmas."""
+"""Square over its sigma, over that of the worst of all others, of images of the typical one, as many of them agree
+only roughly at the start: a hundred times as many sigmas."""
 
 
 def distances_that_stand_out(survey: Survey) -> tuple[BoolArray, Start] | None:
@@ -25,11 +26,12 @@ def distances_that_stand_out(survey: Survey) -> tuple[BoolArray, Start] | None:
     graph = GraphBuilder(survey, start.lenses).build(start)
     every = misfits(graph, graph.start)
     mine = {m.owner.removeprefix("distance "): m.square for m in every if m.owner.startswith("distance ")}
-    others = [m.square for m in every if not m.owner.startswith("distance ")]
-    rest = max(others, default=0.0)
+    images = [m.square for m in every if m.owner.startswith("camera ")]
+    others = [m.square for m in every if not m.owner.startswith(("distance ", "camera "))]
+    rest = max([float(np.median(images or [0.0])), *others])
     square = np.array([mine.get(d.distance_id, 0.0) for d in survey.distances])
     worst = np.argsort(-square, kind="stable")
-    all_of_them = [len(square)] if len(others) >= len(square) else []
+    all_of_them = [len(square)] if len(images) + len(others) >= len(square) else []
     for k in (*range(1, (len(square) + 1) // 2), *all_of_them):
         if square[worst[k - 1]] > _BY_FAR * max([rest, 1.0, *square[worst[k : k + 1]]]):
             return np.isin(np.arange(len(square)), worst[:k]), start

@@ -22,7 +22,7 @@ from adjust.navigation.head import head_and_beacons
 from adjust.navigation.model import Beacons, NavigateOptions, NavigationEpoch, Spots
 from adjust.navigation.sequence import navigate
 from adjust.spatial.rigid import align, inverse
-from survey.jobs.identify import identified, identify_spots
+from survey.jobs.identify import identified, identify_spots, spot_views
 from survey.project import Project
 from survey.project.project import SpotBlock
 from survey.solution.frames import AdjustedFrames
@@ -42,6 +42,7 @@ def in_other_frames(project: Project, first: Adjustment, gate_px: float) -> Iter
     rows = [i for i, c in enumerate(survey.coordinates) if c.used and np.isfinite(np.diag(c.cov)).all()]
     if len(rows) < _FEWEST or any(len(survey.coordinates[i].positions) > 1 for i in rows):
         return
+    views = spot_views(survey, first, project.spots)
     for exchanged in (False, True):
         columns = [1, 0, 2] if exchanged else [0, 1, 2]
         given = {position_text(c.positions[0]): c.values[0, columns] for c in (survey.coordinates[i] for i in rows)}
@@ -51,7 +52,7 @@ def in_other_frames(project: Project, first: Adjustment, gate_px: float) -> Iter
             moved = in_another_frame(survey, rows, motion, exchanged).changed()
             if moved is None:
                 continue
-            found = identify_spots(moved, first, project.spots, gate_px)
+            found = identify_spots(moved, views, gate_px)
             try:
                 fine = _refined(identified(moved, found), rows, given)
             except SurveyError:

@@ -195,7 +195,7 @@ def _left_out(survey: Survey, result: Adjustment, project: Project) -> "Diagnosi
         return None
     from adjust.diagnosis.diagnosis import Diagnosis, diagnose  # here: as above
     from adjust.diagnosis.trial import misfit_of
-    from adjust.diagnosis.units.singles import misread_singles
+    from adjust.diagnosis.units.singles import far_off, misread_singles
     from survey.jobs.adjusting.written import written_of
 
     written = written_of(project)
@@ -206,7 +206,7 @@ def _left_out(survey: Survey, result: Adjustment, project: Project) -> "Diagnosi
         common = diagnose(Case(survey, result, written=written), IN_COMMON)
         if common.candidates:
             return replace(common, spoils=True)
-    found = misread_singles(survey, result, written)
+    found = misread_singles(survey, result, written) or far_off(survey, result)
     names = tuple(dict.fromkeys(c.hypothesis.name for c in found))
     return Diagnosis(found, names, misfit_of(result, survey)) if found else None
 

@@ -21,7 +21,7 @@ from survey.jobs.adjusting.astray import cleaned
 from survey.jobs.adjusting.probable_causes import adjusted_or_explained, explaining, with_probable_causes
 from survey.jobs.adjusting.symmetric_boards import consistent_turns
 from survey.jobs.detecting.image_defects import blurred, defect_warnings
-from survey.jobs.identify import identified, identify_spots, without_points
+from survey.jobs.identify import identified, identify_spots, spot_views, without_points
 from survey.project import Project
 from survey.project.detected import DetectedImage
 from survey.project.project import DEFINITION_FILE
@@ -102,7 +102,7 @@ def _spots_identified(work: Work) -> Work:
             f"{project.folder}/observations: the spots cannot be identified, because cameras and stations are not "
             f"determined without them; name the spots' beacons in image_points.csv, or hold a board\n({error})"
         ) from error
-    found = identify_spots(project.survey, first, project.spots, gate)
+    found = identify_spots(project.survey, spot_views(project.survey, first, project.spots), gate)
     if found.unidentified > found.identified:
         from survey.jobs.adjusting.unnamed_spots import require_names  # here: spots mostly have names
 

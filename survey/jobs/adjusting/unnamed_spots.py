@@ -16,7 +16,7 @@ from survey.jobs.adjusting.frame_of_coordinates import in_other_frames
 from survey.jobs.adjusting.mirrored_survey import mirrored_back, sides
 from survey.jobs.adjusting.places import located
 from survey.jobs.adjusting.probable_causes import causes_first
-from survey.jobs.identify import Identification, identified, identify_spots, without_points
+from survey.jobs.identify import Identification, identified, identify_spots, spot_views, without_points
 from survey.project import Project
 
 _TIMES, _MORE = 2, 4
@@ -32,11 +32,12 @@ def require_names(project: Project, first: Adjustment, found: Identification, ga
     def named(hypotheses: Iterable[Hypothesis]) -> list[Hypothesis]:
         """Those that name most spots, if these are many more."""
         changed = [(h, survey) for h in hypotheses if (survey := h.changed()) is not None]
-        again = [(h, survey, identify_spots(survey, first, project.spots, gate_px)) for h, survey in changed]
+        again = [(h, survey, identify_spots(survey, views, gate_px)) for h, survey in changed]
         most = max((names.identified for *_, names in again), default=0)
         return [_told(h, survey, names, len(again), found.identified) for h, survey, names in again
                 if names.identified == most >= enough]  # fmt: skip
 
+    views = spot_views(project.survey, first, project.spots)
     enough = max(_TIMES * found.identified, found.identified + _MORE)
     best = (
         _mirrored(project, first, gate_px, enough, found.identified)
@@ -59,7 +60,7 @@ def _mirrored(project: Project, first: Adjustment, gate_px: float, enough: int, 
         again = adjust(supported(without_points(back.survey, back.spots))[0])
     except SurveyError:
         return []
-    names = identify_spots(back.survey, again, back.spots, gate_px)
+    names = identify_spots(back.survey, spot_views(back.survey, again, back.spots), gate_px)
     return [_told(hypothesis, back.survey, names, 1, before)] if names.identified >= enough else []
 
 
