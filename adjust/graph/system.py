@@ -201,8 +201,9 @@ class Damping:
     def __init__(self, graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph) -> None:
         stack = stacking(graph, visible_keys(graph, linear))
         self.linear, diagonal = linear, np.maximum(normal_diagonal(linear, stack), 1e-12)
-        one = {n: (gtsam.noiseModel.Unit.Create(n), np.zeros(n)) for n in {at.stop - at.start for at in stack.at.values()}}
-        self.rows = [(key, diagonal[at], *one[at.stop - at.start]) for key, at in stack.at.items()]
+        parts = {key: diagonal[at] for key, at in stack.at.items()}
+        one = {n: (gtsam.noiseModel.Unit.Create(n), np.zeros(n)) for n in {len(part) for part in parts.values()}}
+        self.rows = [(key, part, *one[len(part)]) for key, part in parts.items()]
 
     def damped(self, damping: float) -> gtsam.GaussianFactorGraph:
         """The system with it."""

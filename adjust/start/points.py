@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from adjust.frames.unknowns import Link
+from adjust.model.memory import content, once
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.spatial.rigid import inverse, rigid
 from adjust.start.chains import ChainObservation, Observations
@@ -114,7 +115,21 @@ def intersect_points(network: FrameNetwork, points: PointField, parallax: float,
     return int(new.sum())
 
 
-def improve(network: FrameNetwork, points: PointField, movable: BoolArray) -> None:
+def improve(network: FrameNetwork, points: PointField, movable: BoolArray, rounds: int) -> None:
+    """So many rounds; the same once where it begins with the same images, poses and points."""
+    seen = [part for s in points.sights for part in (s.block_idx, s.focal_px, s.chain, s.rows, s.rays)]
+    state = *network.state, points.x, points.given, points.rough, points.released, movable, rounds
+
+    def improved() -> tuple[FloatArray, Observations, FloatArray, BoolArray, BoolArray]:
+        for _ in range(rounds):
+            _improve(network, points, movable)
+        return network.pose.copy(), network.observations, points.x.copy(), points.given.copy(), points.rough.copy()
+
+    found = once(("improved", content(*state, *seen)), improved)
+    network.pose[:], network.observations, points.x[:], points.given[:], points.rough[:] = found
+
+
+def _improve(network: FrameNetwork, points: PointField, movable: BoolArray) -> None:
     """One round: every block's pose from all points now known, the movable poses from these, and the points again."""
     known = points.known
     placed = [s for s in points.sights if not network.open_slots(s.chain) and known[s.rows].sum() >= 4]
