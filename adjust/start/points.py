@@ -116,17 +116,19 @@ def intersect_points(network: FrameNetwork, points: PointField, parallax: float,
 
 
 def improve(network: FrameNetwork, points: PointField, movable: BoolArray, rounds: int) -> None:
-    """So many rounds; the same once where it begins with the same images, poses and points."""
-    seen = [part for s in points.sights for part in (s.block_idx, s.focal_px, s.chain, s.rows, s.rays)]
-    state = *network.state, points.x, points.given, points.rough, points.released, movable, rounds
+    """So many rounds; what images of the same points, at the same places, led to before is not found again."""
+    seen, sights = points.seen(), [part for s in points.sights
+                                    for part in (s.block_idx, s.focal_px, s.chain, s.rows, s.rays)]  # fmt: skip
+    fields = points.x, points.given, points.rough
+    known = content(*network.state, *(of[seen] for of in fields), points.released, movable, rounds, *sights)
 
-    def improved() -> tuple[FloatArray, Observations, FloatArray, BoolArray, BoolArray]:
+    def improved() -> tuple[FloatArray, Observations, list[FloatArray | BoolArray]]:
         for _ in range(rounds):
             _improve(network, points, movable)
-        return network.pose.copy(), network.observations, points.x.copy(), points.given.copy(), points.rough.copy()
+        return network.pose.copy(), network.observations, [of[seen] for of in fields]
 
-    found = once(("improved", content(*state, *seen)), improved)
-    network.pose[:], network.observations, points.x[:], points.given[:], points.rough[:] = found
+    network.pose[:], network.observations, found = once(("improved", known), improved)
+    points.x[seen], points.given[seen], points.rough[seen] = found
 
 
 def _improve(network: FrameNetwork, points: PointField, movable: BoolArray) -> None:
