@@ -9,10 +9,10 @@ import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, told_edit
-from adjust.diagnosis.memory import remembering
 from adjust.diagnosis.search import Search
 from adjust.diagnosis.trial import NEVER, Misfit, Trial, misfit_of
 from adjust.model.errors import SurveyError
+from adjust.model.memory import remembering
 from adjust.model.survey import FloatArray
 from adjust.start.lens.start import remembering as remembering_lenses
 from adjust.testing.criteria import sidak

@@ -9,7 +9,7 @@ from gtsam import Pose3
 
 from adjust.frames.lens_times import LensTimes
 from adjust.frames.runs import MOVING
-from adjust.frames.tables import table_motions
+from adjust.frames.tables import table_poses
 from adjust.frames.tree import FrameTree
 from adjust.frames.unknowns import Unknowns
 from adjust.graph.assembly import StartValues
@@ -223,7 +223,7 @@ class Prediction:
             angles = next((r.angles for r in self.survey.table_readings if (r.table_id, r.epoch_id) == name[1:]), None)
         if geometry is None or angles is None:
             return None
-        (R,), (t,), _ = table_motions(table.axes, dict(zip(table.geometry.names, geometry, strict=True)), angles[None])
+        (R,), (t,) = table_poses(table.axes, dict(zip(table.geometry.names, geometry, strict=True)), angles[None])
         return rigid(R, t)
 
     def _moved_body(self, block: ImageBlock, pose: FloatArray, altered: Altered) -> FloatArray:

@@ -12,10 +12,11 @@ import gtsam
 import numpy as np
 
 from adjust.diagnosis.case import CAP, Case
-from adjust.diagnosis.memory import own_start, remembered
+from adjust.diagnosis.memory import own_start
 from adjust.graph.assembly import AdjustmentGraph, StartValues, values_of
 from adjust.graph.building import GraphBuilder
 from adjust.model.errors import SurveyError
+from adjust.model.memory import remembered
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.observations.terrestrial import equations as k
 from adjust.observations.terrestrial.batch import TerrestrialBatch

@@ -10,6 +10,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, Survey, Table
 from adjust.model.tables import Harmonic, harmonic
 
+_IDENTITY = np.eye(3)
 _COVERED = 2.0 / 3.0
 """Share of its longest period that the angles of an axis must cover for its harmonics."""
 
@@ -32,22 +33,38 @@ def table_motions(
     Returns R (n, 3, 3), t (n, 3) and D (n, 6, k + len(geometry)), the derivatives by the angles and by what is in
     ``geometry``, in its order; what is not there is zero. Raises SurveyError where the angles are not k.
     """
+    D = np.zeros((len(angles), 6, angles.shape[1] + len(geometry)))
+    return *_moved(axes, geometry, angles, D), D
+
+
+def table_poses(
+    axes: Sequence[str], geometry: Mapping[str, float], angles: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The same without derivatives: R (n, 3, 3), t (n, 3)."""
+    return _moved(axes, geometry, angles, None)
+
+
+def _moved(
+    axes: Sequence[str], geometry: Mapping[str, float], angles: FloatArray, D: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
     n, k = angles.shape
     if k != len(axes):
         raise SurveyError(f"a table of {len(axes)} axes has readings of {k} angles")
-    R, t, D = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), np.zeros((n, 6, k + len(geometry)))
+    R, t = np.zeros((n, 3, 3)) + _IDENTITY, np.zeros((n, 3))
     for step in reversed(_steps(["xyz".index(a) for a in axes], geometry, angles)):
-        for parameter, derivative in step.by:
-            D[:, :, parameter] += derivative[:, None] * _moved(R, t, step)
+        if D is not None and step.by:
+            moved = _by_step(R, t, step)
+            for parameter, derivative in step.by:
+                D[:, :, parameter] += derivative[:, None] * moved
         if step.turn:
             turned = turns(step.axis, step.q)
             R, t = turned @ R, (turned @ t[:, :, None])[:, :, 0]
         else:
-            t = t + step.q[:, None] * np.eye(3)[step.axis]
-    return R, t, D
+            t = t + step.q[:, None] * _IDENTITY[step.axis]
+    return R, t
 
 
-def _moved(R: FloatArray, t: FloatArray, step: _Step) -> FloatArray:
+def _by_step(R: FloatArray, t: FloatArray, step: _Step) -> FloatArray:
     """(n, 6): what a step by one before the motions (R, t) moves, a column of Ad(T^-1), tangents on the right."""
     if not step.turn:
         return np.concatenate([np.zeros_like(t), R[:, step.axis]], axis=1)

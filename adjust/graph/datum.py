@@ -138,9 +138,13 @@ class InnerDatum:
             A[np.arange(len(components)), components] = weights
             linear.add(key, A, np.zeros(len(components)), gtsam.noiseModel.Unit.Create(len(components)))
 
-    def completed(self, graph: AdjustmentGraph, values: gtsam.Values, delta: gtsam.VectorValues) -> gtsam.VectorValues:
-        """The step ``delta`` of all unknowns from ``values``, moved into this datum."""
-        motions = survey_motions(graph, values, self.directions)
+    def completed(
+        self, values: gtsam.Values, delta: gtsam.VectorValues, motions: Mapping[int, FloatArray]
+    ) -> gtsam.VectorValues:
+        """The step ``delta`` of all unknowns from ``values``, moved into this datum.
+
+        motions: by :func:`survey_motions` from there with its ``directions``.
+        """
         offset, seen = np.zeros(self.defect), np.zeros((self.defect, self.defect))
         for key, row in self.rows.items():
             if self.kinds[key] == "point":

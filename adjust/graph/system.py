@@ -5,12 +5,13 @@ import numpy as np
 
 from adjust.graph.assembly import AdjustmentGraph, Evaluation
 from adjust.graph.cliques import Cliques, SolvedTree
-from adjust.graph.datum import inner_datum, normal_diagonal, stacking, visible_keys
+from adjust.graph.datum import InnerDatum, inner_datum, normal_diagonal, stacking, survey_motions, visible_keys
 from adjust.graph.elimination import Elimination
 from adjust.graph.pair_normals import PairLinear, PairNormals
 from adjust.graph.rank import describe_null_space
 from adjust.graph.trial import tried
 from adjust.model.errors import IndeterminateError, SurveyError
+from adjust.model.survey import FloatArray
 from adjust.native.elimination import PoseTree
 
 _LATE = frozenset((
@@ -33,6 +34,9 @@ class System:
         self.reduced, self.use_qr = True, False
         self._orderings: dict[bool, gtsam.Ordering] = {}
         self.linear: gtsam.GaussianFactorGraph | PairLinear
+        self._linear_at: gtsam.Values | None = None
+        self._damping: Damping | None = None
+        self._moved: tuple[gtsam.Values, InnerDatum, dict[int, FloatArray]] | None = None
         self.at = self._evaluated(start)
         self.omega = graph.objective(self.at)
         if not np.isfinite(self.omega) and graph.terrestrial is not None:
@@ -52,6 +56,7 @@ class System:
         self.linear = self.graph.linearized(self.at) if self.pairs is None else self.pairs.linearized(self.at)
         if self.datum is not None:
             self.datum.add_to(self.linear)
+        self._linear_at = self.at.values
 
     def completed(self, delta: gtsam.VectorValues) -> tuple[gtsam.VectorValues, float]:
         """The step of all unknowns in the survey's datum, from that of the visible ones in the minimal datum.
@@ -65,8 +70,16 @@ class System:
             bundle.complete(delta)
             decrease += bundle.hidden_decrease
         if self.datum is not None:
-            delta = self.datum.completed(self.graph, self.at.values, delta)
+            delta = self.datum.completed(self.at.values, delta, self._motions(self.datum))
         return delta, decrease
+
+    def _motions(self, datum: InnerDatum) -> dict[int, FloatArray]:
+        """How all unknowns move with what the datum holds, from here; once for all dampings."""
+        if self._moved is None or self._moved[0] is not self.at.values or self._moved[1] is not datum:
+            if self.at.number != self.graph.state.evaluation:
+                self.at = self._evaluated(self.at.values)
+            self._moved = self.at.values, datum, survey_motions(self.graph, self.at.values, datum.directions)
+        return self._moved[2]
 
     @property
     def elimination(self) -> Elimination:
@@ -86,13 +99,18 @@ class System:
             system = self.linear if self.damping == 0.0 else self.linear.damped(self.damping)
             found = self.linear.normals.solution(system)
         else:
-            graph = self.linear if self.damping == 0.0 else damped(self.graph, self.linear, self.damping)
+            graph = self.linear if self.damping == 0.0 else self._damped(self.linear)
             found = self.elimination.solution(graph)
         if found is None:
             return self._weak_step()
         if not np.isfinite(found[0].norm()):
             raise SurveyError("the normal equations have no finite solution; check the sigmas and start values")
         return found
+
+    def _damped(self, linear: gtsam.GaussianFactorGraph) -> gtsam.GaussianFactorGraph:
+        if self._damping is None or self._damping.linear is not linear:
+            self._damping = Damping(self.graph, linear)
+        return self._damping.damped(self.damping)
 
     def _weak_step(self) -> tuple[gtsam.VectorValues, float]:
         """The step of a system that Cholesky finds indeterminate; raises where it is."""
@@ -162,6 +180,11 @@ class System:
 
     def _prepared_here(self) -> bool:
         """Linearise at the present values with the damping of now; False where that has no solution, which is none."""
+        hidden = self.reduced or self.at.reduction is not None or bool(self.graph.bundles)
+        if self.pairs is None and not hidden:  # the system is the same for every damping
+            if self._linear_at is not self.at.values:
+                self._linearize()
+            return True
         try:
             self.at = self._evaluated(self.at.values)
         except IndeterminateError:
@@ -172,14 +195,20 @@ class System:
         return True
 
 
-def damped(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, damping: float) -> gtsam.GaussianFactorGraph:
-    """The graph with Marquardt's damping: every unknown held with ``damping`` times its own diagonal."""
-    stack = stacking(graph, visible_keys(graph, linear))
-    root = np.sqrt(damping * np.maximum(normal_diagonal(linear, stack), 1e-12))
-    one = {n: gtsam.noiseModel.Unit.Create(n) for n in {place.stop - place.start for place in stack.at.values()}}
-    out = gtsam.GaussianFactorGraph()
-    out.push_back(linear)
-    for key, place in stack.at.items():
-        n = place.stop - place.start
-        out.add(key, np.diag(root[place]), np.zeros(n), one[n])
-    return out
+class Damping:
+    """Marquardt's: every unknown of a linear system held with so many times its own diagonal."""
+
+    def __init__(self, graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph) -> None:
+        stack = stacking(graph, visible_keys(graph, linear))
+        self.linear, diagonal = linear, np.maximum(normal_diagonal(linear, stack), 1e-12)
+        parts = {key: diagonal[at] for key, at in stack.at.items()}
+        one = {n: (gtsam.noiseModel.Unit.Create(n), np.zeros(n)) for n in {len(part) for part in parts.values()}}
+        self.rows = [(key, part, *one[len(part)]) for key, part in parts.items()]
+
+    def damped(self, damping: float) -> gtsam.GaussianFactorGraph:
+        """The system with it."""
+        out = gtsam.GaussianFactorGraph()
+        out.push_back(self.linear)
+        for key, diagonal, noise, zero in self.rows:
+            out.add(key, np.diag(np.sqrt(damping * diagonal)), zero, noise)
+        return out

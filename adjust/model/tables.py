@@ -13,6 +13,7 @@ which are unknowns already (motions of an axis as in ISO 230-7).
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 HARMONICS: Mapping[str, str] = {"angle": "rad", "axial": "m", "radial": "m", "tilt": "rad"}
 """Kinds of harmonics and their units."""
@@ -38,6 +39,7 @@ class Harmonic:
         return f"{self.kind}_{self.axis + 1}_order_{sign}{abs(self.order)}"
 
 
+@lru_cache(1024)
 def harmonic(name: str) -> Harmonic | None:
     """What a component of a table's geometry is; None where it is no harmonic, or one that cannot be told."""
     found = _NAME.fullmatch(name)

@@ -14,6 +14,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.model.result import ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.observations.images.segments import ranges
 from adjust.pose_network.cycles import flat, short_loops
 from adjust.pose_network.from_survey import network_from_survey
 from adjust.pose_network.loops import Loops, misclosures, walked
@@ -62,22 +63,35 @@ def pair_loops(network: PoseNetwork) -> Loops:
     return _short_loops(network, network.used, network.used)
 
 
-def loop_tests(network: PoseNetwork, loops: Loops, motions: Sequence[Motions]) -> FloatArray:
-    """(n, E) misclosures of each pair's loop with each of n sets of motions, chi-square over its freedom; nan without.
+def loop_tests(
+    network: PoseNetwork, loops: Loops, pair_idx: IntArray, others: Motions, sets: Sequence[IntArray]
+) -> FloatArray:
+    """(n, E) misclosures of each pair's loop, chi-square over its freedom; nan without one.
 
-    loops: of :func:`pair_loops`.
+    pair_idx: (m,) pairs that may have other motions, and these; sets: n times the numbers (k,) of those taken. Only
+    the loops through them are walked anew. loops: of :func:`pair_loops`.
     """
-    n, size = len(motions), network.n_pairs
-    out = np.full((n, size), np.nan)
-    if n and len(loops):
-        set_of = np.repeat(np.arange(n), len(loops.pair_idx))
-        ptr = np.concatenate([[0], np.cumsum(np.tile(loops.lengths, n))])
-        pair_idx, (sense, start) = np.tile(loops.pair_idx, n), (np.tile(x, n) for x in (loops.sense, loops.start_idx))
-        every = Loops(ptr, pair_idx + size * set_of, sense, start)
-        each = zip(*((m.rotation, m.translation) for m in motions), strict=True)
-        joined = Motions(*(np.concatenate(x) for x in each))
-        test, freedom = _tested(every, joined, np.tile(network.cov, (n, 1, 1)), np.tile(network.sizes, n), network.dim)
-        out[:, loops.pair_idx[loops.ptr[:-1]]] = (test / freedom).reshape(n, -1)
+    size = network.n_pairs
+    taken = np.tile(np.arange(size), (len(sets), 1))
+    for row, some in zip(taken, sets, strict=True):
+        row[pair_idx[some]] = size + some
+    out = np.full(taken.shape, np.nan)
+    if not len(sets) or not len(loops):
+        return out
+    test, freedom = _tests(network, loops)
+    tests = np.tile(test / freedom, (len(sets), 1))
+    set_of, of = np.nonzero(np.logical_or.reduceat(taken[:, loops.pair_idx] >= size, loops.ptr[:-1], axis=1))
+    if len(of):
+        rows = ranges(loops.ptr[of], loops.lengths[of])
+        pairs = taken[np.repeat(set_of, loops.lengths[of]), loops.pair_idx[rows]]
+        ptr = np.concatenate([[0], np.cumsum(loops.lengths[of])])
+        changed = Loops(ptr, pairs, loops.sense[rows], loops.start_idx[of])
+        every, known = np.append(np.arange(size), pair_idx), network.arrays.motions
+        motions = Motions(np.concatenate([known.rotation, others.rotation]),
+                          np.concatenate([known.shifts, others.shifts]))  # fmt: skip
+        test, freedom = _tested(changed, motions, network.cov[every], network.sizes[every], network.dim)
+        tests[set_of, of] = test / freedom
+    out[:, loops.pair_idx[loops.ptr[:-1]]] = tests
     return out
 
 

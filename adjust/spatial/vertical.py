@@ -135,9 +135,12 @@ class VerticalMap:
         return self.tilt.matrix if self.tilt is not None else np.zeros((2, 0))
 
     def at(self, values: gtsam.Values) -> Plumb:
-        """The plumb line at these values."""
-        tilt = np.asarray(self.vertical.tilt.values, dtype=float) if self.tilt is None else self.tilt.full(values)
-        return _tilted_plumb(self._upright, tilt)
+        """The plumb line at these values; always the same one where its tilt is held."""
+        return self._held if self.tilt is None else _tilted_plumb(self._upright, self.tilt.full(values))
+
+    @cached_property
+    def _held(self) -> Plumb:
+        return _tilted_plumb(self._upright, np.asarray(self.vertical.tilt.values, dtype=float))
 
     @cached_property
     def _upright(self) -> Plumb:

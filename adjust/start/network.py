@@ -10,10 +10,11 @@ from collections.abc import Sequence
 import numpy as np
 from gtsam import Pose3
 
-from adjust.frames.tables import table_motions
+from adjust.frames.tables import table_poses
 from adjust.frames.tree import FrameTree
 from adjust.frames.unknowns import Chain, Link
 from adjust.model.errors import SurveyError
+from adjust.model.names import grouped
 from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, Survey, Table
 from adjust.spatial.averaging import least, mean_poses, pose_distance
 from adjust.spatial.rigid import inverse, rigid
@@ -41,18 +42,27 @@ class FrameNetwork:
         self.observations = Observations.of([])
         self.gauged: list[int] = []
         self.lever = 1.0
-        readings = {(r.table_id, r.epoch_id): r.angles for r in survey.table_readings}
+        moved = ((name, slot) for slot, name in enumerate(self.names) if name[0] == "table_motion")
+        turned = grouped((name[1], (slot, name[2])) for name, slot in moved)
+        readings = {(r.table_id, r.epoch_id): r.angles for r in survey.table_readings} if turned else {}
+        for table_id, of in turned.items():
+            angles = [readings[table_id, epoch_id] for _, epoch_id in of]
+            self.set([slot for slot, _ in of], table_from_mount(survey.tables_by_id[table_id], angles))
         for slot, name in enumerate(self.names):
-            if name[0] == "table_motion":
-                value: FloatArray | None = table_from_mount(survey.tables_by_id[name[1]], readings[(name[1], name[2])])
-            else:
-                value = given_pose(self.parameters[name])
+            value = given_pose(self.parameters[name]) if name[0] != "table_motion" else None
             if value is not None:
                 self.set(slot, value)
         self.fixed = self.has.copy()
 
-    def set(self, slot: int, value: FloatArray) -> None:
-        """Let a slot be known."""
+    @property
+    def state(self) -> tuple[object, ...]:
+        """All that is known and observed, to be told apart from another state."""
+        o = self.observations
+        observed = o.chains.slots, o.chains.inverted, o.poses, o.first, o.block_idx, o.rotation_only
+        return self.pose, self.has, self.lever, *observed
+
+    def set(self, slot: int | list[int], value: FloatArray) -> None:
+        """Let a slot, or several (n), be known."""
         self.pose[slot], self.has[slot] = value, True
 
     def set_link(self, link: Link, value: FloatArray) -> None:
@@ -235,9 +245,9 @@ def partial_pose(parameter: PoseParameter | None) -> FloatArray | None:
     return np.asarray(parameter.value.matrix(), dtype=float)
 
 
-def table_from_mount(table: Table, angles: FloatArray) -> FloatArray:
-    """Motion (4, 4) of a table at angles (k,) rad with its given geometry (:class:`adjust.model.survey.Table`)."""
-    if len(angles) != len(table.axes):
-        raise SurveyError(f"table {table.table_id!r} has {len(table.axes)} axes, a reading has {len(angles)} angles")
-    (R,), (t,), _ = table_motions(table.axes, table.geometry.by_name, np.asarray(angles, dtype=float)[None])
-    return rigid(R, t)
+def table_from_mount(table: Table, angles: Sequence[FloatArray]) -> FloatArray:
+    """Motions (n, 4, 4) of a table at n angles (k,) with its given geometry (:class:`adjust.model.survey.Table`)."""
+    k = len(table.axes)
+    for wrong in (a for a in angles if len(a) != k):
+        raise SurveyError(f"table {table.table_id!r} has {k} axes, a reading has {len(wrong)} angles")
+    return rigid(*table_poses(table.axes, table.geometry.by_name, np.array(angles, dtype=float).reshape(-1, k)))

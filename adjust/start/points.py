@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from adjust.frames.unknowns import Link
+from adjust.model.memory import content, once
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.spatial.rigid import inverse, rigid
 from adjust.start.chains import ChainObservation, Observations
@@ -114,7 +115,23 @@ def intersect_points(network: FrameNetwork, points: PointField, parallax: float,
     return int(new.sum())
 
 
-def improve(network: FrameNetwork, points: PointField, movable: BoolArray) -> None:
+def improve(network: FrameNetwork, points: PointField, movable: BoolArray, rounds: int) -> None:
+    """So many rounds; what images of the same points, at the same places, led to before is not found again."""
+    seen, sights = points.seen(), [part for s in points.sights
+                                    for part in (s.block_idx, s.focal_px, s.chain, s.rows, s.rays)]  # fmt: skip
+    fields = points.x, points.given, points.rough
+    known = content(*network.state, *(of[seen] for of in fields), points.released, movable, rounds, *sights)
+
+    def improved() -> tuple[FloatArray, Observations, list[FloatArray | BoolArray]]:
+        for _ in range(rounds):
+            _improve(network, points, movable)
+        return network.pose.copy(), network.observations, [of[seen] for of in fields]
+
+    network.pose[:], network.observations, found = once(("improved", known), improved)
+    points.x[seen], points.given[seen], points.rough[seen] = found
+
+
+def _improve(network: FrameNetwork, points: PointField, movable: BoolArray) -> None:
     """One round: every block's pose from all points now known, the movable poses from these, and the points again."""
     known = points.known
     placed = [s for s in points.sights if not network.open_slots(s.chain) and known[s.rows].sum() >= 4]

@@ -1,18 +1,18 @@
 """All poses of the network together: a short least squares on the chains, each weighted by what its view can tell."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import csc_array
 
 from adjust.graph.elimination import positive_definite_lu
+from adjust.model.memory import content, once
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.spatial.averaging import pose_distance
 from adjust.spatial.rigid import adjoint, inverse, rigid, rotation_exp, rotation_log, skew
 from adjust.start.chains import ChainObservation, Chains
 from adjust.start.network import FrameNetwork
-from adjust.start.views import View
+from adjust.start.views import View, Views
 
 _DAMPING = 1e-7  # of the diagonal: what the observations leave open stays where it is
 _GROSS_PX = 3.0
@@ -32,12 +32,25 @@ class _Misfits:
     roots: FloatArray
 
 
-def polish(network: FrameNetwork, movable: BoolArray, views: Iterable[View], iterations: int = 6) -> None:
+def polish(network: FrameNetwork, movable: BoolArray, views: Views, iterations: int = 6) -> None:
     """Move the movable poses to the minimum of the chains' misfit in px, robustly; nothing else changes.
 
     Source: pose-graph least squares with each measured pose weighted by the normal matrix of its image points, which is
     the bundle adjustment linearised at the measured poses. The caller's gauge poses are to be left out of ``movable``.
+    From the same views, poses and observations it is done once.
     """
+    s = views.sights
+    seen = s.block_idx, s.x, s.rays, s.ptr, s.focal_px
+    state = content(*network.state, movable, iterations, *seen)
+
+    def polished() -> FloatArray:
+        _polish(network, movable, views, iterations)
+        return network.pose.copy()
+
+    network.pose[:] = once(("polished", state), polished)
+
+
+def _polish(network: FrameNetwork, movable: BoolArray, views: Views, iterations: int) -> None:
     items = network.whole()
     chains, of_block = items.chains, {v.block_idx: v for v in views}
     items = items.part(np.flatnonzero(((chains.slots >= 0) & movable[chains.slots]).any(axis=1)))

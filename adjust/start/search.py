@@ -231,9 +231,8 @@ class _Search:
         gauged = np.isin(np.arange(len(network.has)), network.gauged)
         movable = network.has & ~network.fixed & (~gauged | self.scale_free)
         # a field that grew from one pair has errors that only fade from round to round
-        rounds = _ROUNDS * (4 if self.scale_free else 1)
-        for _ in range(rounds if self.points.sights else 0):
-            improve(network, self.points, movable)
+        if self.points.sights:
+            improve(network, self.points, movable, _ROUNDS * (4 if self.scale_free else 1))
         self.rms = block_rms(network, self.chains, self.views, self.points)
         polished = self.motion_solved or np.nanmax(self.rms, initial=0.0) > _POLISH_PX
         if polished:

@@ -84,7 +84,7 @@ def _world_from_station(survey: Survey, station: Station, angles: FloatArray) ->
     table = survey.tables_by_id[station.table_id or ""]
     world_from_table = _known(table.world_from_table, f"world_from_table of {table.table_id!r}")
     mount_from_station = _known(station.mount_from_station, f"mount_from_station of {station.station_id!r}")
-    return np.asarray(world_from_table @ table_from_mount(table, angles) @ mount_from_station)
+    return np.asarray(world_from_table @ table_from_mount(table, [angles])[0] @ mount_from_station)
 
 
 def _camera_from_target(survey: Survey, camera: Camera, target: Target, angles: FloatArray) -> FloatArray:

@@ -3,7 +3,7 @@
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.frames.tables import table_motions
+from adjust.frames.tables import table_poses
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment, ParameterName, adjusted_numbers, adjusted_pose
 from adjust.model.survey import FloatArray, PoseParameter, Station, Table, Target
@@ -11,7 +11,7 @@ from adjust.model.survey import FloatArray, PoseParameter, Station, Table, Targe
 
 def table_from_mount(axes: tuple[str, ...], geometry: dict[str, float], angles: FloatArray) -> Pose3:
     """The motion of a table, the formula of ``adjust.model.survey.Table``; ``geometry``: by name, missing is zero."""
-    (R,), (t,), _ = table_motions(axes, geometry, np.asarray(angles, dtype=float)[None])
+    (R,), (t,) = table_poses(axes, geometry, np.asarray(angles, dtype=float)[None])
     return Pose3(Rot3(R), t)
 
 

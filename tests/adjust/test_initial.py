@@ -423,6 +423,6 @@ def test_a_table_with_given_geometry_moves_as_its_formula_says():
     table = Table("t", ("x", "z"), geometry=VectorParameter(TABLE_GEOMETRY, np.array([0.02, 0.01, 0.3, -0.2])))
     a1, a2 = np.rad2deg([0.5 + 0.3, -0.7 - 0.2])
     expected = pose((a1, 0, 0)) @ pose(t=(0, 0.01, 0)) @ pose((0, np.rad2deg(0.02), 0)) @ pose((0, 0, a2))
-    np.testing.assert_allclose(table_from_mount(table, np.array([0.5, -0.7])), expected, atol=1e-12)
+    np.testing.assert_allclose(table_from_mount(table, [np.array([0.5, -0.7])])[0], expected, atol=1e-12)
     with pytest.raises(SurveyError, match="2 axes, a reading has 1"):
-        table_from_mount(table, np.array([0.5]))
+        table_from_mount(table, [np.array([0.5])])

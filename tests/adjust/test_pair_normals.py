@@ -12,7 +12,7 @@ from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.cliques import Cliques
 from adjust.graph.elimination import pose_cliques
 from adjust.graph.pair_normals import PairNormals
-from adjust.graph.system import damped
+from adjust.graph.system import Damping
 from adjust.native.elimination import clique_pattern
 from adjust.pose_network.solve import minimize
 from adjust.precision import tree as tree_module
@@ -43,7 +43,7 @@ def test_the_system_is_that_of_gtsams_factors(seed: int) -> None:
         linear, plain = normals.linearized(at), graph.linearized(at)
         assert graph.objective(at) == pytest.approx(2.0 * graph.others_graph.error(start), rel=1e-10)
         order = gtsam.Ordering.ColamdGaussianFactorGraph(plain)
-        for mine, theirs in ((linear, plain), (linear.damped(0.3), damped(graph, plain, 0.3))):
+        for mine, theirs in ((linear, plain), (linear.damped(0.3), Damping(graph, plain).damped(0.3))):
             found = normals.solution(mine)
             assert found is not None
             expected = theirs.optimize(order)

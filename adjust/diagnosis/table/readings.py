@@ -9,6 +9,7 @@ import numpy as np
 from adjust.diagnosis.hypothesis import ChangeColumns, Hypothesis, Place
 from adjust.diagnosis.table.views import TableViews
 from adjust.model.errors import SurveyError
+from adjust.model.memory import content, once
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.spatial.rigid import inverse, rotation_log
@@ -116,6 +117,12 @@ def shared_mistake(views: TableViews) -> tuple[Verdict | None, float]:
     Turning angles sort out most mistakes; exchanged axes leave all of them as they are (the angle of ``R1(a) R2(b)`` is
     that of ``R2(b) R1(a)``), and only show when base and mount have to be the same for all views.
     """
+    table = views.table.axes, views.table.geometry.by_name
+    seen = content(*table, views.inner, views.outer, views.epoch, views.poses, views.angles)
+    return once(("shared mistake", seen), lambda: _shared_mistake(views))
+
+
+def _shared_mistake(views: TableViews) -> tuple[Verdict | None, float]:
     pairs = _pairs(views)
     if not len(pairs):
         return None, 0.0

@@ -8,7 +8,7 @@ import numpy as np
 
 from adjust.diagnosis.alone import single_views, view_covariance
 from adjust.diagnosis.case import Case
-from adjust.frames.tables import table_motions
+from adjust.frames.tables import table_poses
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import FloatArray, IntArray, Survey, Table, Target
 from adjust.spatial.rigid import adjoint, inverse, rigid, rotation_exp
@@ -45,7 +45,7 @@ class TableViews:
         given = self.table.geometry.by_name
         if geometry is not None and len(self.table.axes) > 1:
             given |= dict(zip(("non_orthogonality", "axis_offset"), geometry.tolist(), strict=True))
-        return rigid(*table_motions(self.table.axes, given, a)[:2])
+        return rigid(*table_poses(self.table.axes, given, a))
 
     def by_geometry(self) -> FloatArray:
         """(e, 6, 2): how non-orthogonality and axis offset move the mount, a small motion on the left in the mount."""

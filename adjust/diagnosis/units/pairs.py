@@ -19,6 +19,7 @@ from adjust.diagnosis.sequences import Link, fitted, hand, links, typical
 from adjust.diagnosis.units.conventions import Scope, shrinking
 from adjust.diagnosis.units.motions import CONVENTIONS, Convention, Motion, edits_of, mended, miss, rotation_of
 from adjust.model.errors import listed
+from adjust.model.memory import remembered
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.spatial.rigid_motions import Motions
@@ -145,7 +146,7 @@ def _by_loops(survey: Survey, meant: Mapping[int, Motion], rows: frozenset[int])
 
     How many times less loops then miss.
     """
-    loops, ends = _loop_tests(survey), [{p.a.frame_id, p.b.frame_id} for p in survey.pairs]
+    loops, ends = remembered(_loop_tests, survey), [{p.a.frame_id, p.b.frame_id} for p in survey.pairs]
     turns = [frozenset({i, j}) for i, j in combinations_with_replacement(meant, 2) if ends[i] & ends[j]]
 
     def misses(sets: Sequence[frozenset[int]]) -> FloatArray:
@@ -200,7 +201,7 @@ def _by_start(case: Case) -> _Judge | None:
     before = at_best(case)
     if before is None:
         return None
-    squares, loops = before.pairs_of(survey), _loop_tests(survey)
+    squares, loops = before.pairs_of(survey), remembered(_loop_tests, survey)
     worst = np.argsort(-squares, kind="stable")
     ends = np.array([[p.a.frame_id, p.b.frame_id] for p in survey.pairs])
     ends = np.unique(ends, return_inverse=True)[1].reshape(-1, 2)
@@ -243,17 +244,20 @@ def _loop_tests(survey: Survey) -> Callable[[Sequence[Mapping[int, Motion]]], Fl
     from adjust.pose_network.from_survey import network_from_survey
 
     network = network_from_survey(survey, any_datum=True)
-    loops, read = pair_loops(network), network.arrays.motions
+    loops = pair_loops(network)
 
-    def meant(new: Mapping[int, Motion]) -> Motions:
-        R, t = read.rotation.copy(), np.array(read.translation)
-        for i, motion in new.items():
-            R[i] = rotation_of(motion)
-            if isinstance(motion, Pose3):
-                t[i] = motion.translation()
-        return Motions(R, t)
+    def tests(sets: Sequence[Mapping[int, Motion]]) -> FloatArray:
+        number: dict[tuple[int, int], int] = {}
+        known = [np.array([number.setdefault((i, id(m)), len(number)) for i, m in new.items()], dtype=np.int64)
+                 for new in sets]  # fmt: skip
+        meant = {(i, id(m)): m for new in sets for i, m in new.items()}
+        R = np.array([rotation_of(m) for m in meant.values()]).reshape(-1, 3, 3)
+        read = network.arrays.motions.shifts
+        t = np.array([m.translation() if isinstance(m, Pose3) else read[i] for (i, _), m in meant.items()])
+        pairs = np.array([i for i, _ in meant], dtype=np.int64)
+        return np.nan_to_num(loop_tests(network, loops, pairs, Motions(R, t.reshape(-1, 3)), known), nan=1.0)
 
-    return lambda sets: np.nan_to_num(loop_tests(network, loops, [meant(new) for new in sets]), nan=1.0)
+    return tests
 
 
 def _read_as(found: Screen, new: Mapping[int, Motion]) -> FloatArray:

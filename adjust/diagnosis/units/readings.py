@@ -12,7 +12,6 @@ import numpy as np
 
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import ChangeReadings, Hypothesis, Place
-from adjust.diagnosis.memory import remembered
 from adjust.diagnosis.screen import Screen, at_best, improvement, screen, screen_without
 from adjust.diagnosis.units.conventions import (
     ANGLES,
@@ -25,6 +24,7 @@ from adjust.diagnosis.units.conventions import (
     shrinking,
     slips,
 )
+from adjust.model.memory import remembered
 from adjust.model.observations import ReadingKind
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, IntArray, Survey

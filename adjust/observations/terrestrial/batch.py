@@ -17,7 +17,7 @@ from adjust.observations.terrestrial import equations as k
 from adjust.observations.terrestrial.layout import Chunk, Layout
 from adjust.observations.terrestrial.parameters import TerrestrialParameters
 from adjust.spatial.averaging import circular_median
-from adjust.spatial.vertical import Horizon
+from adjust.spatial.vertical import Horizon, Plumb
 
 
 class TerrestrialBatch:
@@ -63,6 +63,8 @@ class TerrestrialBatch:
         self.correlated = [c for c, chunk in enumerate(layout.chunks) if chunk.whitener is not None]
         self._views = [_blocks(chunk, self.J) for chunk in layout.chunks]
         self.chi_square = 0.0
+        self._plumb: Plumb | None = None
+        """That of the horizons at all positions, where these were found together."""
 
     @property
     def used(self) -> BoolArray:
@@ -91,8 +93,13 @@ class TerrestrialBatch:
         for i, vector in enumerate(self._instrument_maps):
             self.instrument[i + 1] = vector.full(values)
         where: IntArray | slice = slice(None) if positions is None else positions
+        if plumb is self._plumb and not plumb.radius:  # parallel plumb lines: nothing but heights goes with positions
+            x = self.X[where]
+            self.horizon.height[where], self.horizon.height_by_tilt[where] = x @ plumb.up, x @ plumb.turned_up
+            return
         for name, found in vars(plumb.horizon(self.X[where])).items():
             getattr(self.horizon, name)[where] = found
+        self._plumb = plumb if positions is None else None
 
     def _points_of(self, positions: IntArray) -> list[tuple[int, int]]:
         found = [(int(i), self.layout.positions[int(i)].point_key) for i in positions]

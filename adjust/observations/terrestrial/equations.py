@@ -6,11 +6,11 @@ axes. Axes that turn by a small w, about the world's axes, change ``F d`` by ``F
 """
 
 from dataclasses import dataclass, fields
-from typing import NamedTuple
+from functools import cached_property
 
 import numpy as np
 
-from adjust.model.survey import FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.spatial.vertical import Horizon
 
 DIRECTION, ANGLE, ZENITH, AZIMUTH, SLOPE, HORIZONTAL, HEIGHT = range(7)
@@ -39,6 +39,18 @@ class Readings:
         """Some of them."""
         return Readings(*(getattr(self, f.name)[rows] for f in fields(Readings)))
 
+    @cached_property
+    def sorted(self) -> "_Sorted":
+        """What prediction asks of them that does not change with the values."""
+        kind = self.kind
+        level, angles, directions, zenith = (np.flatnonzero(kind == one) for one in (HEIGHT, ANGLE, DIRECTION, ZENITH))
+        sights = np.flatnonzero(kind != HEIGHT)
+        second = _sights_of(self, angles, self.second, 2, SECOND) if len(angles) else None
+        return _Sorted(
+            level, angles, directions, zenith, sights, np.flatnonzero((kind == SLOPE) | (kind == HORIZONTAL)),
+            np.where(kind == ANGLE, -1.0, 1.0), _sights_of(self, sights, self.to, 1, TO), second,
+        )  # fmt: skip
+
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
@@ -61,29 +73,29 @@ def predict(r: Readings, u: Geometry, sign: float, curve: float) -> tuple[FloatA
 
     sign: of angles that count clockwise. curve: 1 / (2 radius), of refraction.
     """
-    level, rows = np.flatnonzero(r.kind == HEIGHT), np.flatnonzero(r.kind != HEIGHT)
-    distances = np.flatnonzero((r.kind == SLOPE) | (r.kind == HORIZONTAL))
-    offset, scale = u.instrument[r.instrument[distances], 0], 1.0 + u.instrument[r.instrument[distances], 1]
-    factor = np.where(r.kind == ANGLE, -1.0, 1.0)
-    factor[distances] = scale
-    value, A = _sights(r, u, rows, _End(r.to, 1, TO), factor[rows], sign, curve)
-    if len(level):
+    s, factor = r.sorted, r.sorted.factor
+    if len(s.distances):
+        offset, scale = u.instrument[r.instrument[s.distances], 0], 1.0 + u.instrument[r.instrument[s.distances], 1]
+        factor = factor.copy()
+        factor[s.distances] = scale
+    value, A = _sights(s.first, u, factor[s.sights], sign, curve)
+    if len(s.level):
         sights, by = value, A
         value, A = np.empty(len(r.kind)), np.zeros((len(r.kind), N_COLUMNS))
-        value[rows], A[rows] = sights, by
-        value[level] = _heights(r, u, level, A)
-    rows = np.flatnonzero(r.kind == ANGLE)
-    if len(rows):
-        more, by = _sights(r, u, rows, _End(r.second, 2, SECOND), np.ones(len(rows)), sign, curve)
-        value[rows], A[rows] = value[rows] + more, A[rows] + by
-    rows = np.flatnonzero(r.kind == DIRECTION)
-    value[rows] -= u.orientation[r.orientation[rows]]
-    A[rows, ORIENTATION] = -1.0
-    rows = np.flatnonzero(r.kind == ZENITH)
-    value[rows] += u.instrument[r.instrument[rows], 3]
-    A[rows, INSTRUMENT + 3] = 1.0
-    A[distances, INSTRUMENT], A[distances, INSTRUMENT + 1] = 1.0, value[distances] / scale
-    value[distances] += offset
+        value[s.sights], A[s.sights] = sights, by
+        value[s.level] = _heights(r, u, s.level, A)
+    if s.second is not None:
+        more, by = _sights(s.second, u, np.ones(len(s.angles)), sign, curve)
+        value[s.angles], A[s.angles] = value[s.angles] + more, A[s.angles] + by
+    if len(s.directions):
+        value[s.directions] -= u.orientation[r.orientation[s.directions]]
+        A[s.directions, ORIENTATION] = -1.0
+    if len(s.zenith):
+        value[s.zenith] += u.instrument[r.instrument[s.zenith], 3]
+        A[s.zenith, INSTRUMENT + 3] = 1.0
+    if len(s.distances):
+        A[s.distances, INSTRUMENT], A[s.distances, INSTRUMENT + 1] = 1.0, value[s.distances] / scale
+        value[s.distances] += offset
     return value, A
 
 
@@ -94,8 +106,7 @@ def wrapped(kind: IntArray, predicted: FloatArray, observed: FloatArray) -> Floa
     return np.asarray(np.where(_IS_TURN[kind], v - 2.0 * np.pi * turns, v))
 
 
-def _centring(r: Readings, u: Geometry, rows: IntArray) -> FloatArray:
-    of = r.centring[rows]
+def _centred(of: IntArray, u: Geometry) -> FloatArray:
     return np.where(of[:, None] >= 0, u.centring[of], 0.0)
 
 
@@ -105,47 +116,91 @@ def _heights(r: Readings, u: Geometry, rows: IntArray, A: FloatArray) -> FloatAr
     A[rows, AT : AT + 3], A[rows, TO : TO + 3] = -h.axes[a, 2], h.axes[b, 2]
     A[rows, CENTRING + 2] = -1.0
     A[rows, TILT : TILT + 2] = h.height_by_tilt[b] - h.height_by_tilt[a]
-    raised = r.heights[rows, 1] - r.heights[rows, 0] - _centring(r, u, rows)[:, 2]
+    raised = r.heights[rows, 1] - r.heights[rows, 0] - _centred(r.centring[rows], u)[:, 2]
     return np.asarray(h.height[b] - h.height[a] + raised)
 
 
-class _End(NamedTuple):
-    """Where sights go: positions (n,) of all readings, the column of their heights, the first one of derivatives."""
+@dataclass(frozen=True, eq=False)
+class _Sights:
+    """Sights (m,) of some readings to one of their ends, whose derivatives begin at ``column``, as they always are.
 
+    at, to: positions. raises, raised_to (m, 1): heights of both ends. turn, slope: which are horizontal angles, slope
+    distances. instrument: of the zenith angles. on_body, levelled: those in the axes of bodies, and of the horizon.
+    """
+
+    at: IntArray
     to: IntArray
-    height: int
     column: int
+    raises: FloatArray
+    raised_to: FloatArray
+    raised: IntArray
+    turn: BoolArray
+    slope: BoolArray
+    is_zenith: BoolArray
+    zenith: IntArray
+    instrument: IntArray
+    centring: IntArray
+    body: IntArray
+    on_body: IntArray
+    levelled: IntArray
 
 
-def _sights(
-    r: Readings, u: Geometry, rows: IntArray, end: _End, factor: FloatArray, sign: float, curve: float
-) -> tuple[FloatArray, FloatArray]:
-    """``factor`` times the values (m,) of the sights of ``rows`` to that end, and derivatives A (m, 22)."""
-    to, target, to_column = end
-    a, b, kind, horizon, body = r.at[rows], to[rows], r.kind[rows], u.horizon, r.body[rows]
-    on_body, F = np.flatnonzero(body >= 0), horizon.axes[a]
-    F[on_body] = u.body_axes[body[on_body]]
-    back, up_b, h_b = np.swapaxes(F, 1, 2), horizon.axes[b, 2], r.heights[rows, target, None]
-    offset = r.heights[rows, 0, None] * F[:, 2] + _times(back, _centring(r, u, rows))
-    d = u.X[b] + h_b * up_b - u.X[a] - offset
+def _sights_of(r: Readings, rows: IntArray, to: IntArray, height: int, column: int) -> _Sights:
+    """height: column of the heights of that end."""
+    kind, body, raised_to = r.kind[rows], r.body[rows], r.heights[rows, height, None]
+    is_zenith, on_body = kind == ZENITH, np.flatnonzero(body >= 0)
+    zenith = np.flatnonzero(is_zenith)
+    return _Sights(
+        r.at[rows], to[rows], column, r.heights[rows, 0, None], raised_to, np.flatnonzero(raised_to), _IS_TURN[kind],
+        kind == SLOPE, is_zenith, zenith, r.instrument[rows[zenith]], r.centring[rows], body[on_body], on_body,
+        np.flatnonzero(body < 0),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Sorted:
+    """Rows of readings by kind, all but height differences as sights, and those of angles to their second targets.
+
+    factor: (n,) by which values of first sights count, but for the scales of distances.
+    """
+
+    level: IntArray
+    angles: IntArray
+    directions: IntArray
+    zenith: IntArray
+    sights: IntArray
+    distances: IntArray
+    factor: FloatArray
+    first: _Sights
+    second: _Sights | None
+
+
+def _sights(s: _Sights, u: Geometry, factor: FloatArray, sign: float, curve: float) -> tuple[FloatArray, FloatArray]:
+    """``factor`` times the values (m,) of these sights, and derivatives A (m, 22)."""
+    F = u.horizon.axes[s.at]
+    F[s.on_body] = u.body_axes[s.body]
+    back, up_b = np.swapaxes(F, 1, 2), u.horizon.axes[s.to, 2]
+    offset = s.raises * F[:, 2] + _times(back, _centred(s.centring, u))
+    d = u.X[s.to] + s.raised_to * up_b - u.X[s.at] - offset
     q = _times(F, d)
-    value, g = _shape(kind, sign, q)
-    A = np.zeros((len(rows), N_COLUMNS))
-    zenith = np.flatnonzero(kind == ZENITH)
-    h = np.hypot(q[zenith, 0], q[zenith, 1])
-    bend = u.instrument[r.instrument[rows[zenith]], 2] * curve
-    value[zenith] -= bend * h
-    A[zenith, INSTRUMENT + 2] -= factor[zenith] * curve * h
-    g[zenith, :2] -= (bend / np.where(h > 0.0, h, np.inf))[:, None] * q[zenith, :2]
+    value, g = _shape(s, sign, q)
+    A = np.zeros((len(q), N_COLUMNS))
+    if len(s.zenith):
+        h = np.hypot(q[s.zenith, 0], q[s.zenith, 1])
+        bend = u.instrument[s.instrument, 2] * curve
+        value[s.zenith] -= bend * h
+        A[s.zenith, INSTRUMENT + 2] -= factor[s.zenith] * curve * h
+        g[s.zenith, :2] -= (bend / np.where(h > 0.0, h, np.inf))[:, None] * q[s.zenith, :2]
     g *= factor[:, None]
     w = _times(back, g)
-    A[:, AT : AT + 3], A[:, to_column : to_column + 3], A[:, CENTRING : CENTRING + 3] = -w, w, -g
+    A[:, AT : AT + 3], A[:, s.column : s.column + 3], A[:, CENTRING : CENTRING + 3] = -w, w, -g
     turn = _cross(w, d + offset)
-    levelled = np.flatnonzero(body < 0)
-    A[on_body, BODY : BODY + 3] = _times(F[on_body], turn[on_body])
-    _add_turn(horizon, a[levelled], turn[levelled], levelled, AT, A)
-    raised = np.flatnonzero(h_b[:, 0])
-    _add_turn(horizon, b[raised], _cross((h_b * up_b)[raised], w[raised]), raised, to_column, A)
+    if len(s.on_body):
+        A[s.on_body, BODY : BODY + 3] = _times(F[s.on_body], turn[s.on_body])
+    _add_turn(u.horizon, s.at[s.levelled], turn[s.levelled], s.levelled, AT, A)
+    if len(s.raised):
+        raised = _cross((s.raised_to * up_b)[s.raised], w[s.raised])
+        _add_turn(u.horizon, s.to[s.raised], raised, s.raised, s.column, A)
     return factor * value, A
 
 
@@ -157,23 +212,22 @@ def _add_turn(h: Horizon, at: IntArray, turn: FloatArray, rows: IntArray, column
     A[rows, TILT : TILT + 2] += _times(np.swapaxes(h.by_tilt[at], 1, 2), turn)
 
 
-def _shape(kind: IntArray, sign: float, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _shape(s: _Sights, sign: float, q: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Geometric values (n,) of q (n, 3) in the instrument's axes, and their gradients (n, 3); nan where is none."""
     x, y, z = q.T
     h2 = x * x + y * y
     h, s2 = np.sqrt(h2), h2 + z * z
-    s, zero = np.sqrt(s2), np.zeros(len(q))
-    turn, zenith, slope = _IS_TURN[kind], kind == ZENITH, kind == SLOPE
+    length, zero = np.sqrt(s2), np.zeros(len(q))
 
     def of_kind(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> FloatArray:
-        return np.where(turn, a, np.where(zenith, b, np.where(slope, c, d)))
+        return np.where(s.turn, a, np.where(s.is_zenith, b, np.where(s.slope, c, d)))
 
     with np.errstate(divide="ignore", invalid="ignore"):
-        value = of_kind(sign * np.arctan2(y, x), np.arctan2(h, z), s, h)
+        value = of_kind(sign * np.arctan2(y, x), np.arctan2(h, z), length, h)
         by_turn, by_zenith = (-sign * y / h2, sign * x / h2, zero), (x * z / (h * s2), y * z / (h * s2), -h / s2)
-        by_slope, by_horizontal = (x / s, y / s, z / s), (x / h, y / h, zero)
+        by_slope, by_horizontal = (x / length, y / length, z / length), (x / h, y / h, zero)
     g = np.stack([of_kind(*parts) for parts in zip(by_turn, by_zenith, by_slope, by_horizontal, strict=True)], axis=1)
-    none = np.where(slope, s, h) == 0.0
+    none = np.where(s.slope, length, h) == 0.0
     value[none], g[none] = np.nan, 0.0
     return value, g
 

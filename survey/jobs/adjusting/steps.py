@@ -9,9 +9,9 @@ from types import MappingProxyType
 from tqdm import tqdm
 
 from adjust.adjustment import AdjustOptions, adjust
-from adjust.diagnosis.memory import remembering
 from adjust.graph.assembly import StartValues
 from adjust.model.errors import IndeterminateError, SurveyError, listed
+from adjust.model.memory import remembering
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import Survey
 from adjust.observations.copies import copied_observations
