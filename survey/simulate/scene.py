@@ -7,6 +7,7 @@ there cannot hide by being made twice.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, reduce
+from typing import Any
 
 import cv2
 import numpy as np
@@ -32,21 +33,23 @@ def rotation_about(axis: str, angle: float | FloatArray) -> FloatArray:
     """(4, 4) right-handed turn by ``angle`` rad about a named axis; (n, 4, 4) by (n,) angles."""
     i = _AXIS_NUMBER[axis]
     j, k = (i + 1) % 3, (i + 2) % 3
-    matrix = _units(angle)
-    matrix[..., j, j] = matrix[..., k, k] = np.cos(angle)
-    matrix[..., k, j] = np.sin(angle)
-    matrix[..., j, k] = -matrix[..., k, j]
+    matrix, sine = _units(angle), np.sin(angle)
+    turned = matrix.T  # by column and row, whether of one or of many
+    turned[j, j] = turned[k, k] = np.cos(angle)
+    turned[j, k], turned[k, j] = sine, -sine
     return matrix
 
 
 def shift_along(axis: str, distance: float | FloatArray) -> FloatArray:
     """(4, 4) shift by ``distance`` m along a named axis; (n, 4, 4) by (n,) distances."""
     matrix = _units(distance)
-    matrix[..., _AXIS_NUMBER[axis], 3] = distance
+    matrix.T[3, _AXIS_NUMBER[axis]] = distance
     return matrix
 
 
 def _units(each: float | FloatArray) -> FloatArray:
+    if isinstance(each, float):  # one
+        return _UNIT.copy()
     units = np.empty((*np.shape(each), 4, 4))
     units[...] = _UNIT
     return units
@@ -80,21 +83,22 @@ def _moving(axis: str, number: int, geometry: Mapping[str, float], angle: FloatA
     waves = [name for name in geometry if name.startswith(_WAVES[number])]
     if not waves:
         return _UNIT
-    still: FloatArray = np.zeros(np.shape(angle))
-    error, along, whirl = still, still, {"radial": still + 0j, "tilt": still + 0j}
+    error: float | FloatArray = 0.0
+    along: float | FloatArray = 0.0
+    whirl: dict[str, Any] = {"radial": 0.0j, "tilt": 0.0j}  # of one angle or of many
     for name in waves:
         (kind, *rest), value = name.split("_"), geometry[name]
         order = int(rest[2].replace("m", "-").replace("p", ""))
         if kind in whirl:
-            whirl[kind] = whirl[kind] + value * (1j if rest[1] == "im" else 1.0) * np.exp(1j * order * angle)
+            whirl[kind] += value * (1j if rest[1] == "im" else 1.0) * np.exp(1j * order * angle)
         elif kind == "angle":
-            error = error + value * (np.cos if rest[1] == "cos" else np.sin)(order * angle)
+            error += value * (np.cos if rest[1] == "cos" else np.sin)(order * angle)
         else:
-            along = along + value * (np.cos if rest[1] == "cos" else np.sin)(order * angle)
+            along += value * (np.cos if rest[1] == "cos" else np.sin)(order * angle)
     x, y = "yzx"["xyz".index(axis)], "zxy"["xyz".index(axis)]
-    radial, tilt = (np.stack([w.real, w.imag]).astype(np.float64) for w in whirl.values())
-    shift = shift_along(x, radial[0]) @ shift_along(y, radial[1]) @ shift_along(axis, along)
-    moved: FloatArray = shift @ rotation_about(x, tilt[0]) @ rotation_about(y, tilt[1]) @ rotation_about(axis, error)
+    shift = shift_along(x, whirl["radial"].real) @ shift_along(y, whirl["radial"].imag) @ shift_along(axis, along)
+    tilt = rotation_about(x, whirl["tilt"].real) @ rotation_about(y, whirl["tilt"].imag)
+    moved: FloatArray = shift @ tilt @ rotation_about(axis, error)
     return moved
 
 
