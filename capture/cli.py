@@ -6,7 +6,7 @@ messages to stderr. Heavy imports happen inside the commands.
 
 import argparse
 from collections.abc import Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -43,6 +43,7 @@ def program() -> NoReturn:
     run_as_program(main)
 
 
+@cache
 def build_parser() -> Parser:
     """All commands and flags."""
     flags = {

@@ -6,7 +6,7 @@ Results go to stdout, progress and messages to stderr. Heavy imports happen insi
 """
 
 from collections.abc import Sequence
-from functools import partial
+from functools import cache, partial
 from typing import NoReturn
 
 from survey.commands.adjusting import adjust, report
@@ -71,6 +71,7 @@ def program() -> NoReturn:
     run_as_program(main)
 
 
+@cache
 def build_parser() -> Parser:
     """All commands and flags."""
     flags = {

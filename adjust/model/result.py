@@ -165,13 +165,19 @@ class OtherArrays:
         return out
 
 
+_KEPT = 10_000  # some 10 MB
+
+
 class Residuals(Sequence[ObservationResidual]):
-    """Observations of which the ``arrays`` (M) are known; each is made when it is asked for, the first ones once."""
+    """Observations of which the ``arrays`` (M) are known; each is made when it is asked for, the first ones once.
+
+    n_kept: so many first ones at least.
+    """
 
     def __init__(self, arrays: OtherArrays, named: Callable[[int], Named], n_kept: int) -> None:
         self.arrays, self.named = arrays, named
         self._ptr = np.concatenate([[0], np.cumsum(arrays.n_components)])
-        self._made: list[ObservationResidual | None] = [None] * n_kept
+        self._made: list[ObservationResidual | None] = [None] * max(n_kept, min(len(self), _KEPT))
 
     def __len__(self) -> int:
         return len(self.arrays.used)

@@ -8,7 +8,7 @@ epochs, another shape of its target. What the residuals say of these is asked in
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy import sparse
@@ -73,11 +73,23 @@ class CondensedSystem:
             out[0, place[: middle - begin]], out[1, place[middle - begin :]] = A.data[begin:middle], A.data[middle:end]
             return columns, out
         b = int(np.searchsorted(images.ptr, at, side="right")) - 1
-        which, point = np.array([b]), at - int(images.ptr[b])
-        local = images.rows(which)[0, 2 * point : 2 * point + 2, :-1]
-        columns = np.concatenate([self.key_columns[key] for key in images.keys[b]])
-        kept = columns >= 0
-        return columns[kept], (local @ images.local_from_keys(which)[0])[:, kept]
+        columns, rows = self._rows_of(b)
+        first = 2 * (at - int(images.ptr[b]))
+        return columns, rows[first : first + 2]
+
+    @cached_property
+    def _rows_of(self) -> Callable[[int], tuple[IntArray, FloatArray]]:
+        """Columns (k,) and rows (2 n, k) of the n points of an image block; the last blocks are kept."""
+        images = self.system.precision.graph.images
+
+        @lru_cache(64)  # the worst points of a survey are in few of its images
+        def of(b: int) -> tuple[IntArray, FloatArray]:
+            columns = np.concatenate([self.key_columns[key] for key in images.keys[b]])
+            kept, which = columns >= 0, np.array([b])
+            rows = images.rows(which)[0, :, :-1] @ images.local_from_keys(which)[0]
+            return columns[kept], np.asarray(rows[:, kept])
+
+        return of
 
     def has_own_poses(self, kind: str, name: str, blocks: IntArray) -> bool:
         """Whether a camera's or target's image blocks have poses of its own, one an epoch, which nothing else touches.

@@ -147,7 +147,7 @@ def make_lab(seed: int, size: LabSize = _DEFAULT) -> SimulatedLab:
 
 
 def furnished_lab(seed: int, poses: tuple[LabPose, ...], noise_seed: int = 0) -> SimulatedLab:
-    """The laboratory of that seed, its positions known already (looking for them takes seconds)."""
+    """The laboratory of that seed, its positions known already."""
     draft = _room(seed, beacons=any(p.exposure_us == BEACON_EXPOSURE_US for p in poses))
     _halve_images(draft)
     return SimulatedLab(draft, seed, poses, noise_seed)

@@ -49,7 +49,7 @@ def _images_are(folder: Path, recorded: Mapping[str, Mapping[str, object]]) -> b
 
 def fingerprint(folder: Path) -> str:
     """One hash of all that decides how a folder fails: definition, tables, names of images, versions; "" for none."""
-    digest = hashlib.sha256(str(installed_versions()).encode())
+    digest = hashlib.sha256(str(dict(installed_versions())).encode())
     try:
         own = sorted(p for p in folder.iterdir() if p.suffix in (".toml", ".csv", ".parquet") and p.is_file())
         for path in (*own, *(folder / name for name in sorted(tables_in(folder)))):

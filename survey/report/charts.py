@@ -157,12 +157,11 @@ def heat_map(m: CorrelationMatrix) -> Markup:
     size = n * cell
     parts = [d.rect(left, 4, size, size, d.PAPER, f' stroke="{d.FAINT}"')]
     # one path per shade keeps a matrix of a hundred rows small
+    across = [f"M{left + j * cell:.1f} " for j in range(n)]
+    down = [f"{4 + i * cell:.1f}h{cell:.1f}v{cell:.1f}h-{cell:.1f}z" for i in range(n)]
     shade = np.clip(np.round(20.0 * m.matrix), -20, 20).astype(int)
     for value in np.unique(shade[shade != 0]).tolist():
-        cells = "".join(
-            f"M{left + j * cell:.1f} {4 + i * cell:.1f}h{cell:.1f}v{cell:.1f}h-{cell:.1f}z"
-            for i, j in np.argwhere(shade == value).tolist()
-        )
+        cells = "".join(across[j] + down[i] for i, j in np.argwhere(shade == value).tolist())
         colour = d.BLUE if value > 0 else d.RED
         parts.append(f'<path d="{cells}" fill="{colour}" fill-opacity="{abs(value) / 20.0:.2f}"/>')
     for at in (*m.starts, n):

@@ -27,6 +27,9 @@ DARK = {
 """What each colour becomes where the reader's screen is dark: attributes of pictures stay those of paper."""
 
 
+_ARROW = "M%.1f %.1fl%.1f %.1f"
+
+
 def svg(width: float, height: float, parts: Iterable[str], title: str) -> Markup:
     """A picture with its accessible title."""
     return Markup(
@@ -64,16 +67,22 @@ def rect(x: float, y: float, w: float, h: float, fill: str, more: str = "") -> s
     return f'<rect x="{x:.1f}" y="{y:.1f}" width="{w:.1f}" height="{h:.1f}" fill="{fill}"{more}/>'
 
 
+def _each(form: str, *columns: FloatArray) -> str:
+    """A form filled with each row of numbers of the columns (n, k)."""
+    rows = np.column_stack(columns)
+    return form * len(rows) % tuple(rows.ravel().tolist())
+
+
 def polygon(xy: FloatArray, fill: str, stroke: str, width: float = 1, more: str = "") -> str:
     """A closed outline."""
-    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in xy)
+    points = _each(" %.1f,%.1f", xy)[1:]
     look = f'fill="{fill}" stroke="{stroke}" stroke-width="{width:g}" stroke-linejoin="round"'
     return f'<polygon points="{points}" {look}{more}/>'
 
 
 def polyline(xy: FloatArray, stroke: str, width: float = 1, more: str = "") -> str:
     """An open line."""
-    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in xy)
+    points = _each(" %.1f,%.1f", xy)[1:]
     return f'<polyline points="{points}" fill="none" stroke="{stroke}" stroke-width="{width:g}"{more}/>'
 
 
@@ -102,15 +111,15 @@ def arrows(start: FloatArray, end: FloatArray, colour: str, width: float, head: 
     """Many arrows (n, 2) as one path; ``head`` is the length of the barbs, 0 for none."""
     if not len(start):
         return ""
-    d = [f"M{a[0]:.1f} {a[1]:.1f}l{b[0] - a[0]:.1f} {b[1] - a[1]:.1f}" for a, b in zip(start, end, strict=True)]
+    d = _each(_ARROW, start, end - start)
     if head > 0.0:
         delta = end - start
         angle = np.arctan2(delta[:, 1], delta[:, 0])
         size = np.minimum(head, 0.45 * np.hypot(delta[:, 0], delta[:, 1]))
         for side in (2.65, -2.65):
             barb = size[:, None] * np.column_stack([np.cos(angle + side), np.sin(angle + side)])
-            d += [f"M{b[0]:.1f} {b[1]:.1f}l{x[0]:.1f} {x[1]:.1f}" for b, x in zip(end, barb, strict=True)]
-    return f'<path d="{"".join(d)}" fill="none" stroke="{colour}" stroke-width="{width:g}" stroke-linecap="round"/>'
+            d += _each(_ARROW, end, barb)
+    return f'<path d="{d}" fill="none" stroke="{colour}" stroke-width="{width:g}" stroke-linecap="round"/>'
 
 
 def round_below(value: float) -> float:

@@ -15,20 +15,21 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from survey.report.drawing import DARK
-from survey.report.language import TURNING, esc, known, language, localised, t, unturned
+from survey.report.language import TURNING, esc, known, language, localised, plain_text, t, unturned
 from survey.report.modules import looks
 
 MISSING = "–"
 _MOST_IN_FULL = 1e9  # a larger number of unknown size has a power of ten
 MINUS = "−"
 _HERE = Path(__file__).parent
+_PLACE = Markup("%s")
 
 
 @cache
 def _environment() -> Environment:
     made = Environment(
         loader=FileSystemLoader(_HERE / "templates"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-        lstrip_blocks=True, finalize=esc,
+        lstrip_blocks=True, finalize=plain_text,
     )  # fmt: skip
     made.globals |= {"t": t, "language": language}
     made.globals["parts"] = made.get_template("parts.html").module
@@ -45,9 +46,20 @@ def part(name: str, *values: object, of: str = "parts.html") -> Markup:
     return Markup(getattr(_module(of), name)(*values))
 
 
+@cache
+def _form(name: str, *values: object) -> str:
+    """A piece that is there many times, with the :data:`_PLACE` of what differs; no value is data."""
+    return str(part(name, *values))
+
+
+def _filled(form: str, *values: object) -> Markup:
+    """A form with what differs; what is no markup is escaped."""
+    return Markup(form % tuple(map(esc, values)))
+
+
 def element(tag: str, body: object, kind: str = "") -> Markup:
-    """``body`` as an element, of class ``kind`` where one is given."""
-    return part("element", tag, body, kind)
+    """``body`` as an element, of class ``kind`` where one is given; neither tag nor kind is data."""
+    return _filled(_form("element", tag, _PLACE, kind), body)
 
 
 def joined(pieces: Iterable[object], between: object = "") -> Markup:
@@ -127,10 +139,14 @@ def with_sigma(value: float | None, sigma: float | None, typical: float | None =
     """A cell of two lines: the value, and its sigma below; ``typical`` sets the decimals of a column or row."""
     decimals = decimals_for(sigma)
     if decimals is None:
-        return part("below", value_text(value, typical), t("held"))
+        return _below(value_text(value, typical), t("held"))
     decimals = max(decimals_for(typical) or 0, 0 if typical else decimals)
     below = fixed(sigma, decimals) if sigma and sigma >= 2 * 10.0**-decimals else sigma_text(sigma)
-    return part("below", fixed(value, decimals), f"± {below}")
+    return _below(fixed(value, decimals), f"± {below}")
+
+
+def _below(value: str, said: str) -> Markup:
+    return _filled(_form("below", _PLACE, _PLACE), value, said)
 
 
 def count(value: int) -> str:
@@ -168,9 +184,8 @@ def table(
 ) -> Markup:
     """A table with columns as of :func:`heads`; a heading that is data is escaped first."""
     named = heads(columns)
-    sides = [Markup(side) for _, side in named]
-    sided = (zip(sides, row, strict=True) for row in rows)
-    return part("table", named, zip_longest(row_classes, sided, fillvalue=""), caption)
+    cells = _form("cells", tuple(side for _, side in named), _PLACE)
+    return part("table", named, zip_longest(row_classes, (_filled(cells, *row) for row in rows), fillvalue=""), caption)
 
 
 def section(anchor: str, title: str, body: Markup | str, note: str = "") -> Markup:

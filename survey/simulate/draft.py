@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cache
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ from gtsam import Pose3
 
 from adjust.model.observations import ImageBlock, TableReading
 from adjust.model.survey import Camera, FloatArray, LensParameter, Point, PoseParameter, Station, Survey, Table, Target
+from adjust.spatial.averaging import wrapped
 from adjust.spatial.rigid import rigid
 from survey.project.targets import TargetKind
 from survey.simulate.scene import BROWN, Scene, Truth, rotation_about, transform
@@ -18,6 +20,8 @@ HELD = PoseParameter(Pose3(), "held")
 FREE_LENS = ("fx", "fy", "u0", "v0", "k1", "k2", "p1", "p2")
 IMAGE_SIZE = (1280, 1024)
 ARCSEC = np.pi / 180.0 / 3600.0
+_HYPOT, _ACOS, _ATAN2 = (np.vectorize(f, otypes=[float]) for f in (math.hypot, math.acos, math.atan2))
+"""Not NumPy's own, whose last digit depends on the processor: equal seeds give equal surveys."""
 
 
 @dataclass(frozen=True)
@@ -90,14 +94,15 @@ class Draft:
         self.targets.append(Target(target_id, ids, x, carrier_from_target=parameter))
 
     def outline_visible(
-        self, shot: Shot, target_id: str, outline_in_target: FloatArray, margin_px: float, scene: Scene | None = None
+        self, shot: Shot, target_id: str, outline_in_target: FloatArray, margin_px: float
     ) -> bool:
-        """Whether the whole outline (n, 3) m of a target lies in the image; of a scene that has all but the truth."""
-        scene = scene or self.scene()
+        """Whether the whole outline (n, 3) m of a target lies in the image."""
+        scene = self.scene()
         x = transform(scene.world_from_target(target_id, shot.epoch_id), outline_in_target)
         return bool(scene.inside(shot.camera_id, scene.project(shot.camera_id, shot.epoch_id, x), margin_px).all())
 
 
+@cache
 def outline(kind: TargetKind, border_m: float) -> FloatArray:
     """Points (16, 3) m around a flat target, ``border_m`` outside its outermost points."""
     x = kind.points()[1]
@@ -109,6 +114,7 @@ def outline(kind: TargetKind, border_m: float) -> FloatArray:
     return np.column_stack([flat, np.zeros(len(flat))])
 
 
+@cache
 def centre(kind: TargetKind) -> FloatArray:
     """Middle of a target's points, (3,) m."""
     x = kind.points()[1]
@@ -130,22 +136,29 @@ def rotation_vector(degrees: FloatArray) -> FloatArray:
     return matrix
 
 
-def pixel_in_cell(number: int, rng: np.random.Generator) -> FloatArray:
-    """A random place (2,) px in one of nine cells of the image, so that a series of images fills the whole frame."""
+def pixel_in_cell(number: int, place_in_cell: FloatArray) -> FloatArray:
+    """Places (..., 2) px in one of nine cells of the image, so that a series of images fills the whole frame.
+
+    place_in_cell: (..., 2), from 0 to 1.
+    """
     order = (4, 0, 8, 2, 6, 1, 7, 3, 5)[number % 9]
     cell = np.array([order % 3, order // 3], dtype=float)
-    place: FloatArray = (cell + rng.uniform(0.0, 1.0, 2)) / 3.0 * np.array(IMAGE_SIZE)
+    place: FloatArray = (cell + place_in_cell) / 3.0 * np.array(IMAGE_SIZE)
     return place
 
 
 def ray(truth: Truth, camera_id: str, pixel: FloatArray) -> FloatArray:
-    """Direction (3,) in the camera of an image point, distortion left aside."""
+    """Directions (..., 3) in the camera of image points (..., 2), distortion left aside."""
     lens = truth["lens", camera_id]
     if isinstance(lens, Pose3):
         raise TypeError("a lens is not a pose")
-    fx, fy, _, u0, v0 = lens[:5]
-    direction = np.array([(pixel[0] - u0) / fx, (pixel[1] - v0) / fy, 1.0])
-    unit: FloatArray = direction / np.linalg.norm(direction)
+    direction = np.ones((*pixel.shape[:-1], 3))
+    direction[..., :2] = (pixel - lens[3:5]) / lens[:2]  # of fx, fy, skew, u0, v0
+    return _unit(direction)
+
+
+def _unit(direction: FloatArray) -> FloatArray:
+    unit: FloatArray = direction / np.sqrt(np.vecdot(direction, direction))[..., None]
     return unit
 
 
@@ -159,27 +172,21 @@ def hand_pose(
     tilted = rotation_vector(tilt * np.array([np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth)), 0.0]))
     roll = rotation_about("z", np.radians(rng.choice([0.0, 0.0, 90.0, 180.0]) + rng.uniform(-25.0, 25.0)))[:3, :3]
     rotation = tilted @ roll
-    place = ray(draft.truth, camera_id, pixel_in_cell(number, rng)) * distance
+    place = ray(draft.truth, camera_id, pixel_in_cell(number, rng.uniform(0.0, 1.0, 2))) * distance
     return rigid(rotation, place - rotation @ centre(kind))
 
 
-def table_angles(direction_in_mount: FloatArray, direction_in_table: FloatArray) -> list[FloatArray]:
-    """Both pairs of angles (2,) rad that turn a direction of the mount into one of an ideal table, axes x then z.
+def table_angles(direction_in_mount: FloatArray, direction_in_table: FloatArray, face: int) -> FloatArray:
+    """Angles (..., 2) rad that turn directions (..., 3) of the mount into those of an ideal table, axes x then z.
 
-    ``Rx(a1) Rz(a2) d = b``: the x component fixes a2 (two faces, as of a theodolite), the other two then a1.
+    ``Rx(a1) Rz(a2) d = b``: the x component fixes a2 (two faces, 0 and 1, as of a theodolite), the other two then a1.
+    NaN where no angles do.
     """
-    d = (direction_in_mount / np.linalg.norm(direction_in_mount)).tolist()
-    b = (direction_in_table / np.linalg.norm(direction_in_table)).tolist()
-    reach = math.hypot(d[0], d[1])
-    if reach < abs(b[0]):
-        return []
-    solutions = []
-    for face in (1.0, -1.0):
-        a2 = face * math.acos(b[0] / reach) - math.atan2(d[1], d[0])
-        y = math.sin(a2) * d[0] + math.cos(a2) * d[1]
-        a1 = math.atan2(b[2], b[1]) - math.atan2(d[2], y)
-        solutions.append(np.array([(a + math.pi) % (2.0 * math.pi) - math.pi for a in (a1, a2)]))
-    return solutions
+    d, b = np.moveaxis(_unit(direction_in_mount), -1, 0), np.moveaxis(_unit(direction_in_table), -1, 0)
+    reach = _HYPOT(d[0], d[1])
+    a2 = (1.0 - 2.0 * face) * _ACOS(np.where(np.abs(b[0]) <= reach, b[0] / reach, np.nan)) - _ATAN2(d[1], d[0])
+    a1 = _ATAN2(b[2], b[1]) - _ATAN2(d[2], np.sin(a2) * d[0] + np.cos(a2) * d[1])
+    return wrapped(np.stack([a1, a2], axis=-1))
 
 
 def image_blocks(scene: Scene, shots: Sequence[Shot], sigma_px: float, margin_px: float = 5.0) -> list[ImageBlock]:

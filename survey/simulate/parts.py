@@ -6,13 +6,13 @@ out in the frame of the table: outer axis x level, inner axis z upright when bot
 obliquely above the table. World is the frame of the board.
 """
 
-from collections.abc import Iterator
+from copy import deepcopy
 from typing import Literal
 
 import numpy as np
 from gtsam import Pose3
 
-from adjust.model.survey import FloatArray, Point, Station, Table
+from adjust.model.survey import BoolArray, FloatArray, Point, Station, Table
 from adjust.spatial.averaging import wrapped
 from adjust.spatial.rigid import rigid
 from survey.project.targets import Charuco, Checkerboard, MarkerGrid, TargetKind
@@ -37,7 +37,8 @@ CHARUCO = Charuco(9, 6, 0.030, 0.022, "DICT_5X5_100")
 UP = np.array([0.0, 0.0, 1.0])
 WALL_X, WALL_Y, CEILING = 2.5, 2.0, 1.8
 _BOARD_BORDER = 0.034  # squares around the inner corners, and some white
-_TRIALS = 4000
+_MARGIN_PX = 8.0
+_TRIALS, _RUN = 4000, 100
 
 _HEAD_LENSES = {
     "X": {"fx": 1599.26, "fy": 1599.93, "u0": 632.62, "v0": 522.18, "k1": -0.1301, "k2": 0.2870, "p1": -4.0e-4,
@@ -107,42 +108,59 @@ def _board_in_table() -> FloatArray:
 
 def shoot_board_from_table(draft: Draft, camera_id: str, n: int) -> None:
     """``n`` epochs of the table with the whole board in one camera, over its whole frame and on both faces."""
-    border, scene, taken = outline(BOARD, _BOARD_BORDER), draft.scene(), 0
-    table_from_board = np.linalg.inv(world_from_room(draft)).astype(np.float64)
-    board_in_table = transform(table_from_board, centre(BOARD)[None])[0]
-    for trial in range(_TRIALS):
-        if taken == n:
-            return
-        pixel = pixel_in_cell(taken + trial // 100, draft.rng)
-        angles = _aimed(draft, scene, camera_id, pixel, board_in_table, face=taken % 2)
-        if angles is None:
-            continue
-        epoch_id = add_table_epoch(draft, "t", angles)
-        shot = Shot(camera_id, epoch_id, ("board",))
-        if draft.outline_visible(shot, "board", border, 8.0, scene):
-            draft.shots.append(shot)
-            taken += 1
-        else:
-            drop_table_epoch(draft, epoch_id)
-    raise ValueError(f"no room for {n} images of the board in camera {camera_id}")
+    scene, trial = draft.scene(), 0
+    places = deepcopy(draft.rng).uniform(0.0, 1.0, (_TRIALS, 2))
+    for number in range(n):
+        angles, trial = _next_whole(scene, camera_id, number, places, trial)
+        draft.shots.append(Shot(camera_id, add_table_epoch(draft, "t", angles), ("board",)))
+    draft.rng.uniform(0.0, 1.0, (trial, 2))  # those that were needed
 
 
-def _aimed(
-    draft: Draft, scene: Scene, camera_id: str, pixel: FloatArray, board_in_table: FloatArray, face: int
-) -> FloatArray | None:
-    """Angles (2,) that bring the board's middle near a pixel; None where the table cannot.
+def _next_whole(
+    scene: Scene, camera_id: str, number: int, places: FloatArray, trial: int
+) -> tuple[FloatArray, int]:
+    """Angles (2,) of the first trial from ``trial`` on that shows the whole board, and the trial after it.
+
+    places: (_TRIALS, 2) within the cell aimed at, which is the next one after a hundred in vain.
+    """
+    while trial < _TRIALS:
+        run = trial // _RUN
+        pixels = pixel_in_cell(number + run, places[trial : _RUN * (run + 1)])
+        angles = _aimed(scene, camera_id, pixels, face=number % 2)
+        seen = np.flatnonzero(_shows_board(scene, camera_id, angles))
+        if len(seen):
+            return angles[seen[0]], trial + int(seen[0]) + 1
+        trial = _RUN * (run + 1)
+    raise ValueError(f"no room for another image of the board in camera {camera_id}")
+
+
+def _aimed(scene: Scene, camera_id: str, pixels: FloatArray, face: int) -> FloatArray:
+    """Angles (n, 2) that bring the board's middle near pixels (n, 2); NaN where the table cannot.
 
     The camera stands off the table's centre and moves as it turns, hence the few rounds.
     """
-    pose = draft.truth["station_from_camera", camera_id]
-    mount_from_camera = pose.matrix() if isinstance(pose, Pose3) else np.eye(4)
-    wanted = mount_from_camera[:3, :3] @ ray(draft.truth, camera_id, pixel)
-    solutions = table_angles(wanted, board_in_table)
+    mount_from_camera = scene.pose("station_from_camera", camera_id)
+    table_from_world = np.linalg.inv(scene.pose("world_from_table", "turntable")).astype(np.float64)
+    board = transform(table_from_world, centre(BOARD)[None])
+    wanted = (mount_from_camera[:3, :3] @ ray(scene.truth, camera_id, pixels)[..., None])[..., 0]
+    angles = table_angles(wanted, board, face)
     for _ in range(3):
-        if solutions:
-            place = (scene.table_from_mount("turntable", solutions[face]) @ mount_from_camera)[:3, 3]
-            solutions = table_angles(wanted, board_in_table - place)
-    return solutions[face] if solutions else None
+        place = (scene.table_from_mount("turntable", angles) @ mount_from_camera)[:, :3, 3]
+        angles = table_angles(wanted, board - place, face)
+    return angles
+
+
+def _shows_board(scene: Scene, camera_id: str, angles: FloatArray) -> BoolArray:
+    """(n,) whether the whole board is in the image with the table at angles (n, 2)."""
+    pose = scene.world_from_turned("head", angles) @ scene.pose("station_from_camera", camera_id)
+    border = transform(scene.world_from_target("board"), outline(BOARD, _BOARD_BORDER))
+    whole = np.ones(len(angles), bool)
+    for points in (border[::4], border):  # the corners first: of most trials one is outside
+        left = np.flatnonzero(whole)
+        x = (points - pose[left, None, :3, 3]) @ pose[left, :3, :3]
+        uv = scene.pixels(camera_id, "", x.reshape(-1, 3)).reshape(*x.shape[:2], 2)
+        whole[left] = scene.inside(camera_id, uv, _MARGIN_PX).all(axis=1)
+    return whole
 
 
 def add_table_epoch(draft: Draft, letter: str, angles: FloatArray) -> str:
@@ -154,46 +172,40 @@ def add_table_epoch(draft: Draft, letter: str, angles: FloatArray) -> str:
     return epoch_id
 
 
-def drop_table_epoch(draft: Draft, epoch_id: str) -> None:
-    """Forget the last position of the table."""
-    draft.table_epochs.remove(epoch_id)
-    del draft.truth["table_angles", "turntable", epoch_id]
-
-
 def shoot_board_by_hand(draft: Draft, camera_id: str, n: int) -> None:
     """``n`` epochs with the head taken off the table and held before the board."""
     camera = draft.truth["station_from_camera", camera_id]
     camera_from_station = np.linalg.inv(camera.matrix()) if isinstance(camera, Pose3) else np.eye(4)
     for number in range(n):
         shot = Shot(camera_id, f"h{camera_id}{number + 1:02d}", ("board",))
-        for camera_from_board in _by_hand(draft, shot, number, (0.45, 1.0), _BOARD_BORDER):
-            pose = Pose3(np.linalg.inv(camera_from_board) @ camera_from_station)
-            draft.truth["world_from_station", "head", shot.epoch_id] = pose
+        camera_from_board = _by_hand(draft, shot, number, (0.45, 1.0), _BOARD_BORDER)
+        pose = Pose3(np.linalg.inv(camera_from_board) @ camera_from_station)
+        draft.truth["world_from_station", "head", shot.epoch_id] = pose
 
 
 def shoot_target_by_hand(
     draft: Draft, camera_id: str, target_id: str, epochs: list[str], distance_m: tuple[float, float], border_m: float
 ) -> None:
     """A target held before a camera of a fixed station, once per epoch."""
+    world_from_camera = draft.scene().world_from_camera(camera_id)
     for number, epoch_id in enumerate(epochs):
-        shot = Shot(camera_id, epoch_id, (target_id,))
-        world_from_camera = draft.scene().world_from_camera(camera_id)
-        for camera_from_target in _by_hand(draft, shot, number, distance_m, border_m):
-            draft.truth["carrier_from_target", target_id, epoch_id] = Pose3(world_from_camera @ camera_from_target)
+        camera_from_target = _by_hand(draft, Shot(camera_id, epoch_id, (target_id,)), number, distance_m, border_m)
+        draft.truth["carrier_from_target", target_id, epoch_id] = Pose3(world_from_camera @ camera_from_target)
 
 
 def _by_hand(
     draft: Draft, shot: Shot, number: int, distance_m: tuple[float, float], border_m: float
-) -> Iterator[FloatArray]:
-    """camera_from_target (4, 4) to be made true, until the image shows the whole target; it is taken then."""
+) -> FloatArray:
+    """camera_from_target (4, 4) with which the image, which is taken, shows the whole target."""
     (target_id,) = shot.target_ids
-    kind = draft.kinds[target_id]
+    kind, scene = draft.kinds[target_id], draft.scene()
     border = outline(kind, border_m)
     for _ in range(_TRIALS):
-        yield hand_pose(draft, shot.camera_id, kind, number, distance_m)
-        if draft.outline_visible(shot, target_id, border, 8.0):
+        camera_from_target = hand_pose(draft, shot.camera_id, kind, number, distance_m)
+        uv = scene.pixels(shot.camera_id, shot.epoch_id, transform(camera_from_target, border))
+        if scene.inside(shot.camera_id, uv, _MARGIN_PX).all():
             draft.shots.append(shot)
-            return
+            return camera_from_target
     raise ValueError(f"no pose of {target_id} is fully in camera {shot.camera_id}")
 
 

@@ -4,10 +4,10 @@ Everything here is plain matrix lines and OpenCV's projection, on purpose not th
 there cannot hide by being made twice.
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, reduce
+from typing import Any
 
 import cv2
 import numpy as np
@@ -29,22 +29,30 @@ _UNIT: FloatArray = np.eye(4)
 _WIDEST_TANGENT = 1.2  # beyond, a Brown polynomial may fold points back into the image
 
 
-def rotation_about(axis: str, angle: float) -> FloatArray:
-    """(4, 4) right-handed turn by ``angle`` rad about a named axis."""
+def rotation_about(axis: str, angle: float | FloatArray) -> FloatArray:
+    """(4, 4) right-handed turn by ``angle`` rad about a named axis; (n, 4, 4) by (n,) angles."""
     i = _AXIS_NUMBER[axis]
     j, k = (i + 1) % 3, (i + 2) % 3
-    matrix = _UNIT.copy()
-    matrix[j, j] = matrix[k, k] = math.cos(angle)
-    matrix[k, j] = math.sin(angle)
-    matrix[j, k] = -matrix[k, j]
+    matrix, sine = _units(angle), np.sin(angle)
+    turned = matrix.T  # by column and row, whether of one or of many
+    turned[j, j] = turned[k, k] = np.cos(angle)
+    turned[j, k], turned[k, j] = sine, -sine
     return matrix
 
 
-def shift_along(axis: str, distance: float) -> FloatArray:
-    """(4, 4) shift by ``distance`` m along a named axis."""
-    matrix = _UNIT.copy()
-    matrix[_AXIS_NUMBER[axis], 3] = distance
+def shift_along(axis: str, distance: float | FloatArray) -> FloatArray:
+    """(4, 4) shift by ``distance`` m along a named axis; (n, 4, 4) by (n,) distances."""
+    matrix = _units(distance)
+    matrix.T[3, _AXIS_NUMBER[axis]] = distance
     return matrix
+
+
+def _units(each: float | FloatArray) -> FloatArray:
+    if isinstance(each, float):  # one
+        return _UNIT.copy()
+    units = np.empty((*np.shape(each), 4, 4))
+    units[...] = _UNIT
+    return units
 
 
 def transform(matrix: FloatArray, x: FloatArray) -> FloatArray:
@@ -70,12 +78,14 @@ def _warped(target: Target, warp: FloatArray, temperature: float) -> FloatArray:
     return x
 
 
-def _moving(axis: str, number: int, geometry: Mapping[str, float], angle: float) -> FloatArray:
-    """(4, 4): what the harmonics of an axis add to its turn by an angle, in the words of ``adjust.model.tables``."""
-    error, along, whirl = 0.0, 0.0, {"radial": 0.0j, "tilt": 0.0j}
+def _moving(axis: str, number: int, geometry: Mapping[str, float], angle: FloatArray) -> FloatArray:
+    """(..., 4, 4): what the harmonics of an axis add to its turn by angles, in the words of ``adjust.model.tables``."""
     waves = [name for name in geometry if name.startswith(_WAVES[number])]
     if not waves:
         return _UNIT
+    error: float | FloatArray = 0.0
+    along: float | FloatArray = 0.0
+    whirl: dict[str, Any] = {"radial": 0.0j, "tilt": 0.0j}  # of one angle or of many
     for name in waves:
         (kind, *rest), value = name.split("_"), geometry[name]
         order = int(rest[2].replace("m", "-").replace("p", ""))
@@ -107,7 +117,8 @@ class Scene:
         """Where things are between the epochs."""
         return Courses(self.survey, self.truth)
 
-    def _pose(self, *name: str, late: Late = 0.0) -> FloatArray:
+    def pose(self, *name: str, late: Late = 0.0) -> FloatArray:
+        """The true value (4, 4) of a pose, or where it is a time after its epoch."""
         if len(name) == 3 and np.any(late):
             return self.courses.pose(name, late)
         pose = self.truth[name]
@@ -124,16 +135,15 @@ class Scene:
         return value
 
     def table_from_mount(self, table_id: str, angles: FloatArray) -> FloatArray:
-        """(4, 4): outer axis, common perpendicular, inner axis, as ``adjust.model.survey.Table`` writes the chain."""
-        if angles.ndim == 2:
-            return np.array([self.table_from_mount(table_id, a) for a in angles])
+        """(4, 4) at angles (k,), (n, 4, 4) at (n, k): the chain as ``adjust.model.survey.Table`` writes it."""
         table = self.survey.tables_by_id[table_id]
         g = dict(zip(table.geometry.names, self.vector("table_geometry", table_id).tolist(), strict=True))
         if len(table.axes) == 1:
-            return _moving(table.axes[0], 1, g, angles[0]) @ rotation_about(table.axes[0], angles[0] + g["zero_1"])
+            a, axis = angles[..., 0], table.axes[0]
+            return _moving(axis, 1, g, a) @ rotation_about(axis, a + g["zero_1"])
         outer, inner = table.axes
         third = next(axis for axis in "xyz" if axis not in (outer, inner))
-        a, b = angles.tolist()
+        a, b = angles[..., 0], angles[..., 1]
         chain = (
             _moving(outer, 1, g, a), rotation_about(outer, a + g["zero_1"]), shift_along(third, g["axis_offset"]),
             rotation_about(third, g["non_orthogonality"]), _moving(inner, 2, g, b),
@@ -145,17 +155,19 @@ class Scene:
         """(4, 4) at an epoch, or a time after it: by the table where it was read then, else the station's own pose."""
         station = self.survey.stations_by_id[station_id]
         if station.motion == "fixed":
-            return self._pose("world_from_station", station_id)
+            return self.pose("world_from_station", station_id)
         if epoch_id is None:
             raise ValueError(f"station {station_id} moves; an epoch is needed")
         reading = ("table_angles", str(station.table_id), epoch_id)
         if station.motion == "epoch" or reading not in self.truth:
-            return self._pose("world_from_station", station_id, epoch_id, late=late)
-        return (
-            self._pose("world_from_table", reading[1])
-            @ self.table_from_mount(reading[1], self.angles(reading[1], epoch_id, late))
-            @ self._pose("mount_from_station", station_id)
-        )
+            return self.pose("world_from_station", station_id, epoch_id, late=late)
+        return self.world_from_turned(station_id, self.angles(reading[1], epoch_id, late))
+
+    def world_from_turned(self, station_id: str, angles: FloatArray) -> FloatArray:
+        """(4, 4) of a station whose table stands at angles (k,) rad, (n, 4, 4) at (n, k)."""
+        table_id = str(self.survey.stations_by_id[station_id].table_id)
+        world_from_mount = self.pose("world_from_table", table_id) @ self.table_from_mount(table_id, angles)
+        return np.asarray(world_from_mount @ self.pose("mount_from_station", station_id))
 
     def angles(self, table_id: str, epoch_id: str, late: Late = 0.0) -> FloatArray:
         """(k,) rad of a table at an epoch, or a time after it."""
@@ -165,7 +177,7 @@ class Scene:
     def world_from_camera(self, camera_id: str, epoch_id: str | None = None, late: Late = 0.0) -> FloatArray:
         """(4, 4) of a camera at an epoch, or a time after it."""
         station_id = self.survey.cameras_by_id[camera_id].station_id
-        return self.world_from_station(station_id, epoch_id, late) @ self._pose("station_from_camera", camera_id)
+        return self.world_from_station(station_id, epoch_id, late) @ self.pose("station_from_camera", camera_id)
 
     def world_from_target(self, target_id: str, epoch_id: str | None = None, late: Late = 0.0) -> FloatArray:
         """(4, 4) of a target at an epoch, or a time after it."""
@@ -175,7 +187,7 @@ class Scene:
             name = (*name, str(epoch_id))
         on = target.station_id
         carrier = np.eye(4) if on is None else self.world_from_station(on, epoch_id, late)
-        return carrier @ self._pose(*name, late=late)
+        return carrier @ self.pose(*name, late=late)
 
     def target_points(
         self, target_id: str, epoch_id: str | None = None, late: Late = 0.0, points: IntArray | slice = slice(None)
@@ -226,8 +238,11 @@ class Scene:
 
     def project(self, camera_id: str, epoch_id: str, x_in_world: FloatArray, late: Late = 0.0) -> FloatArray:
         """Image coordinates (n, 2) px by OpenCV, NaN where a point is behind the camera or far outside its field."""
-        world_from_camera = self.world_from_camera(camera_id, epoch_id, late)
-        x = transform(np.linalg.inv(world_from_camera).astype(np.float64), x_in_world)
+        camera_from_world = np.linalg.inv(self.world_from_camera(camera_id, epoch_id, late)).astype(np.float64)
+        return self.pixels(camera_id, epoch_id, transform(camera_from_world, x_in_world))
+
+    def pixels(self, camera_id: str, epoch_id: str, x: FloatArray) -> FloatArray:
+        """The same of points (n, 3) m in the camera."""
         ahead = (x[:, 2] > 1e-3) & (np.hypot(x[:, 0], x[:, 1]) < _WIDEST_TANGENT * x[:, 2])
         uv = np.full((len(x), 2), np.nan)
         if not ahead.any():
@@ -252,10 +267,10 @@ class Scene:
         return np.asarray(scale * (uv + 0.5 - edges) - 0.5)
 
     def inside(self, camera_id: str, uv: FloatArray, margin_px: float) -> BoolArray:
-        """Which of the image points (n, 2) lie in the image, at least ``margin_px`` from its border."""
+        """Which of the image points (..., 2) lie in the image, at least ``margin_px`` from its border."""
         size = np.array(self.survey.cameras_by_id[camera_id].image_size, dtype=float)
         with np.errstate(invalid="ignore"):
-            within: BoolArray = np.all((uv >= margin_px) & (uv <= size - 1.0 - margin_px), axis=1)
+            within: BoolArray = np.all((uv >= margin_px) & (uv <= size - 1.0 - margin_px), axis=-1)
         return within
 
     def world_from_frame(self, frame: FrameRef, late: Late = 0.0) -> FloatArray:
@@ -270,8 +285,8 @@ class Scene:
             return self.world_from_target(frame.frame_id, frame.epoch_id)
         if frame.kind == "mount":
             angles = self.vector("table_angles", frame.frame_id, str(frame.epoch_id))
-            return self._pose("world_from_table", frame.frame_id) @ self.table_from_mount(frame.frame_id, angles)
-        return self._pose("world_from_table", frame.frame_id)
+            return self.pose("world_from_table", frame.frame_id) @ self.table_from_mount(frame.frame_id, angles)
+        return self.pose("world_from_table", frame.frame_id)
 
     def position(self, ref: PositionRef) -> FloatArray:
         """World coordinates (3,) m of a position."""

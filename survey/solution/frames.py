@@ -9,10 +9,13 @@ from adjust.model.result import Adjustment, ParameterName, adjusted_numbers, adj
 from adjust.model.survey import FloatArray, PoseParameter, Station, Table, Target
 
 
-def table_from_mount(axes: tuple[str, ...], geometry: dict[str, float], angles: FloatArray) -> Pose3:
-    """The motion of a table, the formula of ``adjust.model.survey.Table``; ``geometry``: by name, missing is zero."""
-    (R,), (t,) = table_poses(axes, geometry, np.asarray(angles, dtype=float)[None])
-    return Pose3(Rot3(R), t)
+def table_from_mount(axes: tuple[str, ...], geometry: dict[str, float], angles: FloatArray) -> list[Pose3]:
+    """The motions of a table at angles (n, k), the formula of ``adjust.model.survey.Table``.
+
+    geometry: by name, missing is zero.
+    """
+    motions = zip(*table_poses(axes, geometry, angles), strict=True)
+    return [Pose3(Rot3(turn), shift) for turn, shift in motions]
 
 
 class AdjustedFrames:
@@ -24,6 +27,7 @@ class AdjustedFrames:
         self.cameras, self.stations = survey.cameras_by_id, survey.stations_by_id
         self.tables, self.targets = survey.tables_by_id, survey.targets_by_id
         self.readings = {(r.table_id, r.epoch_id): r for r in survey.table_readings}
+        self._motions: dict[str, dict[str, Pose3]] = {}
 
     def pose(self, name: ParameterName, parameter: PoseParameter) -> Pose3 | None:
         """The adjusted pose of a parameter; where it was held, its constant."""
@@ -61,12 +65,18 @@ class AdjustedFrames:
         return self.pose(("world_from_station", station.station_id, epoch_id), parameter)
 
     def _motion(self, table: Table, epoch_id: str) -> Pose3:
-        geometry = adjusted_numbers(self.estimates, ("table_geometry", table.table_id), table.geometry)
-        reading = self.estimates.get(("table_angles", table.table_id, epoch_id))
-        angles = self.readings[table.table_id, epoch_id].angles
-        if reading is not None and not isinstance(reading.value, Pose3):
-            angles = reading.value
-        return table_from_mount(table.axes, geometry, angles)
+        """At an epoch; those of all epochs are found when one is first asked for."""
+        if table.table_id not in self._motions:
+            read = {epoch: r.angles for (table_id, epoch), r in self.readings.items() if table_id == table.table_id}
+            geometry = adjusted_numbers(self.estimates, ("table_geometry", table.table_id), table.geometry)
+            angles = np.array([self._angles(table.table_id, *one) for one in read.items()], dtype=float)
+            motions = table_from_mount(table.axes, geometry, angles)
+            self._motions[table.table_id] = dict(zip(read, motions, strict=True))
+        return self._motions[table.table_id][epoch_id]
+
+    def _angles(self, table_id: str, epoch_id: str, read: FloatArray) -> FloatArray:
+        adjusted = self.estimates.get(("table_angles", table_id, epoch_id))
+        return read if adjusted is None or isinstance(adjusted.value, Pose3) else adjusted.value
 
     def _target(self, target: Target, epoch_id: str | None) -> Pose3 | None:
         name: ParameterName = ("carrier_from_target", target.target_id)

@@ -153,8 +153,7 @@ def _image_blocks(survey: Survey, lab: Lab, angles: FloatArray) -> list[ImageBlo
         (None, np.array([p.x_in_world.value for p in survey.points])),
     ]
     out = []
-    for e in range(lab.n_epochs):
-        motion = table_from_mount(table.axes, {}, angles[e])
+    for e, motion in enumerate(table_from_mount(table.axes, {}, angles)):
         head_pose = pose_of(table.world_from_table) * motion * pose_of(head.mount_from_station)
         for camera in survey.cameras:
             world_from_camera = head_pose * pose_of(camera.station_from_camera)

@@ -243,10 +243,10 @@ def test_motion_of_a_table_is_the_formula_of_the_model() -> None:
     shift[1, 3] = 0.01
     expected = reduce(np.matmul, (turn("x", 0.3 + 0.01), shift, turn("y", 0.02), turn("z", -0.5 + 0.03)))
     geometry = {"non_orthogonality": 0.02, "axis_offset": 0.01, "zero_1": 0.01, "zero_2": 0.03}
-    got = table_from_mount(("x", "z"), geometry, np.array([0.3, -0.5]))
+    (got,) = table_from_mount(("x", "z"), geometry, np.array([[0.3, -0.5]]))
     np.testing.assert_allclose(got.matrix(), expected, atol=1e-14)
     np.testing.assert_allclose(
-        table_from_mount(("z",), {"zero_1": 0.1}, np.array([0.2])).matrix(), turn("z", 0.3), atol=1e-14
+        table_from_mount(("z",), {"zero_1": 0.1}, np.array([[0.2]]))[0].matrix(), turn("z", 0.3), atol=1e-14
     )
 
 
@@ -254,7 +254,8 @@ def test_frames_follow_the_table_and_its_adjusted_angles(adjustment: Adjustment)
     frames, e = AdjustedFrames(adjustment), adjustment.estimates
     estimate = e["table_geometry", "turntable"]
     geometry = dict(zip(estimate.components, np.asarray(estimate.value).tolist(), strict=True))
-    motion = table_from_mount(("x", "z"), geometry, np.asarray(e["table_angles", "turntable", "e02"].value))
+    angles = np.asarray(e["table_angles", "turntable", "e02"].value)
+    (motion,) = table_from_mount(("x", "z"), geometry, angles[None])
     mount = adjustment.survey.stations[0].mount_from_station.value
     table, camera = e["world_from_table", "turntable"].value, e["station_from_camera", "Y"].value
     assert isinstance(table, Pose3)

@@ -5,6 +5,7 @@ What Arrow does not read as Python would (or not at all) is left to the readers 
 
 import io
 import re
+import sys
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -20,6 +21,7 @@ from survey.folder.text import LARGEST_NUMBER, csv_text, utf8
 from survey.project.tables.reading import LARGEST_ROWS, Columns, Layout, TextColumn, check_header, check_rows, first_row
 
 LARGE = 2**20  # bytes of CSV, cells to write / 10: below, loading Arrow (30 ms) costs more than it saves
+_WORTHWHILE = 2**14  # bytes of CSV once it is loaded
 _LARGEST_DECODED = 8 * 2**30  # bytes of the columns of a Parquet file
 _BLOCK, _ROWS = 2**20, 2**17  # bytes read, rows written at a time
 _PLAIN = re.compile(r"[\w.:/+-]+").fullmatch  # names that need no quotes in CSV
@@ -31,7 +33,7 @@ def csv_columns(data: bytes, layout: Layout) -> dict[str, TextColumn | FloatArra
 
     Plain: no quotes, no blank line.
     """
-    if len(data) < LARGE or b'"' in data:
+    if len(data) < (min(_WORTHWHILE, LARGE) if "pyarrow" in sys.modules else LARGE) or b'"' in data:
         return None
     header = data[: data.find(b"\n")].decode("utf-8-sig", "replace").rstrip("\r").split(",")
     if not set(layout.required) <= set(header) <= set(layout.columns) or not len(set(header)) == len(header) > 1:

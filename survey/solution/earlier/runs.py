@@ -54,18 +54,14 @@ class Clock:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
 
 
-def installed_versions() -> dict[str, str]:
-    """Versions of Python and of the packages that results depend on, as far as they are installed."""
-    return dict(_installed())
-
-
 @cache
-def _installed() -> dict[str, str]:
+def installed_versions() -> Mapping[str, str]:
+    """Versions of Python and of the packages that results depend on, as far as they are installed."""
     found = {"python": platform.python_version()}
     for package in _PACKAGES:
         with suppress(PackageNotFoundError):
             found[package] = version(package)
-    return found
+    return MappingProxyType(found)
 
 
 def same_versions(versions: Mapping[str, str]) -> bool:
