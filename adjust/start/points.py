@@ -127,7 +127,7 @@ def improve(network: FrameNetwork, points: PointField, movable: BoolArray, round
             _improve(network, points, movable)
         return network.pose.copy(), network.observations, [of[seen] for of in fields]
 
-    network.pose[:], network.observations, found = once(("improved", known), improved)
+    network.pose[:], network.observations, found = once((_improve, known), improved)
     points.x[seen], points.given[seen], points.rough[seen] = found
 
 

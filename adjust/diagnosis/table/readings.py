@@ -119,7 +119,7 @@ def shared_mistake(views: TableViews) -> tuple[Verdict | None, float]:
     """
     table = views.table.axes, views.table.geometry.by_name
     seen = content(*table, views.inner, views.outer, views.epoch, views.poses, views.angles)
-    return once(("shared mistake", seen), lambda: _shared_mistake(views))
+    return once((_shared_mistake, seen), lambda: _shared_mistake(views))
 
 
 def _shared_mistake(views: TableViews) -> tuple[Verdict | None, float]:

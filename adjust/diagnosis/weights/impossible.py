@@ -153,13 +153,14 @@ def _of_pairs(survey: Survey) -> Iterator[Sigmas]:
     sigmas = np.sqrt(np.diagonal(measured.cov, axis1=1, axis2=2))
     least = np.maximum(_LENGTH, _PART * np.linalg.norm(measured.shifts, axis=1))
     turn, shift = sigmas[:, :3].max(axis=1), sigmas[:, 3:].max(axis=1)
-    parts = (("rotation", turn, turn < _ANGLE), ("translation", shift, measured.is_pose & (shift < least)))
+    parts = (("rotation", "the rotation of pairs", turn, turn < _ANGLE),
+             ("translation", "the translation of pairs", shift, measured.is_pose & (shift < least)))  # fmt: skip
     for group, rows in grouped((p.group, i) for i, p in enumerate(survey.pairs) if p.used).items():
-        for part, largest, small in parts:
+        for part, what, largest, small in parts:
             odd = np.array(rows)[small[rows]].tolist()
             if odd:
                 ids, size = tuple(survey.pairs[i].pair_id for i in odd), float(largest[odd].max())
-                yield Sigmas("pairs", f"the {part} of pairs", group, tuple(odd), ids, size, False, part)
+                yield Sigmas("pairs", what, group, tuple(odd), ids, size, False, part)
 
 
 def _of_tables(survey: Survey) -> Iterator[Sigmas]:
