@@ -63,8 +63,7 @@ class TerrestrialBatch:
         self.correlated = [c for c, chunk in enumerate(layout.chunks) if chunk.whitener is not None]
         self._views = [_blocks(chunk, self.J) for chunk in layout.chunks]
         self.chi_square = 0.0
-        self._plumb: Plumb | None = None
-        """That of the horizons at all positions, where these were found together."""
+        self._plumb: Plumb | None = None  # that of the horizons at all positions, where these were found together
 
     @property
     def used(self) -> BoolArray:

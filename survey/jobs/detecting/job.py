@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from adjust.lenses.crops import possible_sizes
-from adjust.model.errors import SurveyError
+from adjust.model.errors import SurveyError, listed
 from adjust.model.observations import ImageBlock
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write, time_text
@@ -143,10 +143,9 @@ def _require_something(folder: Path, state: _State) -> None:
 def _nothing_found(
     folder: Path, reports: "Sequence[ImageReport]", wrong: Mapping[str, str], bad: Mapping[ImageKey, str]
 ) -> SurveyError:
-    each = (*defect_warnings(bad), *(f"{r.path}: {r.message}" for r in reports[:10]))
-    lines = "\n".join(f"  {line}" for line in each)
-    lines += f"\n  and {len(reports) - 10} more images" if len(reports) > 10 else ""
-    said = f"{folder}: no target and no spot was found in {len(reports)} images:\n{lines}"
+    each = listed([f"{r.path}: {r.message}" for r in reports], 10, "\n  ")
+    lines = "\n  ".join([*defect_warnings(bad), each])
+    said = f"{folder}: no target and no spot was found in {len(reports)} images:\n  {lines}"
     return SurveyError("\n".join(wrong.values()) if wrong else said)
 
 
