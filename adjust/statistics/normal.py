@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -107,8 +108,12 @@ def _blocks(N: sparse.csr_matrix, sets: IntArray) -> FloatArray:
     return out
 
 
-Solver = tuple[Callable[[FloatArray], FloatArray], Callable[[], FloatArray] | None]
-"""Of a normal matrix with a unit diagonal: solution, inverse where there is a way."""
+class Solver(NamedTuple):
+    """Of a normal matrix N with a unit diagonal: solution; inverse, and half a solution H b with H'H the inverse."""
+
+    solve: Callable[[FloatArray], FloatArray]
+    inverse: Callable[[], FloatArray] | None = None
+    half: Callable[[FloatArray], FloatArray] | None = None
 
 
 def _solver(scaled: sparse.csc_matrix) -> Solver:
@@ -116,17 +121,22 @@ def _solver(scaled: sparse.csc_matrix) -> Solver:
     n = scaled.shape[0]
     if n <= FEW:  # its inverse: SciPy's linear algebra takes longer to load
         inverse = np.linalg.inv(scaled.toarray())
-        return lambda b: inverse @ b, lambda: inverse
+        return Solver(lambda b: inverse @ b, lambda: inverse)
     if n <= DENSE or scaled.nnz > n**2 // 4:  # as the rows of a free datum over all points fill it
-        factor = scipy.linalg.cho_factor(scaled.toarray())
-        return lambda b: np.asarray(scipy.linalg.cho_solve(factor, b)), lambda: inverse_of_factor(*factor)
+        factor, lower = scipy.linalg.cho_factor(scaled.toarray())
+
+        def half(b: FloatArray) -> FloatArray:
+            return np.asarray(scipy.linalg.solve_triangular(factor, b, trans=0 if lower else 1, lower=lower))
+
+        return Solver(lambda b: np.asarray(scipy.linalg.cho_solve((factor, lower), b)),
+                      lambda: inverse_of_factor(factor, lower), half)  # fmt: skip
     from scipy.sparse.linalg import splu  # here: as above
 
     try:
         lu = splu(scaled, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
     except RuntimeError as error:
         raise np.linalg.LinAlgError(str(error)) from error
-    return lu.solve, None
+    return Solver(lu.solve)
 
 
 def inverse_of_factor(factor: FloatArray, lower: bool) -> FloatArray:
@@ -156,14 +166,23 @@ class Normal:
         if self.structured is not None:
             return self.structured.times(right)
         scale = self.scale if right.ndim == 1 else self.scale[:, None]
-        out = self._of_scaled[0](scale * right)
+        out = self._of_scaled.solve(scale * right)
         out *= scale
         return out
+
+    def squares(self, rows: FloatArray) -> FloatArray:
+        """(J, q, q) of sets of rows (J, q, n): A N^-1 A' of each."""
+        columns = rows.reshape(-1, self.n).T
+        half = self._of_scaled.half if self.structured is None else None
+        if half is None:
+            return np.asarray(rows @ self.solve(columns).T.reshape(rows.shape).transpose(0, 2, 1))
+        mine = half(self.scale[:, None] * columns).T.reshape(rows.shape)
+        return np.asarray(mine @ mine.transpose(0, 2, 1))
 
     @cached_property
     def inverse(self) -> FloatArray:
         """Inverse (n, n) of the matrix with its datum rows."""
-        inverse = self._of_scaled[1] if self.structured is None else None
+        inverse = self._of_scaled.inverse if self.structured is None else None
         if inverse is None:
             return self.solve(np.eye(self.n))
         return np.asarray(inverse() * self.scale * self.scale[:, None])

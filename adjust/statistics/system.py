@@ -112,8 +112,7 @@ class LinearSystem:
         """The same (J, q, q) of the sums of the J sets of q rows from each on, as of what changed since then."""
         if len(self.columns) <= PLAIN:
             sums = np.cumsum(rows.toarray().reshape(-1, q, rows.shape[1])[::-1], axis=0)[::-1]
-            solved = self.normal.solve(sums.reshape(rows.shape).T).T.reshape(sums.shape)
-            return np.asarray(sums @ solved.transpose(0, 2, 1))
+            return self.normal.squares(sums)
         return self.precision.stacked.among_sums(self._in_stack(rows), q)
 
     def _in_stack(self, rows: sparse.csr_matrix) -> sparse.csr_array:

@@ -57,7 +57,7 @@ def adjust_job(
             with clock.step("read"):
                 project = read(folder)
         elif project.images and out is None:
-            project = replace(project, detected=remember_images(folder, place))
+            project = replace(project, detected=remember_images(project, place))
         from survey.jobs.adjusting import outcome as results
         from survey.jobs.adjusting.steps import adjust_project
 

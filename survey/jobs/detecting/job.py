@@ -20,7 +20,7 @@ from survey.folder.text import atomic_write, time_text
 from survey.jobs.detecting.board_sizes import wrong_sizes
 from survey.jobs.detecting.image_defects import defect_warnings, defects
 from survey.jobs.detecting.outcome import DetectOutcome, missed
-from survey.project import Definition, SpotBlock, read_definition
+from survey.project import Definition, Project, SpotBlock, read_definition
 from survey.project.detected import (
     DETECTED_FILE,
     DetectedImage,
@@ -263,12 +263,15 @@ def _given(state: _State, known: Mapping[ImageKey, DetectedImage]) -> dict[Image
     }  # fmt: skip
 
 
-def remember_images(folder: Path, place: Path) -> dict[ImageKey, DetectedImage]:
+def remember_images(project: Project, place: Path) -> Mapping[ImageKey, DetectedImage]:
     """Make the list of images anew in ``place`` where their hashes are not known, or were made of older times.
 
     Nothing is looked for: points that are there count as given. For who is changing the folder. What is known now.
     """
-    state = _state(folder)
+    known_all = not project.image_notes and set(project.detected) == set(project.images)
+    if known_all and read_detected(project.folder / OBSERVATIONS_FOLDER) == project.detected:
+        return project.detected
+    state = _state(project.folder)
     old = {*state.news.gone, *state.news.changed, *state.news.by_hand}  # these stay noticed
     known = {key: entry for key, entry in state.known.items() if key in old}
     known |= state.news.same or {}
