@@ -6,7 +6,7 @@ contradicts their lens does, which is not symmetric.
 
 from collections.abc import Container, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 
@@ -14,16 +14,29 @@ from adjust.diagnosis.alone import squares_alone
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import ChangeColumns, Edit, Hypothesis, Place
 from adjust.model.names import numbered
-from adjust.model.observations import ImageBlock
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, Survey
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
 
-if TYPE_CHECKING:
-    from adjust.navigation import Spots
 
-Seen = TypeVar("Seen", ImageBlock, "Spots")
+class _Seen(Protocol):
+    """A dataclass of image points: blocks of a survey, spots."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def uv(self) -> FloatArray:
+        """(n, 2) px."""
+        ...
+
+    @property
+    def cov(self) -> FloatArray:
+        """(n, 2, 2) px^2."""
+        ...
+
+
+Seen = TypeVar("Seen", bound=_Seen)
 _FLAT, _LEAST = 0.02, 2
 _ALPHA, _HALF = 1e-6, 180
 

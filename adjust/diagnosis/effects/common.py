@@ -1,6 +1,6 @@
 """What all distances of a group, or all observed coordinates, have in common: a constant, a scale, another frame."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +22,8 @@ _LARGEST = 0.05
 """Of a scale, and of a constant over the lengths; a larger one is a unit."""
 _PPM = 1e6
 _COLUMNS = ("x_mm", "y_mm", "z_mm")
+IN_ORDER, EXCHANGED = (0, 1, 2), (1, 0, 2)
+"""Columns of coordinates as they stand, and north first."""
 _FRAME = "frame of coordinates"
 _IN_WORLD = "give them in the frame of the world, or let them define it and hold nothing else"
 Said = Callable[[FloatArray, FloatArray], str]
@@ -37,8 +39,8 @@ def common(case: Case, linear: Linear) -> Iterator[Effect]:
             length = 1.0 if scale else float(np.median([survey.distances[i].value for i in rows]))
             if (abs(effect.first.theta) < _LARGEST * length).all():
                 yield effect
-    rows = [i for i, c in enumerate(survey.coordinates) if c.used and np.isfinite(np.diag(c.cov)).all()]
-    if len(rows) >= _FEWEST and all(len(survey.coordinates[i].positions) == 1 for i in rows):
+    rows = whole_points(survey)
+    if len(rows) >= _FEWEST:
         scaled = _scaled(survey, linear, rows)
         yield from [scaled] if (abs(scaled.first.theta) < _LARGEST).all() else []
         yield _elsewhere(survey, linear, rows)
@@ -103,18 +105,30 @@ def _elsewhere_text(theta: FloatArray, exchanged: bool = False) -> str:
     return f"the coordinates in coordinates.csv stand {where}"
 
 
-def in_another_frame(survey: Survey, rows: list[int], world_from_given: FloatArray, exchanged: bool) -> Hypothesis:
-    """Coordinates ``rows``, one point each, in a frame that is known (4, 4); exchanged: their x and y first."""
-    given_from_world, columns = inverse(world_from_given), [1, 0, 2] if exchanged else [0, 1, 2]
+def whole_points(survey: Survey) -> list[int]:
+    """Coordinates in use of which all three were observed; none where some are sets of several points."""
+    rows = [i for i, c in enumerate(survey.coordinates) if c.used and np.isfinite(np.diag(c.cov)).all()]
+    return rows if all(len(survey.coordinates[i].positions) == 1 for i in rows) else []
+
+
+def in_another_frame(
+    survey: Survey, rows: list[int], world_from_given: FloatArray, columns: Sequence[int] = IN_ORDER
+) -> Hypothesis:
+    """Coordinates ``rows``, one point each, in a frame that is known (4, 4), of their columns in this order."""
+    given_from_world = inverse(world_from_given)
     matrix, offset = world_from_given[:3, :3][:, columns], world_from_given[:3, 3]
     theta = np.concatenate([rotation_log(given_from_world[:3, :3]), given_from_world[:3, 3]])
-    moved = {i: replace(c, values=c.values @ matrix.T + offset) for i in rows for c in [survey.coordinates[i]]}
     points = tuple(_points(survey, rows))
     return Hypothesis(
-        _FRAME, _elsewhere_text(theta, exchanged), _IN_WORLD, Place("point", points, "x_mm"),
-        with_rows(survey, "coordinates", moved),
+        _FRAME, _elsewhere_text(theta, columns != IN_ORDER), _IN_WORLD, Place("point", points, "x_mm"),
+        _moved(survey, rows, matrix, offset),
         (ChangeColumns("coordinates", _COLUMNS, matrix, 1e3 * offset, {"point_id": points}),),
     )  # fmt: skip
+
+
+def _moved(survey: Survey, rows: list[int], matrix: FloatArray, offset: FloatArray) -> Survey:
+    new = {i: replace(c, values=c.values @ matrix.T + offset) for i in rows for c in [survey.coordinates[i]]}
+    return with_rows(survey, "coordinates", new)
 
 
 def _points(survey: Survey, rows: list[int]) -> dict[str, FloatArray]:
@@ -128,9 +142,7 @@ def _of_coordinates(
     """back: by a size the matrix and the offset (m) that take the change off."""
 
     def mended(_: Adjustment, theta: FloatArray) -> Survey:
-        matrix, offset = back(theta)
-        new = {i: replace(c, values=c.values @ matrix.T + offset) for i in rows for c in [survey.coordinates[i]]}
-        return with_rows(survey, "coordinates", new)
+        return _moved(survey, rows, *back(theta))
 
     def edits(theta: FloatArray) -> tuple[Edit, ...]:
         matrix, offset = back(theta)

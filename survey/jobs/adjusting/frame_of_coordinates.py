@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from adjust.adjustment import adjust
-from adjust.diagnosis.effects.common import in_another_frame
+from adjust.diagnosis.effects.common import EXCHANGED, IN_ORDER, in_another_frame, whole_points
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, position_text
@@ -38,18 +38,16 @@ def in_other_frames(project: Project, first: Adjustment, gate_px: float) -> Iter
 
     first: of the cameras and stations, without the spots.
     """
-    survey = project.survey
-    rows = [i for i, c in enumerate(survey.coordinates) if c.used and np.isfinite(np.diag(c.cov)).all()]
-    if len(rows) < _FEWEST or any(len(survey.coordinates[i].positions) > 1 for i in rows):
+    survey, rows = project.survey, whole_points(project.survey)
+    if len(rows) < _FEWEST:
         return
     views = spot_views(survey, first, project.spots)
-    for exchanged in (False, True):
-        columns = [1, 0, 2] if exchanged else [0, 1, 2]
+    for columns in (IN_ORDER, EXCHANGED):
         given = {position_text(c.positions[0]): c.values[0, columns] for c in (survey.coordinates[i] for i in rows)}
         cov = block_diag(*(survey.coordinates[i].cov[np.ix_(columns, columns)] for i in rows))
         beacons = Beacons(tuple(given), np.array(list(given.values())), cov)
         for motion in _motions(project, first, beacons):
-            moved = in_another_frame(survey, rows, motion, exchanged).changed()
+            moved = in_another_frame(survey, rows, motion, columns).changed()
             if moved is None:
                 continue
             found = identify_spots(moved, views, gate_px)
@@ -57,7 +55,7 @@ def in_other_frames(project: Project, first: Adjustment, gate_px: float) -> Iter
                 fine = _refined(identified(moved, found), rows, given)
             except SurveyError:
                 continue
-            yield in_another_frame(survey, rows, fine, exchanged)
+            yield in_another_frame(survey, rows, fine, columns)
 
 
 def _motions(project: Project, first: Adjustment, beacons: Beacons) -> Iterator[FloatArray]:

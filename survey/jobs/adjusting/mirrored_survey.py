@@ -5,11 +5,12 @@ Every flat target is then seen from behind and all fits: what is adjusted is the
 
 from dataclasses import dataclass, replace
 
-from adjust.diagnosis.hypothesis import ChangeColumns, Edit, Hypothesis, Place
-from adjust.diagnosis.images import MIRRORED, edits_of, from_behind, is_flat, mapped
+from adjust.diagnosis.hypothesis import ChangeColumns, Hypothesis, Place
+from adjust.diagnosis.images import MIRRORED, from_behind, is_flat, mapped
 from adjust.model.errors import listed
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment
+from survey.jobs.adjusting.edits import OF_IMAGE
 from survey.project import Project
 from survey.project.targets import PointList
 from survey.solution.frames import AdjustedFrames
@@ -29,11 +30,13 @@ class Sides:
 
 def sides(project: Project, result: Adjustment) -> Sides:
     """By the first images of every camera."""
-    survey, frames = result.survey, AdjustedFrames(result)
+    survey = result.survey
     printed = {t for t, kind in project.target_kinds.items() if not isinstance(kind, PointList)}
     flat = {t.target_id: t.x_in_target for t in survey.targets if t.target_id in printed and is_flat(t.x_in_target)}
-    seen: dict[str, list[bool]] = {}
-    for block in survey.image_blocks if flat else ():
+    if not flat:
+        return Sides({}, False)
+    frames, seen = AdjustedFrames(result), dict[str, list[bool]]()
+    for block in survey.image_blocks:
         mine = seen.setdefault(block.camera_id, [])
         if block.target_id is None or block.target_id not in flat or not block.n_used or len(mine) >= _LOOKED_AT:
             continue
@@ -67,18 +70,13 @@ def mirrored_warnings(project: Project, result: Adjustment) -> tuple[tuple[str, 
 
 def mirrored_back(project: Project) -> tuple[Project, Hypothesis]:
     """The project with all image points and spots mirrored back, and that as a hypothesis."""
-    survey, edits = project.survey, list[Edit]()
-    sizes = {c.camera_id: c.image_size for c in survey.cameras}
+    survey, sizes = project.survey, {c.camera_id: c.image_size for c in project.survey.cameras}
     for camera in sizes:
-        epochs = tuple(dict.fromkeys(b.epoch_id for b in survey.image_blocks if b.camera_id == camera))
-        survey = mapped(survey, camera, set(epochs), _BOTTOM)
-        edits += edits_of(survey, camera, epochs, _BOTTOM) if epochs else ()
-    A = _BOTTOM.matrix
-    spots = tuple(replace(b, uv=b.uv @ A.T + _BOTTOM.offset(sizes[b.camera_id]), cov=A @ b.cov @ A.T)
-                  for b in project.spots)  # fmt: skip
-    for camera in dict.fromkeys(b.camera_id for b in spots):
-        offset, where = _BOTTOM.offset(sizes[camera]), {"camera_id": (camera,)}
-        edits.append(ChangeColumns("spots", ("u_px", "v_px"), A, offset, where))
+        epochs = {b.epoch_id for b in survey.image_blocks if b.camera_id == camera}
+        survey = mapped(survey, camera, epochs, _BOTTOM)
+    spots = tuple(_BOTTOM.back(b, sizes[b.camera_id]) for b in project.spots)
+    edits = [ChangeColumns("image_points", OF_IMAGE, _BOTTOM.matrix, _BOTTOM.offset(size), {"camera_id": (camera,)})
+             for camera, size in sizes.items()]  # fmt: skip
     hypothesis = Hypothesis(
         "images mirrored",
         f"all image points are mirrored, {_BOTTOM.text}: they show the front of flat targets from behind",

@@ -58,9 +58,8 @@ def located(found: Diagnosis, project: Project) -> Diagnosis:
 
 def _of_spots(edits: Sequence[Edit], files: "ProjectFiles") -> Iterator[Edit]:
     """Changes of image points, in the table of spots too, or there alone: points of beacons may come from it."""
-    told = any(isinstance(e, ChangeColumns) and e.table == "spots" for e in edits)
     for edit in edits:
-        if told or not isinstance(edit, ChangeColumns) or edit.columns != OF_IMAGE:
+        if not isinstance(edit, ChangeColumns) or (edit.table, edit.columns) != ("image_points", OF_IMAGE):
             yield edit
             continue
         where = {k: v for k, v in edit.where.items() if k != "target_id"}
