@@ -9,20 +9,43 @@ typedef In<uint8_t, 1> Bytes;
 constexpr int64_t LONGEST = 27;  // characters of a number and its comma: one below LARGEST with a sign, a point, decimals
 constexpr double LARGEST = 1e17;
 
+constexpr auto POWERS_OF_TEN = [] {
+    std::array<uint64_t, 20> out{1};
+    for (size_t i = 1; i < out.size(); ++i) out[i] = 10 * out[i - 1];
+    return out;
+}();
+constexpr auto TWO_DIGITS = [] {
+    std::array<uint8_t, 200> out{};
+    for (size_t i = 0; i < out.size(); ++i) out[i] = uint8_t('0' + (i % 2 ? i / 2 % 10 : i / 20));
+    return out;
+}();
+
+// Decimal digits of x, none of zero.
+inline int64_t n_digits(uint64_t x) {
+    const int64_t least = (std::bit_width(x) * 1233) >> 12;  // 1233 / 4096 is just above log10(2)
+    return least + (x >= POWERS_OF_TEN[size_t(least)]);
+}
+
+// The n digits of x, zeros in front where it has fewer, with a point after so many of them where some follow.
+inline uint8_t *with_point(uint64_t x, int64_t n, int64_t before, uint8_t *out) {
+    const int64_t shift = before < n;  // to its place once the digits stand
+    int64_t i = n + shift;
+    for (; i >= 2 + shift; i -= 2, x /= 100) std::memcpy(out + i - 2, TWO_DIGITS.data() + 2 * (x % 100), 2);
+    if (i > shift) out[shift] = uint8_t('0' + x % 10);
+    if (shift == 0) return out + n;
+    for (int64_t k = 0; k < before; ++k) out[k] = out[k + 1];
+    out[before] = '.';
+    return out + n + 1;
+}
+
 // x with so many decimals, the nearest, the even one of two; nothing where it is not finite. power: 10^decimals.
 inline uint8_t *decimal_text(double x, double power, int64_t decimals, uint8_t *out) {
     const double size = magnitude(x) * power;
     if (!(size >= 0.0 && size <= LARGEST)) return out;
-    uint64_t whole = uint64_t(std::nearbyint(size));
+    const uint64_t whole = uint64_t(std::nearbyint(size));
     if (x < 0.0 && whole > 0) *out++ = '-';
-    uint8_t digits[24];
-    int64_t n = 0;
-    for (; whole > 0 || n <= decimals; whole /= 10) digits[n++] = uint8_t('0' + whole % 10);
-    for (; n > 0;) {
-        if (n == decimals) *out++ = '.';
-        *out++ = digits[--n];
-    }
-    return out;
+    const int64_t n = larger(n_digits(whole), decimals + 1);
+    return with_point(whole, n, n - decimals, out);
 }
 
 // For each row the text of its block, that of its item, and its numbers, with commas between them; the length of all. Word
@@ -100,17 +123,14 @@ constexpr int64_t LONGEST_NUMBER = 24;  // characters: a sign, 17 digits, a poin
 inline uint8_t *significant_text(double x, int64_t significant, In<int64_t, 2> powers, uint8_t *out) {
     if (std::signbit(x)) *out++ = '-', x = -x;
     Decimal found = x == 0.0 ? Decimal{0, 0} : shortest(x, powers);
-    uint8_t digits[24];
-    int64_t n = 0;
-    for (uint64_t rest = found.digits; rest > 0; rest /= 10) ++n;
+    int64_t n = n_digits(found.digits);
     if (n > significant) {
-        uint64_t unit = 1;
-        for (int64_t i = significant; i < n; ++i) unit *= 10;
+        const uint64_t unit = POWERS_OF_TEN[size_t(n - significant)];
         const uint64_t kept = found.digits / unit, rest = found.digits % unit;
         found = {kept + (2 * rest > unit || (2 * rest == unit && (kept & 1))), found.exponent + n - significant};
     }
     for (; found.digits > 0 && found.digits % 10 == 0; found.digits /= 10) ++found.exponent;
-    for (n = 0; found.digits > 0 || n == 0; found.digits /= 10) digits[n++] = uint8_t('0' + found.digits % 10);
+    n = larger(n_digits(found.digits), int64_t(1));
     const int64_t before = x == 0.0 ? 1 : n + found.exponent;  // digits before the point
     const bool by_power = before < -3 || before > (significant == WHOLE ? 16 : significant);
     const int64_t point = by_power ? 1 : before;
@@ -118,10 +138,7 @@ inline uint8_t *significant_text(double x, int64_t significant, In<int64_t, 2> p
         *out++ = '0', *out++ = '.';
         for (int64_t i = point; i < 0; ++i) *out++ = '0';
     }
-    for (int64_t i = 0; i < n; ++i) {
-        if (i == point && i > 0) *out++ = '.';
-        *out++ = digits[n - 1 - i];
-    }
+    out = with_point(found.digits, n, point > 0 ? point : n, out);
     for (int64_t i = n; i < point; ++i) *out++ = '0';
     if (!by_power) {
         if (significant == WHOLE && n <= point) *out++ = '.', *out++ = '0';

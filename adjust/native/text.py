@@ -62,7 +62,7 @@ def number_rows(
 
 def record_rows(
     words: Words, word: IntArray, values: FloatArray, parts: Sequence[tuple[int, int]], significant: int = WHOLE
-) -> tuple[bytes, IntArray]:
+) -> tuple[memoryview, IntArray]:
     """Records of one form one after the other, and where each ends (n,).
 
     parts: of every record, in turn: (TEXT, i) the i-th of the words; (WORD, j) the word of number ``word[row, j]``;
@@ -79,7 +79,7 @@ def record_rows(
     out = np.empty(len(values) * each + int(length[word[:, columns]].sum()) + _LONGEST_NUMBER, dtype=np.uint8)
     ends = np.empty(len(values), dtype=np.int64)
     made = _record_rows(*words, word, values, np.array(parts, dtype=np.int64), significant, _powers(), ends, out)
-    return out[:made].tobytes(), ends
+    return out[:made].data, ends
 
 
 @cache

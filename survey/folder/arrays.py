@@ -31,10 +31,11 @@ def read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
 
 
 def packed_arrays(**arrays: npt.NDArray[Any]) -> bytes:
-    """An ``.npz`` of these: packed lightly, as covariances are noise that no more work makes much smaller."""
+    """An ``.npz`` of these: texts packed lightly; numbers as they are, for covariances are noise."""
     out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+    with zipfile.ZipFile(out, "w", compresslevel=1) as archive:
         for name, values in arrays.items():
+            archive.compression = zipfile.ZIP_STORED if values.dtype.kind == "f" else zipfile.ZIP_DEFLATED
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, values, allow_pickle=False)
     return out.getvalue()

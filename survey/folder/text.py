@@ -30,7 +30,7 @@ _LONGEST_ID = 120  # bytes: an id with a prefix and an ending is still the name 
 _DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{i}" for port in ("COM", "LPT") for i in range(1, 10))}
 
 
-def atomic_write(path: Path, content: bytes | str | Iterable[bytes], lasting: bool = False) -> None:
+def atomic_write(path: Path, content: bytes | str | Iterable[bytes | memoryview], lasting: bool = False) -> None:
     """Write ``content`` (text as UTF-8) under a temporary name beside ``path``, then rename: all of it or nothing.
 
     What killed runs left of the same file goes. lasting: on return even a cut of the power leaves the new file.

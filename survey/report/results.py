@@ -16,7 +16,7 @@ from survey.report.page import BegunPage, begun_page, finished_page, report_pdf
 from survey.report.terminal import summary_text
 from survey.solution.covariances import covariance_npz
 from survey.solution.dictionary import RunInfo, solution_dict, with_statistics
-from survey.solution.records import solution_json
+from survey.solution.records import Piece, solution_json, solution_pieces
 from survey.solution.residual_tables import (
     image_residuals_csv,
     image_residuals_parquet,
@@ -71,7 +71,7 @@ class ResultFiles:
         self.folder.mkdir(parents=True, exist_ok=True)
         self._begun: dict[str, Callable[[], None]] = {}
 
-    def begin(self, makers: Mapping[str, Callable[[], bytes | Iterable[bytes]]]) -> None:
+    def begin(self, makers: Mapping[str, Callable[[], bytes | Iterable[Piece]]]) -> None:
         """Files by name, by what makes them."""
         for name, make in makers.items():
             self._begun[name] = self._writing.of(partial(_write, self.folder / name, make))
@@ -125,7 +125,7 @@ def finished_results(
     solution = page.context.solution
     if statistics is not None:
         solution = with_statistics(solution, adjustment, run, statistics)
-    begun.files.begin({"solution.json": lambda: solution_json(solution).encode()})
+    begun.files.begin({"solution.json": lambda: solution_pieces(solution)})
     report = finished_page(page, solution, statistics)
     begun.files.begin({
         "report.html": report.encode, **({"report.pdf": lambda: report_pdf(report)} if options.pdf else {}),
@@ -133,5 +133,5 @@ def finished_results(
     return solution, begun.files.paths
 
 
-def _write(path: Path, make: Callable[[], bytes | Iterable[bytes]]) -> None:
+def _write(path: Path, make: Callable[[], bytes | Iterable[Piece]]) -> None:
     atomic_write(path, make())

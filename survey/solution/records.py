@@ -21,6 +21,8 @@ from survey.folder.plain import PlainEntries, PlainRecords
 Column = np.ndarray[Any, Any] | Sequence[str] | Sequence[list[str]]
 """Of n records: floats, whole numbers or truths (n,), lists of floats (n, k), n words, or n lists of words."""
 Tree = Mapping[str, "Column | Tree"]
+Piece = bytes | memoryview
+"""Of a file."""
 _FLOATS, _WORDS = {float}, {str}
 _JSON = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
 
@@ -73,15 +75,15 @@ class Records(PlainRecords):
         return {name: self[name] for row, name in enumerate(self._names)
                 if row in found or key in self._apart.get(name, ())}  # fmt: skip
 
-    def lines(self, depth: int) -> str:
+    def lines(self, depth: int) -> list[Piece]:
         """As JSON, one line per entry of a mapping, the whole beginning in a line indented by so many spaces."""
         if not self._names:
-            return "{}"
-        parts = [b""] * len(self._names)
+            return [b"{}"]
+        parts: list[Piece] = [b""] * len(self._names)
         for form in self._forms:
             text, ends = _json_rows(form, [self._names[row] for row in form.rows.tolist()], depth + 1)
             if len(form.rows) == len(self._names):
-                return f"{{\n{text[:-2].decode()}\n{' ' * depth}}}"
+                return [b"{\n", text[:-2], f"\n{' ' * depth}}}".encode()]
             first = 0
             for row, end in zip(form.rows.tolist(), ends.tolist(), strict=True):
                 parts[row], first = text[first:end], end
@@ -89,7 +91,7 @@ class Records(PlainRecords):
         for row, name in enumerate(self._names):
             if name in self._apart:
                 parts[row] = f"{before}{_key(name)}: {_lines(self._apart[name], depth + 1)},\n".encode()
-        return f"{{\n{b''.join(parts)[:-2].decode()}\n{' ' * depth}}}"
+        return [b"{\n", *parts[:-1], parts[-1][:-2], f"\n{' ' * depth}}}".encode()]
 
 
 class Entries(PlainEntries):
@@ -114,12 +116,12 @@ class Entries(PlainEntries):
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Sequence) and list(self) == list(other)
 
-    def lines(self, depth: int) -> str:
+    def lines(self, depth: int) -> list[Piece]:
         """As JSON, a list that begins in a line indented by so many spaces."""
         if not self._n:
-            return "[]"
+            return [b"[]"]
         text, _ = _json_rows(Form(np.arange(self._n), self._tree), None, depth + 1)
-        return f"[\n{text[:-2].decode()}\n{' ' * depth}]"
+        return [b"[\n", text[:-2], f"\n{' ' * depth}]".encode()]
 
 
 def _entry(tree: Tree, row: int) -> dict[str, Any]:
@@ -171,7 +173,8 @@ class _Writer:
             said = [_lines(x, depth) for x in of.tolist()]
         else:
             said = [encode_basestring(x) if isinstance(x, str) else _words(x, depth) for x in of]
-        self.of_row.append(np.array([self.number(x) for x in said], dtype=np.int64))
+        known = self.words
+        self.of_row.append(np.array([known.setdefault(x, len(known)) for x in said], dtype=np.int64))
         self.part(WORD, len(self.of_row) - 1)
 
     def tree(self, of: Tree, depth: int) -> None:
@@ -184,7 +187,7 @@ class _Writer:
         self.text += f"\n{' ' * depth}}}"
 
 
-def _json_rows(form: Form, names: Sequence[str] | None, depth: int) -> tuple[bytes, IntArray]:
+def _json_rows(form: Form, names: Sequence[str] | None, depth: int) -> tuple[memoryview, IntArray]:
     """The records one after the other, each with a comma and a line's end, and where each ends."""
     writer, n = _Writer(), len(form.rows)
     writer.text = " " * depth
@@ -200,7 +203,20 @@ def _json_rows(form: Form, names: Sequence[str] | None, depth: int) -> tuple[byt
 
 def solution_json(solution: Mapping[str, Any]) -> str:
     """JSON with one line per entry of a mapping and lists of numbers kept on one line; floats by repr."""
-    return _lines(solution, 0) + "\n"
+    return b"".join(solution_pieces(solution)).decode()
+
+
+def solution_pieces(solution: Mapping[str, Any]) -> Iterator[Piece]:
+    """The same as UTF-8 piece by piece, of which large ones are not put together."""
+    before = "{\n"
+    for key, value in solution.items():
+        yield f"{before} {_key(key)}: ".encode()
+        if isinstance(value, Records | Entries):
+            yield from value.lines(1)
+        else:
+            yield _lines(value, 1).encode()
+        before = ",\n"
+    yield b"\n}\n" if solution else b"{}\n"
 
 
 def sections(document: bytes, *names: str) -> dict[str, Any]:
@@ -225,7 +241,7 @@ def _lines(value: Any, depth: int) -> str:
         inner = ",\n".join([f"{before}{_key(k)}: {_lines(v, depth + 1)}" for k, v in value.items()])
         return f"{{\n{inner}\n{' ' * depth}}}"
     if kind is Records or kind is Entries:
-        return str(value.lines(depth))
+        return b"".join(value.lines(depth)).decode()
     if kind is not list:
         return _one(value)
     kinds = set(map(type, value))

@@ -130,11 +130,12 @@ def _quoted(word: str) -> str:
     return word if _NEEDS_QUOTES.isdisjoint(word) else '"' + word.replace('"', '""') + '"'
 
 
-def other_residuals_csv(adjustment: Adjustment) -> bytes:
-    """``residuals_other.csv``: values in mm and degrees, residuals and sigmas in mm and arcseconds."""
+def other_residuals_csv(adjustment: Adjustment) -> list[bytes | memoryview]:
+    """``residuals_other.csv``, piece by piece: values in mm and degrees, residuals and sigmas in mm and arcseconds."""
     readings, arrays = adjustment.reading_residuals, adjustment.other_arrays
     n = len(adjustment.other_residuals) - (0 if readings is None else len(readings.observed))
-    out, first, at = [OTHER_COLUMNS.encode() + b"\n"], 0, 0
+    first, at = 0, 0
+    out: list[bytes | memoryview] = [OTHER_COLUMNS.encode() + b"\n"]
     columns = np.column_stack([arrays.observed, arrays.adjusted, arrays.residual, arrays.sigma, arrays.redundancies,
                                arrays.standardized, arrays.test[arrays.observation]])  # fmt: skip
     names = names_of(adjustment.other_residuals)[:n]
@@ -145,21 +146,22 @@ def other_residuals_csv(adjustment: Adjustment) -> bytes:
         first, at = first + len(some), end
     if readings is not None:
         out.append(_reading_rows(adjustment.survey.readings, columns[at:], readings.used))
-    return b"".join(out)
+    return out
 
 
-def _other_rows(some: Sequence[Named], columns: FloatArray, used: BoolArray) -> bytes:
+def _other_rows(some: Sequence[Named], columns: FloatArray, used: BoolArray) -> memoryview:
     """Of observations with the same components."""
     (kind, *_, components, units), k = some[0], len(some[0][3])
     names, factor, small_names, small = zip(*map(units_for_people, components, units), strict=True)
-    heads = [_cells(kind, group, " ".join(ids)) for _, group, ids, *_ in some]
+    of_group = {group: _cells(kind, group) for group in {group for _, group, *_ in some}}
+    heads = [f"{of_group[group]},{_cells(' '.join(ids))}" for _, group, ids, *_ in some]
     own = np.tile(np.arange(k), len(some))
     which = np.repeat(np.arange(len(some)), k), own, own
     return _rows(heads, list(map(_cells, components, names)), small_names, which, (np.array(factor), np.array(small)),
                  columns, np.repeat(used, k))  # fmt: skip
 
 
-def _reading_rows(readings: Sequence[Reading], columns: FloatArray, used: BoolArray) -> bytes:
+def _reading_rows(readings: Sequence[Reading], columns: FloatArray, used: BoolArray) -> memoryview:
     """The same of readings, which are many and have one component."""
     of = [(r.kind, *units_for_people(r.kind, reading_unit(r.kind))) for r in readings]
     kinds = list(dict.fromkeys(of))
@@ -179,7 +181,7 @@ def _cells(*words: str) -> str:
 def _rows(
     heads: Sequence[str], middles: Sequence[str], units: Sequence[str], which: tuple[IntArray, IntArray, IntArray],
     factors: tuple[FloatArray, FloatArray], columns: FloatArray, used: BoolArray,
-) -> bytes:  # fmt: skip
+) -> memoryview:  # fmt: skip
     """Rows of ``residuals_other.csv``: words of each, numbers with 12 digits, blank where there is none, used or not.
 
     heads: kind, group and ids; middles: component and its unit; units: of the residual. which: of these, by row (n,).

@@ -176,7 +176,7 @@ def test_no_cell_of_a_table_is_taken_for_a_formula(tmp_path: Path, text: str) ->
 def test_residuals_of_evil_names_are_shown_as_text() -> None:
     survey = measured(chain(), np.random.default_rng(1))
     evil = replace(survey, pairs=(replace(survey.pairs[0], pair_id="=1+1", group="@x"), *survey.pairs[1:]))
-    lines = other_residuals_csv(adjusted(evil)).decode().splitlines()
+    lines = b"".join(other_residuals_csv(adjusted(evil))).decode().splitlines()
     cells = next(line.split(",") for line in lines if "=1+1" in line)
     assert cells[1:3] == ["'@x", "'=1+1 station:S0 station:S1"]
 

@@ -8,13 +8,12 @@ worst, the tables beside it all.
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 from markupsafe import Markup
 
 from adjust.model.names import numbered
 from adjust.model.result import names_of
-from adjust.model.survey import FloatArray, IntArray
-from adjust.native.text import NUMBERS, TEXT, Words, record_rows
+from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.native.text import NUMBERS, TEXT, WORD, Words, record_rows
 from survey.project.observed import name_of_observation
 from survey.report.context import Context, Listed, other_components, worst
 from survey.report.language import group_name, known, t
@@ -29,12 +28,15 @@ COLUMNS = (
     "Observed", "Adjusted", "Unit", "σ adj.", "Kind", "Group",
 )  # fmt: skip
 _NAMES = ("Kind", "Group", "Where", "Point", "Component", "Unit", "Unit of σ")
-_BY_SIZE = {"Residual", "w", "Gross error"}
+_BY_SIZE, _FIXED = {"Residual", "w", "Gross error"}, {"Redundancy", "w", "λ̄"}
+"""What is sorted by its size, and what has no unit, and two decimals."""
 _N_VALUES = 12
-_Rows = tuple[npt.NDArray[np.object_], FloatArray]
-"""Of n rows: names (7, n) in the order of ``_NAMES``; values (12, n): observed, adjusted, sigma, residual, redundancy,
-w, whether used, the factors to the units of values and of sigmas, 0 ordinary, 1 suspect or 2 not used, observation and
-component in the tests."""
+_Names = tuple[Sequence[str], IntArray]
+"""Of n rows the names that there are, and which of them each has (n,)."""
+_Rows = tuple[Sequence[_Names], FloatArray]
+"""Of n rows: names in the order of ``_NAMES``, then those of observations in the page; values (12, n): observed,
+adjusted, sigma, residual, redundancy, w, whether used, the factors to the units of values and of sigmas, 0 ordinary,
+1 suspect or 2 not used, observation and component in the tests."""
 
 
 def listed(c: Context) -> Listed:
@@ -48,19 +50,16 @@ def listed(c: Context) -> Listed:
         (of_image, _every_image(c, *divmod(chosen[of_image], 2))),
         (~of_image, _every_other(c, *(x[chosen[~of_image] - n_image] for x in (observation, component)))),
     )
-    texts, values = np.empty((len(_NAMES), len(chosen)), dtype=object), np.empty((_N_VALUES, len(chosen)))
-    for mine, (part_texts, part_values) in parts:
-        texts[:, mine], values[:, mine] = part_texts, part_values
-    columns = {name: _json_column(name, _coded(own)) for name, own in zip(_NAMES, texts.tolist(), strict=True)}
+    values = np.empty((_N_VALUES, len(chosen)))
+    for mine, (_, part_values) in parts:
+        values[:, mine] = part_values
+    *named, places = (_coded([(mine, *names[i]) for mine, (names, _) in parts]) for i in range(len(_NAMES) + 1))
+    columns = {name: f"{_json_column(name, {})[:-1]},{own}}}" for name, own in zip(_NAMES, named, strict=True)}
     columns |= _numeric(_numbers(values), values)
-    n_images = len(c.adjustment.image_residuals.test)
-    seen, of = np.unique(values[10].astype(int), return_inverse=True)
-    others = [(kind, ids) for kind, _, ids, *_ in names_of(c.adjustment.other_residuals)]
-    each = ["" if k < n_images else name_of_observation(*others[k - n_images]) for k in seen.tolist()]
-    places = _coded([each[i] for i in of.tolist()])
-    rest = {"rows": len(chosen), "flags": values[9].astype(int).tolist(), "places": places,
-            "at": [COLUMNS.index("Where"), COLUMNS.index("Point")]}  # fmt: skip
-    return Listed(len(w), values, columns, json_of(rest))
+    at = json_of([COLUMNS.index("Where"), COLUMNS.index("Point")])
+    flags = _whole(values[9].astype(np.int64), 3)
+    rest = f'{{"rows":{len(chosen)},"flags":{flags},"places":{{{places}}},"at":{at}}}'
+    return Listed(len(w), values, columns, rest)
 
 
 def every_observation(c: Context) -> Markup:
@@ -85,10 +84,25 @@ def every_observation(c: Context) -> Markup:
     return section("all-observations", "All observations", table + json_script("all-data", data), said)
 
 
-def _coded(values: Sequence[str]) -> dict[str, object]:
-    names = list(dict.fromkeys(values))
-    at = {v: i for i, v in enumerate(names)}
-    return {"names": names, "codes": [at[v] for v in values]}
+def _coded(parts: Sequence[tuple[BoolArray, Sequence[str], IntArray]]) -> str:
+    """Names in the order in which rows have them, and which each has, as JSON; of parts their rows, names and which."""
+    names, same = numbered(name for _, own, _ in parts for name in own)
+    code, before = np.empty(len(parts[0][0]), dtype=np.int64), 0
+    for mine, own, which in parts:
+        code[mine], before = same[before:][which], before + len(own)
+    first = np.full(len(names), len(code))
+    first[code[::-1]] = np.arange(len(code))[::-1]  # the last that is written stays
+    order = np.argsort(first, kind="stable")[: np.count_nonzero(first < len(code))]
+    rank = np.zeros(len(names), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    return f'"names":{json_of([names[k] for k in order.tolist()])},"codes":{_whole(rank[code], len(order))}'
+
+
+def _whole(numbers: IntArray, end: int) -> str:
+    """Whole numbers below ``end`` as JSON."""
+    words, none = Words.of([",", *map(str, range(end))]), np.empty((len(numbers), 0))
+    text, _ = record_rows(words, 1 + numbers[:, None], none, ((WORD, 0), (TEXT, 0)))
+    return f"[{str(text, 'ascii').removesuffix(',')}]"
 
 
 def _json_column(name: str, said: dict[str, object]) -> str:
@@ -98,20 +112,18 @@ def _json_column(name: str, said: dict[str, object]) -> str:
 def _numeric(numbers: dict[str, FloatArray], values: FloatArray) -> dict[str, str]:
     """Columns of numbers as JSON, each with its decimals; null where there is none."""
     words, none = Words.of(["null", ","]), np.empty((values.shape[1], 0), dtype=np.int64)
+    of_value, of_sigma = (10.0 ** _digits(values[2] * values[k]) for k in (7, 8))
     out = {}
     for name, of in numbers.items():
-        power = 10.0 ** _digits(name, values)
+        power = 100.0 if name in _FIXED else of_value if name in ("Observed", "Adjusted") else of_sigma
         rounded = (np.rint(of * power) / power)[:, None]
-        text = record_rows(words, none, rounded, ((NUMBERS, 1), (TEXT, 1)))[0].decode().removesuffix(",")
+        text = str(record_rows(words, none, rounded, ((NUMBERS, 1), (TEXT, 1)))[0], "ascii").removesuffix(",")
         out[name] = f'{_json_column(name, {"size": name in _BY_SIZE})[:-1]},"values":[{text}]}}'
     return out
 
 
-def _digits(name: str, values: FloatArray) -> IntArray:
-    """Decimals: two digits of the sigma, three for its fractions; fixed ones for numbers without unit."""
-    if name in ("Redundancy", "w", "λ̄"):
-        return np.full(values.shape[1], 2, dtype=np.int64)
-    sigma = values[2] * values[7 if name in ("Observed", "Adjusted") else 8]
+def _digits(sigma: FloatArray) -> IntArray:
+    """Decimals: two digits of the sigma, three for its fractions."""
     with np.errstate(divide="ignore", invalid="ignore"):
         places = 2 - np.floor(np.log10(np.where(sigma > 0, sigma, np.nan)))
     return np.asarray(np.clip(np.nan_to_num(places, nan=4.0), 0, 9).astype(np.int64))
@@ -123,17 +135,18 @@ def _every_image(c: Context, k: IntArray, i: IntArray) -> _Rows:
     seen, block = np.unique(c.rows.block[k], return_inverse=True)
     of_block = [(group_name(b.group), f"{b.camera_id} · {b.epoch_id} · {b.target_id or 'points'}")
                 for b in (blocks[j] for j in seen.tolist())]  # fmt: skip
-    group, where = (np.array(x, dtype=object)[block] for x in zip(*of_block, strict=True)) if of_block else ("", "")
-    point = [c.rows.point_ids[j] for j in c.rows.point[k].tolist()]
-    texts = np.empty((len(_NAMES), len(k)), dtype=object)
-    for at, column in enumerate((t("image point"), group, where, point, np.array(["u", "v"])[i], "px", "px")):
-        texts[at] = column
+    groups, where = zip(*of_block, strict=True) if of_block else ((), ())
+    points, point = np.unique(c.rows.point[k], return_inverse=True)
+    one = np.zeros(len(k), dtype=np.int64)
+    pixels = ("px",), one
+    called = [c.rows.point_ids[j] for j in points.tolist()], point
+    names = ((t("image point"),), one), (groups, block), (where, block), called, ("uv", i), pixels, pixels, (("",), one)
     observed, residual, used = c.rows.uv[k, i], found.residuals[k, i], found.used[k]
     values = np.stack([
         observed, observed + residual, c.rows.sigmas[k, i], residual, found.redundancy[k, i], found.standardized[k, i],
         used, np.ones(len(k)), np.ones(len(k)), np.where(used, c.suspect[k], 2), k, i,
     ])  # fmt: skip
-    return texts, values
+    return names, values
 
 
 def _every_other(c: Context, observation: IntArray, component: IntArray) -> _Rows:
@@ -142,24 +155,28 @@ def _every_other(c: Context, observation: IntArray, component: IntArray) -> _Row
     at = (np.cumsum(arrays.n_components) - arrays.n_components)[observation] + component
     seen, of = np.unique(observation, return_inverse=True)
     some = [every[k] for k in seen.tolist()]
-    said = [(known(kind.replace("_", " ")), group_name(group), " · ".join(ids)) for kind, group, ids, *_ in some]
+    kinds, kind = numbered(kind for kind, *_ in some)
+    groups, group = numbered(group for _, group, *_ in some)
     alike, number = numbered((components, units) for *_, components, units in some)
     most = max((len(components) for components, _ in alike), default=1)
     cells, cell = np.unique(number[of] * most + component, return_inverse=True)
     named = ((alike[k // most][0][k % most], alike[k // most][1][k % most]) for k in cells.tolist())
-    units = [(name, *units_for_people(name, inside)) for name, inside in named]
-    own, unit, factor, small_unit, small = (np.array([u[i] for u in units], dtype=object)[cell] for i in range(5))
-    texts = np.empty((len(_NAMES), len(at)), dtype=object)
-    texts[:3], texts[3] = np.array(said, dtype=object).reshape(-1, 3)[of].T, ""
-    texts[4], texts[5], texts[6] = own, unit, small_unit
+    own = [(name, *units_for_people(name, inside)) for name, inside in named]
+    components, units, factors, small_units, small = zip(*own, strict=True) if own else ((), (), (), (), ())
+    names = (
+        ([known(name.replace("_", " ")) for name in kinds], kind[of]), (list(map(group_name, groups)), group[of]),
+        ([" · ".join(ids) for _, _, ids, *_ in some], of), (("",), np.zeros(len(at), dtype=np.int64)),
+        (components, cell), (units, cell), (small_units, cell),
+        ([name_of_observation(name, ids) for name, _, ids, *_ in some], of),
+    )  # fmt: skip
     used, w = arrays.used[observation], arrays.standardized[at]
     suspect = np.abs(w) > c.solution["summary"]["suspects"]["standardized_limit"]
     values = np.stack([
         arrays.observed[at], arrays.adjusted[at], arrays.sigma[at], arrays.residual[at], arrays.redundancies[at], w,
-        used, factor.astype(float), small.astype(float), np.where(used, suspect, 2),
+        used, *(np.array(x, dtype=float)[cell] for x in (factors, small)), np.where(used, suspect, 2),
         len(c.adjustment.image_residuals.test) + observation, component,
     ])  # fmt: skip
-    return texts, values
+    return names, values
 
 
 def _numbers(values: FloatArray) -> dict[str, FloatArray]:
