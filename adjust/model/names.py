@@ -24,9 +24,9 @@ def grouped(items: Iterable[tuple[_Key, _Value]]) -> dict[_Key, list[_Value]]:
 
 def numbered(names: Iterable[_Key]) -> tuple[list[_Key], IntArray]:
     """The different ones in the order in which they come, and (n,) of each its number among them."""
-    number: dict[_Key, int] = {}
-    of = np.fromiter((number.setdefault(name, len(number)) for name in names), np.int64)
-    return list(number), of
+    every = list(names)
+    number = {name: k for k, name in enumerate(dict.fromkeys(every))}
+    return list(number), np.fromiter(map(number.__getitem__, every), np.int64, len(every))
 
 
 @lru_cache(maxsize=2**15)

@@ -82,8 +82,14 @@ def polygon(xy: FloatArray, fill: str, stroke: str, width: float = 1, more: str 
 
 def polyline(xy: FloatArray, stroke: str, width: float = 1, more: str = "") -> str:
     """An open line."""
-    points = _each(" %.1f,%.1f", xy)[1:]
-    return f'<polyline points="{points}" fill="none" stroke="{stroke}" stroke-width="{width:g}"{more}/>'
+    return polylines(xy[None], stroke, width, more)
+
+
+def polylines(xy: FloatArray, stroke: str, width: float = 1, more: str = "") -> str:
+    """Open lines (n, k, 2) of one look."""
+    points = " ".join(["%.1f,%.1f"] * xy.shape[1])
+    form = f'<polyline points="{points}" fill="none" stroke="{stroke}" stroke-width="{width:g}"{more}/>'
+    return _each(form, xy.reshape(len(xy), -1))
 
 
 def dot(x: float, y: float, radius: float, fill: str, more: str = "") -> str:
@@ -98,7 +104,7 @@ def half_axes(cov: FloatArray) -> FloatArray:
     return np.column_stack([np.sqrt(np.clip(variances, 0.0, None))[:, ::-1], angle])
 
 
-def ellipse(centre: FloatArray, axes: FloatArray, fill: str, stroke: str) -> str:
+def ellipse(centre: Sequence[float], axes: Sequence[float], fill: str, stroke: str) -> str:
     """One of the :func:`half_axes` about a centre, in the picture's units."""
     a, b, angle = axes
     return (

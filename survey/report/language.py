@@ -133,7 +133,10 @@ def language() -> str:
 
 def esc(value: object) -> Markup:
     """Text that cannot be taken for markup, and shows its characters in the order in which they stand."""
-    return value if isinstance(value, Markup) else escape(plain_text(value))
+    if isinstance(value, Markup):
+        return value
+    text = str(value)
+    return escape(text if text.isascii() else unturned(text, TURNING))
 
 
 def plain_text(value: object) -> str:

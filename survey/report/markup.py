@@ -96,9 +96,9 @@ def fixed(value: float | None, decimals: int) -> str:
     if value is None or not math.isfinite(value):
         return MISSING
     text = f"{value:.{decimals}f}"
-    if float(text) == 0.0:
-        text = text.lstrip("-")
-    return localised(text.replace("-", MINUS))
+    if text[0] == "-":
+        text = MINUS * (float(text) != 0.0) + text[1:]
+    return localised(text)
 
 
 def general(value: float | None, digits: int = 4) -> str:
@@ -139,13 +139,14 @@ def with_sigma(value: float | None, sigma: float | None, typical: float | None =
     """A cell of two lines: the value, and its sigma below; ``typical`` sets the decimals of a column or row."""
     decimals = decimals_for(sigma)
     if decimals is None:
-        return _below(value_text(value, typical), t("held"))
+        return below(value_text(value, typical), t("held"))
     decimals = max(decimals_for(typical) or 0, 0 if typical else decimals)
-    below = fixed(sigma, decimals) if sigma and sigma >= 2 * 10.0**-decimals else sigma_text(sigma)
-    return _below(fixed(value, decimals), f"± {below}")
+    own = fixed(sigma, decimals) if sigma and sigma >= 2 * 10.0**-decimals else sigma_text(sigma)
+    return below(fixed(value, decimals), f"± {own}")
 
 
-def _below(value: str, said: str) -> Markup:
+def below(value: str, said: str) -> Markup:
+    """Two lines of a cell."""
     return _filled(_form("below", _PLACE, _PLACE), value, said)
 
 

@@ -170,7 +170,7 @@ def draw(scene: Scene, view: View, everything: FloatArray, enlarged: float, elli
         feet = scene.spot_places().repeat(2, axis=0)
         feet[1::2, 2] = everything[:, 2].min()
         ends = view.to_picture(feet).reshape(-1, 2, 2)
-        parts += [d.polyline(foot, d.FAINT, 0.8, ' stroke-dasharray="2 2"') for foot in ends]
+        parts.append(d.polylines(ends, d.FAINT, 0.8, ' stroke-dasharray="2 2"'))
     parts += [d.polygon(view.to_picture(x), d.BODY, d.INK, 1.0, ' fill-opacity="0.18"') for _, x in scene.outlines]
     parts += [d.dot(x, y, 1.2, d.INK) for _, cloud in scene.clouds for x, y in view.to_picture(cloud)]
     parts += [d.dot(x, y, 1.4, d.GREEN, ' fill-opacity="0.6"') for m in scene.moves for x, y in view.to_picture(m)]
@@ -178,11 +178,11 @@ def draw(scene: Scene, view: View, everything: FloatArray, enlarged: float, elli
     parts += [_frustum(view, s, 0.075 * extent) for s in sorted(scene.shots, key=lambda s: s.main)]
     J = view.jacobian(scene.spot_places()) * ellipsoid * enlarged
     cov = J @ np.array([spot.cov for spot in scene.spots]).reshape(-1, 3, 3) @ J.swapaxes(1, 2)
-    xy, ellipses = view.to_picture(scene.spot_places()), d.half_axes(cov)
+    xy, ellipses = view.to_picture(scene.spot_places()).tolist(), d.half_axes(cov).tolist()
     for i, spot in sorted(enumerate(scene.spots), key=lambda s: s[1].kind):
         colour, size = (d.RED, 2.2) if spot.kind == "point" else (d.GREEN, 3.0)
-        parts.append(d.ellipse(xy[i], ellipses[i], colour, colour))
-        parts.append(d.dot(xy[i, 0], xy[i, 1], size, colour))
+        (x, y), axes = xy[i], ellipses[i]
+        parts += [d.ellipse((x, y), axes, colour, colour), d.dot(x, y, size, colour)]
     parts += _labels(view, scene, 0.09 * extent, letters)
     step = d.round_below(0.25 * WIDTH / view.unit)
     parts.append(d.scale_bar(2, HEIGHT - 8, step * view.unit, localised(f"{step:g} m")))

@@ -164,9 +164,9 @@ def pairs(c: Context) -> Markup:
         return Markup()
     tests = np.nan_to_num(list(every.numbers("test").values()), nan=-1.0)
     names = list(every)
-    order = [names[i] for i in np.argsort(-tests, kind="stable")[:_MOST_PAIRS].tolist()]
-    poses = any("translation_mm" in every[p]["measured"] for p in order)
-    rows = [_pair_row(p, every[p], poses) for p in order]
+    shown = [(names[i], every[names[i]]) for i in np.argsort(-tests, kind="stable")[:_MOST_PAIRS].tolist()]
+    poses = any("translation_mm" in entry["measured"] for _, entry in shown)
+    rows = [_pair_row(name, entry, poses) for name, entry in shown]
     columns = ["<Pair, from a to b", "Residual", *(["[mm]"] if poses else []), "Redundancy", "Largest std."]
     columns += ["Test", "p", "<", "x [°]", "y [°]", "z [°]", *(["x [mm]", "y [mm]", "z [mm]"] if poses else [])]
     more = " " + t("The worst {shown} of {n}", shown=m.count(len(rows)), n=m.count(len(every))) + "."
@@ -177,7 +177,7 @@ def pairs(c: Context) -> Markup:
         "translation that takes the measured pair to the adjusted one; of pairs not used, to its prediction. "
         "Redundancy: mean of its components, 0 where nothing checks the pair, 1 where the others alone determine it."
     ) + more
-    classes = ["off" if not every[p]["used"] else "" for p in order]
+    classes = ["off" if not entry["used"] else "" for _, entry in shown]
     return m.section("pairs", "Adjusted pairs", m.table(columns, rows, "", classes), note)
 
 
@@ -185,7 +185,7 @@ def _pair_row(pair_id: str, e: dict[str, Any], poses: bool) -> list[str]:
     value = e.get("adjusted", {})
     quaternion = " ".join(m.fixed(q, 7) for q in value.get("rotation_quaternion_wxyz", ()))
     ends = " → ".join(e[end].removeprefix("station:") for end in "ab")
-    cells: list[str] = [m.part("below", m.joined((m.element("b", pair_id), ends), " "), quaternion)]
+    cells: list[str] = [m.below(m.joined((m.element("b", pair_id), ends), " "), quaternion)]
     cells.append(angle_text(e["misfit_arcsec"], None) if e.get("misfit_arcsec") is not None else m.MISSING)
     cells += [m.general(e.get("misfit_mm"), 4)] if poses else []
     redundancy = [r for r in e.get("redundancy", ()) if r is not None]
@@ -195,7 +195,7 @@ def _pair_row(pair_id: str, e: dict[str, Any], poses: bool) -> list[str]:
     sigmas = value.get("sigma_rotation_arcsec", [None] * 3)
     for angle, sigma in zip(value.get("rotation_euler_xyz_deg", [None] * 3), sigmas, strict=True):
         shown = m.value_text(angle, None if not sigma else sigma / 3600.0)
-        cells.append(m.part("below", shown, f"± {m.sigma_text(sigma)}″"))
+        cells.append(m.below(shown, f"± {m.sigma_text(sigma)}″"))
     if poses:
         shift = value.get("translation_mm", [None] * 3)
         along = value.get("sigma_translation_mm", [None] * 3)

@@ -38,7 +38,7 @@ def _pose_row(pose: _Pose) -> list[str]:
     least = min((s for s in entry["sigma_rotation_arcsec"] if s), default=None)
     for angle, sigma in zip(entry["rotation_euler_xyz_deg"], entry["sigma_rotation_arcsec"], strict=True):
         below = f"± {m.sigma_text(sigma)}″" if sigma else t("held")
-        cells.append(m.part("below", value_in("deg", angle, least, "arcsec"), below))
+        cells.append(m.below(value_in("deg", angle, least, "arcsec"), below))
     return [m.joined((m.element("b", thing_id), m.code(name)), " "), epoch, *cells, status_pill(entry["status"])]
 
 
