@@ -211,6 +211,7 @@ class Residuals(Sequence[ObservationResidual]):
 
 
 @lru_cache(2)
+@lru_cache(2)  # those of an adjustment that is given another warning are the same
 def names_of(residuals: Sequence[ObservationResidual]) -> tuple[Named, ...]:
     """What each is called; none of ``Residuals`` is made for that."""
     if isinstance(residuals, Residuals):
@@ -218,7 +219,7 @@ def names_of(residuals: Sequence[ObservationResidual]) -> tuple[Named, ...]:
     return tuple((o.kind, o.group, o.ids, o.components, o.units) for o in residuals)
 
 
-@lru_cache(2)  # those of an adjustment that is given another warning are the same
+@lru_cache(2)  # likewise
 def arrays_of(residuals: Sequence[ObservationResidual]) -> OtherArrays:
     """Observations as arrays; none of ``Residuals`` is made for that."""
     if isinstance(residuals, Residuals):

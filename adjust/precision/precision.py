@@ -235,18 +235,27 @@ class Precision(Covariances):
         of_dim = grouped((unknown.dim, key) for key, unknown in self.unknowns.by_key.items())
         return {k: Q for dim, keys in of_dim.items() for k, Q in zip(keys, self.covs(np.array(keys), dim), strict=True)}
 
-    def pair_covariances(self) -> dict[str, FloatArray]:
-        """Covariances (k, k) of the adjusted pairs by id, a priori, in the tangent in frame a."""
-        graph, out = self.graph, dict[str, FloatArray]()
+    def pair_covariances(self, ids: Sequence[str]) -> tuple[FloatArray, IntArray]:
+        """Covariances (E, 6, 6) of these adjusted pairs, a priori, in the tangent in frame a; their components (E,).
+
+        Zero beyond these: the last three of a rotation, all of a pair that was not adjusted.
+        """
+        graph, cov, size = self.graph, np.zeros((len(ids), 6, 6)), np.zeros(len(ids), dtype=np.int64)
+        number = {name: e for e, name in enumerate(ids)}
         if graph.pairs is not None:
-            cov, sizes = self.pairs.adjusted_cov, np.where(graph.pairs.arrays.is_pose, 6, 3).tolist()
-            out = {graph.survey.pairs[row].pair_id: cov[e, :k, :k]
-                   for e, (row, k) in enumerate(zip(graph.pairs.rows.tolist(), sizes, strict=True))}  # fmt: skip
-        for item in graph.singles:
-            if item.kind == "pair":
-                x = self.rows(item)
-                out[item.ids[0]] = x.root @ x.influence @ x.root.T
-        return out | dict(self.by_conditions)
+            rows, sizes = graph.pairs.rows.tolist(), np.where(graph.pairs.arrays.is_pose, 6, 3)
+            of = np.array([number.get(graph.survey.pairs[row].pair_id, -1) for row in rows], dtype=np.int64)
+            kept = of >= 0
+            within = np.arange(6) < sizes[kept, None]
+            size[of[kept]] = sizes[kept]
+            cov[of[kept]] = np.where(within[:, :, None] & within[:, None], self.pairs.adjusted_cov[kept], 0.0)
+        others = {item.ids[0]: self.rows(item) for item in graph.singles if item.kind == "pair"}
+        found = {name: x.root @ x.influence @ x.root.T for name, x in others.items()} | dict(self.by_conditions)
+        for name in found.keys() & number.keys():
+            e, k = number[name], len(found[name])
+            cov[e], size[e] = 0.0, k
+            cov[e, :k, :k] = found[name]
+        return cov, size
 
 
 def precision_of(adjustment: Adjustment) -> Precision:

@@ -89,7 +89,7 @@ def polylines(xy: FloatArray, stroke: str, width: float = 1, more: str = "") -> 
     """Open lines (n, k, 2) of one look."""
     points = " ".join(["%.1f,%.1f"] * xy.shape[1])
     form = f'<polyline points="{points}" fill="none" stroke="{stroke}" stroke-width="{width:g}"{more}/>'
-    return _each(form, xy.reshape(len(xy), -1))
+    return _each(form, xy.reshape(len(xy), 2 * xy.shape[1]))
 
 
 def dot(x: float, y: float, radius: float, fill: str, more: str = "") -> str:

@@ -75,9 +75,14 @@ def test_eyes_that_are_no_stations_close_their_loops(rotations: bool) -> None:
     assert not expected.precision.by_conditions
     assert found.redundancy == (3 if rotations else 6) * (9 - 5 + 1)
     check_equal(found, expected)
-    covs = found.precision.pair_covariances()
-    for pair_id, cov in expected.precision.pair_covariances().items():
-        assert h.relative(covs[pair_id], cov) < 1e-6
+    ids = [p.pair_id for p in survey.pairs]
+    (covs, sizes), (known, n) = (x.precision.pair_covariances(ids) for x in (found, expected))
+    dim = 3 if rotations else 6
+    assert sizes.tolist() == n.tolist() == [dim] * len(ids)
+    assert not covs[:, dim:].any()
+    for cov, expected_cov in zip(covs[:, :dim, :dim], known[:, :dim, :dim], strict=True):
+        assert h.relative(cov, expected_cov) < 1e-6
+    assert not any(found.precision.pair_covariances(["none"])[1])
     assert not any("differ" in w for w in found.warnings)
 
 

@@ -8,6 +8,7 @@ pairs reach more than one of its frames, each joined to the station.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -52,9 +53,9 @@ def frame_name(frame: FrameRef) -> str:
 
 def pair_network(survey: Survey) -> PairNetwork:
     """Count what the pairs in use can tell."""
-    used = [p for p in survey.pairs if p.used]
+    used = tuple(p for p in survey.pairs if p.used)
     bare = _bare_stations(survey)
-    poses = [p for p in used if isinstance(p.b_from_a, Pose3)]
+    poses = tuple(p for p in used if isinstance(p.b_from_a, Pose3))
     dim, ends = 6 if len(poses) == len(used) and used else 3, ends_of(used)
     whole = topology(ends, bare)
     counts, links = count(whole, dim), links_of(survey, used, ends, 6 if poses else 3)
@@ -88,11 +89,10 @@ def measured_only(ids: Sequence[str]) -> tuple[str, ...]:
     return tuple(i for i in ids if not i.startswith(_GIVEN))
 
 
-def ends_of(pairs: Sequence[Pair]) -> Ends:
+@lru_cache(2)  # all pairs, and those in use
+def ends_of(pairs: tuple[Pair, ...]) -> Ends:
     """Ids of the pairs, and names of their frames a and b."""
-    seen = {id(r): r for p in pairs for r in (p.a, p.b)}  # most are the same object
-    name = {k: frame_name(r) for k, r in seen.items()}
-    return [(p.pair_id, name[id(p.a)], name[id(p.b)]) for p in pairs]
+    return [(p.pair_id, frame_name(p.a), frame_name(p.b)) for p in pairs]
 
 
 def _bare_stations(survey: Survey) -> tuple[str, ...]:
@@ -109,8 +109,8 @@ def _is_given(parameter: PoseParameter, dim: int) -> bool:
 
 
 def _given(survey: Survey, ends: Ends, dim: int) -> tuple[str, ...]:
-    names = {name for _, *both in ends for name in both}
-    given = tuple(name for name, (_, pose) in _in_world(survey).items() if name in names and _is_given(pose, dim))
+    names = {a for _, a, _ in ends}.union(b for _, _, b in ends)
+    given = tuple(name for name, (_, pose) in _in_world(survey).items() if _is_given(pose, dim) and name in names)
     return ((_WORLD,) if _WORLD in names else ()) + given
 
 
@@ -149,11 +149,11 @@ def links_of(survey: Survey, pairs: Sequence[Pair], ends: Ends, dim: int) -> lis
     given, stations, standing = _given(survey, ends, dim), survey.stations_by_id, _in_world(survey)
     out = [Link(name, _WORLD, *standing[name]) for name in given if name != _WORLD] if len(given) > 1 else []
     frames, rig = dict[str, FrameRef](), dict[str, list[Link]]()
-    for pair, (_, a, b) in zip(pairs, ends, strict=True):
-        frames[a], frames[b] = pair.a, pair.b
     on = {("camera", c.camera_id): (c.station_id, c.station_from_camera) for c in survey.cameras}
     on |= {("target", t.target_id): (t.station_id, t.carrier_from_target)
            for t in survey.targets if t.station_id is not None and t.motion != "epoch"}  # fmt: skip
+    for pair, (_, a, b) in zip(pairs, ends, strict=True) if on else ():
+        frames[a], frames[b] = pair.a, pair.b
     for name, ref in frames.items():
         station_id, known = on.get((ref.kind, ref.frame_id), ("", None))
         if station_id and known is not None and _is_given(known, dim):

@@ -31,10 +31,10 @@ def pair_loops(survey: Survey) -> LoopMisclosures | None:
 
     Of pairs with and without translation the rotations alone.
     """
-    pairs = list(survey.pairs)
+    pairs = survey.pairs
     if not pairs:
         return None
-    measured, ends = pair_arrays(survey.pairs), ends_of(pairs)
+    measured, ends = pair_arrays(pairs), ends_of(pairs)
     dim = 6 if measured.is_pose.all() else 3
     links, covs = links_of(survey, pairs, ends, dim), [measured.cov[:, :dim, :dim]]
     for given in (link.given for link in links):
@@ -125,7 +125,7 @@ def closures_dict(adjustment: Adjustment) -> dict[str, Any]:
         rows = [number[i] for i in closure.pair_ids]
         pairs, dim = [survey.pairs[e] for e in rows], 6 if every.is_pose[rows].all() else 3
         motions = Motions(every.rotations[rows], every.translations[rows] if dim == 6 else None)
-        loop = loop_misclosures(MeasuredPairs(topology(ends_of(pairs)), motions, every.cov[rows, :dim, :dim]))
+        loop = loop_misclosures(MeasuredPairs(topology(ends_of(tuple(pairs))), motions, every.cov[rows, :dim, :dim]))
         entry: dict[str, Any] = {"pairs": list(closure.pair_ids), "used": pairs[-1].used}
         entry |= {"sigma_arcsec": ARCSEC_PER_RAD * closure.rotation_sigma, "sigma_mm": 1e3 * closure.translation_sigma}
         entry |= {key: float(of[0]) for key, of in misclosure_columns(loop.vector, loop.cov).items()}
@@ -145,7 +145,8 @@ def _walks(loops: LoopMisclosures, order: Sequence[int], left_out: Sequence[str]
     """What loops lead through, in this order, and of how many components each is."""
     out = frozenset(left_out)
     stations, pairs = loops.basis.all_stations, loops.basis.all_pairs
-    measured = [list(measured_only(pairs[k])) for k in order]
+    every = len(measured_only(loops.basis.topology.pair_ids)) == loops.basis.topology.n_pairs
+    measured = [list(pairs[k] if every else measured_only(pairs[k])) for k in order]
     return {
         "stations": [list(stations[k]) for k in order],
         "pairs": measured,

@@ -3,6 +3,7 @@
 import numpy as np
 from gtsam import Pose3
 
+from adjust.model.names import numbered
 from adjust.model.observations import frame_text
 from adjust.model.result import Adjustment, names_of
 from adjust.model.survey import FloatArray, IntArray
@@ -27,9 +28,8 @@ def pairs_dict(adjustment: Adjustment, scale: Scale) -> Records:
     pairs, (known, ends, now) = adjustment.survey.pairs, _adjusted(adjustment)
     covs, n_cov = _covariances(adjustment)
     tests, n_tested = _tests(adjustment)
-    whole = np.array([isinstance(p.b_from_a, Pose3) for p in pairs])
-    measured, adjusted = _columns(pair_arrays(pairs).motions), _columns(now)
-    used = np.array([p.used for p in pairs])
+    arrays = pair_arrays(pairs)
+    measured, adjusted, used = _columns(arrays.motions), _columns(now), arrays.used
 
     def tree(rows: IntArray, is_pose: bool, there: bool, dim: int, size: int) -> Tree:
         kept = [key for key in measured if is_pose or key != "translation_mm"]
@@ -40,9 +40,10 @@ def pairs_dict(adjustment: Adjustment, scale: Scale) -> Records:
             out["adjusted"] = {key: adjusted[key][rows] for key in kept} | sigmas
         return out | _tested(tests, rows, size)
 
-    kinds, of_kind = np.unique(np.column_stack([whole, known, n_cov, n_tested]), axis=0, return_inverse=True)
-    rows = [np.flatnonzero(of_kind.ravel() == k) for k in range(len(kinds))]
-    forms = (Form(of, tree(of, bool(w), bool(t), d, s)) for of, (w, t, d, s) in zip(rows, kinds.tolist(), strict=True))
+    alike = (arrays.is_pose, known, n_cov, n_tested)
+    kinds, of_kind = numbered(zip(*(x.tolist() for x in alike), strict=True))
+    rows = [np.flatnonzero(of_kind == k) for k in range(len(kinds))]
+    forms = (Form(of, tree(of, *kind)) for of, kind in zip(rows, kinds, strict=True))
     return Records([p.pair_id for p in pairs], tuple(forms))
 
 
@@ -52,12 +53,11 @@ def _columns(of: Motions) -> dict[str, FloatArray]:
 
 def _adjusted(adjustment: Adjustment) -> tuple[FloatArray, tuple[list[str], list[str]], Motions]:
     """Of which pairs (E,) both ends are known; names of these; the adjusted ``b_from_a``, nonsense for the others."""
-    frames, pairs = AdjustedFrames(adjustment), adjustment.survey.pairs
-    ends = [frame_text(p.a) for p in pairs], [frame_text(p.b) for p in pairs]
-    ref = dict(zip(ends[0] + ends[1], [*(p.a for p in pairs), *(p.b for p in pairs)], strict=True))
-    number = {name: i for i, name in enumerate(ref)}
+    frames, survey = AdjustedFrames(adjustment), adjustment.survey
+    number = {frame_text(ref): i for i, ref in enumerate(survey.pair_frames)}
+    ends = [frame_text(p.a) for p in survey.pairs], [frame_text(p.b) for p in survey.pairs]
     a, b = (np.array([number[name] for name in names], dtype=np.int64) for names in ends)
-    place = [frames.world_from(r) for r in ref.values()]
+    place = list(map(frames.world_from, survey.pair_frames))
     known = np.array([p is not None for p in place])
     at = np.array([(Pose3() if p is None else p).matrix() for p in place])
     world = Motions(at[:, :3, :3], at[:, :3, 3])
@@ -67,12 +67,9 @@ def _adjusted(adjustment: Adjustment) -> tuple[FloatArray, tuple[list[str], list
 def _covariances(adjustment: Adjustment) -> tuple[FloatArray, IntArray]:
     """Of the adjusted pairs (E, 6, 6), and how many components of them there are (E,), 0 where none."""
     precision, pairs = adjustment.precision, adjustment.survey.pairs
-    found = precision.pair_covariances() if isinstance(precision, Precision) else {}
-    covs = [found.get(p.pair_id, np.zeros((0, 0))) for p in pairs]
-    out = np.zeros((len(pairs), 6, 6))
-    for e, cov in enumerate(covs):
-        out[e, : len(cov), : len(cov)] = cov
-    return out, np.array(list(map(len, covs)), dtype=np.int64)
+    if isinstance(precision, Precision):
+        return precision.pair_covariances([p.pair_id for p in pairs])
+    return np.zeros((len(pairs), 6, 6)), np.zeros(len(pairs), dtype=np.int64)
 
 
 def _tests(adjustment: Adjustment) -> tuple[dict[str, FloatArray], IntArray]:
