@@ -12,6 +12,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.names import numbered
 from adjust.model.result import Adjustment, names_of
 from adjust.model.survey import FloatArray, Survey
+from adjust.observations.pair_arrays import pair_arrays
 from adjust.testing.criteria import CLEARLY, contradicting, is_noise
 
 _NOISE = 5.0
@@ -226,10 +227,14 @@ def _at_best_scale(squares: FloatArray) -> float:
 @lru_cache(4)  # of the survey of a case, and of what is tried
 def n_other_components(survey: Survey, used_only: bool = True) -> int:
     """Observed components in use, or all, that are no image points: the finite variances of covariances, else one."""
-    observed = [o for kind in survey.others.values() for o in kind if o.used or not used_only]
+    kinds = (kind for name, kind in survey.others.items() if name != "pairs")
+    observed = [o for kind in kinds for o in kind if o.used or not used_only]
+    pairs = pair_arrays(survey.pairs)
+    of_pairs = np.isfinite(np.diagonal(pairs.cov, axis1=1, axis2=2)).sum(axis=1)
     covs = [cov for o in observed if (cov := getattr(o, "cov", None)) is not None]
     variances = np.concatenate([np.zeros(0), *(cov.diagonal() for cov in covs)])
-    return len(observed) - len(covs) + int(np.isfinite(variances).sum())
+    n_pairs = int(of_pairs[pairs.used].sum() if used_only else of_pairs.sum())
+    return len(observed) - len(covs) + int(np.isfinite(variances).sum()) + n_pairs
 
 
 def _left_out(survey: Survey) -> set[tuple[str, ...]]:

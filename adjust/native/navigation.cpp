@@ -11,7 +11,7 @@ extern "C" __attribute__((visibility("default"))) const Entry *navigation() {
         entry<three_point_problem>("three_point_poses"), entry<search>("search"), entry<horton_loops>("horton_loops"),
         entry<label_chords>("label_chords"), entry<shortest_loop>("shortest_loop"),
         entry<pair_jacobians>("pair_jacobians"), entry<pair_rows>("pair_rows"), entry<pair_gradient>("pair_gradient"),
-        entry<sure_forms>("sure_forms"),
+        entry<sure_forms>("sure_forms"), entry<pair_spread>("pair_spread"),
         entry<elimination_tree>("elimination_tree"), entry<gather_cliques>("gather_cliques"), entry<clique_nodes>("clique_nodes"),
         entry<elimination_room>("elimination_room"), entry<eliminate>("eliminate"), entry<solve_poses>("solve_poses"),
         entry<eliminate_rows>("eliminate_rows"), entry<compose_poses>("compose_poses"), entry<right_jacobians>("right_jacobians"), {nullptr, nullptr, nullptr}};

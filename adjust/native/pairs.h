@@ -151,6 +151,48 @@ inline void pair_rows(const Pairs &pairs, In<double, 3> W, Out<double, 2> white,
     }
 }
 
+// out = A B' (6 by 6).
+inline void times6_transposed(const double *A, const double *B, double *out) {
+    for (int i = 0; i < 6; ++i)
+        for (int j = 0; j < 6; ++j) {
+            double sum = 0.0;
+            for (int k = 0; k < 6; ++k) sum += A[6 * i + k] * B[6 * j + k];
+            out[6 * i + j] = sum;
+        }
+}
+// out = A S A'.
+inline void carried6(const double *A, bool upper, const Block &S, double *out) {
+    Block left;
+    times6(1.0, A, upper, S, left[0]);
+    times6_transposed(left[0], A, out);
+}
+
+// From the covariance of both ends, b before a (E, 12, 12), that of b_from_a, as its residual moves, and this whitened; and the
+// whitened variances of the residual were the ends not correlated. turn: the derivative by b is that by a times -turn.
+inline void pair_spread(In<double, 3> ends, In<double, 3> turn, In<double, 3> by_a, In<double, 3> W, Out<double, 3> own, Out<double, 3> moved,
+                        Out<double, 3> white, Out<double, 2> apart) {
+    for (int64_t e = 0; e < own.n[0]; ++e) {
+        const double *T = &turn(e, 0, 0), *A = &by_a(e, 0, 0), *weight = &W(e, 0, 0);
+        Block bb, ba, ab, turned, half, left, alone;
+        for (int i = 0; i < 6; ++i)
+            for (int j = 0; j < 6; ++j) bb[i][j] = ends(e, i, j), ba[i][j] = ends(e, i, 6 + j), ab[i][j] = ends(e, 6 + i, j);
+        times6(1.0, T, false, bb, turned[0]);
+        times6_transposed(turned[0], T, alone[0]);
+        for (int i = 0; i < 6; ++i)
+            for (int j = 0; j < 6; ++j) half[i][j] = ab[i][j] - turned[i][j], alone[i][j] += ends(e, 6 + i, 6 + j);
+        times6(1.0, T, false, ba, left[0]);
+        times6_transposed(half[0], T, turned[0]);
+        Block &now = *reinterpret_cast<Block *>(&own(e, 0, 0)), &residual = *reinterpret_cast<Block *>(&moved(e, 0, 0));
+        for (int i = 0; i < 6; ++i)
+            for (int j = 0; j < 6; ++j) now[i][j] = ends(e, 6 + i, 6 + j) - left[i][j] - turned[i][j];
+        carried6(A, false, now, residual[0]);
+        carried6(weight, true, residual, &white(e, 0, 0));
+        carried6(A, false, alone, left[0]);
+        carried6(weight, true, left, half[0]);
+        for (int i = 0; i < 6; ++i) apart(e, i) = half[i][i];
+    }
+}
+
 // The forms v' Q^-1 v of symmetric Q whose eigenvalues are all above `least`, as the trace of the inverse tells; else -1.
 inline void sure_forms(In<double, 3> Q, In<double, 2> v, double least, Out<double, 1> form) {
     for (int64_t e = 0; e < form.n[0]; ++e) {

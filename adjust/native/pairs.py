@@ -10,6 +10,10 @@ _pair_jacobians = Function("pair_jacobians", f"{_PAIRS} residual[E,6] by_b[E,6,6
 _pair_rows = Function("pair_rows", f"{_PAIRS} W[E,6,6] white[E,6] by_b[E,6,6] by_a[E,6,6]")
 _compose_poses = Function("compose_poses", "order[N] parent[N] R[N,3,3] t[N,3]")
 _right_jacobians = Function("right_jacobians", "d[n,k] back J[n,k,k]")
+_pair_spread = Function(
+    "pair_spread",
+    "ends[E,12,12] turn[E,6,6] by_a[E,6,6] W[E,6,6] own[E,6,6] moved[E,6,6] white[E,6,6] apart[E,6]",
+)
 _sure_forms = Function("sure_forms", "Q[E,6,6] v[E,6] least form[E]")
 
 
@@ -50,6 +54,19 @@ def right_jacobians(d: FloatArray, back: bool) -> FloatArray:
     out = np.empty((*d.shape, d.shape[-1]))
     _right_jacobians(tangents.reshape(-1, d.shape[-1]), back, out.reshape(-1, *out.shape[-2:]))
     return out
+
+
+def pair_spread(
+    ends: FloatArray, turn: FloatArray, by_a: FloatArray, whitening: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Covariances (E, 6, 6) of adjusted ``b_from_a``, of their residuals by these, and the latter whitened.
+
+    And the variances (E, 6) of whitened residuals as if both ends were apart. ends: (E, 12, 12) covariance of both, b
+    before a. turn, by_a: of :func:`pair_jacobians`. whitening: upper triangular.
+    """
+    (own, moved, white), apart = np.empty((3, len(ends), 6, 6)), np.empty((len(ends), 6))
+    _pair_spread(*map(np.ascontiguousarray, (ends, turn, by_a, whitening)), own, moved, white, apart)
+    return own, moved, white, apart
 
 
 def sure_forms(Q: FloatArray, v: FloatArray, least: float) -> FloatArray:

@@ -34,7 +34,10 @@ def copied_observations(survey: Survey) -> dict[str, tuple[tuple[str, str], ...]
     Images of a camera at two epochs, pairs of the same frames; distances and readings of a set-up where almost all that
     were made again came out the same.
     """
-    pairs = ((_value(p), p.pair_id) for p in survey.pairs if p.used)
+    used = [p for p in survey.pairs if p.used]
+    ends = Counter((p.a.text, p.b.text) for p in used)
+    again = (p for p in used if ends[p.a.text, p.b.text] > 1) if len(ends) < len(used) else ()
+    pairs = ((_value(p), p.pair_id) for p in again)
     distances = [((d.a, d.b), d.value, d.distance_id) for d in survey.distances if d.used]
     readings = [((r.kind, r.setup_id, r.at, r.to, r.second), r.value, r.reading_id) for r in survey.readings if r.used]
     found = {"images": _same_images(survey.image_blocks), "pairs": _same(pairs),

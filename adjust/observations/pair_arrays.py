@@ -106,6 +106,17 @@ def whitening(cov: FloatArray) -> FloatArray:
     return np.linalg.inv(flipped)
 
 
+def upper_inverse(of: FloatArray) -> FloatArray:
+    """Inverses of upper triangular matrices (E, dim, dim), column by column of all at once."""
+    out = np.zeros(of.shape)
+    for j in range(of.shape[-1]):
+        out[:, j, j] = 1.0 / of[:, j, j]
+        for i in range(j - 1, -1, -1):
+            row = np.einsum("nk,nk->n", of[:, i, i + 1 : j + 1], out[:, i + 1 : j + 1, j])
+            out[:, i, j] = -row / of[:, i, i]
+    return out
+
+
 @lru_cache(2)  # of a survey as it was given, and as it is solved
 def pair_arrays(pairs: tuple[Pair, ...]) -> PairArrays:
     """Pairs as arrays, which are not to be changed: those of the same pairs are made once."""

@@ -21,7 +21,7 @@ from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Link, Unknowns
 from adjust.model.observations import Pair
 from adjust.model.result import Named, OtherArrays, Residuals
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
-from adjust.native.pairs import pair_jacobians, pair_rows, sure_forms
+from adjust.native.pairs import pair_jacobians, pair_rows, pair_spread, sure_forms
 from adjust.native.trees import KeyCovariances
 from adjust.observations.factors import ObservationFactor, pair_item
 from adjust.observations.pair_arrays import PairArrays
@@ -200,20 +200,16 @@ class PairBatch:
             free = [i for i, k in enumerate(keys) if k != _HELD]
             at = np.concatenate([np.arange(6 * i, 6 * i + 6) for i in free])
             Q[e][np.ix_(at, at)] = tree.joint([keys[i] for i in free])
-        W, half = arrays.whitening, Q[:, 6:] - turn @ Q[:, :6]  # the derivative by b is that by a times -turn
-        own = half[:, :, 6:] - half[:, :, :6] @ np.swapaxes(turn, 1, 2)
-        scatter = by_a @ own @ np.swapaxes(by_a, 1, 2)
-        sign = np.where(used, -1.0, 1.0)[:, None, None]
+        W, sign = arrays.whitening, np.where(used, -1.0, 1.0)[:, None, None]
+        # the covariance of a pair is the difference of those of its far ends, which share nearly all of their errors
+        own, scatter, white_scatter, apart = pair_spread(Q, turn, by_a, W)
         # a row of the whitening that is zero was not measured
-        Qvv = sign * (W @ scatter @ np.swapaxes(W, 1, 2)) + np.any(W, axis=2)[..., None] * np.eye(6)
+        Qvv = sign * white_scatter + np.any(W, axis=2)[..., None] * np.eye(6)
         white = np.einsum("nij,nj->ni", W, residual)
         redundancy = np.where(used[:, None], np.diagonal(Qvv, axis1=1, axis2=2), 0.0)
         test, freedom, p = pair_tests(Qvv, white, UNCONTROLLED)
         residual_cov = arrays.cov + sign * scatter
-        # the covariance of a pair is the difference of those of its far ends, which share nearly all of their errors
-        apart = by_a @ (turn @ Q[:, :6, :6] @ np.swapaxes(turn, 1, 2) + Q[:, 6:, 6:]) @ np.swapaxes(by_a, 1, 2)
-        rounding = 4.0 * np.finfo(float).eps * np.einsum("nij,njk,nik->ni", W, apart, W).max(axis=1, initial=0.0)
-        far = rounding > MOST_ROUNDING
+        far = 4.0 * np.finfo(float).eps * apart.max(axis=1, initial=0.0) > MOST_ROUNDING
         test[far], freedom[far], p[far], residual_cov[far] = np.nan, 0, np.nan, 0.0
         return PairStatistics(residual, white, redundancy, test, freedom, p, own, residual_cov, far)
 

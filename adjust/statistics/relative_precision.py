@@ -58,10 +58,16 @@ def relative_precision(
     Raises SurveyError for a name that is no position.
     """
     places = _Places(adjustment)
-    found = [(places.place(a), places.place(b)) for a, b in pairs]
+    known = {what: places.place(what) for what in dict.fromkeys(what for both in pairs for what in both)}
+    found = [(known[a], known[b]) for a, b in pairs]
     unknowns = (tuple(dict.fromkeys([*a.by, *b.by])) for a, b in found)
     adjustment.precision.bring_together((names[0], names[1]) for names in unknowns if len(names) == 2)
-    return tuple(_relative(adjustment, a, b, level, scaled) for a, b in found)
+    covs = np.array([_difference_cov(adjustment, a, b) for a, b in found]).reshape(-1, 6, 6)
+    sigma0 = adjustment.sigma0 if scaled and adjustment.redundancy > 0 else None
+    regions = ellipsoids(covs[:, 3:, 3:], level, sigma0, adjustment.redundancy)
+    nowhere = Ellipsoid(np.zeros(0), np.zeros((3, 0)), level, scaled)
+    return tuple(_relative(*both, cov, region if np.isfinite(both[1].x - both[0].x).all() else nowhere)
+                 for both, cov, region in zip(found, covs, regions, strict=True))  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,24 +120,25 @@ class _Places:
         return _Place(called, np.asarray(pose.translation()), R, by)
 
 
-def _relative(adjustment: Adjustment, a: _Place, b: _Place, level: float, scaled: bool) -> RelativePrecision:
+def _difference_cov(adjustment: Adjustment, a: _Place, b: _Place) -> FloatArray:
+    """Covariance (6, 6) of b relative to a: turn, and difference of the positions."""
     dims = {n: J.shape[1] for p in (a, b) for n, J in p.by.items()}
-    turned, back = False, np.eye(3)
-    if a.R is not None and b.R is not None:
-        turned, back = True, b.R.T @ a.R
+    back = np.eye(3) if a.R is None or b.R is None else b.R.T @ a.R
     columns = [np.zeros((6, 0))]
     for n, dim in dims.items():
         of_a, of_b = (p.by.get(n, np.zeros((6, dim))) for p in (a, b))
         columns.append(np.vstack([of_b[:3] - back @ of_a[:3], of_b[3:] - of_a[3:]]))
     J = np.hstack(columns)
-    cov = J @ np.asarray(adjustment.precision.joint(list(dims))) @ J.T if dims else np.zeros((6, 6))
-    d, own, of_rotation = b.x - a.x, cov[3:, 3:], cov[:3, :3] if turned else None
+    return np.asarray(J @ adjustment.precision.joint(list(dims)) @ J.T) if dims else np.zeros((6, 6))
+
+
+def _relative(a: _Place, b: _Place, cov: FloatArray, region: Ellipsoid) -> RelativePrecision:
+    of_rotation = None if a.R is None or b.R is None else cov[:3, :3]
+    d, own = b.x - a.x, cov[3:, 3:]
     if not np.isfinite(d).all():
-        nan, none = np.full((3, 3), np.nan), Ellipsoid(np.zeros(0), np.zeros((3, 0)), level, scaled)
-        return RelativePrecision(a.name, b.name, d, nan, float("nan"), float("nan"), none, of_rotation)
+        nan = np.full((3, 3), np.nan)
+        return RelativePrecision(a.name, b.name, d, nan, float("nan"), float("nan"), region, of_rotation)
     length = float(np.linalg.norm(d))
     u = d / length if length > 0.0 else np.zeros(3)
-    sigma0 = adjustment.sigma0 if scaled and adjustment.redundancy > 0 else None
-    region = ellipsoid(own, level, sigma0, adjustment.redundancy)
     along = float(np.sqrt(max(0.0, float(u @ own @ u))))
     return RelativePrecision(a.name, b.name, d, own, length, along, region, of_rotation)

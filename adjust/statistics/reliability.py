@@ -10,6 +10,7 @@ from adjust.model.names import numbered
 from adjust.model.result import Adjustment, ReadingResiduals
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.point_tests import AdjustedPoints, controlled_directions, point_tests
+from adjust.observations.pair_arrays import upper_inverse
 from adjust.precision.precision import Precision, precision_of
 from adjust.statistics.condensed import CondensedSystem, condensed_system
 from adjust.statistics.effects import influences
@@ -106,7 +107,7 @@ def _pairs(precision: Precision, n_image: int) -> list[_Batch]:
             M = W @ stats.adjusted_cov[chosen, :k, :k] @ W.transpose(0, 2, 1)
             x = whitened(stats.whitened[chosen, :k], M, np.asarray(arrays.used[chosen], dtype=np.bool_))
             rows = n_image + precision.graph.first_pair + batch.rows[chosen]
-            out.append(_Batch(rows, x, W, np.asarray(np.linalg.inv(W))))
+            out.append(_Batch(rows, x, W, upper_inverse(W)))
     return out
 
 

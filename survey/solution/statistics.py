@@ -173,13 +173,13 @@ def neighbours(adjustment: Adjustment, scale: Scale) -> tuple[RelativePrecision,
     names, places = [], []
     for name, e in adjustment.estimates.items():
         if len(name) == 2 and name[0] in ("point", "world_from_station"):
-            x = origin(e.value)
-            if np.isfinite(x).all():
-                names.append(name)
-                places.append(x)
+            names.append(name)
+            places.append(origin(e.value))
+    x, found = np.array(places).reshape(-1, 3), dict[tuple[int, int], None]()
+    there = np.flatnonzero(np.isfinite(x).all(axis=1))
+    names, x = [names[i] for i in there.tolist()], x[there]
     if len(names) < 2:
         return ()
-    x, found = np.array(places), dict[tuple[int, int], None]()
     for i in range(len(x)):
         near = _nearest(x, i, min(3, len(x)))
         free = [bool(_unknown_components(adjustment.estimates[names[k]])) for k in near]

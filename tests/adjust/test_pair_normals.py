@@ -14,6 +14,7 @@ from adjust.graph.elimination import pose_cliques
 from adjust.graph.pair_normals import PairNormals
 from adjust.graph.system import Damping
 from adjust.native.elimination import clique_pattern
+from adjust.native.pairs import pair_spread
 from adjust.pose_network.solve import minimize
 from adjust.precision import tree as tree_module
 from adjust.precision.precision import precision_of
@@ -69,6 +70,24 @@ def test_rows_of_pairs_are_those_of_plain_arrays(size: float) -> None:
     expected = pose_networks.pair_jacobians(pairs.arrays.motions, b.inverse() @ a)
     for mine, theirs in zip(found, expected, strict=True):
         np.testing.assert_allclose(mine, theirs, atol=1e-12 * np.abs(theirs).max())
+
+
+def test_covariances_of_pairs_are_those_of_plain_arrays() -> None:
+    """From those of both ends by the derivatives: turned, moved and whitened one product after the other."""
+    rng = np.random.default_rng(4)
+    n = 7
+    factor, turn, by_a = rng.normal(size=(n, 12, 12)), rng.normal(size=(n, 6, 6)), rng.normal(size=(n, 6, 6))
+    ends, W = factor @ np.swapaxes(factor, 1, 2), np.triu(rng.normal(size=(n, 6, 6)))
+    own, moved, white, apart = pair_spread(ends, turn, by_a, W)
+    for e in range(n):
+        D = np.hstack([-turn[e], np.eye(6)])
+        scatter = by_a[e] @ D @ ends[e] @ D.T @ by_a[e].T
+        np.testing.assert_allclose(own[e], D @ ends[e] @ D.T, rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(moved[e], scatter, rtol=1e-10, atol=1e-9)
+        np.testing.assert_allclose(white[e], W[e] @ scatter @ W[e].T, rtol=1e-10, atol=1e-8)
+        ends[e, :6, 6:] = ends[e, 6:, :6] = 0.0
+        lone = W[e] @ by_a[e] @ D @ ends[e] @ D.T @ by_a[e].T @ W[e].T
+        np.testing.assert_allclose(apart[e], np.diag(lone), rtol=1e-10)
 
 
 @pytest.mark.parametrize(("nx", "extra"), [(1, 1), (3, 3), (20, 20), (40, 240)])
