@@ -211,15 +211,19 @@ class Residuals(Sequence[ObservationResidual]):
 
 
 @lru_cache(2)
-@lru_cache(2)  # those of an adjustment that is given another warning are the same
 def names_of(residuals: Sequence[ObservationResidual]) -> tuple[Named, ...]:
     """What each is called; none of ``Residuals`` is made for that."""
     if isinstance(residuals, Residuals):
-        return tuple(map(residuals.named, range(len(residuals))))
+        return _every_name(residuals.named, len(residuals))
     return tuple((o.kind, o.group, o.ids, o.components, o.units) for o in residuals)
 
 
-@lru_cache(2)  # likewise
+@lru_cache(2)  # those of other sigmas are called the same
+def _every_name(named: Callable[[int], Named], n: int) -> tuple[Named, ...]:
+    return tuple(map(named, range(n)))
+
+
+@lru_cache(2)  # those of an adjustment that is given another warning are the same
 def arrays_of(residuals: Sequence[ObservationResidual]) -> OtherArrays:
     """Observations as arrays; none of ``Residuals`` is made for that."""
     if isinstance(residuals, Residuals):

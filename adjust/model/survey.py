@@ -442,7 +442,7 @@ class Survey:
             "laser_spots": self.laser_spots, "on_surfaces": self.on_surfaces,
         }  # fmt: skip
 
-    @property
+    @cached_property
     def n_others_used(self) -> int:
         """How many of them are in use."""
         return sum(o.used for kind in self.others.values() for o in kind)

@@ -12,7 +12,7 @@ from gtsam import Pose3
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.weights.impossible import with_part
-from adjust.model.names import grouped
+from adjust.model.names import numbered
 from adjust.model.result import Adjustment
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, Survey
@@ -41,8 +41,10 @@ def units_of_parts(case: Case) -> Iterator[Hypothesis]:
     survey = case.survey
     if case.result is None or not any(p.used for p in survey.pairs):
         return
-    sums = _sums(case.result)
-    for group, rows in grouped((p.group, i) for i, p in enumerate(survey.pairs) if p.used).items():
+    sums, used = _sums(case.result), np.flatnonzero(pair_arrays(survey.pairs).used)
+    groups, number = numbered(survey.pairs[i].group for i in used.tolist())
+    for k, group in enumerate(groups):
+        rows = used[number == k].tolist()
         for part, units in (("rotation", _TURNS), ("translation", _SHIFTS)):
             square, redundancy = sums.get((group, part), (0.0, 0.0))
             if redundancy < _FEWEST or square <= 0.0:
@@ -60,12 +62,14 @@ def _sums(result: Adjustment) -> dict[tuple[str, str], tuple[float, float]]:
     if batch is None:
         return out
     found, pairs = precision.pairs, precision.graph.survey.pairs
+    groups, number = numbered(pairs[row].group for row in batch.rows.tolist())
+    used = pair_arrays(pairs).used[batch.rows]
     for part, columns in (("rotation", slice(0, 3)), ("translation", slice(3, 6))):
         square, redundancy = ((found.whitened[:, columns] ** 2).sum(axis=1), found.redundancy[:, columns].sum(axis=1))
-        known = np.isfinite(square).tolist()
-        of = ((pairs[row], i) for i, row in enumerate(batch.rows.tolist()) if known[i])
-        for group, mine in grouped((pair.group, i) for pair, i in of if pair.used).items():
-            out[group, part] = float(square[mine].sum()), float(redundancy[mine].sum())
+        for k, group in enumerate(groups):
+            mine = np.isfinite(square) & used & (number == k)
+            if mine.any():
+                out[group, part] = float(square[mine].sum()), float(redundancy[mine].sum())
     return out
 
 

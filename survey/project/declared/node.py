@@ -21,7 +21,7 @@ _Word = TypeVar("_Word", bound=str)
 _NO_KEY = Key("", "text", "")
 _LARGEST_TOML = 256 * 2**20  # bytes: some millions of stations
 _DEEPEST_KEY = 32  # parts between dots; time and memory grow with their square
-_NUMBERS = {int, float}
+_NUMBERS, _FLOATS = {int, float}, {float}
 _LONGEST_INTEGER = 1000  # bits: all that a double can hold, and less than what cannot be printed
 _MANY_DIGITS = re.compile(r"[0-9A-Fa-f_]{200}")  # no integer of so many bits has fewer, in whatever base
 _KEY_PART = re.compile(r"[ \t]*([A-Za-z0-9_-]+|\"[^\"\n]*\"|'[^'\n]*')[ \t]*")
@@ -148,6 +148,8 @@ class Node:
 
     def tables(self, key: str) -> list[tuple[str, "Node"]]:
         """The tables under the ids below a key, in the order of the file."""
+        if key not in self.values:
+            return []
         parent = self.table(key)
         for name in parent.values:
             problem = id_problem(name)
@@ -205,8 +207,12 @@ class Node:
         self, key: str, shape: tuple[int, ...], default: Any = REQUIRED, infinite: bool = False, blank: bool = False
     ) -> FloatArray:
         """Numbers of the given shape; ``infinite`` allows ``inf``, also written "inf", ``blank`` allows ``nan``."""
+        value = self.value(key, default)
+        plain = type(value) is list and (len(value),) == shape and set(map(type, value)) == _FLOATS
+        if plain and math.hypot(*value) <= LARGEST_NUMBER:  # as nearly all are, of thousands of stations
+            return np.array(value)
         array = np.empty(shape)
-        self._fill(array, self.value(key, default), (key,))
+        self._fill(array, value, (key,))
         if np.abs(array).max(initial=0.0) <= LARGEST_NUMBER:
             return array
         if (not blank and np.isnan(array).any()) or (not infinite and np.isinf(array).any()):

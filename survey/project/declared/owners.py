@@ -63,7 +63,7 @@ def read_stations(root: Node, table_ids: tuple[str, ...], timed: bool) -> tuple[
                 read_pose(node.table("world_from_station")),
                 read_epochs(node, motion == "fixed"),
                 table_id,
-                read_pose(node.table("mount_from_station")),
+                read_pose(node.table("mount_from_station")) if motion == "table" else PoseParameter(),
                 read_clock(node, timed),
             )
         )

@@ -33,12 +33,13 @@ def is_unit(length: Any) -> Any:
 
 def rotation_from_quaternion(wxyz: FloatArray) -> Rot3 | None:
     """The rotation of a quaternion, or None where its length is not 1 within 1e-3."""
-    if not max(map(abs, wxyz.tolist())) < 2.0:  # nor is there an end to what stands in files
+    parts = wxyz.tolist()
+    if not max(map(abs, parts)) < 2.0:  # nor is there an end to what stands in files
         return None
     length = math.sqrt(wxyz @ wxyz)
     if not is_unit(length):
         return None
-    return Rot3.Quaternion(*(wxyz / length).tolist())
+    return Rot3.Quaternion(*(part / length for part in parts))
 
 
 def quaternion_wxyz(rotation: Rot3) -> list[float]:
