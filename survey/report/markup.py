@@ -5,15 +5,21 @@ Every text that is not markup already is escaped on its way into a page; the HTM
 
 import json
 import math
+import sys
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from functools import cache
+from importlib.util import cache_from_source
 from itertools import zip_longest
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
+from jinja2 import BytecodeCache, Environment, FileSystemLoader, StrictUndefined, Template
+from jinja2.bccache import Bucket
 from markupsafe import Markup
 
+from survey.folder.text import NOT_OURS, atomic_write
 from survey.report.drawing import DARK
 from survey.report.language import TURNING, esc, known, language, localised, plain_text, t, unturned
 from survey.report.modules import looks
@@ -23,13 +29,37 @@ _MOST_IN_FULL = 1e9  # a larger number of unknown size has a power of ten
 MINUS = "−"
 _HERE = Path(__file__).parent
 _PLACE = Markup("%s")
+_HOW: dict[str, Any] = {"autoescape": True, "trim_blocks": True, "lstrip_blocks": True}
+
+
+class _Compiled(BytecodeCache):
+    """Templates stay compiled beside them, as Python keeps its modules; compiled again where that cannot be written."""
+
+    def get_cache_key(self, name: str, filename: str | None = None) -> str:
+        """Where it is kept."""
+        return cache_from_source(filename or name)
+
+    def get_source_checksum(self, source: str) -> str:
+        """Of all that tells what it is compiled to."""
+        return super().get_source_checksum(f"{_HOW} {source}")
+
+    def load_bytecode(self, bucket: Bucket) -> None:
+        """Where it is kept whole, and of this source: else Jinja compiles it."""
+        with suppress(UnpicklingError, EOFError, *NOT_OURS), open(bucket.key, "rb") as stream:
+            bucket.load_bytecode(stream)
+
+    def dump_bytecode(self, bucket: Bucket) -> None:
+        """Keep it, unless Python is told to keep nothing."""
+        if not sys.dont_write_bytecode:
+            with suppress(OSError):
+                atomic_write(Path(bucket.key), bucket.bytecode_to_string())
 
 
 @cache
 def _environment() -> Environment:
     made = Environment(
-        loader=FileSystemLoader(_HERE / "templates"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-        lstrip_blocks=True, finalize=plain_text,
+        loader=FileSystemLoader(_HERE / "templates"), undefined=StrictUndefined, finalize=plain_text,
+        bytecode_cache=_Compiled(), **_HOW,
     )  # fmt: skip
     made.globals |= {"t": t, "language": language}
     made.globals["parts"] = made.get_template("parts.html").module

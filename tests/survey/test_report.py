@@ -1,5 +1,7 @@
 import json
 import re
+import shutil
+import sys
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -8,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
+from jinja2 import Environment
 
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ImageResiduals
@@ -207,6 +210,35 @@ def test_what_is_made_before_the_statistics_does_not_ask_for_them() -> None:
     asked = ("statistics", "found")
     asking = {anchor for _, anchor, make in page_module._SECTIONS if {*asked} & {*make.__code__.co_names}}
     assert asking == page_module._OF_STATISTICS
+
+
+def test_templates_are_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And again where they have changed, what is kept of them is damaged, or nothing may be kept."""
+    shutil.copytree(markup._HERE / "templates", tmp_path / "templates", ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(markup, "_HERE", tmp_path)
+    compiled: list[str] = []
+    plain = Environment.compile
+    monkeypatch.setattr(Environment, "compile", lambda self, source, name, file: compiled.append(name) or plain(
+        self, source, name, file))  # fmt: skip
+
+    def said() -> str:
+        compiled.clear()
+        return str(markup._environment.__wrapped__().get_template("parts.html").module.element("b", "x", ""))
+
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    assert [said(), said()] == ["<b>x</b>"] * 2
+    assert compiled == ["parts.html"]
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    assert [said(), said()] == ["<b>x</b>"] * 2
+    assert not compiled
+    (kept,) = (tmp_path / "templates" / "__pycache__").glob("parts.*")
+    kept.write_bytes(kept.read_bytes()[:40])
+    assert said() == "<b>x</b>"
+    assert compiled == ["parts.html"]
+    source = tmp_path / "templates" / "parts.html"
+    source.write_text(source.read_text().replace("</{{ tag }}>", "!</{{ tag }}>"))
+    assert said() == "<b>x!</b>"
+    assert compiled == ["parts.html"]
 
 
 def test_report_is_the_same_every_time(adjustment: Adjustment, page: str) -> None:
