@@ -57,7 +57,7 @@ class PairLinear:
         white, last = np.zeros(self.white.shape), np.vstack([x, np.zeros(6)])  # of what is held
         for nodes, J in ((self.normals.b, self.by_b), (self.normals.a, self.by_a)):
             white += np.einsum("eij,ej->ei", J, last[nodes])
-        return float((white**2).sum() + np.einsum("ni,nij,nj->", x, self.own, x, optimize=True))
+        return float((white**2).sum() + (np.einsum("nij,nj->ni", self.own, x) * x).sum())
 
     def gradient(self) -> FloatArray:
         """Right hand side (N, 6) of the normal equations."""

@@ -26,6 +26,8 @@ NOT_OURS = (ValueError, KeyError, TypeError, AttributeError, IndexError, Overflo
 """What a file raises that is taken for one of this program and is none, or was damaged."""
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what spreadsheets take for the beginning of a formula
 _ASKING = threading.Lock()
+_PLAIN_ID = re.compile(r"(?:[0-9][A-Za-z0-9_-]{0,99}|[A-Za-z_][A-Za-z0-9_-]{4,99})", re.ASCII).fullmatch
+"""Nearly all of thousands; a shorter word may be that of a device."""
 _LONGEST_ID = 120  # bytes: an id with a prefix and an ending is still the name of a file
 _DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{i}" for port in ("COM", "LPT") for i in range(1, 10))}
 
@@ -173,6 +175,8 @@ def time_text() -> str:
 @functools.lru_cache(1 << 16)
 def id_problem(name: str) -> str | None:
     """Why ``name`` cannot be an id, or None. Ids become names of files and parts of references, so both stay safe."""
+    if _PLAIN_ID(name):
+        return None
     if not name:
         return "an id is empty; give it a name"
     if name in (".", "..") or name.startswith(".") or set(name) & FORBIDDEN_IN_IDS or not name.isprintable():

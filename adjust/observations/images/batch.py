@@ -162,8 +162,9 @@ class ImageBatch:
 
         With ``jacobians`` the normal equations of every block, from which rows are served and poses are reduced.
         """
-        self.chains.evaluate(self.state)
-        self._evaluate(self._all, jacobians)
+        if self.blocks:
+            self.chains.evaluate(self.state)
+            self._evaluate(self._all, jacobians)
 
     def _evaluate(self, runs: list[IntArray], jacobians: bool) -> None:
         if jacobians:
@@ -173,7 +174,7 @@ class ImageBatch:
 
     def serve(self, which: IntArray | None = None) -> None:
         """Condense these blocks, or all, for their factors, as last prepared with Jacobians."""
-        if which is not None and len(which) == 0:
+        if not self.blocks or (which is not None and len(which) == 0):
             return
         if self._flat is None:
             self._make_room()
