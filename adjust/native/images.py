@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.native.blocks import run_ranges
 from adjust.native.library import Function
-from adjust.native.parallel import run_ranges
 from adjust.native.trees import TREE, TreeArrays
 
 SEGMENT_LENS, SEGMENT_POSE, SEGMENT_TABLE, SEGMENT_WARP = 0, 1, 2, 3

@@ -1,42 +1,27 @@
-"""Compiled kernels on all cores: they hold no lock and write disjoint places, so threads need no copies."""
+"""Work on all cores. Nothing here needs NumPy: files are read while that is loaded."""
 
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from functools import cache
-from itertools import pairwise
-from typing import Any, Self, TypeVar
-from weakref import WeakSet
+from typing import Any, Generic, Self, TypeVar
+from weakref import ref
 
-import numpy as np
-
-from adjust.model.arrays import IntArray
-
-_WORTHWHILE = 5_000
 _here = threading.local()
 _Part = TypeVar("_Part")
 _Result = TypeVar("_Result")
 
 
 @cache
-def _pool(workers: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(workers, thread_name_prefix="adjust", initializer=setattr, initargs=(_here, "busy", True))
+def _pool(kind: str, threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix=kind)
 
 
-@cache
-def _stages(workers: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(workers, thread_name_prefix="stage", initializer=setattr, initargs=(_here, "step", True))
-
-
-def _no_threads() -> None:
-    """In a forked process, which has none of its parent's threads: new ones where they are wanted."""
-    _pool.cache_clear()
-    _stages.cache_clear()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_no_threads)
+if hasattr(os, "register_at_fork"):  # a forked process has none of its parent's threads: new ones where they are wanted
+    os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 def workers() -> int:
@@ -50,63 +35,106 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def split_blocks(ptr: IntArray, parts: int = 0) -> list[IntArray]:
-    """Block numbers in runs of about equal numbers of points: one run for small batches, else one per worker.
-
-    parts: so many instead, whatever the number of workers, where what the runs give is added up.
-    """
-    n, total = len(ptr) - 1, int(ptr[-1])
-    count = 1 if total < _WORTHWHILE else min(n, parts or workers())
-    if count <= 1:
-        return [np.arange(n)] if n else []
-    edges = np.searchsorted(ptr, np.linspace(0, total, count + 1)[1:-1])
-    return [run.astype(np.int64) for run in np.split(np.arange(n), edges) if len(run)]
+@contextmanager
+def _doing(what: str) -> Iterator[None]:
+    """A mark on this thread while it does a ``part`` or a ``step``."""
+    before = hasattr(_here, what)
+    setattr(_here, what, True)
+    try:
+        yield
+    finally:
+        if not before:
+            delattr(_here, what)
 
 
 def side_by_side(function: Callable[[_Part], _Result], parts: Sequence[_Part]) -> list[_Result]:
     """The results of a function of every part, in their order; where the parts are the same, so are the results.
 
-    What a function itself gives here is done in its own thread.
+    This thread takes parts as others do. What a function itself gives here is done in its own thread. Raises what the
+    first part in their order raised.
     """
-    if len(parts) <= 1 or workers() == 1 or hasattr(_here, "busy"):
+    if len(parts) <= 1 or workers() == 1 or hasattr(_here, "part"):
         return [function(part) for part in parts]
-    return list(_pool(workers()).map(function, parts))
+    return shared_out(function, parts)
+
+
+def shared_out(function: Callable[[_Part], _Result], parts: Sequence[_Part]) -> list[_Result]:
+    """As :func:`side_by_side`, of several parts by several threads."""
+    done: list[Any] = [None] * len(parts)
+    failed: dict[int, BaseException] = {}
+    waiting = iter(range(len(parts)))
+
+    def share() -> None:
+        with _doing("part"):
+            for i in waiting:
+                try:
+                    done[i] = function(parts[i])
+                except BaseException as error:  # who waits is told
+                    failed[i] = error
+                    deque(waiting, maxlen=0)  # no more of them
+
+    helpers = [_pool("adjust", workers() - 1).submit(share) for _ in range(min(workers(), len(parts)) - 1)]
+    share()
+    for helper in helpers:
+        if not helper.cancel():
+            helper.result()
+    if failed:
+        raise failed[min(failed)]
+    return done
+
+
+class _Step(Generic[_Result]):
+    """A step that is done once, by whoever comes first."""
+
+    def __init__(self, function: Callable[[], _Result]) -> None:
+        self._function: Callable[[], _Result] | None = function
+        self._first, self.done = threading.Lock(), Future[_Result]()
+
+    def do(self) -> None:
+        """Do it, unless it is done or being done."""
+        if not self._first.acquire(blocking=False):
+            return
+        function, self._function = self._function, None
+        assert function is not None
+        try:
+            with _doing("step"):
+                self.done.set_result(function())
+        except BaseException as error:  # who asks is told
+            self.done.set_exception(error)
+
+    def result(self) -> _Result:
+        """What it gives, or raises; done here if nobody has begun."""
+        self.do()
+        return self.done.result()
 
 
 class Beside:
     """Steps that need nothing of each other, begun as they are given; each may share out its own work.
 
     Only one thread runs Python at a time: it pays for those that wait for kernels, for libraries or for the disk. With
-    one thread, and inside a step, they are done where they are given. Leaving a ``with`` of it waits for all.
+    one thread, and inside a step, they are done where they are given. Who asks for a step that nobody has begun does
+    it. Leaving a ``with`` of it waits for all.
     """
 
     def __init__(self) -> None:
-        self.alone = workers() == 1 or hasattr(_here, "step") or hasattr(_here, "busy")
-        self._begun = WeakSet[Future[Any]]()  # what nobody asks for any more need not stay in memory
+        self.alone = workers() == 1 or hasattr(_here, "step") or hasattr(_here, "part")
+        self._begun: list[ref[_Step[Any]]] = []  # of what is done and asked for no more nothing stays in memory
 
-    def of(self, step: Callable[[], _Result]) -> Callable[[], _Result]:
+    def of(self, function: Callable[[], _Result]) -> Callable[[], _Result]:
         """What gives the result of a step, or raises what it raised."""
         if self.alone:
-            result = step()
+            result = function()
             return lambda: result
-        begun = _stages(workers()).submit(step)
-        self._begun.add(begun)
-        return begun.result
+        step = _Step(function)
+        self._begun.append(ref(step))
+        _pool("stage", workers() - 1).submit(step.do)
+        return step.result
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        wait(list(self._begun))
-
-
-def run_split(kernel: Callable[..., object], runs: list[IntArray], *arguments: object) -> None:
-    """Call ``kernel(run, *arguments)`` for every run, side by side."""
-    side_by_side(lambda run: kernel(run, *arguments), runs)
-
-
-def run_ranges(kernel: Callable[..., object], n: int, *arguments: object) -> None:
-    """Call ``kernel(first, last, *arguments)`` for ranges that make up 0 .. n, side by side; items do not meet."""
-    count = 1 if n < _WORTHWHILE else workers()
-    edges = [n * i // count for i in range(count + 1)]
-    side_by_side(lambda ends: kernel(*ends, *arguments), list(pairwise(edges)))
+        begun = [step for known in self._begun if (step := known()) is not None]
+        for step in begun:
+            step.do()
+        wait([step.done for step in begun])

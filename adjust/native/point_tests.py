@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.native.blocks import run_ranges, run_split, split_blocks
 from adjust.native.library import Function
-from adjust.native.parallel import run_ranges, run_split, split_blocks
 
 _ADJUSTED = "v[N,2] M[N,3] W[N,3] used[N]"
 _POINTS = f"first last {_ADJUSTED}"

@@ -79,10 +79,16 @@ def run_as_program(main: Callable[[], int]) -> NoReturn:
 
 
 def begin_adjusting() -> None:
-    """Before a command that adjusts and ends: less to load, and memory that was freed is used again.
+    """Before a command that adjusts and ends: less to load, and memory that was freed is used again."""
+    use_memory_again()
+    load_late()
 
-    Modules that load when their contents are first looked at: SciPy imports all of NumPy and needs little of it. Large
-    arrays come and go by the hundred; given back every time, the system clears as many pages as the command has points.
+
+def use_memory_again() -> None:
+    """Before the first thread and the first array.
+
+    Large arrays come and go by the hundred; given back every time, the system clears as many pages as the command has
+    points.
     """
     import ctypes  # here: --help starts without it
 
@@ -91,6 +97,10 @@ def begin_adjusting() -> None:
     if sys.platform == "linux" and (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:  # of glibc
         for option, value in _MALLOC.items():
             mallopt(option, value)
+
+
+def load_late() -> None:
+    """Modules that load when their contents are first looked at: SciPy imports all of NumPy and needs little of it."""
     for name in ("numpy.f2py", "numpy.testing"):  # not numpy.ma: two threads that are first to use a lazy module fail
         spec = None if name in sys.modules else importlib.util.find_spec(name)
         if spec is not None and spec.loader is not None:
@@ -110,7 +120,7 @@ class Version(argparse.Action):
         from importlib.metadata import PackageNotFoundError, version
 
         from adjust.model.errors import SurveyError
-        from adjust.native import instruction_set
+        from adjust.native.library import instruction_set
 
         try:
             core = f"(native core: {instruction_set()})"

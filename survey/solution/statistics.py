@@ -102,9 +102,10 @@ def statistics_of(
         weak = made.of(lambda: weak_directions(adjustment, system=system))
         correlated = made.of(lambda: correlations(adjustment, system=system))
         budget = made.of(lambda: _budget(adjustment, names[:MOST_BUDGETS], system, scale.factor))
+        left_out = consistent().left_out  # first: it takes longest
         return Statistics(
             reliable(), components, correlated(), weak(), near, budget(), drawn, adjustment.decisions, judged,
-            consistent(), (*consistent().left_out, *_left_out(adjustment, system, len(names))),
+            consistent(), (*left_out, *_left_out(adjustment, system, len(names))),
         )  # fmt: skip
 
 

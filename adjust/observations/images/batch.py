@@ -18,6 +18,7 @@ from adjust.frames.unknowns import Chain
 from adjust.model.boards import warming_of
 from adjust.model.observations import ImageBlock, ImagePoints
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.native.blocks import run_split, split_blocks
 from adjust.native.images import (
     N_SHAPE,
     BlockArrays,
@@ -38,7 +39,6 @@ from adjust.native.images import (
     serve,
     square_root_information,
 )
-from adjust.native.parallel import run_split, split_blocks
 from adjust.native.trees import KeyCovariances, TreeArrays
 from adjust.observations.adapter import evaluated
 from adjust.observations.images.segments import block_keys

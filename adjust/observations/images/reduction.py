@@ -16,7 +16,7 @@ import numpy as np
 from adjust.frames.unknowns import Unknowns
 from adjust.model.errors import IndeterminateError
 from adjust.model.survey import FloatArray, IntArray
-from adjust.native.parallel import run_split, split_blocks
+from adjust.native.blocks import run_split, split_blocks
 from adjust.native.reduction import WEAKEST_PIVOT, ReducedPoses, ReductionArrays, leaf_rows, pose_steps, reduce_poses
 from adjust.observations.adapter import evaluated
 from adjust.observations.images.batch import ImageBatch

@@ -47,10 +47,10 @@ def adjust_job(
                 here = place if out is None else None
                 detect_job(folder, progress=progress, everything=redetect, place=here)
 
-        with clock.step("read"), Beside() as loading:
-            loaded = loading.of(_load if ahead else lambda: None)
+        with clock.step("read"):
+            if ahead:
+                _load()
             project = read(folder, ahead)
-            loaded()
         nothing_yet = bool(project.images) and not (project.survey.image_blocks or project.spots)
         if redetect or project.to_detect or (nothing_yet and not project.detected):
             detected()

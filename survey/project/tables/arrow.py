@@ -17,10 +17,10 @@ import numpy.typing as npt
 from adjust.model.arrays import BoolArray, FloatArray
 from adjust.model.errors import SurveyError
 from adjust.native.parallel import side_by_side, workers
+from survey.folder.ahead import LARGE
 from survey.folder.text import LARGEST_NUMBER, csv_text, utf8
 from survey.project.tables.reading import LARGEST_ROWS, Columns, Layout, TextColumn, check_header, check_rows, first_row
 
-LARGE = 2**20  # bytes of CSV, cells to write / 10: below, loading Arrow (30 ms) costs more than it saves
 _WORTHWHILE = 2**14  # bytes of CSV once it is loaded
 _LARGEST_DECODED = 8 * 2**30  # bytes of the columns of a Parquet file
 _BLOCK, _ROWS = 2**20, 2**17  # bytes read, rows written at a time
