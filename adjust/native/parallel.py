@@ -11,6 +11,8 @@ from typing import Any, Generic, Self, TypeVar
 from weakref import ref
 
 _here = threading.local()
+_counting = threading.Lock()
+_active = 1  # threads that compute: the first one, those that it has begun, without those that wait for a step
 _Part = TypeVar("_Part")
 _Result = TypeVar("_Result")
 
@@ -20,8 +22,15 @@ def _pool(kind: str, threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix=kind)
 
 
-if hasattr(os, "register_at_fork"):  # a forked process has none of its parent's threads: new ones where they are wanted
-    os.register_at_fork(after_in_child=_pool.cache_clear)
+def _first_thread() -> None:
+    """In a forked process, which has none of its parent's threads: new ones where they are wanted."""
+    global _counting, _active
+    _pool.cache_clear()
+    _counting, _active = threading.Lock(), 1
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_first_thread)
 
 
 def workers() -> int:
@@ -35,8 +44,26 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def free_threads() -> int:
+    """How many threads may compute besides those that do."""
+    return max(0, workers() - _active)
+
+
 @contextmanager
-def _doing(what: str) -> Iterator[None]:
+def _more_active(threads: int) -> Iterator[None]:
+    """So many more compute meanwhile."""
+    global _active
+    with _counting:
+        _active += threads
+    try:
+        yield
+    finally:
+        with _counting:
+            _active -= threads
+
+
+@contextmanager
+def doing(what: str) -> Iterator[None]:
     """A mark on this thread while it does a ``part`` or a ``step``."""
     before = hasattr(_here, what)
     setattr(_here, what, True)
@@ -50,8 +77,8 @@ def _doing(what: str) -> Iterator[None]:
 def side_by_side(function: Callable[[_Part], _Result], parts: Sequence[_Part]) -> list[_Result]:
     """The results of a function of every part, in their order; where the parts are the same, so are the results.
 
-    This thread takes parts as others do. What a function itself gives here is done in its own thread. Raises what the
-    first part in their order raised.
+    This thread takes parts as others do, as many as have nothing else to do. What a function itself gives here is done
+    in its own thread. Raises what the first part in their order raised.
     """
     if len(parts) <= 1 or workers() == 1 or hasattr(_here, "part"):
         return [function(part) for part in parts]
@@ -59,13 +86,17 @@ def side_by_side(function: Callable[[_Part], _Result], parts: Sequence[_Part]) -
 
 
 def shared_out(function: Callable[[_Part], _Result], parts: Sequence[_Part]) -> list[_Result]:
-    """As :func:`side_by_side`, of several parts by several threads."""
+    """As :func:`side_by_side`, of several parts and with several threads.
+
+    Where more threads compute than there are cores, the one that holds Python's lock is made to wait while others wait
+    for that lock.
+    """
     done: list[Any] = [None] * len(parts)
     failed: dict[int, BaseException] = {}
     waiting = iter(range(len(parts)))
 
     def share() -> None:
-        with _doing("part"):
+        with doing("part"):
             for i in waiting:
                 try:
                     done[i] = function(parts[i])
@@ -73,11 +104,13 @@ def shared_out(function: Callable[[_Part], _Result], parts: Sequence[_Part]) -> 
                     failed[i] = error
                     deque(waiting, maxlen=0)  # no more of them
 
-    helpers = [_pool("adjust", workers() - 1).submit(share) for _ in range(min(workers(), len(parts)) - 1)]
-    share()
-    for helper in helpers:
-        if not helper.cancel():
-            helper.result()
+    free = min(free_threads(), len(parts) - 1)
+    with _more_active(free):
+        helpers = [_pool("adjust", workers() - 1).submit(share) for _ in range(free)]
+        share()
+        for helper in helpers:
+            if not helper.cancel():
+                helper.result()
     if failed:
         raise failed[min(failed)]
     return done
@@ -90,22 +123,25 @@ class _Step(Generic[_Result]):
         self._function: Callable[[], _Result] | None = function
         self._first, self.done = threading.Lock(), Future[_Result]()
 
-    def do(self) -> None:
-        """Do it, unless it is done or being done."""
+    def do(self, threads: int = 0) -> None:
+        """Do it, unless it is done or being done. threads: how many more compute with the one that does it."""
         if not self._first.acquire(blocking=False):
             return
         function, self._function = self._function, None
         assert function is not None
         try:
-            with _doing("step"):
-                self.done.set_result(function())
+            with _more_active(threads), doing("step"):
+                result = function()
         except BaseException as error:  # who asks is told
             self.done.set_exception(error)
+        else:
+            self.done.set_result(result)
 
     def result(self) -> _Result:
         """What it gives, or raises; done here if nobody has begun."""
         self.do()
-        return self.done.result()
+        with _more_active(-1):
+            return self.done.result()
 
 
 class Beside:
@@ -127,7 +163,7 @@ class Beside:
             return lambda: result
         step = _Step(function)
         self._begun.append(ref(step))
-        _pool("stage", workers() - 1).submit(step.do)
+        _pool("stage", workers() - 1).submit(step.do, 1)
         return step.result
 
     def __enter__(self) -> Self:
@@ -137,4 +173,5 @@ class Beside:
         begun = [step for known in self._begun if (step := known()) is not None]
         for step in begun:
             step.do()
-        wait([step.done for step in begun])
+        with _more_active(-1):
+            wait([step.done for step in begun])

@@ -20,6 +20,7 @@ from survey.folder.messages import message, shown
 
 DONE, FAILED, USAGE, TEST_FAILED, INTERRUPTED = 0, 1, 2, 3, 130
 _OBJECTS = 400_000  # new ones before Python looks for cycles: loading modules makes 150,000 and no cycles
+_TURN = 0.0005  # s that a thread which comes back from a kernel waits for one that runs Python
 _MALLOC = {-3: 2**30, -1: 2**30, -2: 2**26, -8: 1}  # M_MMAP_THRESHOLD, _TRIM_THRESHOLD, _TOP_PAD (bytes), _ARENA_MAX
 _OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)  # writing does not say which file
 
@@ -73,6 +74,7 @@ def run_as_program(main: Callable[[], int]) -> NoReturn:
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     gc.set_threshold(_OBJECTS)
+    sys.setswitchinterval(_TURN)
     code = main()
     gc.freeze()  # at its end Python looks for cycles once more, in all that was ever loaded
     sys.exit(code)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adjust.native import parallel, vision
+from adjust.native import blocks, parallel, vision
 from adjust.native.lenses import BROWN, N_LENS, lens_residuals, lens_rows
 from adjust.native.library import Function, instruction_set, instruction_sets, opened
 from adjust.precision.precision import Precision
@@ -101,7 +101,7 @@ def _squares_of_served(call: Call, arrays: list[np.ndarray]) -> np.ndarray:
 def _solution(monkeypatch: pytest.MonkeyPatch, threads: int) -> str:
     """Digest of image points of boards and of beacons: solution, covariances, redundancy."""
     monkeypatch.setenv("LABSURVEY_THREADS", str(threads))
-    monkeypatch.setattr(parallel, "_WORTHWHILE", 1)
+    monkeypatch.setattr(blocks, "_WORTHWHILE", 1)
     digest = hashlib.sha256()
     scenes = (
         head_on_table(1, n_cameras=2, n_table_epochs=4, n_free_epochs=3),
@@ -124,13 +124,13 @@ def _solution(monkeypatch: pytest.MonkeyPatch, threads: int) -> str:
 @pytest.mark.slow
 def test_threads_do_not_change_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     taken: list[int] = []
-    pool = parallel._pool
+    shared_out = parallel.shared_out
 
-    def counted(workers: int) -> Any:
-        taken.append(workers)
-        return pool(workers)
+    def counted(function: Any, parts: Any) -> Any:
+        taken.append(parallel.workers())
+        return shared_out(function, parts)
 
-    monkeypatch.setattr(parallel, "_pool", counted)
+    monkeypatch.setattr(parallel, "shared_out", counted)
     alone = _solution(monkeypatch, 1)
     assert not taken
     assert _solution(monkeypatch, 2) == alone

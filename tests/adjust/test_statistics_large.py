@@ -9,7 +9,7 @@ from scipy import sparse
 
 from adjust.adjustment import adjust
 from adjust.model.result import Adjustment
-from adjust.native import parallel
+from adjust.native import blocks
 from adjust.observations.images import batch as batch_module
 from adjust.precision.precision import precision_of
 from adjust.statistics import changes, weakness
@@ -222,13 +222,13 @@ def test_threads_and_portions_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> 
         shifts = np.array([x.shift for x in found.influences])
         return [*tests, *rows, shifts, np.array([x.coefficient for x in listed])]
 
-    monkeypatch.setattr(parallel, "_WORTHWHILE", 300)
+    monkeypatch.setattr(blocks, "_WORTHWHILE", 300)
     monkeypatch.setattr(batch_module, "_AT_ONCE", 200)
     found = []
     for threads in ("1", "3"):
         monkeypatch.setenv("LABSURVEY_THREADS", threads)
         found.append(everything())
-    monkeypatch.setattr(parallel, "_WORTHWHILE", 50_000)
+    monkeypatch.setattr(blocks, "_WORTHWHILE", 50_000)
     found.append(everything())
     assert len(found[0][0]) > 900
     for others in found[1:]:

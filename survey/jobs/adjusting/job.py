@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from adjust.model.errors import SurveyError
-from adjust.native.parallel import Beside
 from survey.folder.replacing import changing, replace_parts
 from survey.jobs.detecting.job import detect_job, remember_images
 from survey.project import read

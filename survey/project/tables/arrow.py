@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from adjust.model.arrays import BoolArray, FloatArray
 from adjust.model.errors import SurveyError
-from adjust.native.parallel import side_by_side, workers
+from adjust.native.parallel import free_threads, side_by_side, workers
 from survey.folder.ahead import LARGE
 from survey.folder.text import LARGEST_NUMBER, csv_text, utf8
 from survey.project.tables.reading import LARGEST_ROWS, Columns, Layout, TextColumn, check_header, check_rows, first_row
@@ -45,7 +45,7 @@ def csv_columns(data: bytes, layout: Layout) -> dict[str, TextColumn | FloatArra
     try:
         read = arrow_csv.read_csv(
             pa.BufferReader(data),
-            arrow_csv.ReadOptions(use_threads=workers() > 1, block_size=_BLOCK, skip_rows=1, column_names=header),
+            arrow_csv.ReadOptions(use_threads=free_threads() > 0, block_size=_BLOCK, skip_rows=1, column_names=header),
             arrow_csv.ParseOptions(quote_char=False, ignore_empty_lines=False),
             arrow_csv.ConvertOptions(column_types=types, null_values=[""], strings_can_be_null=False),
         ).unify_dictionaries()
