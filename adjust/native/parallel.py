@@ -2,17 +2,17 @@
 
 import os
 import threading
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from typing import Any, Generic, Self, TypeVar
 from weakref import ref
 
 _here = threading.local()
 _counting = threading.Lock()
 _active = 1  # threads that compute: the first one, those that it has begun, without those that wait for a step
+_shared: list["_Shared"] = []  # what is being shared out: for threads that have nothing else to do any more
 _Part = TypeVar("_Part")
 _Result = TypeVar("_Result")
 
@@ -88,32 +88,47 @@ def side_by_side(function: Callable[[_Part], _Result], parts: Sequence[_Part]) -
 def shared_out(function: Callable[[_Part], _Result], parts: Sequence[_Part]) -> list[_Result]:
     """As :func:`side_by_side`, of several parts and with several threads.
 
-    Where more threads compute than there are cores, the one that holds Python's lock is made to wait while others wait
-    for that lock.
+    No more than there are cores: else the one that holds Python's lock is made to wait, and all with it.
     """
-    done: list[Any] = [None] * len(parts)
-    failed: dict[int, BaseException] = {}
-    waiting = iter(range(len(parts)))
-
-    def share() -> None:
-        with doing("part"):
-            for i in waiting:
-                try:
-                    done[i] = function(parts[i])
-                except BaseException as error:  # who waits is told
-                    failed[i] = error
-                    deque(waiting, maxlen=0)  # no more of them
-
-    free = min(free_threads(), len(parts) - 1)
+    shared, free = _Shared(function, parts), min(free_threads(), len(parts) - 1)
     with _more_active(free):
-        helpers = [_pool("adjust", workers() - 1).submit(share) for _ in range(free)]
-        share()
+        helpers = [_pool("adjust", workers() - 1).submit(shared.take) for _ in range(free)]
+        _shared.append(shared)
+        shared.take()
+        _shared.remove(shared)
         for helper in helpers:
-            if not helper.cancel():
-                helper.result()
-    if failed:
-        raise failed[min(failed)]
-    return done
+            helper.cancel()
+        shared.finished.wait()
+    if shared.failed:
+        raise shared.failed[min(shared.failed)]
+    return shared.done
+
+
+class _Shared:
+    """Parts that threads take one after the other, and what a function gives of them."""
+
+    def __init__(self, function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
+        self.done: list[Any] = [None] * len(parts)
+        self.failed: dict[int, BaseException] = {}
+        self.is_open, self.finished = True, threading.Event()
+        self._function, self._parts = function, parts
+        self._waiting, self._left = iter(range(len(parts))), len(parts)
+
+    def take(self) -> None:
+        """Do parts until there are no more, or one fails."""
+        with doing("part"):
+            for i in self._waiting:
+                ended = 1
+                try:
+                    self.done[i] = self._function(self._parts[i])
+                except BaseException as error:  # who waits is told
+                    self.failed[i] = error
+                    ended += sum(1 for _ in self._waiting)
+                with _counting:
+                    self._left -= ended
+                    if not self._left:
+                        self.finished.set()
+        self.is_open = False
 
 
 class _Step(Generic[_Result]):
@@ -137,24 +152,18 @@ class _Step(Generic[_Result]):
         else:
             self.done.set_result(result)
 
-    def result(self) -> _Result:
-        """What it gives, or raises; done here if nobody has begun."""
-        self.do()
-        with _more_active(-1):
-            return self.done.result()
-
 
 class Beside:
-    """Steps that need nothing of each other, begun as they are given; each may share out its own work.
+    """Steps that need nothing of those after them, begun as they are given; each may share out its own work.
 
     Only one thread runs Python at a time: it pays for those that wait for kernels, for libraries or for the disk. With
-    one thread, and inside a step, they are done where they are given. Who asks for a step that nobody has begun does
-    it. Leaving a ``with`` of it waits for all.
+    one thread, and inside a step, they are done where they are given. Who waits for a step does what nobody has begun.
+    Leaving a ``with`` of it waits for all.
     """
 
     def __init__(self) -> None:
         self.alone = workers() == 1 or hasattr(_here, "step") or hasattr(_here, "part")
-        self._begun: list[ref[_Step[Any]]] = []  # of what is done and asked for no more nothing stays in memory
+        self._given: list[ref[_Step[Any]]] = []  # of what is done and asked for no more nothing stays in memory
 
     def of(self, function: Callable[[], _Result]) -> Callable[[], _Result]:
         """What gives the result of a step, or raises what it raised."""
@@ -162,16 +171,36 @@ class Beside:
             result = function()
             return lambda: result
         step = _Step(function)
-        self._begun.append(ref(step))
+        self._given.append(ref(step))
         _pool("stage", workers() - 1).submit(step.do, 1)
-        return step.result
+        return partial(self._result, step)
+
+    def _result(self, step: _Step[_Result]) -> _Result:
+        step.do()
+        self._wait([step])
+        return step.done.result()
+
+    def _wait(self, wanted: Sequence[_Step[Any]]) -> None:
+        """Until they are done; other steps and parts of others meanwhile.
+
+        A step that waits leaves other steps alone: they may need it.
+        """
+        others = [] if hasattr(_here, "step") else self._steps()
+        while any(not step.done.done() for step in wanted):
+            if others:
+                others.pop(0).do()
+            elif shared := [x for x in _shared if x.is_open]:
+                shared[0].take()
+            else:
+                break
+        with _more_active(-1):
+            wait([step.done for step in wanted])
+
+    def _steps(self) -> list[_Step[Any]]:
+        return [step for known in self._given if (step := known()) is not None]
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        begun = [step for known in self._begun if (step := known()) is not None]
-        for step in begun:
-            step.do()
-        with _more_active(-1):
-            wait([step.done for step in begun])
+        self._wait(self._steps())
