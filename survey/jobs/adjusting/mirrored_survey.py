@@ -3,11 +3,12 @@
 Every flat target is then seen from behind and all fits: what is adjusted is the mirror image of what was measured.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from adjust.diagnosis.hypothesis import ChangeColumns, Hypothesis, Place
 from adjust.diagnosis.images import MIRRORED, from_behind, is_flat, mapped
 from adjust.model.errors import listed
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment
 from survey.jobs.adjusting.edits import OF_IMAGE
@@ -20,7 +21,7 @@ _FEWEST, _LOOKED_AT = 3, 12
 """Images of a camera by which it is judged, and at how many one looks."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Sides:
     """From where cameras see printed flat targets. behind: how many images of cameras that see none from its front."""
 

@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 
 from tqdm import tqdm
@@ -11,6 +11,7 @@ from tqdm import tqdm
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.graph.assembly import StartValues
 from adjust.model.errors import IndeterminateError, SurveyError, listed
+from adjust.model.frozen import frozen
 from adjust.model.memory import remembering
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import Survey
@@ -30,7 +31,7 @@ Begin = Callable[[Survey], StartValues | None]
 Progress = Callable[[int, float], None]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Work:
     """What one step hands on to the next: the project with its survey as it is now, and what was noticed.
 
@@ -54,7 +55,7 @@ class Work:
         return replace(self, project=replace(self.project, survey=survey), notes=self.notes + notes)
 
 
-@dataclass(frozen=True)
+@frozen
 class Step:
     """One step: its name in the log, which projects it concerns, and what it makes of them. Raises SurveyError."""
 

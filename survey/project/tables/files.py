@@ -7,7 +7,6 @@ import re
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ import numpy as np
 
 from adjust.model.arrays import FloatArray, IntArray
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.native.parallel import Beside
 from survey.folder.locking import OBSERVATIONS_FOLDER
 from survey.folder.text import (
@@ -37,7 +37,7 @@ _NUMBERS = re.compile(r"[-+.\deE ]+")  # the components of an axis in one cell
 Chunk = tuple[IntArray, Sequence[Sequence[str]]]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Content:
     """What is in a file: its bytes, and their sha256."""
 
@@ -45,7 +45,7 @@ class _Content:
     digest: Callable[[], str]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Begun:
     """A table that is being read: the file as it was then, by inode, size and time, and what gives the table."""
 
