@@ -7,6 +7,7 @@ start of a command hundreds of times. Here all classes share functions that go b
 
 from collections.abc import Callable
 from dataclasses import MISSING, Field, FrozenInstanceError, dataclass, field, fields
+from itertools import repeat
 from operator import attrgetter
 from reprlib import recursive_repr
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, dataclass_transform, overload
@@ -52,19 +53,24 @@ def _constructor(cls: type[Any]) -> Callable[..., None]:
     in_order = [f.name for f in arguments if not f.kw_only]
     defaults = {f.name: f.default for f in arguments if f.default is not MISSING}
     factories = {f.name: f.default_factory for f in arguments if f.default_factory is not MISSING}
-    known, needed = set(names), set(names) - defaults.keys() - factories.keys()
-    finishes = hasattr(cls, "__post_init__")
+    least = max((i for i, name in enumerate(names, start=1) if name not in defaults), default=0)
+    absent = tuple(defaults.get(name) for name in names)
+    known, finishes = set(names), hasattr(cls, "__post_init__")
 
     def arranged(values: tuple[object, ...], named: dict[str, object]) -> list[object]:
         given = dict(zip(in_order, values, strict=False)) | named
-        if len(given) < len(values) + len(named) or not needed <= given.keys() <= known:
+        made = {name: factory() for name, factory in factories.items() if name not in given} if factories else {}
+        full = defaults | made | given
+        if len(given) < len(values) + len(named) or full.keys() != known:
             _Signature.of(cls).bind(*values, **named)  # raises, and says what is wrong
-        return [given[n] if n in given else defaults[n] if n in defaults else factories[n]() for n in names]
+        return [full[name] for name in names]
 
     def init(self: Any, *values: object, **named: object) -> None:
-        in_full = not named and len(values) == len(names) == len(in_order)
-        for name, value in zip(names, values if in_full else arranged(values, named), strict=True):
-            _put(self, name, value)
+        n = len(values)
+        in_order_alone = not named and least <= n <= len(in_order)
+        found = values + absent[n:] if in_order_alone else arranged(values, named)
+        for _ in map(_put, repeat(self), names, found):  # quicker than calls in a loop
+            pass
         if finishes:
             self.__post_init__()
 
@@ -112,7 +118,7 @@ class _Signature:
             there = {} if default is MISSING else {"default": default}
             return Parameter(f.name, kind, annotation=f.type, **there)
 
-        return Signature([parameter(f) for f in _arguments(cls)])
+        return Signature([parameter(f) for f in _arguments(cls)], return_annotation=None)
 
 
 _SHARED = {"__repr__": _repr, "__setattr__": _refuse, "__delattr__": _refuse, "__signature__": _Signature()}
