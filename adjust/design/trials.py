@@ -109,6 +109,8 @@ def _summary(
 
 @frozen(eq=False)
 class _Task:
+    """Some trials in a process of its own."""
+
     ideal: Survey
     start: StartValues
     names: tuple[ParameterName, ...]

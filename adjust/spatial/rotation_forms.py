@@ -30,6 +30,8 @@ GIMBAL_COSINE = 1e-7
 
 @frozen
 class _Order:
+    """Axes of the three turns from the left, and the sense in which all turn."""
+
     axes: tuple[int, int, int]
     sense: float
 

@@ -26,6 +26,8 @@ class AxisPhysics:
 
 @frozen
 class _Piece:
+    """A stretch of a motion with one acceleration."""
+
     begin: float
     duration: float
     angle: float
