@@ -65,7 +65,7 @@ def _constructor(cls: type[Any]) -> Callable[..., None]:
             _Signature.of(cls).bind(*values, **named)  # raises, and says what is wrong
         return [full[name] for name in names]
 
-    def init(self: Any, *values: object, **named: object) -> None:
+    def init(self: Any, /, *values: object, **named: object) -> None:
         n = len(values)
         in_order_alone = not named and least <= n <= len(in_order)
         found = values + absent[n:] if in_order_alone else arranged(values, named)
