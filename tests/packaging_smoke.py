@@ -32,7 +32,8 @@ _COMMANDS = (
 _SHIPPED = (
     *("adjust/py.typed", "survey/py.typed", "capture/py.typed"),
     *("survey/report/style.css", "survey/report/web/report.js", "survey/report/web/de.json"),
-    *("survey/report/catalogues/de.toml", "capture/web/page.html", "capture/devices/turntables/dialects/two-axis.toml"),
+    *("capture/web/page.html", "capture/devices/turntables/dialects/two-axis.toml"),
+    *("survey/report/templates/parts.html", "survey/report/catalogues/de.toml"),
 )
 _BUILT_FROM = (
     "LICENSE", "README.md", "setup.py", "build_tools/backend.py", "build_tools/native.py", "adjust/native/lenses.h",

@@ -36,7 +36,7 @@ def overview_html(
             ("numbers", "All numbers", _numbers(trends, records)),
             ("folders", "Folders", _folders(records, place)),
         )
-        nav = m.nav([(anchor, t(name)) for anchor, name, body in made if body])
+        nav = m.part("nav", [(anchor, t(name)) for anchor, name, body in made if body])
         shown = _header(records, trends, date) + nav + m.joined((body for _, _, body in made), "\n")
         return m.document(t("Overview of {n} surveys", n=m.count(len(records))), shown)
 
@@ -64,15 +64,15 @@ def _header(records: Sequence[Record], trends: Trends, date: str) -> Markup:
         (t("{n} s", n=m.fixed(seconds, 1)), t("time of all adjustments")),
     )  # fmt: skip
     title = t("Overview of {n} surveys", n=m.count(len(records)))
-    head = m.header(t("Overview of a batch"), title, date)
-    return m.joined((head, m.verdict(kind, word, said), m.cards(cards)))
+    head = m.part("header", t("Overview of a batch"), title, date)
+    return m.joined((head, m.part("verdict", kind, word, said), m.part("cards", cards)))
 
 
 def _link(record: Record, name: str, place: Path) -> Markup:
     report = record.written.get("report.html")
     if not report:
         return m.element("b", name)
-    return m.filled('<a href="{}">{}</a>', quote(os.fsencode(Path(os.path.relpath(report, place)).as_posix())), name)
+    return m.part("link", quote(os.fsencode(Path(os.path.relpath(report, place)).as_posix())), name)
 
 
 def _failures(records: Sequence[Record], place: Path) -> Markup:
@@ -87,7 +87,7 @@ def _failures(records: Sequence[Record], place: Path) -> Markup:
 
 
 def _wrapped(lines: Sequence[str]) -> Markup:
-    return m.element("div", m.lines(lines), "words")
+    return m.element("div", m.part("lines", lines), "words")
 
 
 def _tests(records: Sequence[Record], place: Path) -> Markup:
@@ -141,7 +141,7 @@ def _control(records: Sequence[Record], trends: Trends) -> Markup:
     body = _figures(shown, records)
     if calm:
         rest = t("{n} more charts", n=m.count(len(calm[:_MOST_MORE])))
-        body += m.details(rest, _figures(calm[:_MOST_MORE], records))
+        body += m.part("details", rest, _figures(calm[:_MOST_MORE], records), False)
     said = m.joined(m.element("p", message(n)) for n in trends.notes)
     return m.section("control", "Control charts", said + body, note)
 
@@ -180,7 +180,7 @@ def _numbers(trends: Trends, records: Sequence[Record]) -> Markup:
 
 
 def _slope(c: Chart) -> Markup:
-    return m.below(m.value_text(c.slope, c.slope_sigma), f"± {m.sigma_text(c.slope_sigma)}")
+    return m.part("below", m.value_text(c.slope, c.slope_sigma), f"± {m.sigma_text(c.slope_sigma)}")
 
 
 def _alarm(trends: Trends, c: Chart, names: Sequence[str]) -> Markup:

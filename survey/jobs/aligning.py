@@ -11,23 +11,14 @@ from adjust.model.result import Adjustment
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import csv_rows, csv_text, read_text, time_text
 from survey.jobs.adjusting.steps import adjust_project
-from survey.jobs.working_sheet import ARCSEC, STATES, Sheet, State, angle_text, sheet_text, steps, working_sheets
+from survey.jobs.working_sheet import ARCSEC, STATES, Sheet, angle_text, sheet_text, steps, working_sheets
 from survey.project import atomic_write, read
 from survey.project.project import RESULTS
 from survey.report import drawing as d
-from survey.report.markup import document, each, element, filled, joined, note
+from survey.report.markup import document, part
 
 PAGE, ROUNDS = "alignment.html", "alignment_rounds.csv"
 ROUND_COLUMNS = ("date", "task", "state", "x_arcsec", "y_arcsec", "z_arcsec", "sigma_x", "sigma_y", "sigma_z")
-_STYLE = """<style>
-ol { font-size: 1.15em; } li { margin: .4em 0; } td, th { text-align: right; }
-td:first-child, th:first-child { text-align: left; }
-.state { padding: .1em .8em; border-radius: 1em; font-size: 14px; font-weight: 600; white-space: nowrap; }
-.aligned { background: var(--good-pill); color: var(--good); } .turn { background: var(--bad-pill); color: var(--bad); }
-.measure { background: var(--warn-pill); color: var(--warn); }
-.held { background: var(--plain-back); color: var(--plain); }
-@media print { .state { border: 1px solid currentColor; } }
-</style>"""
 
 
 @frozen(eq=False)
@@ -118,37 +109,12 @@ def _with_round(rounds: list[list[str]], sheets: tuple[Sheet, ...], date: str) -
 
 def sheet_html(sheets: Sequence[Sheet], title: str, date: str, rounds: Sequence[Sequence[str]] = ()) -> str:
     """One page that needs nothing but itself; ``rounds`` are rows of ``ROUND_COLUMNS``, oldest first."""
-    shown = joined(_sheet_html(s, [row for row in rounds if row[1] == s.task.task_id]) for s in sheets)
+    shown = [
+        part("sheet", s, STATES, angle_text, steps(s), drawing(s), [row for row in rounds if row[1] == s.task.task_id],
+             of="working_sheet.html") for s in sheets
+    ]  # fmt: skip
     head = f"{title}: alignment"
-    return document(head, filled('{}<h1>{}</h1><p class="meta">{}</p>{}', Markup(_STYLE), head, date, shown))
-
-
-def _sheet_html(sheet: Sheet, rounds: Sequence[Sequence[str]]) -> Markup:
-    """What the operator is to do at a body, and the rounds so far."""
-    task, body, onto = sheet.task, sheet.task.body, sheet.task.onto
-    limit = "" if task.tolerance is None else f" Tolerance {angle_text(task.tolerance)} about each axis."
-    head = filled(
-        "<h2>{} {}</h2><p>{} <b>{}</b> is to be parallel to {} <b>{}</b>.{}</p>",
-        task.task_id, _state(sheet.state), body.kind, body.frame_id, onto.kind, onto.frame_id, limit,
-    )  # fmt: skip
-    to_do = each("<li>{}</li>", ((step,) for step in steps(sheet)))
-    angles = [(a.axis, *map(angle_text, (a.angle, a.sigma, a.uncertainty)), _state(a.state)) for a in sheet.axes]
-    axes = _table(("Axis", "Off by", "σ", f"{sheet.level:.0%}", ""),
-                  each("<tr><td>{}</td><td>{}</td><td>{}</td><td>± {}</td><td>{}</td></tr>", angles))  # fmt: skip
-    said = note(f"Off by: how far {body.frame_id} is turned about its own axis, right-handed.")
-    seen = each("<tr><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td></tr>", ((r[0], *r[2:6]) for r in rounds))
-    before = element("h3", "Rounds") + _table(("Date", "State", "x ″", "y ″", "z ″"), seen) if len(rounds) > 1 else ""
-    doing = element("ol", to_do) if to_do else element("p", "Nothing to do.")
-    return joined((head, doing, drawing(sheet), axes, said, before))
-
-
-def _state(state: State) -> Markup:
-    return element("span", STATES[state], f"state {state}")
-
-
-def _table(columns: Sequence[str], rows: Markup) -> Markup:
-    titles = each("<th>{}</th>", ((text,) for text in columns))
-    return filled('<div class="t"><table><tr>{}</tr>{}</table></div>', titles, rows)
+    return document(head, part("page", head, date, shown, of="working_sheet.html"))
 
 
 def drawing(sheet: Sheet) -> Markup:

@@ -11,7 +11,7 @@ from markupsafe import Markup
 from adjust.model.errors import SurveyError
 from adjust.model.result import Estimate, ParameterName
 from survey.folder.text import suggestion
-from survey.report.markup import each, filled
+from survey.report.markup import part
 from survey.solution.quantities import estimated, in_joint
 
 Component = tuple[ParameterName, str]
@@ -68,26 +68,20 @@ def rows_in_joint(estimates: Estimates, wanted: Sequence[Component]) -> tuple[li
 
 
 Cell = str | tuple[str, str]
+_OF = "notebook.html"
 
 
 def heading(title: str, said: str = "") -> Markup:
     """A title with a remark; both are escaped."""
-    return filled('<div style="margin:4px 0"><b>{}</b> <span style="opacity:.7">{}</span></div>', title, said)
+    return part("heading", title, said, of=_OF)
 
 
 def verdict(colour: str, said: str) -> Markup:
     """What an adjustment comes to, in a colour of CSS."""
-    return filled('<div style="color:{}"><b>{}</b></div>', colour, said)
+    return part("verdict", colour, said, of=_OF)
 
 
 def html_table(columns: Sequence[str], rows: Iterable[Sequence[Cell]]) -> Markup:
     """A table of texts, first column left, others right; a cell may be a text with its style. Texts are escaped."""
-    body = each("<tr>{}</tr>", ((_cells("td", row),) for row in rows))
-    table = '<table style="border-collapse:collapse"><thead><tr>{}</tr></thead><tbody>{}</tbody></table>'
-    return filled(table, _cells("th", columns), body)
-
-
-def _cells(tag: str, row: Sequence[Cell]) -> Markup:
-    form = '<{0} style="padding:2px 9px;text-align:{1};white-space:nowrap;{3}">{2}</{0}>'
-    texts = [cell if isinstance(cell, tuple) else (cell, "") for cell in row]
-    return each(form, ((tag, "right" if i else "left", *text) for i, text in enumerate(texts)))
+    cells = [[cell if isinstance(cell, tuple) else (cell, "") for cell in row] for row in rows]
+    return part("table", columns, cells, of=_OF)

@@ -52,7 +52,7 @@ def _summary(o: PlanResult) -> Markup:
     cards = [(m.count(e.n_observations), "observations"), (m.count(e.n_unknowns), "unknowns"),
              (m.count(e.redundancy), "redundancy"), (m.count(o.planned.n_planned_epochs), "planned epochs"),
              (m.count(o.planned.n_existing_blocks), "images measured already")]  # fmt: skip
-    body = m.listed([*o.planned.notes, *e.warnings]) + m.cards(cards)
+    body = m.listed([*o.planned.notes, *e.warnings]) + m.part("cards", cards)
     rows = [
         (g, m.count(n), m.fixed(r, 1), m.fixed(q[0], 3), m.fixed(q[1], 3), m.fixed(q[2], 3))
         for g, (n, r, q) in group_redundancy(e).items()
@@ -102,7 +102,7 @@ def _sigmas(o: PlanResult) -> Markup:
 
 def _weak(o: PlanResult) -> Markup:
     rows = [
-        (m.fixed(w.factor, 0), m.lines([f"{s:+.2f}  {a}: {c}" for a, c, s in w.parts])) for w in o.weak
+        (m.fixed(w.factor, 0), m.part("lines", [f"{s:+.2f}  {a}: {c}" for a, c, s in w.parts])) for w in o.weak
     ]  # fmt: skip
     said = (
         "Combinations of unknowns that the observations hardly tell apart. Factor: how many times less precise the "
@@ -133,7 +133,7 @@ def _selection(o: PlanResult) -> Markup:
         for g in gained(s)
     ]  # fmt: skip
     wanted = m.table(("<Component", "Before", "After all", "<Unit", "Smaller by"), rows)
-    body += m.details("Sigmas of everything wanted, before and after", wanted)
+    body += m.part("details", "Sigmas of everything wanted, before and after", wanted, False)
     said = (
         f"{len(s.first)} candidates; {s.criterion}-optimal choice of {len(s.steps)}, one after the other, each beside "
         "those taken. ln det: of the covariance of what is wanted; the mean variance counts every component in units "
@@ -198,7 +198,7 @@ def _navigation(n: NavigationOutcome) -> Markup:
                  Series(f"largest sigma of {what}", x[good], values[good], d.BLUE)]  # fmt: skip
         drawn.append(chart(lines, f"Expected {what} of every pose", "pose", unit))
     drawn += [_room(n)] if n.placement is None else []
-    body = m.figures(drawn)
+    body = m.part("figures", drawn, "figures")
     good = meets(n)
     open_poses = [i + 1 for i, e in enumerate(n.precision) if e.undetermined]
     facts = [("Poses as precise as required", f"{int(good.sum())} of {len(good)}")]

@@ -133,7 +133,12 @@ def language() -> str:
 
 def esc(value: object) -> Markup:
     """Text that cannot be taken for markup, and shows its characters in the order in which they stand."""
-    return value if isinstance(value, Markup) else escape(unturned(str(value), TURNING))
+    return value if isinstance(value, Markup) else escape(plain_text(value))
+
+
+def plain_text(value: object) -> str:
+    """The same before it is escaped, as templates do on their own."""
+    return value if isinstance(value, Markup) else unturned(str(value), TURNING)
 
 
 def unturned(text: str, shown: Mapping[int, str]) -> str:

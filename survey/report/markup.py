@@ -1,55 +1,70 @@
-"""What pages are made of: numbers as people read them, and components as functions of values.
+"""What pages are made of: numbers as people read them, and the components of the templates as functions of values.
 
-Every text that is not markup already is escaped on its way into a page.
+Every text that is not markup already is escaped on its way into a page; the HTML stands in ``templates/`` alone.
 """
 
 import json
 import math
 from collections.abc import Iterable, Sequence
+from functools import cache
 from itertools import zip_longest
 from pathlib import Path
+from typing import Any
 
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from survey.report.drawing import DARK
-from survey.report.language import TURNING, esc, known, language, localised, t, unturned
+from survey.report.language import TURNING, esc, known, language, localised, plain_text, t, unturned
 from survey.report.modules import looks
 
 MISSING = "–"
 _MOST_IN_FULL = 1e9  # a larger number of unknown size has a power of ten
 MINUS = "−"
 _HERE = Path(__file__).parent
-_DOCUMENT = """\
-<!doctype html>
-<html lang="{}"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">\
-<title>{}</title><style>{}@media screen and (prefers-color-scheme: dark) {{ {} }}
-</style></head>
-<body><main>{}</main>{}</body></html>
-"""
+_PLACE = Markup("%s")
 
 
-def filled(form: str, *values: object) -> Markup:
-    """HTML with ``{}`` for each value; what is no markup is escaped. The form is never data."""
-    return Markup(form.format(*map(esc, values)))
+@cache
+def _environment() -> Environment:
+    made = Environment(
+        loader=FileSystemLoader(_HERE / "templates"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+        lstrip_blocks=True, finalize=plain_text,
+    )  # fmt: skip
+    made.globals |= {"t": t, "language": language}
+    made.globals["parts"] = made.get_template("parts.html").module
+    return made
 
 
-def each(form: str, rows: Iterable[Sequence[object]]) -> Markup:
-    """A form filled with every row, one after the other."""
-    return Markup("".join(filled(form, *row) for row in rows))
+@cache
+def _module(template: str) -> Any:
+    return _environment().get_template(template).module
+
+
+def part(name: str, *values: object, of: str = "parts.html") -> Markup:
+    """A piece of a page by its macro in the template ``of``."""
+    return Markup(getattr(_module(of), name)(*values))
+
+
+@cache
+def _form(name: str, *values: object) -> str:
+    """A piece that is there many times, with the :data:`_PLACE` of what differs; no value is data."""
+    return str(part(name, *values))
+
+
+def _filled(form: str, *values: object) -> Markup:
+    """A form with what differs; what is no markup is escaped."""
+    return Markup(form % tuple(map(esc, values)))
+
+
+def element(tag: str, body: object, kind: str = "") -> Markup:
+    """``body`` as an element, of class ``kind`` where one is given; neither tag nor kind is data."""
+    return _filled(_form("element", tag, _PLACE, kind), body)
 
 
 def joined(pieces: Iterable[object], between: object = "") -> Markup:
     """Pieces one after the other; what is no markup is escaped."""
     return esc(between).join(esc(x) for x in pieces)
-
-
-def _of_class(kind: str) -> Markup:
-    return filled(' class="{}"', kind) if kind else Markup()
-
-
-def element(tag: str, body: object, kind: str = "") -> Markup:
-    """``body`` as an element, of class ``kind`` where one is given; neither tag nor kind is data."""
-    return filled("<{0}{1}>{2}</{0}>", tag, _of_class(kind), body)
 
 
 def document(title: str, body: Markup, after: Markup | str = "") -> str:
@@ -58,13 +73,14 @@ def document(title: str, body: Markup, after: Markup | str = "") -> str:
     On a dark screen the pictures follow the page; ``after`` follows the body's main part.
     """
     style = Markup(looks("colours", "parts") + (_HERE / "style.css").read_text(encoding="utf-8"))
-    dark = each('svg [{0}="{1}"]{{{0}:{2}}}', ((at, *pair) for pair in DARK.items() for at in ("fill", "stroke")))
-    return unturned(filled(_DOCUMENT, language(), title, style, dark, body, after), TURNING)
+    page: Template = _environment().get_template("document.html")
+    values = {"title": title, "style": style, "colours": tuple(DARK.items()), "body": body, "after": after}
+    return unturned(page.render(values), TURNING) + "\n"
 
 
 def json_script(anchor: str, text: str) -> Markup:
     """JSON of :func:`json_of` as a block with an id."""
-    return filled('<script type="application/json" id="{}">{}</script>', anchor, Markup(text))
+    return part("data", anchor, Markup(text))
 
 
 def json_of(value: object) -> str:
@@ -123,15 +139,14 @@ def with_sigma(value: float | None, sigma: float | None, typical: float | None =
     """A cell of two lines: the value, and its sigma below; ``typical`` sets the decimals of a column or row."""
     decimals = decimals_for(sigma)
     if decimals is None:
-        return below(value_text(value, typical), t("held"))
+        return _below(value_text(value, typical), t("held"))
     decimals = max(decimals_for(typical) or 0, 0 if typical else decimals)
-    shown = fixed(sigma, decimals) if sigma and sigma >= 2 * 10.0**-decimals else sigma_text(sigma)
-    return below(fixed(value, decimals), f"± {shown}")
+    below = fixed(sigma, decimals) if sigma and sigma >= 2 * 10.0**-decimals else sigma_text(sigma)
+    return _below(fixed(value, decimals), f"± {below}")
 
 
-def below(value: object, said: object) -> Markup:
-    """A value with what is said of it in small print below."""
-    return filled('{}<span class="s">{}</span>', value, said)
+def _below(value: str, said: str) -> Markup:
+    return _filled(_form("below", _PLACE, _PLACE), value, said)
 
 
 def count(value: int) -> str:
@@ -169,65 +184,27 @@ def table(
 ) -> Markup:
     """A table with columns as of :func:`heads`; a heading that is data is escaped first."""
     named = heads(columns)
-    titles = each('<{0} class="{1}">{2}</{0}>', (("th" if text else "td", side, text) for text, side in named))
-    cells = "".join(f'<td class="{side}">{{}}</td>' for _, side in named)
-    shown = zip_longest(map(_of_class, row_classes), (filled(cells, *row) for row in rows), fillvalue=Markup())
-    return filled(
-        '<div class="t"><table>{}<thead><tr>{}</tr></thead><tbody>{}</tbody></table></div>',
-        element("caption", caption) if caption else "", titles, each("<tr{}>{}</tr>", shown),
-    )  # fmt: skip
+    cells = _form("cells", tuple(side for _, side in named), _PLACE)
+    return part("table", named, zip_longest(row_classes, (_filled(cells, *row) for row in rows), fillvalue=""), caption)
 
 
 def section(anchor: str, title: str, body: Markup | str, note: str = "") -> Markup:
     """A section of the page; empty where there is nothing to show. ``title`` is English."""
-    if not body:
-        return Markup()
-    said = element("p", note, "note") if note else ""
-    return filled('<section id="{}"><h2>{}</h2>{}{}</section>', anchor, t(title), said, body)
+    return part("section", anchor, t(title), body, note) if body else Markup()
 
 
 def listed(items: Iterable[object], kind: str = "problems") -> Markup:
     """A list of points; nothing where there is none."""
-    points = each("<li>{}</li>", ((item,) for item in items))
-    return element("ul", points, kind) if points else points
+    items = list(items)
+    return part("listed", items, kind) if items else Markup()
 
 
 def definition(pairs: Iterable[tuple[object, object]]) -> Markup:
     """A list of names and values."""
-    return element("dl", each("<div><dt>{}</dt><dd>{}</dd></div>", pairs))
+    return part("definition", list(pairs))
 
 
 def figures(drawn: Iterable[Markup], kind: str = "figures") -> Markup:
     """Pictures side by side; nothing where there is none."""
-    shown = each("<figure>{}</figure>", ((svg,) for svg in drawn))
-    return element("div", shown, kind) if shown else shown
-
-
-def details(summary: object, body: object, opened: bool = False) -> Markup:
-    """What opens at a click."""
-    return filled("<details{}><summary>{}</summary>{}</details>", " open" if opened else "", summary, body)
-
-
-def cards(values: Iterable[tuple[object, object]]) -> Markup:
-    """Large numbers with their names."""
-    return element("div", each("<div><b>{}</b><span>{}</span></div>", values), "cards")
-
-
-def verdict(kind: str, word: object, said: object) -> Markup:
-    """What it comes to, on a ground of its colour."""
-    return filled('<div class="verdict {}"><b>{}</b><span>{}</span></div>', kind, word, said)
-
-
-def header(kind: object, title: object, meta: object) -> Markup:
-    """How a page begins."""
-    return filled('<header><p class="meta">{}</p><h1>{}</h1><p class="meta">{}</p></header>', kind, title, meta)
-
-
-def nav(sections: Iterable[tuple[str, object]]) -> Markup:
-    """Links to sections by their anchors."""
-    return element("nav", each('<a href="#{}">{}</a>', sections))
-
-
-def lines(texts: Iterable[object]) -> Markup:
-    """Lines one below the other."""
-    return joined(texts, Markup("<br>"))
+    drawn = list(drawn)
+    return part("figures", drawn, kind) if drawn else Markup()

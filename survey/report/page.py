@@ -16,7 +16,7 @@ from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from survey.report.context import Context
 from survey.report.language import language, localised, speaking, t
-from survey.report.markup import document, element, joined, json_of, json_script, nav
+from survey.report.markup import document, element, joined, json_of, json_script, part
 from survey.report.modules import WEB, bundled
 from survey.report.sections import (
     diagnosis,
@@ -118,9 +118,9 @@ def finished_page(begun: BegunPage, solution: dict[str, Any], found: Statistics 
     with speaking(begun.language):
         made = begun.made | {anchor: make(c) if found is not None or anchor == _LAST else Markup()
                              for _, anchor, make in _SECTIONS if anchor in _OF_STATISTICS}  # fmt: skip
-        links = nav([(anchor, t(name)) for name, anchor, _ in _SECTIONS if made[anchor]])
+        nav = part("nav", [(anchor, t(name)) for name, anchor, _ in _SECTIONS if made[anchor]])
         title = f"{c.solution['summary']['title'] or c.run.folder} – {t('Adjustment report')}"
-        shown = overview.header(c) + links + joined((made[anchor] for _, anchor, _ in _SECTIONS), "\n")
+        shown = overview.header(c) + nav + joined((made[anchor] for _, anchor, _ in _SECTIONS), "\n")
         scripts = json_script("words", json_of(_words())) + element("script", Markup(bundled("report")))
         return document(title, shown, scripts)
 

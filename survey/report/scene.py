@@ -18,8 +18,7 @@ from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Target
 from survey.folder.plain import plain
 from survey.report import drawing as d
-from survey.report.language import t
-from survey.report.markup import filled, json_of, json_script
+from survey.report.markup import json_of, json_script, part
 from survey.solution.frames import AdjustedFrames
 from survey.solution.quantities import Scale
 
@@ -218,9 +217,7 @@ def space(adjustment: Adjustment, scale: Scale, scene: Scene) -> Markup:
         return Markup()
     extent = float(np.linalg.norm(np.ptp(everything, axis=0)))
     data = scene_values(adjustment, scale, scene) | {"enlarged": enlargement(scene, scale.ellipsoid, extent)}
-    how = t("Drag to turn, Ctrl and wheel to zoom; arrow keys, + and − do the same.")
-    shown = filled('<div class="screen" id="space"></div><p class="note screen">{}</p>', how)
-    return shown + json_script("space-data", json_of(_short(data)))
+    return part("space", of="report.html") + json_script("space-data", json_of(_short(data)))
 
 
 def _short(value: object) -> object:

@@ -11,7 +11,7 @@ from adjust.model.errors import DiagnosedError, IndeterminateError, NotConverged
 from adjust.model.stopped import Stopped, UnknownState
 from survey.folder.plain import plain
 from survey.report.language import group_name, message, speaking, t
-from survey.report.markup import count, document, element, general, header, joined, note, section, table, verdict
+from survey.report.markup import count, document, element, general, joined, note, part, section, table
 from survey.report.sections.diagnosis import causes
 from survey.solution.dictionary import RunInfo
 from survey.solution.quantities import key_of, pose_dict, unit_for_people
@@ -89,10 +89,10 @@ def _values(unknown: UnknownState, value: Any) -> dict[str, Any]:
 def _page(found: Mapping[str, Any]) -> str:
     s = found["summary"]
     first, *rest = str(found["message"]).splitlines()
-    head = header(t("Adjustment report"), s["title"] or s["folder"], " · ".join((s["folder"], s["date"])))
-    failed = verdict("failed", t("Failed"), message(first))
+    head = part("header", t("Adjustment report"), s["title"] or s["folder"], " · ".join((s["folder"], s["date"])))
+    verdict = part("verdict", "failed", t("Failed"), message(first))
     lines = joined([element("p", message(line.strip().removeprefix("- "))) for line in rest])
-    body = head + failed + lines + causes(found["diagnosis"], s["folder"])
+    body = head + verdict + lines + causes(found["diagnosis"], s["folder"])
     if "groups" in found:
         body += _groups(found["groups"]) + _gradient(found["gradient"]) + _moved(found["state"])
     return document(f"{s['title'] or s['folder']} – {t('Adjustment report')}", body)

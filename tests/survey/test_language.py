@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
+from jinja2 import Environment, nodes
 
 import adjust
 import survey
@@ -33,6 +34,7 @@ from survey.report.language import (
 
 SURVEY, ADJUST = (Path(str(package.__file__)).parent for package in (survey, adjust))
 PAGES = (*SURVEY.glob("report/**/*.py"), *SURVEY.glob("batch/*.py"))  # what is said in the reader's language
+TEMPLATES = SURVEY / "report" / "templates"
 TERMINAL = {"beforehand", "between.py", "trajectory.py"}
 """What speaks on a terminal alone, of the diagnosis."""
 NAMES = """angles from another zero|axes or unit of given coordinates|axis of a table runs out|cameras exchanged
@@ -60,6 +62,16 @@ def literals(paths: tuple[Path, ...]) -> set[str]:
     }  # fmt: skip
 
 
+def said_by_templates() -> set[str]:
+    """What ``t`` is called with in templates."""
+    out = set()
+    for path in TEMPLATES.glob("*.html"):
+        for call in Environment().parse(path.read_text(encoding="utf-8")).find_all(nodes.Call):
+            if isinstance(call.node, nodes.Name) and call.node.name == "t" and isinstance(call.args[0], nodes.Const):
+                out.add(call.args[0].value)
+    return out
+
+
 def said_by_pages() -> Iterator[str]:
     """What ``t`` and ``section`` are called with, headings of tables, titles of the sections."""
     at = {"t": 0, "section": 1}
@@ -76,7 +88,7 @@ def said_by_pages() -> Iterator[str]:
 
 @pytest.mark.parametrize("language", OTHERS)
 def test_every_text_has_its_translation(language: str) -> None:
-    wanted = {*said_by_pages(), *CAUSES.values()}
+    wanted = {*said_by_pages(), *said_by_templates(), *CAUSES.values()}
     assert len(wanted) > 250
     assert wanted - set(catalogue(language).texts) == set()
 
@@ -86,7 +98,7 @@ def test_every_text_has_its_translation(language: str) -> None:
 def test_nothing_stale_remains(language: str) -> None:
     near = literals(PAGES)
     far = literals((*SURVEY.rglob("*.py"), *ADJUST.rglob("*.py")))
-    used = near | {x.removeprefix("<") for x in near} | {x.replace("_", " ") for x in far}
+    used = near | {x.removeprefix("<") for x in near} | said_by_templates() | {x.replace("_", " ") for x in far}
     assert set(catalogue(language).texts) - used == set()
     everything = "\n".join(far)
     sentences = catalogue(language).sentences

@@ -68,7 +68,7 @@ bench = Workbench(sys.argv[1], read_only=True)
 Server(bench, "token").app()
 bench.state(), bench.findings(), bench.points(), bench.readings(), bench.runs()
 assert bench.kept is not None
-heavy = {"scipy.sparse", "adjust.adjustment", "adjust.graph.assembly", "survey.report.markup", "cv2", "pandas"}
+heavy = {"scipy.sparse", "adjust.adjustment", "adjust.graph.assembly", "jinja2", "cv2", "pandas"}
 print(sorted(heavy & set(sys.modules)))
 """
 

@@ -7,7 +7,7 @@ from markupsafe import Markup
 
 from survey.report.context import Context
 from survey.report.language import message, t
-from survey.report.markup import code, element, fixed, general, joined, section, table
+from survey.report.markup import code, fixed, general, joined, part, section, table
 
 
 def diagnosis(c: Context) -> Markup:
@@ -36,4 +36,4 @@ def causes(found: Sequence[dict[str, Any]], folder: str) -> Markup:
     )
     how = t("A program can do it, and it can be taken back: {commands}", commands=joined(possible, ", ")) \
         if possible else t("Only a person can do that.")  # fmt: skip
-    return section("diagnosis", "Diagnosis", table(columns, rows) + element("p", how, "lead"), said)
+    return section("diagnosis", "Diagnosis", table(columns, rows) + part("element", "p", how, "lead"), said)

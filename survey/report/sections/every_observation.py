@@ -18,7 +18,7 @@ from adjust.native.text import NUMBERS, TEXT, Words, record_rows
 from survey.project.observed import name_of_observation
 from survey.report.context import Context, Listed, other_components, worst
 from survey.report.language import group_name, known, t
-from survey.report.markup import count, filled, fixed, json_of, json_script, section
+from survey.report.markup import count, fixed, json_of, json_script, part, section
 from survey.solution.quantities import units_for_people
 
 MOST = 20_000
@@ -80,8 +80,7 @@ def every_observation(c: Context) -> Markup:
     if rows.total > n:
         shown = {"shown": count(n), "n": count(rows.total)}
         said += " " + t("The worst {shown} of {n}; all in residuals.csv and residuals_other.csv.", **shown)
-    on_paper = t("On the screen this table can be searched and sorted.")
-    table = filled('<div class="screen" id="all"></div><p class="note paper">{}</p>', on_paper)
+    table = part("all_observations", of="report.html")
     data = f'{{"columns":[{",".join(columns[name] for name in COLUMNS)}],{rows.rest[1:]}'
     return section("all-observations", "All observations", table + json_script("all-data", data), said)
 

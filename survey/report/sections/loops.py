@@ -185,7 +185,7 @@ def _pair_row(pair_id: str, e: dict[str, Any], poses: bool) -> list[str]:
     value = e.get("adjusted", {})
     quaternion = " ".join(m.fixed(q, 7) for q in value.get("rotation_quaternion_wxyz", ()))
     ends = " → ".join(e[end].removeprefix("station:") for end in "ab")
-    cells: list[str] = [m.below(m.joined((m.element("b", pair_id), ends), " "), quaternion)]
+    cells: list[str] = [m.part("below", m.joined((m.element("b", pair_id), ends), " "), quaternion)]
     cells.append(angle_text(e["misfit_arcsec"], None) if e.get("misfit_arcsec") is not None else m.MISSING)
     cells += [m.general(e.get("misfit_mm"), 4)] if poses else []
     redundancy = [r for r in e.get("redundancy", ()) if r is not None]
@@ -195,7 +195,7 @@ def _pair_row(pair_id: str, e: dict[str, Any], poses: bool) -> list[str]:
     sigmas = value.get("sigma_rotation_arcsec", [None] * 3)
     for angle, sigma in zip(value.get("rotation_euler_xyz_deg", [None] * 3), sigmas, strict=True):
         shown = m.value_text(angle, None if not sigma else sigma / 3600.0)
-        cells.append(m.below(shown, f"± {m.sigma_text(sigma)}″"))
+        cells.append(m.part("below", shown, f"± {m.sigma_text(sigma)}″"))
     if poses:
         shift = value.get("translation_mm", [None] * 3)
         along = value.get("sigma_translation_mm", [None] * 3)

@@ -53,8 +53,8 @@ def header(c: Context) -> Markup:
         problems.insert(0, said)
     calm = m.element("p", t("No warnings, nothing suspect, nothing left out."), "calm")
     return m.joined((
-        m.header(t("Adjustment report"), s["title"] or c.run.folder, meta),
-        m.verdict(s["verdict"], t(_WORDS[s["verdict"]]), message(s["reason"])), m.listed(problems) or calm,
+        m.part("header", t("Adjustment report"), s["title"] or c.run.folder, meta),
+        m.part("verdict", s["verdict"], t(_WORDS[s["verdict"]]), message(s["reason"])), m.listed(problems) or calm,
     ))  # fmt: skip
 
 
@@ -78,7 +78,7 @@ def summary(c: Context) -> Markup:
     said += " " + t(
         "Sigmas of observations, standardized residuals and tests are a priori. Residuals are adjusted minus observed."
     )
-    cards = m.cards([(value, name) for name, value in values])
+    cards = m.part("cards", [(value, name) for name, value in values])
     return m.section("summary", "Summary", cards + _global_test(s["global_test"]) + m.note(said))
 
 
@@ -222,7 +222,7 @@ def inputs(c: Context) -> Markup:
         images, left_out = m.table(("<Image", "<Hash", "Points"), rows), len(i["images"]) - len(rows)
         images += m.note(m.more(left_out)) if left_out else Markup()
         said = t("{n} images, each with the hash of the file that its points come from", n=m.count(len(i["images"])))
-        parts.append(m.details(said, images))
+        parts.append(m.part("details", said, images, False))
     for title, entries in (("Options", i["options"]), ("Versions", i["versions"])):
         if entries:
             parts.append(m.element("h3", t(title)) + m.definition(entries.items()))

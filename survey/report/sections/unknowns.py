@@ -38,7 +38,7 @@ def _pose_row(pose: _Pose) -> list[str]:
     least = min((s for s in entry["sigma_rotation_arcsec"] if s), default=None)
     for angle, sigma in zip(entry["rotation_euler_xyz_deg"], entry["sigma_rotation_arcsec"], strict=True):
         below = f"± {m.sigma_text(sigma)}″" if sigma else t("held")
-        cells.append(m.below(value_in("deg", angle, least, "arcsec"), below))
+        cells.append(m.part("below", value_in("deg", angle, least, "arcsec"), below))
     return [m.joined((m.element("b", thing_id), m.code(name)), " "), epoch, *cells, status_pill(entry["status"])]
 
 
@@ -83,7 +83,7 @@ def cameras(c: Context) -> Markup:
         n = m.count(len(others))
         title = t("{n} more cameras, with smaller residuals; their lenses and poses in solution.json", n=n)
         columns = ("<Camera", "Images", "Points", "RMS residual [px]")
-        parts.append(m.details(title, _limited(columns, others, lambda k: _camera_row(k, entries[k])), True))
+        parts.append(m.part("details", title, _limited(columns, others, lambda k: _camera_row(k, entries[k])), True))
     said = t(
         "Residual vectors point from the observed to the adjusted position. Red: suspect, orange: not used. "
         "A pattern in the mean per cell is what the lens model leaves over; empty cells hold no points."
@@ -112,9 +112,7 @@ def _camera(camera_id: str, entry: dict[str, Any], residuals: charts.CameraResid
     drawn = [make(residuals) for make in makers] if len(residuals.uv) else []
     rows = [row[:1] + row[2:] for row in map(_pose_row, _poses(camera_id, {camera_id: entry}))]
     poses = m.table(_POSE_COLUMNS[:1] + _POSE_COLUMNS[2:], rows) if rows else ""
-    panes = m.joined((m.element("div", shown, "pane") if shown else "", m.figures(drawn, "pane figures")))
-    head = m.filled("<h3>{} {}</h3>", t("Camera"), camera_id) + m.note(facts)
-    return m.element("div", m.joined((head, m.element("div", panes, "panes"), poses)), "camera")
+    return m.part("camera", camera_id, facts, shown, drawn, poses, of="report.html")
 
 
 _OF_LENS = {"lens_drift": "changes", "lens_crop": "crops", "lens_shared": "differences"}
@@ -148,7 +146,7 @@ def _clock(entry: dict[str, Any], owner: str = "") -> Markup:
     head = t("Clock of {name}", name=owner) if owner else t("Clock")
     title = t("{n} epochs: times of their own", n=m.count(len(rows)))
     shown = m.element("h3", head) + vector_table(clock)
-    return shown + (m.details(title, _limited(_OWN_TIMES, rows, list)) if rows else Markup())
+    return shown + (m.part("details", title, _limited(_OWN_TIMES, rows, list), False) if rows else Markup())
 
 
 def _remarks(lens: dict[str, Any]) -> Markup:
@@ -181,7 +179,7 @@ def stations(c: Context) -> Markup:
     body = _limited(_POSE_COLUMNS, [pose for pose in poses if not pose[2]] if many else poses, _pose_row)
     if many:
         title = t("{n} poses by epoch", n=m.count(len(by_epoch)))
-        body += m.details(title, _limited(_POSE_COLUMNS, by_epoch, _pose_row))
+        body += m.part("details", title, _limited(_POSE_COLUMNS, by_epoch, _pose_row), False)
     body += m.joined(_clock(e, k) for k, e in having(c.solution["stations"], "clock").items())
     return m.section("poses", "Poses of stations, tables and targets", body, t(_POSE_NOTE))
 
@@ -200,7 +198,7 @@ def tables(c: Context) -> Markup:
             columns = ("<Epoch", *(x for n in names for x in (f"{n} [°]", "σ [″]")))
             epochs = list(entry["epochs"].items())
             title = t("{n} epochs: adjusted angles", n=m.count(len(epochs)))
-            body += m.details(title, _limited(columns, epochs, _angles_row), len(epochs) <= _MANY_EPOCHS)
+            body += m.part("details", title, _limited(columns, epochs, _angles_row), len(epochs) <= _MANY_EPOCHS)
         parts.append(body)
     return m.section("tables", "Turntables", m.joined(parts))
 
@@ -238,8 +236,7 @@ def points(c: Context) -> Markup:
     def row(point: tuple[str, dict[str, Any]]) -> list[str]:
         point_id, p = point
         axes = p["ellipsoid_95_semi_axes_mm"]
-        percent = f"{100.0 * axes[0] / worst if worst else 0.0:.0f}"
-        bar = m.filled('<span class="share"><i style="width:{}%"></i></span>', percent)
+        bar = m.part("bar", f"{100.0 * axes[0] / worst if worst else 0.0:.0f}")
         cells = [m.element("b", point_id), *(m.with_sigma(p[f"{a}_mm"], p[f"sigma_{a}_mm"], typical) for a in "xyz")]
         return [*cells, *(m.sigma_text(a) for a in axes), bar, status_pill(p["status"])]
 
