@@ -9,13 +9,14 @@ can be paid for; each that is found is added to the model before the next is loo
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 from scipy import sparse
 
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS
+from adjust.model.frozen import frozen
 from adjust.model.names import natural_key
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
@@ -38,7 +39,7 @@ _SHAPES = {True: (("width", "1"), ("height", "1"), ("sag along x", "m"), ("sag a
            False: (("width", "1"), ("height", "1"), ("depth", "1"), ("", "1"))}  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Unit:
     """What may change: kind and name of its owner, rows (k,) of the condensed system, columns B (k, q) in these.
 
@@ -55,7 +56,7 @@ class Unit:
     components: tuple[tuple[str, str], ...]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Candidates:
     """A unit's possible changes (J, ...), scaled so that B'B has a unit diagonal: M (J, q, q), g (J, q), scale (J, q).
 
@@ -68,7 +69,7 @@ class _Candidates:
     scale: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Chosen:
     """What was found, less what was found before it: B (m, q) over all rows, and left = (I - A Q A') B.
 

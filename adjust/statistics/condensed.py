@@ -7,7 +7,6 @@ epochs, another shape of its target. What the residuals say of these is asked in
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -17,6 +16,7 @@ from adjust.frames.tables import adjoint_of_inverse
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.singles import beside_images
 from adjust.model.boards import BENT, deformation
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.images import N_SHAPE
 from adjust.native.lenses import MAX_LENS
@@ -39,7 +39,7 @@ _OWN = (MAX_LENS, MAX_LENS + 6, MAX_LENS + 12, MAX_LENS + 12 + N_SHAPE)
 """Where lens, camera, target and shape end among the columns that a block could have besides."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class CondensedSystem:
     """The system, whose first observations are the image blocks, and its m image rows by what a block has of its own.
 
@@ -134,7 +134,7 @@ class CondensedSystem:
         return np.cumsum([0] + [len(b.uv) for b in blocks])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Part:
     """Some blocks by their numbers: rows of the system, block (m,) of each and what it could have besides (m, 30)."""
 

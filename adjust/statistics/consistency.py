@@ -7,11 +7,11 @@ global test stands out in its own part.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.names import numbered
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
@@ -63,7 +63,7 @@ def consistency(adjustment: Adjustment, condensed: CondensedSystem | None, alpha
     )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Part:
     """A part: the observations (k,) of the condensed system that belong to it; none where only its sums are known."""
 

@@ -5,7 +5,6 @@ of uncertainty (GUM, JCGM 100:2008) is ``Q = sum of Q N_g Q``, N_g the normal ma
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +12,7 @@ from scipy import sparse
 
 from adjust.frames.tree import in_world
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment, ParameterName, VarianceComponents
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import side_by_side
@@ -97,7 +97,7 @@ def furthest_of(dx: FloatArray, sigmas: FloatArray, coordinates: sparse.csr_matr
     return Furthest(at, dx[at, k], ratio[at, k], place, np.sqrt(squares[place, k]))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Shared:
     """How far things move by what all unknowns share, ``U' y``: at most the length of y times that of their own part.
 
@@ -133,7 +133,7 @@ class _Shared:
         return (int(self.number[at]), float(np.sqrt(squares[at]))) if squares[at] > found**2 else None
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Reach:
     """What biases move where Q = own + U' U: the sets of unknowns that one touches by both, all others by U' U alone.
 

@@ -1,7 +1,6 @@
 """The normal matrix of a linear system, factored by the structure that surveys have."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -9,6 +8,7 @@ import numpy as np
 import scipy
 from scipy import sparse
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from adjust.precision.s_transformation import without_datum_rows
 
@@ -26,7 +26,7 @@ _ROOM, _WIDEST = 20_000_000, 500
 """Numbers that the shared part of an inverse may need, and unknowns of a core: more are faster through a tree."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Inverse:
     """An inverse (n, n) as a sum: ``own + U' U``.
 

@@ -1,7 +1,6 @@
 """Confidence ellipsoids, and the precision of one point, station or camera relative to another."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from gtsam import Pose3
@@ -9,6 +8,7 @@ from gtsam import Pose3
 from adjust.graph.assembly import values_of
 from adjust.graph.building import GraphBuilder
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray
@@ -64,7 +64,7 @@ def relative_precision(
     return tuple(_relative(adjustment, a, b, level, scaled) for a, b in found)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Place:
     """A position x (3,), its axes R (3, 3), and derivatives (6, dim) by unknowns: turn (own axes), x (world)."""
 

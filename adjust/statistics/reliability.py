@@ -1,11 +1,11 @@
 """Tests, minimal detectable biases and external reliability of every observation of an adjusted survey."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from adjust.model.arrays import largest
+from adjust.model.frozen import frozen
 from adjust.model.names import numbered
 from adjust.model.result import Adjustment, ReadingResiduals
 from adjust.model.survey import FloatArray, IntArray
@@ -26,7 +26,7 @@ _OF_COMPONENTS = ("w", "error", "detectable_component", "bias")
 """Columns as :func:`adjust.native.point_tests.point_tests` fills them."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Batch:
     """Observations of the same number of components: their rows in the table, what they are whitened with."""
 

@@ -1,12 +1,12 @@
 """What the statistics of an adjustment give back: tables for a report, all values in SI units, angles in radians."""
 
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
 from adjust.model.errors import listed
+from adjust.model.frozen import frozen
 from adjust.model.result import ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.testing.criteria import Criteria
@@ -14,7 +14,7 @@ from adjust.testing.distributions import norm
 from adjust.testing.single_tests import p_posterior, p_prior, p_tau
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ObservationTests:
     """Tests and reliability of every observation: image points first, then ``Adjustment.other_residuals``, M in all.
 
@@ -90,7 +90,7 @@ class ObservationTests:
         return p_tau(self.tau[:, None], np.repeat(self.used, self.n_components), self.total_redundancy)[:, 0]
 
 
-@dataclass(frozen=True)
+@frozen
 class Influence:
     """What an undetected bias of the least detectable size does.
 
@@ -109,7 +109,7 @@ class Influence:
     position_shift: float
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Reliability:
     """Tests of all observations, what they could not find, and what is not controlled.
 
@@ -125,7 +125,7 @@ class Reliability:
     redundancy: int
 
 
-@dataclass(frozen=True)
+@frozen
 class Alternative:
     """Two explanations that the data hardly tell apart: with ``instead`` out, ``kept`` would fit.
 
@@ -145,7 +145,7 @@ class Alternative:
         )
 
 
-@dataclass(frozen=True)
+@frozen
 class Correlation:
     """Two components of unknowns with their correlation coefficient."""
 
@@ -156,7 +156,7 @@ class Correlation:
     coefficient: float
 
 
-@dataclass(frozen=True)
+@frozen
 class WeakPart:
     """A component that moves in a weak direction: by ``amount`` (its unit) for one sigma of the direction."""
 
@@ -166,7 +166,7 @@ class WeakPart:
     amount: float
 
 
-@dataclass(frozen=True)
+@frozen
 class WeakDirection:
     """A combination of unknowns that the survey determines badly.
 
@@ -182,7 +182,7 @@ class WeakDirection:
         return f"{self.inflation:.3g} times weaker together than alone: {listed(named, most)}"
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Ellipsoid:
     """A confidence region: semi_axes (k,) m, largest first, axes (3, k) unit vectors in the world, at ``level``.
 
@@ -200,7 +200,7 @@ class Ellipsoid:
         return len(self.semi_axes)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class RelativePrecision:
     """Precision of b relative to a, whatever the datum of position.
 
@@ -218,7 +218,7 @@ class RelativePrecision:
     rotation_cov: FloatArray | None
 
 
-@dataclass(frozen=True)
+@frozen
 class BudgetLine:
     """What one source contributes to the standard uncertainty: u (unit of the parameter), share of the variance.
 
@@ -233,7 +233,7 @@ class BudgetLine:
     freedom: float
 
 
-@dataclass(frozen=True)
+@frozen
 class BudgetEntry:
     """Uncertainty budget of one component of a parameter (GUM, 8.1): largest source first.
 
@@ -251,7 +251,7 @@ class BudgetEntry:
     lines: tuple[BudgetLine, ...]
 
 
-@dataclass(frozen=True)
+@frozen
 class PartTest:
     """Whether the residuals of one part of a survey are as large as its sigmas say.
 
@@ -278,7 +278,7 @@ class PartTest:
         )
 
 
-@dataclass(frozen=True)
+@frozen
 class ChangeShift:
     """One component of a change: its amount in ``unit`` as the residuals have it, and the sigma of that."""
 
@@ -291,7 +291,7 @@ class ChangeShift:
 _IN_UNITS = {"rad": (" arcsec", 180.0 * 3600.0 / np.pi), "m": (" mm", 1e3), "1": ("", 1.0)}
 
 
-@dataclass(frozen=True)
+@frozen
 class Change:
     """What the residuals say that a camera, target or table has of its own: a score test of what was no unknown.
 
@@ -321,7 +321,7 @@ class Change:
         return f"{said}: {', '.join(parts)} (p {self.p:.2g})"
 
 
-@dataclass(frozen=True)
+@frozen
 class Consistency:
     """Whether every part of a survey fits, and whether cameras and targets stayed the same.
 

@@ -2,10 +2,10 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from adjust.model.frozen import frozen
 from adjust.native.parallel import Beside
 from survey.folder.locking import OBSERVATIONS_FOLDER
 from survey.folder.text import content
@@ -14,7 +14,7 @@ LARGE = 2**20  # bytes of CSV; below, loading Arrow (30 ms) costs more than it s
 Version = tuple[int, ...]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Ahead:
     """Files that are being read, as they were then, what gives their bytes, and the steps that these are."""
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from adjust.model.errors import SurveyError
 from survey.folder.replacing import changing, replace_parts
-from survey.jobs.detecting.job import detect_job, remember_images
 from survey.project import read
 from survey.project.project import RESULTS
 from survey.project.tables.files import Begun
@@ -42,6 +41,8 @@ def adjust_job(
     with changing(target) as place:
 
         def detected() -> None:
+            from survey.jobs.detecting.job import detect_job  # here: a survey without images starts without it
+
             with clock.step("detect"):
                 here = place if out is None else None
                 detect_job(folder, progress=progress, everything=redetect, place=here)
@@ -56,6 +57,8 @@ def adjust_job(
             with clock.step("read"):
                 project = read(folder)
         elif project.images and out is None:
+            from survey.jobs.detecting.job import remember_images  # here: as above
+
             project = replace(project, detected=remember_images(project, place))
         from survey.jobs.adjusting import outcome as results
         from survey.jobs.adjusting.steps import adjust_project

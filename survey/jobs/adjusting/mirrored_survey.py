@@ -3,10 +3,9 @@
 Every flat target is then seen from behind and all fits: what is adjusted is the mirror image of what was measured.
 """
 
-from dataclasses import dataclass
-
 from adjust.diagnosis.images import from_behind, is_flat
 from adjust.model.errors import listed
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment
 from survey.project import Project
@@ -17,7 +16,7 @@ _FEWEST, _LOOKED_AT = 3, 12
 """Images of a camera by which it is judged, and at how many one looks."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Sides:
     """From where cameras see printed flat targets. behind: how many images of cameras that see none from its front."""
 

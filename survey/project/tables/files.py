@@ -6,7 +6,6 @@ import itertools
 import re
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 
 from adjust.model.arrays import FloatArray, IntArray
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.native.parallel import Beside
 from survey.folder.ahead import LARGE, Ahead, Version, version
 from survey.folder.text import (
@@ -38,7 +38,7 @@ _NUMBERS = re.compile(r"[-+.\deE ]+")  # the components of an axis in one cell
 Chunk = tuple[IntArray, Sequence[Sequence[str]]]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Begun:
     """A table that is being read: the file as it was then, and what gives the table."""
 
