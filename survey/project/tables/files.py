@@ -17,7 +17,7 @@ from adjust.model.arrays import FloatArray, IntArray
 from adjust.model.errors import SurveyError
 from adjust.model.frozen import frozen
 from adjust.native.parallel import Beside
-from survey.folder.ahead import LARGE, Ahead, Version, version
+from survey.folder.ahead import LARGE, Ahead, Content, Version, begun, version
 from survey.folder.text import (
     LARGEST_NUMBER,
     atomic_write,
@@ -27,7 +27,6 @@ from survey.folder.text import (
     decode,
     formula_problem,
     utf8,
-    with_digest,
 )
 from survey.project.tables.arrow import csv_bytes, csv_columns, parquet_bytes, parquet_columns
 from survey.project.tables.layouts import LAYOUTS
@@ -52,10 +51,9 @@ def begin_tables(ahead: Ahead) -> dict[Path, Begun]:
     if ahead.files:
         import_module("pyarrow.csv")  # before GTSAM, which is loaded with Python's lock held
     while ahead.files:
-        path, (file, data) = ahead.files.popitem()
+        path, (file, found) = ahead.files.popitem()
         if path.stem in LAYOUTS:
-            digest = partial(_digest, data)
-            begun_tables[path] = Begun(file, ahead.steps.of(partial(_read, path, LAYOUTS[path.stem], data, digest)))
+            begun_tables[path] = Begun(file, ahead.steps.of(partial(_read, path, LAYOUTS[path.stem], found)))
     return begun_tables
 
 
@@ -66,31 +64,25 @@ def read_table(path: Path, layout: Layout, instead: str | None = None, ahead: Be
     """
     if ahead is not None and instead is None and ahead.file == version(path):
         return ahead.table()
-    data = content(path) if instead is None else instead.encode()
     with Beside() as steps:
-        return _read(path, layout, lambda: data, steps.of(lambda: _digest(lambda: data)))
+        return _read(path, layout, begun(lambda: content(path) if instead is None else instead.encode(), steps))
 
 
-def _digest(data: Callable[[], bytes]) -> str:
-    return with_digest(data())[1]
-
-
-def _read(path: Path, layout: Layout, data: Callable[[], bytes], digest: Callable[[], str]) -> Table:
-    """digest: asked for last."""
+def _read(path: Path, layout: Layout, found: Content) -> Table:
     if path.suffix == ".parquet":
-        columns = parquet_columns(path, data(), layout)
+        columns = parquet_columns(path, found.data(), layout)
         lines = np.arange(1, len(next(iter(columns.values()))) + 1)
-        return _table(path, layout, digest(), lines, columns)
-    plain = csv_columns(data(), layout)
+        return _table(path, layout, found.digest(), lines, columns)
+    plain = csv_columns(found.data(), layout)
     if plain is not None:
-        return _table(path, layout, digest(), np.arange(2, len(next(iter(plain.values()))) + 2), plain)
-    text = decode(path, data())
+        return _table(path, layout, found.digest(), np.arange(2, len(next(iter(plain.values()))) + 2), plain)
+    text = decode(path, found.data())
     if not text.strip():
         raise SurveyError(f"{path}:1: the file is empty; the first line names the columns: {','.join(layout.required)}")
     check_rows(path, text.count("\n"))
     header, chunks = csv_chunks(path, text)
     check_header(path, header, layout)
-    return _assemble(path, layout, digest(), header, chunks)
+    return _assemble(path, layout, found.digest(), header, chunks)
 
 
 def _assemble(path: Path, layout: Layout, digest: str, header: Sequence[str], chunks: Iterable[Chunk]) -> Table:
