@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
-from adjust.model.frozen import frozen
 from adjust.native.parallel import Beside
 from survey.folder.locking import OBSERVATIONS_FOLDER
 from survey.folder.text import content, with_digest
@@ -14,16 +14,14 @@ LARGE = 2**20  # bytes of CSV; below, loading Arrow (30 ms) costs more than it s
 Version = tuple[int, ...]
 
 
-@frozen(eq=False)
-class Content:
+class Content(NamedTuple):
     """What gives the bytes of a file, and their sha256."""
 
     data: Callable[[], bytes]
     digest: Callable[[], str]
 
 
-@frozen(eq=False)
-class Ahead:
+class Ahead(NamedTuple):
     """Files that are being read, as they were then, and the steps that these are."""
 
     steps: Beside
