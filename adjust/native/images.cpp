@@ -2,6 +2,7 @@
 #include "calibration.h"
 #include "chains.h"
 #include "changes.h"
+#include "condensed.h"
 #include "parallels.h"
 #include "planes.h"
 #include "point_tests.h"

@@ -1,16 +1,19 @@
 """A solved survey as one linear system that stays small: the image points of a block stand in a few rows.
 
-A block's 2n whitened rows over its local unknowns are turned (orthogonally) into as many rows as there are columns: the
-same normal equations, gradients and quadratic forms for any n. Beside the columns of the unknowns the rows are kept by
+A block's 2n whitened rows over its local unknowns are turned into as many rows as there are columns, the triangle of
+their normal equations: the same gradients and quadratic forms for any n. The solution knows a block by that triangle
+too, so that nothing is lost that its covariances still have. Beside the columns of the unknowns the rows are kept by
 what a block could have besides: a motion of its camera, of its target, other lens parameters than those of the other
 epochs, another shape of its target. What the residuals say of these is asked in :mod:`adjust.statistics.changes`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
 from adjust.frames.tables import adjoint_of_inverse
@@ -18,13 +21,12 @@ from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.singles import beside_images
 from adjust.model.boards import BENT, deformation
 from adjust.model.survey import FloatArray, IntArray
-from adjust.native.images import N_SHAPE
+from adjust.native.images import N_SHAPE, CondensedRows, ShapeFactors
 from adjust.native.lenses import MAX_LENS
 from adjust.native.parallel import side_by_side
 from adjust.observations.images.bundles import BundleBatch
 from adjust.precision.precision import Precision
 from adjust.statistics.rows import (
-    Entries,
     ImageRows,
     KeyColumns,
     bundle_order,
@@ -34,16 +36,17 @@ from adjust.statistics.rows import (
 )
 from adjust.statistics.system import LinearSystem, assembled
 
+_Number = TypeVar("_Number", bound=np.generic)
 _FLAT = 1e-9
-_OWN = (MAX_LENS, MAX_LENS + 6, MAX_LENS + 12, MAX_LENS + 12 + N_SHAPE)
-"""Where lens, camera, target and shape end among the columns that a block could have besides."""
+_OWN = (-12 - N_SHAPE, -6 - N_SHAPE, -N_SHAPE)
+"""Where lens, camera and target end among the columns that a block could have besides; the shape is last."""
 
 
 @dataclass(frozen=True, eq=False)
 class CondensedSystem:
     """The system, whose first observations are the image blocks, and its m image rows by what a block has of its own.
 
-    block: (m,) index into ``Survey.image_blocks``. lens: (m, MAX_LENS) by the free lens parameters of its camera.
+    block: (m,) index into ``Survey.image_blocks``. lens: (m, ..) by the free lens parameters of its camera, then zeros.
     camera, target: (m, 6) by a motion of the camera in its own axes, of the target in its own axes (rotation,
     translation). shape: (m, 4) by the shape of the target: flat ones grow along x and y, and bend (unit sags) along x
     and y; others grow along x, y and z, the last column is zero. e: (m,). numbers: the image block
@@ -136,7 +139,7 @@ class CondensedSystem:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Some blocks by their numbers: rows of the system, block (m,) of each and what it could have besides (m, 30)."""
+    """Some blocks by their numbers: rows of the system, block (m,) of each and what it could have besides (m, ..)."""
 
     rows: ImageRows
     numbers: IntArray
@@ -153,72 +156,62 @@ def condensed_system(precision: Precision) -> CondensedSystem:
         parts.append(_known(graph, n, key_columns))
         for part, bundle in enumerate(graph.bundles, 1):
             number = np.flatnonzero(graph.image_parts == part)
-            parts.append(_unknown(bundle, number, n, key_columns))
+            parts.append(_unknown(graph, bundle, number, n, key_columns))
         rows = [p.rows for p in parts]
-        e, lengths, used = (np.concatenate([getattr(p, x) for p in rows]) for x in ("e", "lengths", "used"))
+        e, lengths, used = (_joined([getattr(p, x) for p in rows]) for x in ("e", "lengths", "used"))
         return ImageRows(stacked([p.A for p in rows]), e, lengths, used, [g for p in rows for g in p.groups])
 
     system = assembled(precision, image_rows)
-    numbers, block, own = (np.concatenate([getattr(p, x) for p in parts]) for x in ("numbers", "block", "own"))
-    lens, camera, target, shape = np.split(own, _OWN[:-1], axis=1)
+    numbers, block, own = (_joined([getattr(p, x) for p in parts]) for x in ("numbers", "block", "own"))
+    lens, camera, target, shape = np.split(own, _OWN, axis=1)
     return CondensedSystem(system, block, lens, camera, target, shape, system.e[: len(block)], numbers, columns)
+
+
+def _joined(parts: Sequence[NDArray[_Number]]) -> NDArray[_Number]:
+    """One behind the other; not copied where there is one."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
+def _most_lens(graph: AdjustmentGraph) -> int:
+    """Free parameters of a lens, at most."""
+    return int(graph.images.state.lenses.n_free.max(initial=0))
 
 
 def _known(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> _Part:
     """Blocks of known targets, those of the same size together."""
-    images, entries = graph.images, Entries()
-    number = graph.image_numbers
+    images, number = graph.images, graph.image_numbers
     shapes, columns, sets = _shapes(graph), columns_of_blocks(graph, key_columns), images.alike()
     heights = [images.condensed_height(int(mine[0])) for mine in sets]
     ends = np.cumsum([0, *(len(mine) * k for mine, k in zip(sets, heights, strict=True))]).tolist()
-    own, e = np.zeros((ends[-1], _OWN[-1])), np.empty(ends[-1])
+    own, e, length = np.empty((ends[-1], _most_lens(graph) - _OWN[0])), np.empty(ends[-1]), np.empty(ends[-1], np.int64)
 
-    def condensed(i: int) -> FloatArray:
-        """Rows by the keys of the i-th set, the rest of which goes where it belongs."""
-        rows, shape = slice(ends[i], ends[i + 1]), (len(sets[i]), heights[i])
-        return _condensed(graph, sets[i], shapes, own[rows].reshape(*shape, -1), e[rows].reshape(shape))
+    def condensed(i: int) -> tuple[FloatArray, NDArray[np.int32]]:
+        """Entries of the i-th set and their columns; the rest goes where it belongs."""
+        rows, shape, across = slice(ends[i], ends[i + 1]), (len(sets[i]), heights[i]), columns(sets[i])
+        whole = *shape, across.shape[1]
+        out = CondensedRows(own[rows].reshape(*shape, -1), e[rows].reshape(shape), length[rows].reshape(shape),
+                            np.empty(whole), np.empty(whole, dtype=np.int64))  # fmt: skip
+        found = images.condensed_rows(sets[i], shapes, across, out)
+        return out.entry.ravel()[:found].copy(), out.column.ravel()[:found].astype(np.int32)
 
-    for i, by_key in enumerate(side_by_side(condensed, range(len(sets)))):
-        entries.add_blocks(np.arange(ends[i], ends[i + 1]).reshape(-1, heights[i]), columns(sets[i]), by_key)
+    parts = [(np.zeros(0), np.zeros(0, dtype=np.int32)), *side_by_side(condensed, range(len(sets)))]
+    entry, column = (np.concatenate(x) for x in zip(*parts, strict=True))
+    A = sparse.csr_matrix((entry, column, np.append(0, np.cumsum(length)).astype(np.int32)), (len(e), n))
     order = np.concatenate([np.zeros(0, dtype=np.int64), *sets])
     groups = [images.blocks[b].group for b in order.tolist()]
-    A, of_blocks = entries.matrix((len(e), n)), np.repeat(np.array(heights, dtype=np.int64), list(map(len, sets)))
-    A.eliminate_zeros()  # rows that are triangular leave half of it empty
+    of_blocks = np.repeat(np.array(heights, dtype=np.int64), list(map(len, sets)))
     rows = ImageRows(A, e, of_blocks, np.ones(len(groups), dtype=np.bool_), groups)
     return _Part(rows, number[order], np.repeat(number[order], of_blocks), own)
 
 
-def _shapes(graph: AdjustmentGraph) -> Callable[[IntArray], FloatArray]:
-    """Of image points (..) of known targets what their derivatives are to be multiplied by: (.., 4)."""
-    first, every, images = dict[str | None, int](), [np.zeros((1, N_SHAPE))], graph.images
+def _shapes(graph: AdjustmentGraph) -> ShapeFactors:
+    """Of the image points of known targets."""
+    first, every, images = dict[str | None, int](), [np.zeros((0, N_SHAPE))], graph.images
     for target in graph.survey.targets:
         first[target.target_id] = sum(map(len, every))
         every.append(_shape_factors(target.x_in_target))
     begin = np.array([first.get(b.target_id, -1) for b in images.blocks], dtype=np.int64)
-    of_point = np.repeat(begin, np.diff(images.ptr))
-    table, at = np.concatenate(every), np.where(of_point < 0, 0, of_point + images.point_idx)
-    return lambda points: table[at[points]]
-
-
-def _condensed(
-    graph: AdjustmentGraph, mine: IntArray, shapes: Callable[[IntArray], FloatArray], own: FloatArray, e: FloatArray
-) -> FloatArray:
-    """Of g blocks that are alike, k rows each, by the columns of their keys (g, k, w); into own (g, k, 30), e (g, k).
-
-    own: of zeros.
-    """
-    images, width = graph.images, int(graph.images.n_rows[mine[0]]) - 1
-    points = images.ptr[mine][:, None] + np.arange(len(images.blocks[mine[0]].uv))
-    rows = images.condensed_rows(mine, shapes(points))
-    nl = images.state.lenses.n_free[images.camera[mine]]
-    lens, camera, pose, shape = np.split(own, _OWN[:-1], axis=2)
-    for count in np.unique(nl):  # warps make up for lens parameters in the number of columns
-        those = nl == count
-        lens[those, :, :count] = rows[those][:, :, :count]
-        pose[those] = rows[those][:, :, count : count + 6]
-    camera[:] = pose @ adjoint_of_inverse(images.chains.R[mine], images.chains.t[mine])
-    shape[:], e[:] = rows[:, :, width:-1], rows[:, :, -1]
-    return rows[:, :, :width] @ images.local_from_keys(mine)
+    return ShapeFactors(begin, images.point_idx, np.concatenate(every))
 
 
 def _shape_factors(x: FloatArray) -> FloatArray:
@@ -230,15 +223,15 @@ def _shape_factors(x: FloatArray) -> FloatArray:
     return out
 
 
-def _unknown(bundle: BundleBatch, number: IntArray, n: int, key_columns: KeyColumns) -> _Part:
+def _unknown(graph: AdjustmentGraph, bundle: BundleBatch, number: IntArray, n: int, key_columns: KeyColumns) -> _Part:
     """Blocks of unknown points, whose rows differ in the columns of their points: as they are, two per point."""
     A, e = bundle_rows(bundle, n, key_columns)
     used, lengths = np.repeat(bundle.unsorted(bundle.used), 2).astype(float), 2 * np.diff(bundle.block_ptr)
     of_row = np.repeat(np.arange(len(lengths)), lengths)
     local = bundle.A.reshape(-1, MAX_LENS + 7)[bundle_order(bundle)] * used[:, None]
-    own, pose = np.zeros((len(local), _OWN[-1])), local[:, MAX_LENS : MAX_LENS + 6]
-    own[:, :MAX_LENS] = local[:, :MAX_LENS]
-    by_camera = adjoint_of_inverse(bundle.chains.R, bundle.chains.t)
+    lens, pose = _most_lens(graph), local[:, MAX_LENS : MAX_LENS + 6]
+    own, by_camera = np.zeros((len(local), lens - _OWN[0])), adjoint_of_inverse(bundle.chains.R, bundle.chains.t)
+    own[:, :lens] = local[:, :lens]
     own[:, _OWN[0] : _OWN[1]] = np.einsum("ni,nij->nj", pose, by_camera[of_row])
     groups = [b.group for b in bundle.blocks]
     A = A if used.all() else (sparse.diags(used) @ A).tocsr()

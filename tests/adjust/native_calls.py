@@ -35,6 +35,7 @@ from adjust.precision.precision import Precision
 from adjust.relay.loops import loop_basis
 from adjust.relay.network import topology
 from adjust.start import find_start
+from adjust.statistics.condensed import condensed_system
 from survey.detection import SpotOptions, detect_image, detect_spots
 from survey.detection.corners import grown
 from survey.project.targets import Checkerboard
@@ -133,7 +134,7 @@ def _images() -> None:
     precision.joint([names[0], names[-1]])
     batch = graph.images
     batch.rows(np.array([0]))
-    batch.condensed_rows(np.array([0]), np.ones((1, len(batch.blocks[0].uv), 4)))
+    condensed_system(precision)
     batch.local_from_keys(np.array([0]))
     solved = solve_network(pose_networks.simulate(3, 2).network)
     solved.pairs  # noqa: B018  # is computed when asked for

@@ -23,10 +23,12 @@ from adjust.native.images import (
     BlockArrays,
     BlocksAt,
     ByKeys,
+    CondensedRows,
     KeyArrays,
     PointArrays,
     PointStatistics,
     RowPlaces,
+    ShapeFactors,
     all_statistics,
     block_rows,
     condensed_rows,
@@ -254,15 +256,12 @@ class ImageBatch:
         block_rows(which, self.at(self.W_all_columns), out)
         return out
 
-    def condensed_rows(self, which: IntArray, factors: FloatArray) -> FloatArray:
-        """Rows (g, m, local unknowns, 4 of the shape and 1) of the used points of g blocks that are alike.
+    def condensed_rows(self, which: IntArray, shapes: ShapeFactors, columns: IntArray, out: CondensedRows) -> int:
+        """Into ``out`` rows of the used points of g alike blocks, with the same normal equations as all of them.
 
-        The same normal equations as all their rows; factors as :func:`adjust.native.images.condensed_rows` has them.
+        As :func:`adjust.native.images.condensed_rows`, weights left aside.
         """
-        b = int(which[0])
-        out = np.zeros((len(which), self.condensed_height(b), int(self.n_rows[b]) + N_SHAPE))
-        condensed_rows(which, self.at(self._used_weights), factors, out)
-        return out
+        return condensed_rows(which, self.at(self._used_weights), self.by_keys, shapes, columns, out)
 
     def condensed_height(self, b: int) -> int:
         """How many rows these are for a block like ``b``."""
