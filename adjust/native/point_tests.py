@@ -17,6 +17,7 @@ _residual_tests = Function("residual_tests", f"{_POINTS} redundancy[N,2] standar
 _sums_of_blocks = Function("sums_of_blocks", f"which[*] ptr[B+1] {_ADJUSTED} sums[B,3]")
 _farthest_points = Function("farthest_points", "which[*] ptr[B+1] uv[N,2] centre[B,2] farthest[B]")
 _controlled_directions = Function("controlled_directions", f"{_POINTS} freedom[N]")
+_external_reliability = Function("external_reliability", f"{_POINTS} lambda0[2] external[N]")
 _point_tests = Function(
     "point_tests",
     f"{_POINTS} lambda0[2] redundancy[N] least[N] statistic[N] detectable[N] external[N] w[N,2] error[N,2] "
@@ -42,6 +43,10 @@ class AdjustedPoints(NamedTuple):
     M: FloatArray
     W: FloatArray
     used: BoolArray
+
+    def at(self, rows: IntArray) -> "AdjustedPoints":
+        """Some of them."""
+        return AdjustedPoints(self.v[rows], self.M[rows], self.W[rows], self.used[rows])
 
 
 def residual_tests(points: AdjustedPoints) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -74,10 +79,15 @@ def controlled_directions(points: AdjustedPoints, freedom: IntArray) -> None:
     run_ranges(_controlled_directions, len(points.v), *points, freedom)
 
 
+def external_reliability(points: AdjustedPoints, lambda0: FloatArray, external: FloatArray) -> None:
+    """Into ``external`` (N,) how far the least detectable bias of each point moves the unknowns, as ``point_tests``."""
+    run_ranges(_external_reliability, len(points.v), *points, lambda0, external)
+
+
 def point_tests(points: AdjustedPoints, lambda0: FloatArray, out: tuple[FloatArray, ...]) -> None:
     """Into ``out`` redundancy, least, statistic, detectable, external (N,), then w, error, detectable_component, bias.
 
-    The latter (N, 2); all as ``ObservationTests`` has them. lambda0: (2,) of tests with one and two components.
+    The latter (N, 2); all as ``TestColumns`` has them. lambda0: (2,) of tests with one and two components.
     """
     run_ranges(_point_tests, len(points.v), *points, lambda0, *out)
 

@@ -7,9 +7,9 @@ what a block could have besides: a motion of its camera, of its target, other le
 epochs, another shape of its target. What the residuals say of these is asked in :mod:`adjust.statistics.changes`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -63,36 +63,31 @@ class CondensedSystem:
     numbers: IntArray
     key_columns: KeyColumns
 
-    def point_rows(self, row: int) -> tuple[IntArray, FloatArray]:
-        """Columns (k,) and the whitened rows (2, k) over them of an image point that is in use."""
+    def point_rows(self, points: IntArray) -> list[tuple[IntArray, FloatArray]]:
+        """Of image points that are in use columns (k,), and the whitened rows (2, k) over them of each."""
         graph = self.system.precision.graph
-        images, at = graph.images, int(graph.image_rows[row])
-        if at >= images.n_points:  # its rows are among those of the system
-            A, i = self.system.A, int(np.searchsorted(self._first_points, row, side="right")) - 1
-            first = int(self._first_rows[i]) + 2 * (row - int(self._first_points[i]))
-            begin, middle, end = A.indptr[first : first + 3].tolist()
-            columns, place = np.unique(A.indices[begin:end], return_inverse=True)
-            out = np.zeros((2, len(columns)))
-            out[0, place[: middle - begin]], out[1, place[middle - begin :]] = A.data[begin:middle], A.data[middle:end]
-            return columns, out
-        b = int(np.searchsorted(images.ptr, at, side="right")) - 1
-        columns, rows = self._rows_of(b)
-        first = 2 * (at - int(images.ptr[b]))
-        return columns, rows[first : first + 2]
+        images, at = graph.images, graph.image_rows[points]
+        known = at < images.n_points
+        found = {int(i): self._row_of_system(int(points[i])) for i in np.flatnonzero(~known)}
+        block = np.searchsorted(images.ptr, at, side="right") - 1
+        for mine in images.alike(np.unique(block[known])):
+            rows, from_keys = images.rows(mine), images.local_from_keys(mine)
+            for i in np.flatnonzero(known & np.isin(block, mine)).tolist():
+                b, first = int(np.searchsorted(mine, block[i])), 2 * int(at[i] - images.ptr[block[i]])
+                columns = np.concatenate([self.key_columns[key] for key in images.keys[block[i]]])
+                kept = columns >= 0
+                found[i] = columns[kept], (rows[b, first : first + 2, :-1] @ from_keys[b])[:, kept]
+        return [found[i] for i in range(len(points))]
 
-    @cached_property
-    def _rows_of(self) -> Callable[[int], tuple[IntArray, FloatArray]]:
-        """Columns (k,) and rows (2 n, k) of the n points of an image block; the last blocks are kept."""
-        images = self.system.precision.graph.images
-
-        @lru_cache(64)  # the worst points of a survey are in few of its images
-        def of(b: int) -> tuple[IntArray, FloatArray]:
-            columns = np.concatenate([self.key_columns[key] for key in images.keys[b]])
-            kept, which = columns >= 0, np.array([b])
-            rows = images.rows(which)[0, :, :-1] @ images.local_from_keys(which)[0]
-            return columns[kept], np.asarray(rows[:, kept])
-
-        return of
+    def _row_of_system(self, point: int) -> tuple[IntArray, FloatArray]:
+        """The same of one whose rows are among those of the system."""
+        A, i = self.system.A, int(np.searchsorted(self._first_points, point, side="right")) - 1
+        first = int(self._first_rows[i]) + 2 * (point - int(self._first_points[i]))
+        begin, middle, end = A.indptr[first : first + 3].tolist()
+        columns, place = np.unique(A.indices[begin:end], return_inverse=True)
+        out = np.zeros((2, len(columns)))
+        out[0, place[: middle - begin]], out[1, place[middle - begin :]] = A.data[begin:middle], A.data[middle:end]
+        return columns, out
 
     def has_own_poses(self, kind: str, name: str, blocks: IntArray) -> bool:
         """Whether a camera's or target's image blocks have poses of its own, one an epoch, which nothing else touches.

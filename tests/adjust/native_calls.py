@@ -122,6 +122,7 @@ def _images() -> None:
     point_tests.sums_of_blocks(ptr, points)
     point_tests.farthest_points(ptr, points.v, np.zeros((len(ptr) - 1, 2)))
     point_tests.controlled_directions(points, np.zeros(n, dtype=np.int64))
+    point_tests.external_reliability(points, lambda0, np.zeros(n))
     point_tests.point_tests(points, lambda0, tuple(np.zeros((n,) if i < 5 else (n, 2)) for i in range(9)))
     eye, ones = point_tests.SparseRows(np.arange(4), np.arange(3), np.ones(3)), np.ones((3, 2))
     point_tests.change_squares(np.array([0, 1, 3]), np.arange(3), ones, eye, ones[:, 0].copy(), eye, ones)

@@ -108,8 +108,8 @@ def test_the_condensed_system_is_the_same_system(case: Callable[[], tuple[Survey
     e, f = full.e[full.used[full.row_of]], small.e[small.used[small.row_of]]
     assert float(f @ f) == pytest.approx(float(e @ e), rel=1e-9)
     np.testing.assert_allclose(scale * (B.T @ f), scale * (A.T @ e), atol=1e-7)
-    for row in np.flatnonzero(full.used[: full.n_image])[::7].tolist():
-        columns, rows = condensed.point_rows(row)
+    some = np.flatnonzero(full.used[: full.n_image])[::7][::-1]
+    for row, (columns, rows) in zip(some.tolist(), condensed.point_rows(some), strict=True):
         whole = np.zeros((2, A.shape[1]))
         whole[:, columns] = rows
         np.testing.assert_allclose(whole * scale, full.A[2 * row : 2 * row + 2].toarray() * scale, atol=1e-9)

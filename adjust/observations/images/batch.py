@@ -236,13 +236,14 @@ class ImageBatch:
             if keys:
                 graph.add(evaluated(noise[int(self.height[i])], keys, partial(self.residual, i)))
 
-    def alike(self) -> list[IntArray]:
-        """All blocks in sets with the same numbers of points, rows and columns, none of much more than ``_AT_ONCE``."""
-        sizes = np.stack([np.diff(self.ptr), self.n_rows, self.of_blocks.columns], axis=1)
+    def alike(self, which: IntArray | None = None) -> list[IntArray]:
+        """These blocks, or all, in sets with the same numbers of points, rows and columns, of about ``_AT_ONCE``."""
+        among = np.arange(len(self.blocks)) if which is None else which
+        sizes = np.stack([np.diff(self.ptr)[among], self.n_rows[among], self.of_blocks.columns[among]], axis=1)
         kinds, kind = np.unique(sizes, axis=0, return_inverse=True)
         sets: list[IntArray] = []
         for j, n in enumerate(kinds[:, 0].tolist()):
-            mine, most = np.flatnonzero(kind.ravel() == j), max(_AT_ONCE // max(n, 1), 1)
+            mine, most = among[kind.ravel() == j], max(_AT_ONCE // max(n, 1), 1)
             sets += [mine[i : i + most] for i in range(0, len(mine), most)]
         return sets
 
