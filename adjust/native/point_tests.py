@@ -25,8 +25,8 @@ _point_tests = Function(
 )
 _change_squares = Function(
     "change_squares",
-    "first[J+1] rows[k] B[k,w] A_ptr[m+1] A_column[a] A_entry[a] e[m] own_ptr[n+1] own_column[o] own_entry[o] U[n,c] "
-    "x[n,w] s[n,w] mark[n] touched[n] left[q,w] shared[q,c] columns[2,w] squares[J,q] M[J,q,q] g[J,q]",
+    "first[J+1] rows[k] at[k] table[*] A_ptr[m+1] A_column[a] A_entry[a] e[m] own_ptr[n+1] own_column[o] own_entry[o] "
+    "U[n,c] x[n,w] s[n,w] mark[n] touched[n] left[q,w] shared[c,w] columns[2,w] squares[J,q] M[J,q,q] g[J,q]",
 )
 _parallel_pairs = Function("parallel_pairs", "first last end u[N,d] head[h,N+31] rest[N+31] least found[m,3]")
 _HEAD, _BEHIND = 16, 31
@@ -100,20 +100,27 @@ class SparseRows(NamedTuple):
     entry: FloatArray
 
 
-def change_squares(
-    first: IntArray, rows: IntArray, B: FloatArray, A: SparseRows, e: FloatArray, own: SparseRows, U: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Of columns B (k, q) in these rows (k,) of a system, run j from ``first[j]`` on: the sums over all runs from j on.
+class ColumnsOfRows(NamedTuple):
+    """Columns (k, q) of some rows (k,) of a system: those of the i-th are ``table[at[i] : at[i] + q]``."""
 
-    The diagonal (J, q) of B'B, ``B' (I - A Q A') B`` (J, q, q) and B'e (J, q), with Q = own + U U', U (n, c).
+    rows: IntArray
+    at: IntArray
+    table: FloatArray
+
+
+def change_squares(
+    first: IntArray, B: ColumnsOfRows, q: int, A: SparseRows, e: FloatArray, own: SparseRows, U: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Of q columns B of rows of a system, run j from ``first[j]`` on: the sums over all runs from j on.
+
+    The diagonal (J, q) of B'B, ``B' (I - A Q A') B`` (J, q, q) and B'e (J, q), with Q = own + U U', U (n, c); c is a
+    multiple of eight.
     """
-    (k, q), (n, c), J, w = B.shape, U.shape, len(first) - 1, -(-B.shape[1] // 8) * 8
-    padded = np.zeros((k, w))
-    padded[:, :q] = B
+    (n, c), J, w = U.shape, len(first) - 1, -(-q // 8) * 8
     later = np.zeros((n, w)), np.zeros((n, w)), np.full(n, -1), np.empty(n, dtype=np.int64)
-    sums = np.zeros((q, w)), np.zeros((q, c)), np.zeros((2, w))
+    sums = np.zeros((q, w)), np.zeros((c, w)), np.zeros((2, w))
     out = np.empty((J, q)), np.empty((J, q, q)), np.empty((J, q))
-    _change_squares(first, rows, padded, *A, e, *own, U, *later, *sums, *out)
+    _change_squares(first, *B, *A, e, *own, U, *later, *sums, *out)
     return out
 
 

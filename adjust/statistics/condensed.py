@@ -24,6 +24,7 @@ from adjust.model.survey import FloatArray, IntArray
 from adjust.native.images import N_SHAPE, CondensedRows, ShapeFactors
 from adjust.native.lenses import MAX_LENS
 from adjust.native.parallel import side_by_side
+from adjust.native.point_tests import ColumnsOfRows
 from adjust.observations.images.bundles import BundleBatch
 from adjust.precision.precision import Precision
 from adjust.statistics.rows import (
@@ -38,30 +39,53 @@ from adjust.statistics.system import LinearSystem, assembled
 
 _Number = TypeVar("_Number", bound=np.generic)
 _FLAT = 1e-9
-_OWN = (-12 - N_SHAPE, -6 - N_SHAPE, -N_SHAPE)
-"""Where lens, camera and target end among the columns that a block could have besides; the shape is last."""
+_OWN = {"lens": 0, "camera": -12 - N_SHAPE, "target": -6 - N_SHAPE, "shape": -N_SHAPE}
+"""Where each begins among the columns that a block could have besides."""
 
 
 @dataclass(frozen=True, eq=False)
 class CondensedSystem:
     """The system, whose first observations are the image blocks, and its m image rows by what a block has of its own.
 
-    block: (m,) index into ``Survey.image_blocks``. lens: (m, ..) by the free lens parameters of its camera, then zeros.
-    camera, target: (m, 6) by a motion of the camera in its own axes, of the target in its own axes (rotation,
-    translation). shape: (m, 4) by the shape of the target: flat ones grow along x and y, and bend (unit sags) along x
-    and y; others grow along x, y and z, the last column is zero. e: (m,). numbers: the image block
-    of each of the first observations. key_columns: of the system.
+    block: (m,) index into ``Survey.image_blocks``. own: (m, ..) by what a block could have besides. e: (m,). numbers:
+    the image block of each of the first observations. key_columns: of the system.
     """
 
     system: LinearSystem
     block: IntArray
-    lens: FloatArray
-    camera: FloatArray
-    target: FloatArray
-    shape: FloatArray
+    own: FloatArray
     e: FloatArray
     numbers: IntArray
     key_columns: KeyColumns
+
+    @property
+    def lens(self) -> FloatArray:
+        """By the free lens parameters of its camera (m, ..), then zeros."""
+        return self.own[:, : _OWN["camera"]]
+
+    @property
+    def camera(self) -> FloatArray:
+        """By a motion of the camera in its own axes (m, 6): rotation, translation."""
+        return self.own[:, _OWN["camera"] : _OWN["target"]]
+
+    @property
+    def target(self) -> FloatArray:
+        """By a motion of the target in its own axes (m, 6): rotation, translation."""
+        return self.own[:, _OWN["target"] : _OWN["shape"]]
+
+    @property
+    def shape(self) -> FloatArray:
+        """By the shape of the target (m, 4).
+
+        Flat ones grow along x and y, and bend (unit sags) along x and y; others grow along x, y and z, the last column
+        is zero.
+        """
+        return self.own[:, _OWN["shape"] :]
+
+    def columns_of(self, what: str, rows: IntArray) -> ColumnsOfRows:
+        """By lens, camera, target or shape, of some rows."""
+        width = self.own.shape[1]
+        return ColumnsOfRows(rows, rows * width + _OWN[what] % width, self.own.ravel())
 
     def point_rows(self, points: IntArray) -> list[tuple[IntArray, FloatArray]]:
         """Of image points that are in use columns (k,), and the whitened rows (2, k) over them of each."""
@@ -158,8 +182,7 @@ def condensed_system(precision: Precision) -> CondensedSystem:
 
     system = assembled(precision, image_rows)
     numbers, block, own = (_joined([getattr(p, x) for p in parts]) for x in ("numbers", "block", "own"))
-    lens, camera, target, shape = np.split(own, _OWN, axis=1)
-    return CondensedSystem(system, block, lens, camera, target, shape, system.e[: len(block)], numbers, columns)
+    return CondensedSystem(system, block, own, system.e[: len(block)], numbers, columns)
 
 
 def _joined(parts: Sequence[NDArray[_Number]]) -> NDArray[_Number]:
@@ -178,7 +201,8 @@ def _known(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> _Part:
     shapes, columns, sets = _shapes(graph), columns_of_blocks(graph, key_columns), images.alike()
     heights = [images.condensed_height(int(mine[0])) for mine in sets]
     ends = np.cumsum([0, *(len(mine) * k for mine, k in zip(sets, heights, strict=True))]).tolist()
-    own, e, length = np.empty((ends[-1], _most_lens(graph) - _OWN[0])), np.empty(ends[-1]), np.empty(ends[-1], np.int64)
+    own = np.empty((ends[-1], _most_lens(graph) - _OWN["camera"]))
+    e, length = np.empty(ends[-1]), np.empty(ends[-1], dtype=np.int64)
 
     def condensed(i: int) -> tuple[FloatArray, NDArray[np.int32]]:
         """Entries of the i-th set and their columns; the rest goes where it belongs."""
@@ -225,9 +249,9 @@ def _unknown(graph: AdjustmentGraph, bundle: BundleBatch, number: IntArray, n: i
     of_row = np.repeat(np.arange(len(lengths)), lengths)
     local = bundle.A.reshape(-1, MAX_LENS + 7)[bundle_order(bundle)] * used[:, None]
     lens, pose = _most_lens(graph), local[:, MAX_LENS : MAX_LENS + 6]
-    own, by_camera = np.zeros((len(local), lens - _OWN[0])), adjoint_of_inverse(bundle.chains.R, bundle.chains.t)
+    own, by_camera = np.zeros((len(local), lens - _OWN["camera"])), adjoint_of_inverse(bundle.chains.R, bundle.chains.t)
     own[:, :lens] = local[:, :lens]
-    own[:, _OWN[0] : _OWN[1]] = np.einsum("ni,nij->nj", pose, by_camera[of_row])
+    own[:, _OWN["camera"] : _OWN["target"]] = np.einsum("ni,nij->nj", pose, by_camera[of_row])
     groups = [b.group for b in bundle.blocks]
     A = A if used.all() else (sparse.diags(used) @ A).tocsr()
     rows = ImageRows(A, e * used, lengths.astype(np.int64), np.ones(len(groups), dtype=np.bool_), groups)
