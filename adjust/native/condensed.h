@@ -13,12 +13,12 @@ struct Shapes {
     Ints first, point;
     In<double, 2> table;
 };
-// Where rows (g, m) of g blocks go: by lens, camera, target and shape into own (g, m, ..), residuals e (g, m); over the keys,
+// Where rows (g, m) of g blocks go: by lens, camera, target and shape (g, m, ..), residuals e (g, m); over the keys,
 // which have the columns (g, w), -1 for what is held, the entries that are not zero one row after the other, length (g, m) of each.
 struct CondensedRows {
-    explicit CondensedRows(Reader &r) : columns(r), own(r), e(r), length(r), entry(r), column(r) {}
+    explicit CondensedRows(Reader &r) : columns(r), lens(r), camera(r), target(r), shape(r), e(r), length(r), entry(r), column(r) {}
     In<int64_t, 2> columns;
-    Out<double, 3> own;
+    Out<double, 3> lens, camera, target, shape;
     Out<double, 2> e;
     Out<int64_t, 2> length;
     Out<double, 3> entry;
@@ -63,17 +63,12 @@ inline void local_rows(const Batch &B, int64_t b, const Shapes &shapes, bool tri
     half_cholesky(T, k);
 }
 
-// By lens, the camera in its own axes, the target in its own and the shape: T' of one row, with nl lens and n local unknowns.
-inline void own_columns(const double *T, int64_t nl, int64_t n, const double *R, const double *t, int64_t width, double *own) {
-    const int64_t lens = width - 12 - N_SHAPE;
-    for (int64_t c = 0; c < lens; ++c) own[c] = c < nl ? T[c] : 0.0;
-    const double *pose = T + nl;
-    double *camera = own + lens, *target = camera + 6, *shift = camera + 3;
+// By a motion of the camera in its own axes, Ad(T^-1)' of that by one of the target (6,).
+inline void by_camera(const double *pose, const double *R, const double *t, double *camera) {
+    double *shift = camera + 3;
     for (int i = 0; i < 3; ++i) shift[i] = dot3(R + 3 * i, pose + 3);
-    cross3(t, shift, camera);  // Ad(T^-1)
+    cross3(t, shift, camera);
     for (int i = 0; i < 3; ++i) camera[i] += dot3(R + 3 * i, pose);
-    std::memcpy(target, pose, sizeof(double) * 6);
-    std::memcpy(target + 6, T + n, sizeof(double) * N_SHAPE);
 }
 
 // Of listed blocks, which have equally many points and columns, rows with the normal equations of their own; how many entries.
@@ -88,7 +83,10 @@ inline int64_t condensed_rows(Ints which, const Batch &B, const Segments &S, In<
         const int64_t rows = m < k ? m : n;  // those of a triangle behind have nothing of the keys
         local_rows(B, b, shapes, m == k, room, T);
         for (int64_t j = 0; j < m; ++j) {
-            own_columns(T[j], nl, n, &B.poses.R(b, 0, 0), &B.poses.t(b, 0), out.own.n[2], &out.own(i, j, 0));
+            for (int64_t c = 0; c < out.lens.n[2]; ++c) out.lens(i, j, c) = c < nl ? T[j][c] : 0.0;
+            by_camera(T[j] + nl, &B.poses.R(b, 0, 0), &B.poses.t(b, 0), &out.camera(i, j, 0));
+            std::memcpy(&out.target(i, j, 0), T[j] + nl, sizeof(double) * 6);
+            std::memcpy(&out.shape(i, j, 0), T[j] + n, sizeof(double) * N_SHAPE);
             out.e(i, j) = T[j][k - 1], out.length(i, j) = 0;
         }
         double *by_key = out.entry.data + found;

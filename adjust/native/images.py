@@ -41,8 +41,8 @@ _errors = Function("errors", f"which[*] {_BATCH} chi[B] depth[B]")
 _block_rows = Function("block_rows", f"which[g] {_BATCH} out[g,*,*]")
 _condensed_rows = Function(
     "condensed_rows",
-    f"which[g] {_BATCH} {SEGMENTS} {CHAINED} first[B] point[N] table[*,{N_SHAPE}] columns[g,w] own[g,m,*] e[g,m] "
-    "length[g,m] entry[g,m,w] column[g,m,w]",
+    f"which[g] {_BATCH} {SEGMENTS} {CHAINED} first[B] point[N] table[*,{N_SHAPE}] columns[g,w] lens[g,m,*] "
+    f"camera[g,m,6] target[g,m,6] shape[g,m,{N_SHAPE}] e[g,m] length[g,m] entry[g,m,w] column[g,m,w]",
 )
 _serve = Function(
     "serve",
@@ -228,11 +228,15 @@ class ShapeFactors(NamedTuple):
 class CondensedRows(NamedTuple):
     """Rows (g, m) of g blocks with the normal equations of all their rows; m: as many as columns, or rows where fewer.
 
-    By their lens, a motion of the camera, of the target, each in its own axes, and the shape: own (g, m, lens + 16). e:
-    (g, m). length (g, m): how many entries each has over the keys; entry, column: of these, room for all (g, m, w).
+    By their lens (g, m, ..), a motion of the camera and of the target, each in its own axes (g, m, 6), and the shape
+    (g, m, 4). e: (g, m). length: (g, m) how many entries each has over the keys; entry, column: of these, room for all
+    (g, m, w).
     """
 
-    own: FloatArray
+    lens: FloatArray
+    camera: FloatArray
+    target: FloatArray
+    shape: FloatArray
     e: FloatArray
     length: IntArray
     entry: FloatArray

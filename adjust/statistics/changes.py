@@ -184,13 +184,14 @@ class ChangeSearch:
                 lens = vectors[("lens", name)]
                 free = tuple((x, lens.units[lens.names.index(x)]) for x in lens.free) if lens.key is not None else ()
                 if free and len(first) > 1:
-                    yield Unit(kind, name, "lens", c.columns_of("lens", rows), run, first, free)
+                    yield Unit(kind, name, "lens", _columns(rows, c.own.lens), run, first, free)
             if len(first) > 1:
-                yield Unit(kind, name, "position", c.columns_of(kind, rows), run, first, poses)
+                B = c.own.camera if kind == "camera" else c.own.target
+                yield Unit(kind, name, "position", _columns(rows, B), run, first, poses)
             if kind == "target":
                 flat = bool(np.ptp(whole[name][:, 2]) < 1e-9)
                 once = np.zeros_like(run), first[:1]
-                yield Unit(kind, name, "shape", c.columns_of("shape", rows), *once, _SHAPES[flat])
+                yield Unit(kind, name, "shape", _columns(rows, c.own.shape), *once, _SHAPES[flat])
         yield from self._table_units(most_runs)
 
     def _table_units(self, most_runs: int) -> Iterator[Unit]:
@@ -207,17 +208,17 @@ class ChangeSearch:
             rows = np.concatenate([np.arange(s.ptr[s.n_image + i], s.ptr[s.n_image + i + 1]) for i in mine])
             epochs = [others[i].ids[1] for i, w in zip(mine, W, strict=True) for _ in range(len(w))]
             run, first = _runs(*_coded(epochs), most_runs)
-            axes = tuple(others[mine[0]].components)
+            axes, apart = tuple(others[mine[0]].components), np.arange(len(rows))
             if len(first) > 1:
                 zeros = tuple((x, "rad") for x in axes)
-                yield Unit("table", table.table_id, "zero", _columns(rows, np.vstack(W)), run, first, zeros)
+                yield Unit("table", table.table_id, "zero", _columns(rows, np.vstack(W), apart), run, first, zeros)
             for axis, name in enumerate(axes):
                 angle = np.array([others[i].observed[axis] for i in mine])
                 waves = np.stack([f(k * angle) for k in (1, 2) for f in (np.sin, np.cos)], axis=1)
                 B = np.concatenate([w[:, axis, None] * wave for w, wave in zip(W, waves, strict=True)])
                 said = tuple((f"{name} {f} {k}a".replace(" 1a", " a"), "rad") for k in (1, 2) for f in ("sin", "cos"))
                 once = np.zeros_like(run), first[:1], said
-                yield Unit("table", table.table_id, f"reading of {name}", _columns(rows, B), *once)
+                yield Unit("table", table.table_id, f"reading of {name}", _columns(rows, B, apart), *once)
 
     def _taken_over(self, u: Unit) -> bool:
         """Whether unknowns take over all of it: it is a test like the others, and finds nothing."""
@@ -263,9 +264,9 @@ class ChangeSearch:
         return _Chosen(B @ V, left @ V, inverse, inverse @ (V.T @ c.g[j]))
 
 
-def _columns(rows: IntArray, B: FloatArray) -> ColumnsOfRows:
-    """B (k, q) in rows (k,)."""
-    return ColumnsOfRows(rows, np.arange(len(rows)) * B.shape[1], B.ravel())
+def _columns(rows: IntArray, B: FloatArray, at: IntArray | None = None) -> ColumnsOfRows:
+    """Columns that rows (k,) of the system have in those rows of B, or in others (k,)."""
+    return ColumnsOfRows(rows, (rows if at is None else at) * B.shape[1], B.ravel())
 
 
 def _by_runs(u: Unit) -> Unit:

@@ -10,7 +10,7 @@ epochs, another shape of its target. What the residuals say of these is asked in
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,6 @@ from adjust.model.survey import FloatArray, IntArray
 from adjust.native.images import N_SHAPE, CondensedRows, ShapeFactors
 from adjust.native.lenses import MAX_LENS
 from adjust.native.parallel import side_by_side
-from adjust.native.point_tests import ColumnsOfRows
 from adjust.observations.images.bundles import BundleBatch
 from adjust.precision.precision import Precision
 from adjust.statistics.rows import (
@@ -39,53 +38,37 @@ from adjust.statistics.system import LinearSystem, assembled
 
 _Number = TypeVar("_Number", bound=np.generic)
 _FLAT = 1e-9
-_OWN = {"lens": 0, "camera": -12 - N_SHAPE, "target": -6 - N_SHAPE, "shape": -N_SHAPE}
-"""Where each begins among the columns that a block could have besides."""
+
+
+class Own(NamedTuple):
+    """Rows (m, ..) by what image blocks could have besides.
+
+    lens: (m, ..) by the free lens parameters of its camera, then zeros. camera, target: (m, 6) by a motion of the
+    camera in its own axes, of the target in its own axes (rotation, translation). shape: (m, 4) by the shape of the
+    target: flat ones grow along x and y, and bend (unit sags) along x and y; others grow along x, y and z, the last
+    column is zero.
+    """
+
+    lens: FloatArray
+    camera: FloatArray
+    target: FloatArray
+    shape: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class CondensedSystem:
     """The system, whose first observations are the image blocks, and its m image rows by what a block has of its own.
 
-    block: (m,) index into ``Survey.image_blocks``. own: (m, ..) by what a block could have besides. e: (m,). numbers:
-    the image block of each of the first observations. key_columns: of the system.
+    block: (m,) index into ``Survey.image_blocks``. own: by what a block could have besides. e: (m,). numbers: the
+    image block of each of the first observations. key_columns: of the system.
     """
 
     system: LinearSystem
     block: IntArray
-    own: FloatArray
+    own: Own
     e: FloatArray
     numbers: IntArray
     key_columns: KeyColumns
-
-    @property
-    def lens(self) -> FloatArray:
-        """By the free lens parameters of its camera (m, ..), then zeros."""
-        return self.own[:, : _OWN["camera"]]
-
-    @property
-    def camera(self) -> FloatArray:
-        """By a motion of the camera in its own axes (m, 6): rotation, translation."""
-        return self.own[:, _OWN["camera"] : _OWN["target"]]
-
-    @property
-    def target(self) -> FloatArray:
-        """By a motion of the target in its own axes (m, 6): rotation, translation."""
-        return self.own[:, _OWN["target"] : _OWN["shape"]]
-
-    @property
-    def shape(self) -> FloatArray:
-        """By the shape of the target (m, 4).
-
-        Flat ones grow along x and y, and bend (unit sags) along x and y; others grow along x, y and z, the last column
-        is zero.
-        """
-        return self.own[:, _OWN["shape"] :]
-
-    def columns_of(self, what: str, rows: IntArray) -> ColumnsOfRows:
-        """By lens, camera, target or shape, of some rows."""
-        width = self.own.shape[1]
-        return ColumnsOfRows(rows, rows * width + _OWN[what] % width, self.own.ravel())
 
     def point_rows(self, points: IntArray) -> list[tuple[IntArray, FloatArray]]:
         """Of image points that are in use columns (k,), and the whitened rows (2, k) over them of each."""
@@ -158,12 +141,12 @@ class CondensedSystem:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Some blocks by their numbers: rows of the system, block (m,) of each and what it could have besides (m, ..)."""
+    """Some blocks by their numbers: rows of the system, block (m,) of each, by what it could have besides."""
 
     rows: ImageRows
     numbers: IntArray
     block: IntArray
-    own: FloatArray
+    own: Own
 
 
 def condensed_system(precision: Precision) -> CondensedSystem:
@@ -181,7 +164,8 @@ def condensed_system(precision: Precision) -> CondensedSystem:
         return ImageRows(stacked([p.A for p in rows]), e, lengths, used, [g for p in rows for g in p.groups])
 
     system = assembled(precision, image_rows)
-    numbers, block, own = (_joined([getattr(p, x) for p in parts]) for x in ("numbers", "block", "own"))
+    numbers, block = (_joined([getattr(p, x) for p in parts]) for x in ("numbers", "block"))
+    own = Own(*(_joined(x) for x in zip(*(p.own for p in parts), strict=True)))
     return CondensedSystem(system, block, own, system.e[: len(block)], numbers, columns)
 
 
@@ -201,17 +185,18 @@ def _known(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> _Part:
     shapes, columns, sets = _shapes(graph), columns_of_blocks(graph, key_columns), images.alike()
     heights = [images.condensed_height(int(mine[0])) for mine in sets]
     ends = np.cumsum([0, *(len(mine) * k for mine, k in zip(sets, heights, strict=True))]).tolist()
-    own = np.empty((ends[-1], _most_lens(graph) - _OWN["camera"]))
+    own = Own(*(np.empty((ends[-1], k)) for k in (_most_lens(graph), 6, 6, N_SHAPE)))
     e, length = np.empty(ends[-1]), np.empty(ends[-1], dtype=np.int64)
 
     def condensed(i: int) -> tuple[FloatArray, NDArray[np.int32]]:
         """Entries of the i-th set and their columns; the rest goes where it belongs."""
-        rows, shape, across = slice(ends[i], ends[i + 1]), (len(sets[i]), heights[i]), columns(sets[i])
-        whole = *shape, across.shape[1]
-        out = CondensedRows(own[rows].reshape(*shape, -1), e[rows].reshape(shape), length[rows].reshape(shape),
-                            np.empty(whole), np.empty(whole, dtype=np.int64))  # fmt: skip
+        rows, size, across = slice(ends[i], ends[i + 1]), (len(sets[i]), heights[i]), columns(sets[i])
+        lens, camera, target, shape = (x[rows].reshape(*size, x.shape[1]) for x in own)
+        entry, column = np.empty((*size, across.shape[1])), np.empty((*size, across.shape[1]), dtype=np.int64)
+        places = e[rows].reshape(size), length[rows].reshape(size), entry, column
+        out = CondensedRows(lens, camera, target, shape, *places)
         found = images.condensed_rows(sets[i], shapes, across, out)
-        return out.entry.ravel()[:found].copy(), out.column.ravel()[:found].astype(np.int32)
+        return entry.ravel()[:found].copy(), column.ravel()[:found].astype(np.int32)
 
     parts = [(np.zeros(0), np.zeros(0, dtype=np.int32)), *side_by_side(condensed, range(len(sets)))]
     entry, column = (np.concatenate(x) for x in zip(*parts, strict=True))
@@ -248,10 +233,9 @@ def _unknown(graph: AdjustmentGraph, bundle: BundleBatch, number: IntArray, n: i
     used, lengths = np.repeat(bundle.unsorted(bundle.used), 2).astype(float), 2 * np.diff(bundle.block_ptr)
     of_row = np.repeat(np.arange(len(lengths)), lengths)
     local = bundle.A.reshape(-1, MAX_LENS + 7)[bundle_order(bundle)] * used[:, None]
-    lens, pose = _most_lens(graph), local[:, MAX_LENS : MAX_LENS + 6]
-    own, by_camera = np.zeros((len(local), lens - _OWN["camera"])), adjoint_of_inverse(bundle.chains.R, bundle.chains.t)
-    own[:, :lens] = local[:, :lens]
-    own[:, _OWN["camera"] : _OWN["target"]] = np.einsum("ni,nij->nj", pose, by_camera[of_row])
+    pose, of_pose = local[:, MAX_LENS : MAX_LENS + 6], adjoint_of_inverse(bundle.chains.R, bundle.chains.t)
+    camera, none = np.einsum("ni,nij->nj", pose, of_pose[of_row]), np.zeros((len(local), 6 + N_SHAPE))
+    own = Own(local[:, : _most_lens(graph)], camera, none[:, :6], none[:, 6:])
     groups = [b.group for b in bundle.blocks]
     A = A if used.all() else (sparse.diags(used) @ A).tocsr()
     rows = ImageRows(A, e * used, lengths.astype(np.int64), np.ones(len(groups), dtype=np.bool_), groups)

@@ -44,7 +44,7 @@ class Inverse:
 
 
 def structured_inverse(N: sparse.csc_matrix, scale: FloatArray) -> Inverse | None:
-    """The inverse of a symmetric matrix (n, n), its unknowns counted in these scales (n,), where it is an arrow; None of others.
+    """The inverse of a symmetric matrix (n, n), its unknowns in these scales (n,), where it is an arrow; else None.
 
     An arrow has few unknowns that most others touch, the core, and small sets that touch nothing but these: a survey of
     many epochs, or of many points seen from a few places. Linear in n.

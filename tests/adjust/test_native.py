@@ -105,7 +105,8 @@ def _squares_of_condensed(call: Call, arrays: list[np.ndarray]) -> np.ndarray:
     rows = np.repeat(np.arange(a["e"].size), a["length"].ravel())
     A = np.zeros((a["e"].size, int(a["columns"].max()) + 1))
     A[rows, a["column"].ravel()[: len(rows)]] = a["entry"].ravel()[: len(rows)]
-    M = np.concatenate([A.reshape(*a["e"].shape, -1), a["own"], a["e"][:, :, None]], axis=2)
+    own = (a[name] for name in ("lens", "camera", "target", "shape"))
+    M = np.concatenate([A.reshape(*a["e"].shape, -1), *own, a["e"][:, :, None]], axis=2)
     return np.swapaxes(M, 1, 2) @ M
 
 

@@ -219,7 +219,7 @@ def test_threads_and_portions_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> 
         listed = correlations(adjustment, 0.5, system=condensed.system)
         tests = [found.tests.external, found.tests.freedom, *vars(found.tests.every).values()]
         tests += [found.tests.p, found.tests.p_posterior, found.tests.p_w, found.tests.p_tau]
-        rows = [condensed.system.A.toarray(), condensed.e, condensed.lens, condensed.camera, condensed.shape]
+        rows = [condensed.system.A.toarray(), condensed.e, *condensed.own]
         shifts = np.array([x.shift for x in found.influences])
         return [*tests, *rows, shifts, np.array([x.coefficient for x in listed])]
 
