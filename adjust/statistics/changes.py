@@ -241,12 +241,12 @@ class ChangeSearch:
 
     def _whole(self, u: Unit) -> tuple[FloatArray, FloatArray, FloatArray]:
         """The same of a system without structure."""
-        u = u.at(np.flatnonzero(u.B.any(axis=1)))
-        given, J, q = u.B, len(u.epochs), len(u.components)
-        columns = (u.run * q)[:, None] + np.arange(q)
-        B = sparse.csr_matrix((given.ravel(), columns.ravel(), np.arange(0, given.size + 1, q)), (len(given), J * q))
-        both = np.cumsum(_by_run(u, np.column_stack([given, self.e[u.rows]]))[::-1], axis=0)[::-1]
-        taken = self.system.among_sums((B.T @ self.A[u.rows]).tocsr(), q)
+        B, J, q = u.B, len(u.epochs), len(u.components)
+        some = B.any(axis=1)
+        places = ((u.run[some] * q)[:, None] + np.arange(q)).ravel(), np.repeat(u.rows[some], q)
+        turned = sparse.csr_matrix((B[some].ravel(), places), (J * q, self.A.shape[0]))
+        both = np.cumsum(_by_run(u, B, np.column_stack([B, self.e[u.rows]]))[::-1], axis=0)[::-1]
+        taken = self.system.among_sums(turned @ self.A, q)
         return np.einsum("jqq->jq", both[:, :, :q]), both[:, :, :q] - taken, both[:, :, q]
 
     def _chosen(self, c: _Candidates, j: int, before: Sequence[_Chosen]) -> _Chosen:
@@ -296,9 +296,8 @@ def _first(u: Unit) -> IntArray:
     return np.searchsorted(u.run, np.arange(len(u.epochs) + 1))
 
 
-def _by_run(u: Unit, other: FloatArray) -> FloatArray:
+def _by_run(u: Unit, B: FloatArray, other: FloatArray) -> FloatArray:
     """B' times other columns (k, r), of every run apart: (J, q, r)."""
-    B = u.B
     return np.array([B[i:j].T @ other[i:j] for i, j in pairwise(_first(u).tolist())])
 
 
@@ -309,7 +308,7 @@ def _from_runs_on(of_runs: FloatArray) -> FloatArray:
 
 def _given(c: _Candidates, known: _Chosen) -> _Candidates:
     """Candidates with M and g where one more change is part of the model."""
-    K = _from_runs_on(_by_run(c.unit, known.left[c.unit.rows])) * c.scale[:, :, None]
+    K = _from_runs_on(_by_run(c.unit, c.unit.B, known.left[c.unit.rows])) * c.scale[:, :, None]
     M = c.M - K @ known.inverse @ K.transpose(0, 2, 1)
     return replace(c, M=0.5 * (M + M.transpose(0, 2, 1)), g=c.g - K @ known.amounts)
 

@@ -237,6 +237,7 @@ def _unknown(graph: AdjustmentGraph, bundle: BundleBatch, number: IntArray, n: i
     camera, none = np.einsum("ni,nij->nj", pose, of_pose[of_row]), np.zeros((len(local), 6 + N_SHAPE))
     own = Own(local[:, : _most_lens(graph)], camera, none[:, :6], none[:, 6:])
     groups = [b.group for b in bundle.blocks]
-    A = A if used.all() else (sparse.diags(used) @ A).tocsr()
+    if not used.all():
+        A.data *= np.repeat(used, np.diff(A.indptr))
     rows = ImageRows(A, e * used, lengths.astype(np.int64), np.ones(len(groups), dtype=np.bool_), groups)
     return _Part(rows, number, number[of_row], own)
