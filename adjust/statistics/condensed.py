@@ -231,13 +231,14 @@ def _unknown(graph: AdjustmentGraph, bundle: BundleBatch, number: IntArray, n: i
     """Blocks of unknown points, whose rows differ in the columns of their points: as they are, two per point."""
     A, e = bundle_rows(bundle, n, key_columns)
     used, lengths = np.repeat(bundle.unsorted(bundle.used), 2).astype(float), 2 * np.diff(bundle.block_ptr)
-    of_row = np.repeat(np.arange(len(lengths)), lengths)
-    local = bundle.A.reshape(-1, MAX_LENS + 7)[bundle_order(bundle)] * used[:, None]
-    pose, of_pose = local[:, MAX_LENS : MAX_LENS + 6], adjoint_of_inverse(bundle.chains.R, bundle.chains.t)
-    camera, none = np.einsum("ni,nij->nj", pose, of_pose[of_row]), np.zeros((len(local), 6 + N_SHAPE))
-    own = Own(local[:, : _most_lens(graph)], camera, none[:, :6], none[:, 6:])
-    groups = [b.group for b in bundle.blocks]
+    of_row, order, k = np.repeat(np.arange(len(lengths)), lengths), bundle_order(bundle), _most_lens(graph)
+    by_lens, by_pose = bundle.A[:, :, :k], bundle.A[:, :, MAX_LENS : MAX_LENS + 6]
+    lens, pose = by_lens.reshape(len(order), k)[order], by_pose.reshape(len(order), 6)[order]
     if not used.all():
         A.data *= np.repeat(used, np.diff(A.indptr))
-    rows = ImageRows(A, e * used, lengths.astype(np.int64), np.ones(len(groups), dtype=np.bool_), groups)
+        lens, pose, e = lens * used[:, None], pose * used[:, None], e * used
+    camera = np.einsum("ni,nij->nj", pose, adjoint_of_inverse(bundle.chains.R, bundle.chains.t)[of_row])
+    own = Own(lens, camera, np.zeros_like(pose), np.zeros((len(pose), N_SHAPE)))
+    groups = [b.group for b in bundle.blocks]
+    rows = ImageRows(A, e, lengths.astype(np.int64), np.ones(len(groups), dtype=np.bool_), groups)
     return _Part(rows, number, number[of_row], own)
