@@ -54,20 +54,24 @@ struct LaterRuns {
             add_vectors(-0.5 * z[a], &x(i, 0), &left(a, 0), w);
         }
     }
-    // U'x of the rows that a run touched: eight of U at a time, their sums in registers.
-    void share(In<double, 2> U, int64_t count) const {
-        for (int64_t c = 0; c < U.n[1]; c += 8)
-            for (int64_t v = 0; v < x.n[1]; v += W) {
-                V sum[8];
-                for (int k = 0; k < 8; ++k) sum[k] = load(&shared(c + k, v));
-                for (int64_t t = 0; t < count; ++t) {
-                    const V of_x = load(&x(touched[t], v));
-                    const double *u = &U(touched[t], c);
+    // U'x of the rows that a run touched, of K columns of U from c on: their sums in registers.
+    template <int K> void share(In<double, 2> U, int64_t c, int64_t count) const {
+        for (int64_t v = 0; v < x.n[1]; v += W) {
+            V sum[K];
+            for (int k = 0; k < K; ++k) sum[k] = load(&shared(c + k, v));
+            for (int64_t t = 0; t < count; ++t) {
+                const V of_x = load(&x(touched[t], v));
+                const double *u = &U(touched[t], c);
 #pragma GCC unroll 8
-                    for (int k = 0; k < 8; ++k) sum[k] += u[k] * of_x;
-                }
-                for (int k = 0; k < 8; ++k) store(&shared(c + k, v), sum[k]);
+                for (int k = 0; k < K; ++k) sum[k] += u[k] * of_x;
             }
+            for (int k = 0; k < K; ++k) store(&shared(c + k, v), sum[k]);
+        }
+    }
+    void share(In<double, 2> U, int64_t count) const {
+        int64_t c = 0;
+        for (; c + 8 <= U.n[1]; c += 8) share<8>(U, c, count);
+        for (; c < U.n[1]; ++c) share<1>(U, c, count);
     }
     // left - shared'shared, of the first q columns.
     void difference(Out<double, 2> M) const {
@@ -89,9 +93,9 @@ struct LaterRuns {
     }
 };
 
-// Of columns B, the rows of run j from first[j] on, and of the sums over all runs from j on: the diagonal of B'B
-// into squares (J, q), B'(I - A Q A')B into M (J, q, q), B'e into g (J, q). Q = own + U'U, given U' (n, c), c a multiple of
-// eight. w: as many, no more than 2 WIDEST; later: all zero, mark -1.
+// Of columns B, the rows of run j from first[j] on, and of the sums over all runs from j on: the diagonal of B'B into squares
+// (J, q), B'(I - A Q A')B into M (J, q, q), B'e into g (J, q). Q = own + U'U, given U' (n, c). later: all zero, mark -1; w no
+// more than 2 WIDEST.
 inline void change_squares(Ints first, const ColumnsOfRows &B, const SparseRows &A, Vector e, const SparseRows &own, In<double, 2> U,
                            const LaterRuns &later, Out<double, 2> squares, Out<double, 3> M, Out<double, 2> g) {
     const int64_t w = later.x.n[1], q = g.n[1];

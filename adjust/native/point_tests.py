@@ -113,8 +113,7 @@ def change_squares(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Of q columns B of rows of a system, run j from ``first[j]`` on: the sums over all runs from j on.
 
-    The diagonal (J, q) of B'B, ``B' (I - A Q A') B`` (J, q, q) and B'e (J, q), with Q = own + U U', U (n, c); c is a
-    multiple of eight.
+    The diagonal (J, q) of B'B, ``B' (I - A Q A') B`` (J, q, q) and B'e (J, q), with Q = own + U U', U (n, c).
     """
     (n, c), J, w = U.shape, len(first) - 1, -(-q // 8) * 8
     later = np.zeros((n, w)), np.zeros((n, w)), np.full(n, -1), np.empty(n, dtype=np.int64)
