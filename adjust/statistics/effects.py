@@ -38,13 +38,16 @@ def shifts(condensed: CondensedSystem, rows: Sequence[int], bias: Mapping[int, F
 
 def _right(condensed: CondensedSystem, rows: Sequence[int], bias: Mapping[int, FloatArray]) -> sparse.csc_matrix:
     """The right-hand sides (n, k) of the normal equations for these biases."""
-    system, parts = condensed.system, list[tuple[IntArray, FloatArray]]()
+    system, n = condensed.system, condensed.n_points
+    points = [row for row in rows if row < n]
+    of_points = iter(condensed.point_rows(np.array(points, dtype=np.int64)))
+    parts = list[tuple[IntArray, FloatArray]]()
     for row in rows:
-        if row < condensed.n_points:
-            columns, A = condensed.point_rows(row)
+        if row < n:
+            columns, A = next(of_points)
             parts.append((columns, A.T @ bias[row]))
         else:
-            parts.append(system.bias_column(row - condensed.n_points + system.n_image, bias[row]))
+            parts.append(system.bias_column(row - n + system.n_image, bias[row]))
     places, values = (np.concatenate(x) for x in zip(*parts, strict=True))
     ptr = np.cumsum([0, *(len(x) for x, _ in parts)])
     return sparse.csc_matrix((values, places, ptr), (len(system.columns), len(rows)))

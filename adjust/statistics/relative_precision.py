@@ -61,7 +61,12 @@ def relative_precision(
     found = [(places.place(a), places.place(b)) for a, b in pairs]
     unknowns = (tuple(dict.fromkeys([*a.by, *b.by])) for a, b in found)
     adjustment.precision.bring_together((names[0], names[1]) for names in unknowns if len(names) == 2)
-    return tuple(_relative(adjustment, a, b, level, scaled) for a, b in found)
+    covs = [_covariance(adjustment, a, b) for a, b in found]
+    own = np.array([cov[3:, 3:] for cov in covs]).reshape(-1, 3, 3)
+    sigma0 = adjustment.sigma0 if scaled and adjustment.redundancy > 0 else None
+    regions = ellipsoids(own, level, sigma0, adjustment.redundancy)
+    none = Ellipsoid(np.zeros(0), np.zeros((3, 0)), level, scaled)
+    return tuple(_relative(*both, cov, region, none) for both, cov, region in zip(found, covs, regions, strict=True))
 
 
 @frozen(eq=False)
@@ -114,24 +119,24 @@ class _Places:
         return _Place(called, np.asarray(pose.translation()), R, by)
 
 
-def _relative(adjustment: Adjustment, a: _Place, b: _Place, level: float, scaled: bool) -> RelativePrecision:
+def _covariance(adjustment: Adjustment, a: _Place, b: _Place) -> FloatArray:
+    """Of b relative to a (6, 6): turn in the axes of b, position in the world."""
     dims = {n: J.shape[1] for p in (a, b) for n, J in p.by.items()}
-    turned, back = False, np.eye(3)
-    if a.R is not None and b.R is not None:
-        turned, back = True, b.R.T @ a.R
+    back = b.R.T @ a.R if a.R is not None and b.R is not None else np.eye(3)
     columns = [np.zeros((6, 0))]
     for n, dim in dims.items():
         of_a, of_b = (p.by.get(n, np.zeros((6, dim))) for p in (a, b))
         columns.append(np.vstack([of_b[:3] - back @ of_a[:3], of_b[3:] - of_a[3:]]))
     J = np.hstack(columns)
-    cov = J @ np.asarray(adjustment.precision.joint(list(dims))) @ J.T if dims else np.zeros((6, 6))
-    d, own, of_rotation = b.x - a.x, cov[3:, 3:], cov[:3, :3] if turned else None
+    return np.asarray(J @ np.asarray(adjustment.precision.joint(list(dims))) @ J.T if dims else np.zeros((6, 6)))
+
+
+def _relative(a: _Place, b: _Place, cov: FloatArray, region: Ellipsoid, none: Ellipsoid) -> RelativePrecision:
+    """region: of positions; none: where there are none."""
+    d, own, of_rotation = b.x - a.x, cov[3:, 3:], cov[:3, :3] if a.R is not None and b.R is not None else None
     if not np.isfinite(d).all():
-        nan, none = np.full((3, 3), np.nan), Ellipsoid(np.zeros(0), np.zeros((3, 0)), level, scaled)
-        return RelativePrecision(a.name, b.name, d, nan, float("nan"), float("nan"), none, of_rotation)
+        return RelativePrecision(a.name, b.name, d, np.full((3, 3), np.nan), np.nan, np.nan, none, of_rotation)
     length = float(np.linalg.norm(d))
     u = d / length if length > 0.0 else np.zeros(3)
-    sigma0 = adjustment.sigma0 if scaled and adjustment.redundancy > 0 else None
-    region = ellipsoid(own, level, sigma0, adjustment.redundancy)
     along = float(np.sqrt(max(0.0, float(u @ own @ u))))
     return RelativePrecision(a.name, b.name, d, own, length, along, region, of_rotation)

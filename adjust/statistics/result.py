@@ -1,5 +1,6 @@
 """What the statistics of an adjustment give back: tables for a report, all values in SI units, angles in radians."""
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Literal
 
@@ -15,36 +16,24 @@ from adjust.testing.single_tests import p_posterior, p_prior, p_tau
 
 
 @frozen(eq=False)
-class ObservationTests:
-    """Tests and reliability of every observation: image points first, then ``Adjustment.other_residuals``, M in all.
+class TestColumns:
+    """Tests and reliability of some observations, k in all, with the components ``ptr[i]`` to ``ptr[i + 1]`` of K.
 
-    n_image: rows of image points, in the order of ``ImageResiduals``. ptr: (M + 1,) ranges of an observation's
-    components in the arrays of length K. group: (M,) into ``group_names``. used: (M,).
-
-    n_components: (M,). freedom: (M,) controlled directions, the degrees of freedom of the test; 0: uncontrolled.
-    redundancy: (M,) sum of the redundancy numbers, 0 where not used. least: (M,) the smallest share of an error of
+    redundancy: (k,) sum of the redundancy numbers, 0 where not used. least: (k,) the smallest share of an error of
     this observation, in any direction, that shows in its own residuals (the redundancy number where it has one
     component); of what is not used how certain its prediction is, 1 / (1 + variance of the prediction / its own).
-    statistic: (M,) v' inv(Q_vv) v over the controlled directions. p: (M,) a priori (chi-square). p_posterior: (M,)
-    with sigma0 estimated (F; the tau-test where there is one component). fails: (M,) where p is below the level of the
-    criteria. Probabilities are computed when they are asked for.
-    detectable: (M,) length of the least detectable bias in sigmas of the observation, over the controlled directions;
-    inf where there is none. external: (M,) lambda-bar, how far that bias moves the unknowns: no unknown, and no
-    function of them, moves by more than this many of its sigmas; 0 where not used.
+    statistic: (k,) v' inv(Q_vv) v over the controlled directions. detectable: (k,) length of the least detectable bias
+    in sigmas of the observation, over the controlled directions; inf where there is none. external: (k,) lambda-bar,
+    how far that bias moves the unknowns: no unknown, and no function of them, moves by more than this many of its
+    sigmas; 0 where not used.
 
     w: (K,) Baarda's w of the single components, positive where the observed value is too large; nan where
-    uncontrolled. tau: (K,) Pope's. p_w, p_tau: (K,) two-sided. error: (K,) estimated gross error (observed minus
-    true) in the component's unit. detectable_component: (K,) minimal detectable bias of the component alone, in its
-    unit. bias: (K,) the least detectable bias as a vector, in units.
+    uncontrolled. error: (K,) estimated gross error (observed minus true) in the component's unit.
+    detectable_component: (K,) minimal detectable bias of the component alone, in its unit. bias: (K,) the least
+    detectable bias as a vector, in units.
     """
 
-    n_image: int
     ptr: IntArray
-    group: IntArray
-    group_names: tuple[str, ...]
-    used: BoolArray
-    n_components: IntArray
-    freedom: IntArray
     redundancy: FloatArray
     least: FloatArray
     statistic: FloatArray
@@ -54,10 +43,64 @@ class ObservationTests:
     error: FloatArray
     detectable_component: FloatArray
     bias: FloatArray
+
+
+class _Column:
+    """Of tests, by its name, an array of all observations."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, tests: "ObservationTests", owner: type) -> FloatArray:
+        found: FloatArray = getattr(tests.every, self._name)
+        return found
+
+
+@frozen(eq=False)
+class ObservationTests:
+    """Tests and reliability of every observation: image points first, then ``Adjustment.other_residuals``, M in all.
+
+    n_image: rows of image points, in the order of ``ImageResiduals``. runs: of observations one after the other of the
+    same group its number in group_names, and how many they are. used, n_components: (M,). freedom: (M,) controlled
+    directions, the degrees of freedom of the test; 0: uncontrolled. external: (M,) as in ``TestColumns``, whose arrays
+    of all observations this has by their names; they are computed when one is asked for. of: those of some
+    observations, in ascending order.
+
+    p: (M,) a priori (chi-square). p_posterior: (M,) with sigma0 estimated (F; the tau-test where there is one
+    component). fails: (M,) where p is below the level of the criteria. tau: (K,) Pope's. p_w, p_tau: (K,) two-sided.
+    """
+
+    n_image: int
+    runs: tuple[IntArray, IntArray]
+    group_names: tuple[str, ...]
+    used: BoolArray
+    n_components: IntArray
+    freedom: IntArray
+    external: FloatArray
+    of: Callable[[IntArray | None], TestColumns]
     criteria: Criteria
     omega: float
     total_redundancy: int
     sigma0: float
+
+    redundancy, least, statistic, detectable = _Column(), _Column(), _Column(), _Column()
+    w, error, detectable_component, bias = _Column(), _Column(), _Column(), _Column()
+
+    @cached_property
+    def every(self) -> TestColumns:
+        """Of all observations."""
+        return self.of(None)
+
+    @property
+    def ptr(self) -> IntArray:
+        """(M + 1,) ranges of an observation's components in the arrays of length K."""
+        return self.every.ptr
+
+    @cached_property
+    def group(self) -> IntArray:
+        """(M,) into ``group_names``."""
+        numbers, counts = self.runs
+        return np.repeat(numbers, counts)
 
     @cached_property
     def p(self) -> FloatArray:
@@ -96,7 +139,7 @@ class Influence:
 
     row: of ``ObservationTests``. name, component, unit: the unknown that moves most in its sigmas; shift in that unit,
     ratio = shift / sigma. position, position_shift: the point or station whose origin moves furthest, m ("" and 0.0
-    where there is none).
+    where there is none). detectable, external: of the observation, as in ``TestColumns``.
     """
 
     row: int
@@ -107,6 +150,8 @@ class Influence:
     ratio: float
     position: ParameterName
     position_shift: float
+    detectable: float = np.nan
+    external: float = np.nan
 
 
 @frozen(eq=False)

@@ -154,7 +154,8 @@ class LinearSystem:
         if (weights[kept] != 1.0).any():
             weighted = A.copy()
             weighted.data *= np.repeat(weights[kept], np.diff(A.indptr))
-        return Normal((A.T @ weighted + self.datum.T @ self.datum).tocsc(), self.motions)
+        N = (A.T @ weighted).tocsc()
+        return Normal((N + self.datum.T @ self.datum).tocsc() if self.datum.shape[0] else N, self.motions)
 
     @cached_property
     def sigmas(self) -> FloatArray:

@@ -62,9 +62,9 @@ def test_vector_instructions_change_nothing(name: str, instructions: str) -> Non
             continue
         (answer, plain), (other_answer, wide) = call.again("base"), call.again(instructions)
         assert answer == other_answer
-        if name == "serve":
-            plain, wide = [_squares_of_served(call, plain)], [_squares_of_served(call, wide)]
-            written = ["R'R"]
+        if name in ("serve", "condensed_rows"):
+            squares = _squares_of_served if name == "serve" else _squares_of_condensed
+            plain, wide, written = [squares(call, plain)], [squares(call, wide)], ["R'R"]
         else:
             arrays = [(argument, kind) for argument, kind in call.function.kinds() if kind not in "nd"]
             kept = [i for i, (argument, kind) in enumerate(arrays) if kind.isupper() and argument not in _WORK]
@@ -96,6 +96,18 @@ def _squares_of_served(call: Call, arrays: list[np.ndarray]) -> np.ndarray:
         M = np.hstack(rows)
         out.append((M.T @ M).ravel())
     return np.concatenate(out)
+
+
+def _squares_of_condensed(call: Call, arrays: list[np.ndarray]) -> np.ndarray:
+    """The same of the rows over the keys, by what a block could have besides, and e."""
+    names = [argument for argument, kind in call.function.kinds() if kind not in "nd"]
+    a = dict(zip(names, arrays, strict=True))
+    rows = np.repeat(np.arange(a["e"].size), a["length"].ravel())
+    A = np.zeros((a["e"].size, int(a["columns"].max()) + 1))
+    A[rows, a["column"].ravel()[: len(rows)]] = a["entry"].ravel()[: len(rows)]
+    own = (a[name] for name in ("lens", "camera", "target", "shape"))
+    M = np.concatenate([A.reshape(*a["e"].shape, -1), *own, a["e"][:, :, None]], axis=2)
+    return np.swapaxes(M, 1, 2) @ M
 
 
 def _solution(monkeypatch: pytest.MonkeyPatch, threads: int) -> str:

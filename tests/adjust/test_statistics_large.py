@@ -1,5 +1,6 @@
 """What the statistics do in large surveys, against what they do in small ones."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
@@ -216,9 +217,9 @@ def test_threads_and_portions_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> 
         condensed = condensed_system(precision_of(adjustment))
         found = reliability(adjustment, system=condensed)
         listed = correlations(adjustment, 0.5, system=condensed.system)
-        tests = [x for x in vars(found.tests).values() if isinstance(x, np.ndarray)]
+        tests = [found.tests.external, found.tests.freedom, *vars(found.tests.every).values()]
         tests += [found.tests.p, found.tests.p_posterior, found.tests.p_w, found.tests.p_tau]
-        rows = [condensed.system.A.toarray(), condensed.e, condensed.lens, condensed.camera, condensed.shape]
+        rows = [condensed.system.A.toarray(), condensed.e, *condensed.own]
         shifts = np.array([x.shift for x in found.influences])
         return [*tests, *rows, shifts, np.array([x.coefficient for x in listed])]
 
@@ -234,6 +235,21 @@ def test_threads_and_portions_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> 
     for others in found[1:]:
         for a, b in zip(found[0], others, strict=True):
             np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("case", [lab, free, lambda: adjust(*net.hall(2, n_points=30))])
+def test_tests_of_some_observations_are_those_of_all(case: Callable[[], Adjustment]) -> None:
+    tests = reliability(case(), most_influences=0).tests
+    rows = np.flatnonzero(np.arange(len(tests.used)) % 7 == 3)
+    assert rows[-1] > tests.n_image
+    parts = np.concatenate([np.arange(tests.ptr[i], tests.ptr[i + 1]) for i in rows])
+    some = tests.of(rows)
+    np.testing.assert_array_equal(np.diff(some.ptr), tests.n_components[rows])
+    np.testing.assert_array_equal(tests.every.external, tests.external)
+    for name in ("redundancy", "least", "statistic", "detectable", "external"):
+        np.testing.assert_array_equal(getattr(some, name), getattr(tests, name)[rows])
+    for name in ("w", "error", "detectable_component", "bias"):
+        np.testing.assert_array_equal(getattr(some, name), getattr(tests, name)[parts])
 
 
 def test_what_others_say_as_arrays_is_what_they_say_one_by_one() -> None:
