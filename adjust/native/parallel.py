@@ -94,8 +94,10 @@ def shared_out(function: Callable[[_Part], _Result], parts: Sequence[_Part]) -> 
     with _more_active(free):
         helpers = [_pool("adjust", workers() - 1).submit(shared.take) for _ in range(free)]
         _shared.append(shared)
-        shared.take()
-        _shared.remove(shared)
+        try:
+            shared.take()
+        finally:
+            _shared.remove(shared)
         for helper in helpers:
             helper.cancel()
         shared.finished.wait()
