@@ -1,7 +1,7 @@
 """The whole way: survey -> start -> graph -> solution -> precision."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +16,7 @@ from adjust.graph.elimination import EXACT
 from adjust.graph.solver import Solved, SolveOptions, settled, solve
 from adjust.lenses.models import MODELS, camera_constants, monotone_radius_px, principal_point_px
 from adjust.model.errors import NotConvergedError, listed
+from adjust.model.frozen import frozen
 from adjust.model.observations import ImageBlock, ImageBlocks
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import BoolArray, Survey
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from adjust.pose_network import PoseNetwork
 
 
-@dataclass(frozen=True)
+@frozen
 class AdjustOptions:
     """What is decided on the way.
 

@@ -1,7 +1,7 @@
 """Observations that could be added to a design, and what each of them tells about the unknowns that are there."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -12,6 +12,7 @@ from adjust.design.exact import exact
 from adjust.graph.assembly import AdjustmentGraph, StartValues
 from adjust.graph.building import GraphBuilder
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import (
     Alignment,
     CoordinateDifferences,
@@ -35,7 +36,7 @@ from adjust.statistics.rows import Columns, ItemRows, points_apart, survey_rows
 _RANK = 1e-10
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Candidate:
     """Something to measure in addition: an epoch with its images and reading, a beacon, a distance, a pair, readings.
 
@@ -78,7 +79,7 @@ def with_candidates(survey: Survey, candidates: Sequence[Candidate]) -> Survey:
     return replace(survey, points=tuple(points), image_blocks=tuple(blocks), **lists)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Observed:
     """The rows (k,) of one observation.
 
@@ -91,7 +92,7 @@ class Observed:
     rows: IntArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class DesignMatrix:
     """All observations of a survey at given values: A (m, n), zero in the rows of what is not used."""
 
@@ -125,7 +126,7 @@ def design_matrix(survey: Survey, start: StartValues) -> DesignMatrix:
     return DesignMatrix(graph, found.columns, (sparse.diags(used) @ found.A).tocsr(), parts)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Informed:
     """What candidates tell about the unknowns of the design: whitened rows, their own new unknowns eliminated.
 

@@ -18,12 +18,12 @@ trials that is about f / sqrt(N). The second order adds ``3 alpha^2 s^4 (1 + 3 E
 ``E 1/Z^4 = 1 / (n f)^2``; beyond s of about n / 4 no expansion holds, since beacons get behind the camera.
 """
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from adjust.spatial.rotation_forms import matrix_from_euler
 
@@ -31,7 +31,7 @@ ErrorKind = Literal["beacon position", "camera position", "camera attitude"]
 ERROR_KINDS: tuple[ErrorKind, ...] = ("beacon position", "camera position", "camera attitude")
 
 
-@dataclass(frozen=True)
+@frozen
 class BeaconField:
     """A camera and where its beacons may be: in the image, to the right of the principal point, at some depth.
 

@@ -11,7 +11,6 @@ the first order over the very same draws, and ``effective`` says how many of the
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,6 +23,7 @@ from adjust.design.error_analysis import (
     second_order,
     u_jacobian,
 )
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 
 # what the paper's figures span, m and rad
@@ -34,7 +34,7 @@ SIZES: dict[ErrorKind, FloatArray] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ErrorFigure:
     """RMS error of u over the size of one kind of error; arrays (k,).
 

@@ -1,6 +1,6 @@
 """The precision of a survey before it is measured: its adjustment without the observations' values."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -11,6 +11,7 @@ from adjust.graph.assembly import StartValues
 from adjust.graph.building import GraphBuilder
 from adjust.graph.rank import readable
 from adjust.graph.solver import settled
+from adjust.model.frozen import frozen
 from adjust.model.names import grouped
 from adjust.model.result import CAUTIOUS_SIGMAS, Adjustment, ParameterName
 from adjust.model.survey import FloatArray, Survey
@@ -20,7 +21,7 @@ from adjust.statistics.weakness import inflated
 _PART, _MOST = 0.25, 6  # of the largest share: what is named of a direction, and how many
 
 
-@dataclass(frozen=True)
+@frozen
 class WeakDirection:
     """A combination of unknowns that the design determines badly.
 

@@ -7,13 +7,13 @@ already are lit from the start, with their own errors and what these share with 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.navigation.model import Beacons, Head
 from adjust.navigation.system import System, evaluate, in_view, make_system, visible
@@ -22,7 +22,7 @@ _START = np.array([3.0] * 3 + [10.0] * 3)  # rad and m: what an attitude and a p
 _LEAST_GAIN = 1e-6
 
 
-@dataclass(frozen=True)
+@frozen
 class PlacementOptions:
     """What a good set of beacons is.
 
@@ -40,7 +40,7 @@ class PlacementOptions:
     spacing: float = 0.0
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Placement:
     """Beacons chosen, in the order of choice, beside those that are there.
 

@@ -7,7 +7,7 @@ pose that is weighted by all covariances, as navigation does it, is never worse.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from gtsam import Pose3
@@ -15,6 +15,7 @@ from gtsam import Pose3
 from adjust.lenses.compared import motion_derivatives
 from adjust.lenses.models import MODELS, lens_derivatives, lens_residuals
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from adjust.navigation.fit import local
 from adjust.navigation.model import Beacons, Head
@@ -27,7 +28,7 @@ _OPEN = 1e-9
 _STEPS, _SETTLED = 20, 1e-6  # px, of all spots of a pose
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PoseBudget:
     """What each source does to the poses: ``unit`` (q, 4, 6) variances per unit variance of the source.
 
@@ -49,7 +50,7 @@ class PoseBudget:
         return np.asarray(np.einsum("s,qsij->qij", np.asarray(sigmas) ** 2, self.full))
 
 
-@dataclass(frozen=True)
+@frozen
 class PoseTolerance:
     """Sigma a source may have, px, m or rad.
 

@@ -1,7 +1,7 @@
 """What a planned survey would observe: everything projected through the model at the planned values."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from gtsam import Pose3, Rot3
@@ -12,6 +12,7 @@ from adjust.graph.building import GraphBuilder
 from adjust.lenses.models import MODELS, camera_constants, lens_residuals, project
 from adjust.model.boards import deformed, warming_of
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef, ImageBlock, PositionRef, Reading, TableReading
 from adjust.model.survey import BoolArray, Camera, FloatArray, Point, Survey, Target
 from adjust.native.lenses import FISHEYE
@@ -21,7 +22,7 @@ _STEPS = np.linspace(1.0 / 16.0, 1.0, 16)
 _NEAREST_M = 1e-3
 
 
-@dataclass(frozen=True)
+@frozen
 class Seeing:
     """When an image point counts as seen.
 

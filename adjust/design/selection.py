@@ -13,7 +13,6 @@ here every unknown in units of its variance in the design as it is, so that angl
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -23,6 +22,7 @@ from adjust.design.candidates import Candidate, Informed, inform
 from adjust.design.expectation import expect
 from adjust.graph.assembly import StartValues
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.precision.precision import precision_of
@@ -31,7 +31,7 @@ from adjust.testing.quadratic_forms import pseudo_half
 Criterion = Literal["D", "A"]
 
 
-@dataclass(frozen=True)
+@frozen
 class Component:
     """A component of an unknown whose precision is wanted."""
 
@@ -45,7 +45,7 @@ class Component:
         return ".".join((*self.name, self.component))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Gain:
     """What one candidate brings to the covariance as it stands.
 
@@ -67,7 +67,7 @@ class Gain:
         return self.ln_det if criterion == "D" else self.mean_variance
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Selection:
     """The choice: ``first`` are the gains of all candidates to the design as it is, best first; ``steps`` the chosen.
 

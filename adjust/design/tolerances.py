@@ -9,19 +9,19 @@ through the estimator). Where the adjustment is told the new sigmas it weighs an
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from adjust.design.selection import Component
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray
 from adjust.statistics.system import linear_system
 from adjust.statistics.weakness import covariance_columns
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Budget:
     """Where the variance of wanted components comes from: ``variances`` (g, p) of every group, which add up."""
 
@@ -35,7 +35,7 @@ class Budget:
         return np.asarray(np.sqrt(self.variances.sum(axis=0)))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Tolerance:
     """How much larger (or smaller) the sigmas of a group may be: factors on the planned ones.
 

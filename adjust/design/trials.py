@@ -8,7 +8,6 @@ import multiprocessing
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -20,6 +19,7 @@ from adjust.graph.assembly import StartValues
 from adjust.graph.building import GraphBuilder
 from adjust.graph.solver import settled
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, Survey
 from adjust.native.parallel import workers
@@ -29,7 +29,7 @@ from adjust.testing.quadratic_forms import pseudo_squares
 _CHUNK = 8
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Trials:
     """Errors of the unknowns of several epochs over the trials that converged.
 
@@ -107,8 +107,10 @@ def _summary(
     return Trials(names, errors, s, omega, expected.redundancy, failed, mean, dof, (float(low), float(high)))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Task:
+    """Some trials in a process of its own."""
+
     ideal: Survey
     start: StartValues
     names: tuple[ParameterName, ...]

@@ -5,7 +5,7 @@ observations of one epoch (images, time, targets, weights) is diagnosed where th
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -16,6 +16,7 @@ from adjust.epochs.congruence import Common, CongruenceOptions, common, compare
 from adjust.epochs.congruence_result import Congruence
 from adjust.epochs.states import Epoch, aligned, moved, origin
 from adjust.model.errors import SurveyError, listed
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray
 from adjust.spatial.rigid import align, rotation_log, transform
@@ -30,7 +31,7 @@ _MOST_IN_PAIRS, _PAIRS = 1_000, 500_000
 _RIGID, _SCALE = np.eye(7)[:, :6], np.eye(7)[:, 6:]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Between:
     """One cause. ids: whom it concerns. p: of the test of all with the change; statistic: F then, ``before`` without.
 

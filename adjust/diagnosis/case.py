@@ -1,7 +1,7 @@
 """The survey that does not fit, with the data from which hypotheses are formed; everything costly is found once."""
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,6 +15,7 @@ from adjust.diagnosis.units.conventions import UNKNOWN, Written
 from adjust.graph.assembly import StartValues, values_of
 from adjust.graph.solver import SolveOptions
 from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 from adjust.start.given import given_starts
@@ -33,7 +34,7 @@ _LOST = 1e4
 """v'Pv over that of observations none of which is explained, from which values that are on their way say nothing."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Case:
     """A survey, and what became of it: its adjustment, or the error instead; what its diagnosis may still adjust.
 

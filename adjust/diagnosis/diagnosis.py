@@ -1,7 +1,6 @@
 """The way of a diagnosis: hypotheses from cheap evidence, the likeliest tried, those that explain the misfit ranked."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +11,7 @@ from adjust.diagnosis.hypothesis import Hypothesis, told_edit
 from adjust.diagnosis.search import Search
 from adjust.diagnosis.trial import NEVER, Misfit, Trial, misfit_of
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.memory import remembering
 from adjust.model.survey import FloatArray
 from adjust.start.lens.start import remembering as remembering_lenses
@@ -31,7 +31,7 @@ _LIKELY = 0.01
 """Probability among all that were tried, and the survey as it stands, below which a cause is not named."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Candidate:
     """A hypothesis that passed its test. explained: share of the misfit beyond noise that it takes away, 0 to 1.
 
@@ -49,7 +49,7 @@ class Candidate:
     where: str = ""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Diagnosis:
     """What explains that a survey does not fit: candidates, the best first; empty where nothing that was tried does.
 

@@ -1,18 +1,19 @@
 """What may be wrong with a survey: one cause, the one change that would mend it, and where a project says it."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.lenses.models import MODELS
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 
 
-@dataclass(frozen=True)
+@frozen
 class Place:
     """Where a mistake sits. kind: camera, station, table, target, point, image, reading, pair, epoch, group ...
 
@@ -26,7 +27,7 @@ class Place:
     epochs: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
+@frozen
 class ScaleKey:
     """The number, or every number, at ``path`` of ``survey.toml`` is multiplied: ("targets", "board", "square_mm")."""
 
@@ -34,7 +35,7 @@ class ScaleKey:
     factor: float
 
 
-@dataclass(frozen=True)
+@frozen
 class SetKey:
     """The value at ``path`` of ``survey.toml`` becomes another: a number, a word, yes or no, a list of them.
 
@@ -45,7 +46,7 @@ class SetKey:
     value: float | int | str | bool | tuple[str | float, ...]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ChangeColumns:
     """In the rows of a table where each column of ``where`` has one of its values: new = matrix @ old + offset.
 
@@ -59,7 +60,7 @@ class ChangeColumns:
     where: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
+@frozen
 class Rename:
     """In the rows of a table where each column of ``where`` has one of its values: ids of a column become others."""
 
@@ -69,7 +70,7 @@ class Rename:
     where: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
+@frozen
 class ExchangeColumns:
     """In the rows of a table where each column of ``where`` has one of its values: two columns trade their values."""
 
@@ -78,7 +79,7 @@ class ExchangeColumns:
     where: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
+@frozen
 class ChangeReadings:
     """The values of readings or distances, by id: new = factor * old + offset (rad or m), each in its own unit.
 
@@ -92,7 +93,7 @@ class ChangeReadings:
     field: str = "value"
 
 
-@dataclass(frozen=True)
+@frozen
 class SetReadings:
     """A column of ``terrestrial.csv`` gets this word in the rows of some readings, by id."""
 
@@ -102,7 +103,7 @@ class SetReadings:
     table: str = "terrestrial"
 
 
-@dataclass(frozen=True)
+@frozen
 class LeaveOut:
     """Rows of ``exclusions.csv``, each as a person would name it: "image:Y/hY06", "epoch:t09", "pairs:p3"."""
 
@@ -133,7 +134,7 @@ def _tuples(value: Any) -> Any:
     return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Hypothesis:
     """One cause, and the survey as it would be without it.
 
@@ -174,7 +175,7 @@ class Hypothesis:
         return self.survey() if callable(self.survey) else self.survey
 
 
-@dataclass(frozen=True)
+@frozen
 class Finding:
     """One thing to mend or to measure, told before anything is adjusted.
 

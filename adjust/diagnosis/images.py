@@ -5,7 +5,7 @@ contradicts their lens does, which is not symmetric.
 """
 
 from collections.abc import Container, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from adjust.diagnosis.alone import squares_alone
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import ChangeColumns, Edit, Hypothesis, Place
+from adjust.model.frozen import frozen
 from adjust.model.names import numbered
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, Survey
@@ -41,7 +42,7 @@ _FLAT, _LEAST = 0.02, 2
 _ALPHA, _HALF = 1e-6, 180
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ImageMap:
     """``matrix`` (2, 2) about the middle of the image, of entries 0, 1 and -1; a quarter turn exchanges its sides."""
 

@@ -1,7 +1,6 @@
 """What an adjustment says an image block should show, also under another name or with another value of one unknown."""
 
 from collections.abc import Container, Mapping
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -18,6 +17,7 @@ from adjust.lenses.models import MODELS, camera_constants, lens_derivatives, pro
 from adjust.model.boards import deformed, warming_of
 from adjust.model.clocks import epoch_times
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import Clock, FloatArray, Survey, Target
@@ -48,7 +48,7 @@ def started_values(start: StartValues) -> Altered:
     return out
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Prediction:
     """Image points of the blocks of ``survey``, and of others of its things, by values of its unknowns."""
 
@@ -258,7 +258,7 @@ class Prediction:
         return np.array([np.full(3, np.nan) if x is None else x for x in found])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Linear(LinearScores):
     """The adjustment that is diagnosed as a linear system: scores of changes of things whose images it predicts."""
 

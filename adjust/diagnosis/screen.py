@@ -4,7 +4,7 @@ The closed forms of the start are robust: what one set-up or one pair says wrong
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -16,6 +16,7 @@ from adjust.diagnosis.memory import own_start
 from adjust.graph.assembly import AdjustmentGraph, StartValues, values_of
 from adjust.graph.building import GraphBuilder
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.memory import remembered
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.observations.terrestrial import equations as k
@@ -31,7 +32,7 @@ _MISSED = 25.0
 _AT_ONCE = 200_000  # readings that are predicted in one go
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Fit:
     """How observations fit rough values.
 
@@ -58,7 +59,7 @@ class Fit:
         return float(np.minimum(np.concatenate([self.readings, self.others]) / scale, CAP).sum())
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Screen(Fit):
     """A graph at its start values. ``start``: these; orientations of set-ups are medians of their directions."""
 

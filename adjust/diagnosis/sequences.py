@@ -6,7 +6,6 @@ in the base (closed form: Shah 2013, in :mod:`adjust.start.closed_forms.hand_eye
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import combinations
 from typing import Literal
@@ -16,6 +15,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.diagnosis.case import Case
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.spatial.averaging import mean_pose, mean_poses, pose_distance, typical_distance
 from adjust.spatial.rigid import inverse
@@ -30,7 +30,7 @@ _JOINED = 30.0
 """Times the error of single poses that two sequences miss each other at most where they belong together."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Link:
     """Poses (n, 4, 4) of two things at n epochs. kind: "rig" or "hand_eye". names: of first and second.
 
@@ -62,7 +62,7 @@ class Link:
         return fitted(self.kind, self.first, self.second)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Fit:
     """The constant motions (4, 4) of a link."""
 
@@ -159,7 +159,7 @@ def hand_poses(survey: Survey) -> dict[str, dict[str, tuple[int, Pose3]]]:
     return out
 
 
-@dataclass(frozen=True)
+@frozen
 class Shift:
     """From epoch number ``begin`` on the second is that of ``by`` epochs later; evidence: ratio of misfits."""
 

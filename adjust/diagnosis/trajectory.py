@@ -5,7 +5,7 @@ What concerns the calibration itself is diagnosed where it is adjusted.
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -15,6 +15,7 @@ from adjust.diagnosis.hypothesis import ChangeColumns, Edit, Rename
 from adjust.diagnosis.images import MIRRORED, TURNED, ImageMap
 from adjust.diagnosis.units.conventions import ANGLE_RATIOS
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from adjust.navigation import Beacons, EpochPose, Head, NavigateOptions, NavigationEpoch, Spots, Trajectory, navigate
 from adjust.testing.criteria import sidak
@@ -25,7 +26,7 @@ _ALPHA, _EXPLAINED, _BAD = 1e-4, 0.5, 3.0
 """Level shared by all that is tried; share of the misfit that a cause takes away; misfit over its count looked into."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class OfTrajectory:
     """One cause. ids: of cameras, beacons or the table. edits: the same in a project, as far as a program can do it.
 
@@ -97,7 +98,7 @@ def _misfit(pose: EpochPose) -> float:
     return known + 2.0 * CAP * (len(spots) if pose.status == "none" else without)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Rows:
     """The rows of a project that these epochs are: how each change is made there, and what it does to an epoch."""
 

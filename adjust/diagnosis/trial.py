@@ -1,7 +1,7 @@
 """One hypothesis, tried: its survey adjusted, and what is left unexplained."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -9,6 +9,7 @@ import numpy as np
 from adjust.diagnosis.case import CAP, Case, block_squares
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.names import numbered
 from adjust.model.result import Adjustment, names_of
 from adjust.model.survey import FloatArray, Survey
@@ -26,7 +27,7 @@ NEVER = 1200.0
 _FACTORS = 2.0 ** np.arange(24.0)
 
 
-@dataclass(frozen=True)
+@frozen
 class Misfit:
     """What a survey leaves unexplained. omega: sum of squares over sigmas, each bounded by ``CAP``, all observations.
 
@@ -72,7 +73,7 @@ class Misfit:
         return (beyond + noise) / (left + noise)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Trial:
     """A hypothesis, with the misfit of its survey and the adjustment that showed it (None: it led to no solution).
 

@@ -2,13 +2,13 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from adjust.epochs.states import Epoch, EpochState, differences
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.precision.s_transformation import transformed
@@ -23,7 +23,7 @@ Between = tuple[
 """The fields of a :class:`Change`, and which of all components they are of."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Change(ABC):
     """Differences d (n,) of known components, the motions G (n, k) that do not count, and whose rows are whose.
 
@@ -91,7 +91,7 @@ def between(before: Epoch, after: Epoch, directions: FloatArray, determined: Boo
     return (before.names, d[known], G[known], before.owner[known], component[known], nowhere), known
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class MatrixChange(Change):
     """By the covariance Q (n, n) of the differences."""
 

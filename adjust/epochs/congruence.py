@@ -6,7 +6,7 @@ contributes most is taken out of the datum, until what is left is congruent.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from gtsam import Pose3
@@ -26,6 +26,7 @@ from adjust.epochs.states import (
     known,
 )
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray
 from adjust.testing.criteria import sidak
@@ -36,7 +37,7 @@ MOST_IN_MATRIX = 600
 """Components up to which epochs are compared by one covariance matrix; more, by their normal equations."""
 
 
-@dataclass(frozen=True)
+@frozen
 class CongruenceOptions:
     """alpha: of the global test, and of all single tests together.
 
@@ -68,7 +69,7 @@ def congruence(
     return compare(replace(both, after=after), options)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Common:
     """What two epochs have in common; directions (7, k): motions that do not count."""
 
@@ -169,7 +170,7 @@ def _change(before: Epoch, after: Epoch, directions: FloatArray, cross: FloatArr
     raise TypeError("both epochs are known by their covariance matrices, or independent and by their normal equations")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Tests:
     """Tests of what lies between two epochs."""
 

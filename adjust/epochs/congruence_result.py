@@ -1,13 +1,13 @@
 """What a congruence test of epochs gives back."""
 
-from dataclasses import dataclass
 
+from adjust.model.frozen import frozen
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray
 from adjust.statistics.result import Ellipsoid
 
 
-@dataclass(frozen=True)
+@frozen
 class CongruenceTest:
     """d' Q_d^+ d / (h s0^2) against Fisher's F(h, f), f = inf where sigma0 is taken as known (chi-square / h).
 
@@ -21,7 +21,7 @@ class CongruenceTest:
     passed: bool
 
 
-@dataclass(frozen=True)
+@frozen
 class CongruenceStep:
     """One round of the search for stable points: ``name`` was taken out; what is left then tests as ``test``.
 
@@ -33,7 +33,7 @@ class CongruenceStep:
     test: CongruenceTest
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Motion:
     """How one point or station moved between two epochs, in the datum of the stable ones.
 
@@ -57,7 +57,7 @@ class Motion:
     smallest: float
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Congruence:
     """Two epochs compared. epochs: their names. alpha: of the global test, and of all single tests together.
 

@@ -8,13 +8,13 @@ nothing moved.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import FloatArray
 from adjust.precision.precision import rotations_only
@@ -26,7 +26,7 @@ from adjust.testing.distributions import chi2
 from adjust.testing.quadratic_forms import squares_in_sigmas
 
 
-@dataclass(frozen=True)
+@frozen
 class DeformationTest:
     """Chi-square test of some components: ``statistic`` with ``freedom`` degrees, ``p`` of as much without motion.
 
@@ -38,7 +38,7 @@ class DeformationTest:
     p: float
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Deformation:
     """What happened between stations a and b; see the module for its sense and frame.
 

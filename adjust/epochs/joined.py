@@ -6,7 +6,7 @@ share, with the gradient g by its displacement and the M that the other unknowns
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 from itertools import pairwise
 
@@ -16,6 +16,7 @@ from scipy import sparse
 
 from adjust.epochs.change import Change, Displaced, between
 from adjust.epochs.states import EpochNormals
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.precision.s_transformation import moved
 from adjust.spatial.motions import values_motions
@@ -29,7 +30,7 @@ _APART = 1e-6
 _ROOM = 64_000_000  # numbers of what was freed
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Together:
     """Both epochs with some ``names`` the same: their unknowns z (u,) are P y + D; K = P'NP of N (u, u) is factored.
 
@@ -64,7 +65,7 @@ class _Together:
         self.freed.update({i: (z[:, a:b], Nz[:, a:b]) for i, (a, b) in zip(new, pairwise(ends), strict=True)})
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Rise:
     """What v'Pv rises by where names are the same. gradient: (u,) by the unknowns.
 
@@ -78,7 +79,7 @@ class _Rise:
     M: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class JoinedChange(Change):
     """By the normal equations of both epochs.
 

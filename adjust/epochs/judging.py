@@ -1,7 +1,6 @@
 """How every name moved between two epochs, and whether that is significant: all of a kind at once."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +8,7 @@ import numpy as np
 from adjust.epochs.change import Change, Displaced
 from adjust.epochs.congruence_result import CongruenceTest, Motion
 from adjust.epochs.states import Epoch
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from adjust.statistics.relative_precision import ellipsoids
 from adjust.statistics.result import Ellipsoid
@@ -36,7 +36,7 @@ def tests_of(statistic: FloatArray, freedom: IntArray, pooled: Pooled, level: fl
     return [CongruenceTest(x, n, f, q, q >= level) if n else CongruenceTest(nan, 0, f, nan, True) for x, n, q in rows]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Kind:
     """Names (p,) of which the same is known: components (k,) of rx ry rz x y z, in rows (p, k); or no position."""
 
@@ -47,7 +47,7 @@ class _Kind:
     nowhere: bool
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Judging:
     """What every motion is judged by. level: of a single test, alpha of all, power: of :attr:`Motion.smallest`."""
 

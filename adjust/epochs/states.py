@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 from typing import Self, TypeVar
 
@@ -11,6 +11,7 @@ from gtsam import Pose3, Rot3
 from scipy import sparse
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.precision.precision import Precision, precision_of, rotations_only
@@ -24,7 +25,7 @@ _POSE = np.arange(6)
 _MIXED = 1e-12
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Epoch(ABC):
     """names with values (Pose3 or (3,) m), n components in all: three a point, six a pose.
 
@@ -88,7 +89,7 @@ class Epoch(ABC):
         """With these values, to which L (3, 3) took the points; poses turned along, and their positions scaled."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class EpochState(Epoch):
     """By the joint covariance cov (n, n) of all components."""
 
@@ -107,7 +108,7 @@ class EpochState(Epoch):
         return replace(self, values=values, cov=rows(rows(self.cov).T))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class EpochNormals(Epoch):
     """By the normal equations N (u, u) of all unknowns of the epoch, which its datum has no part in.
 

@@ -1,7 +1,6 @@
 """Which lens an image was taken with: that of its camera, as it had changed by then and as the image was cropped."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -11,12 +10,13 @@ from adjust.frames.unknowns import Unknowns, VectorMap, vector_map
 from adjust.lenses.crops import UNITS, CroppedLens, cropped_lens
 from adjust.lenses.models import MODELS, LensModel, camera_constants
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import ParameterName
 from adjust.model.survey import CROP, BoolArray, Camera, FloatArray, LensDrift, LensSharing, Survey, VectorParameter
 from adjust.native.lenses import MAX_LENS
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class CropState:
     """How images are cropped: ``CROP``, for a lens model with the constants (4,) of the whole image."""
 
@@ -35,7 +35,7 @@ class CropState:
         return cropped_lens(self.model, whole, self.constants, self.vector.full(values))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class LensState:
     """The lens of a camera (its number), what is added to it, times a factor, and how it is cropped."""
 
@@ -44,7 +44,7 @@ class LensState:
     crop: CropState | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class LensPart:
     """Free parameters ``first`` and the n - 1 after it come from components of a key, times a factor."""
 

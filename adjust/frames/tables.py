@@ -2,11 +2,11 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, Survey, Table
 from adjust.model.tables import Harmonic, harmonic
 
@@ -15,7 +15,7 @@ _COVERED = 2.0 / 3.0
 """Share of its longest period that the angles of an axis must cover for its harmonics."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Step:
     """A turn (rad) about or a shift (m) along an axis by q (n,); by: derivatives (n,) of q by parameters."""
 

@@ -14,6 +14,7 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, PoseParameter, VectorParameter
 
@@ -38,7 +39,7 @@ class Unknown(NamedTuple):
         return len(self.components)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class VectorMap:
     """A parameter vector from its unknown: full = base + matrix @ free; ``key`` is None when all is held.
 
@@ -91,7 +92,7 @@ class Link(NamedTuple):
 Chain = tuple[Link, ...]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class TableSlot:
     """A slot that is the motion of a table at an epoch: from its angles and its geometry."""
 
@@ -110,7 +111,7 @@ class TableSlot:
         return [angles] if geometry.key is None else [angles, (geometry.key, k, len(geometry.free))]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ShiftedSlot:
     """A slot that is another one, the first of ``nodes``, at another time than its epoch's.
 

@@ -1,7 +1,7 @@
 """The one graph of a survey as GTSAM has it, what it is evaluated to, and values to begin with."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, TypeVar
 
@@ -12,6 +12,7 @@ from gtsam import Pose3
 from adjust.frames.state import State
 from adjust.frames.unknowns import Unknowns
 from adjust.model.clocks import CLOCKS
+from adjust.model.frozen import frozen
 from adjust.model.observations import ImageBlock, Pair
 from adjust.model.result import Estimated, ParameterName
 from adjust.model.rewriting import vector_parameters
@@ -30,7 +31,7 @@ _Rows = TypeVar("_Rows", FloatArray, BoolArray)
 _T = TypeVar("_T")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class StartValues:
     """Where the adjustment begins: full lens vectors, poses by parameter name, world points, table angles, vectors."""
 
@@ -68,7 +69,7 @@ def _by_component(adjustment: Estimated, survey: Survey | None) -> dict[Paramete
     return out
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Evaluation:
     """A graph evaluated at ``values``, with ``damping`` of what is reduced there.
 
@@ -82,7 +83,7 @@ class Evaluation:
     number: int
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class AdjustmentGraph:
     """The graph, its start and the batches that serve it. Held together with the survey only by the solver.
 

@@ -3,7 +3,7 @@
 Moved each for itself, neighbours end up apart by the product of what both move and what they move apart.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import gtsam
 import numpy as np
@@ -12,6 +12,7 @@ from scipy import sparse
 
 from adjust.frames.tree import in_world
 from adjust.graph.assembly import AdjustmentGraph
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.pairs import compose_poses
 from adjust.observations.images.batch import Chains
@@ -28,7 +29,7 @@ def _none() -> IntArray:
     return np.zeros(0, dtype=np.int64)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Bending:
     """Poses (N,) of the world by key, an order in which they are reached, and (N,) from which each, -1: from none.
 

@@ -1,7 +1,6 @@
 """From a survey and its start values to the one graph."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -16,6 +15,7 @@ from adjust.graph.singles import Singles, beside_images
 from adjust.model.boards import deformation, warming_of
 from adjust.model.clocks import EpochTimes
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef, ImageBlock, PositionRef
 from adjust.model.result import ParameterName
 from adjust.model.rewriting import vector_parameters
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from adjust.observations.pairs import PairBatch
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Images:
     """Image blocks, or parts of them that were exposed at one moment, with their chains. number: each one's block."""
 

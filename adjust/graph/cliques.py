@@ -1,19 +1,19 @@
 """A Bayes tree as arrays: its cliques one after the other, parents first, and the ways through them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property
 
 import gtsam
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.elimination import PoseTree
 from adjust.native.trees import TreeArrays, invert_cliques, solve_cliques
 from adjust.observations.images.reduction import Leaves
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Cliques:
     """C cliques of K keys, which are numbered where they first appear: in the clique that has them as frontal ones.
 
@@ -146,7 +146,7 @@ class Cliques:
         return eliminations * float(self.front @ self.width.astype(float) ** 2) / max(way, default=1)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class SolvedTree:
     """What a system was eliminated to; ``dims`` of every key, and the poses that were reduced before."""
 

@@ -7,7 +7,6 @@ motions G. The adjusted shape does not depend on either datum.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import gtsam
@@ -19,6 +18,7 @@ from adjust.frames.tree import in_world
 from adjust.frames.unknowns import Unknown
 from adjust.graph.assembly import AdjustmentGraph, Evaluation
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from adjust.observations.motions import MOVED, READINGS_MOVED, orientation_motions, reading_motions, vector_motions
 from adjust.spatial.motions import motions_of, points_motions, poses_at, poses_motions
@@ -61,7 +61,7 @@ def visible_keys(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph) -> l
     return [u.key for u in graph.unknowns.by_name.values() if u.key in seen]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Stacking:
     """Where each key stands in a stacked vector of length ``n``."""
 
@@ -110,7 +110,7 @@ def normal_diagonal(linear: gtsam.GaussianFactorGraph, stack: Stacking) -> Float
     return np.asarray(np.bincount(j, value**2, stack.n + 1)[: stack.n], dtype=np.float64)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class InnerDatum:
     """Inner constraints: rows (k, dim) per key, relative to ``base``; ``directions`` (7, k) are the defects there.
 

@@ -1,6 +1,5 @@
 """What to say of an adjustment that did not arrive: what moved away, and which observations fit worst, by group."""
 
-from dataclasses import dataclass
 from itertools import pairwise
 
 import gtsam
@@ -12,6 +11,7 @@ from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.datum import normal_diagonal, stacking, visible_keys
 from adjust.graph.rank import readable
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.names import grouped
 from adjust.model.observations import position_text
 from adjust.model.stopped import GroupFit, Pull, Stopped, UnknownState
@@ -24,7 +24,7 @@ _MISFIT = 16.0
 """Mean squares over their variance from which a group or one of its owners is named: four sigmas."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Misfit:
     """One observation: its group, whom it belongs to (a setup, a camera, itself), its name, and v'Pv per component."""
 

@@ -1,7 +1,6 @@
 """In which order, and how, a linear system is eliminated: by Cholesky, or by QR where that resolves what it refuses."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, TypeVar
 
@@ -9,6 +8,7 @@ import gtsam
 import numpy as np
 from scipy import sparse
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.elimination import CliquePattern, clique_pattern
 
@@ -22,7 +22,7 @@ _LARGE = 2000
 """Poses of networks from which their order is looked for in a second way: smaller ones take no time in either."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Elimination:
     """An order of elimination and its method."""
 

@@ -5,7 +5,7 @@ serves every step, and near the solution one factor serves several of them. Long
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import gtsam
@@ -14,11 +14,12 @@ import numpy as np
 from adjust.graph.assembly import AdjustmentGraph, Evaluation
 from adjust.graph.bending import Bending, tree
 from adjust.graph.elimination import EXACT, force_on, lost, numbers, pose_cliques
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from adjust.native.elimination import PoseFactor, PoseTree, pair_gradient
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PairLinear:
     """Whitened residuals (E, 6) of pairs and their derivatives (E, 6, 6) by b and by a; what is known of single poses.
 

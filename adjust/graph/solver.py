@@ -5,7 +5,6 @@ nothing of the unknowns hidden in a batch.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import cached_property
 
 import gtsam
@@ -21,6 +20,7 @@ from adjust.graph.pair_normals import PairLinear
 from adjust.graph.rank import unobserved_unknowns
 from adjust.graph.system import System
 from adjust.model.errors import GivenUpError, IndeterminateError, NotConvergedError, listed
+from adjust.model.frozen import frozen
 
 _SIGMA_ROUNDS, _SIGMA_CHANGE = 3, 1e-6
 """Sigmas that depend on distances (target centring) follow the solution until they change by no more than this."""
@@ -45,7 +45,7 @@ From farther off where the one before is known, and more was gained.
 Progress = Callable[[int, float], None]
 
 
-@dataclass(frozen=True)
+@frozen
 class SolveOptions:
     """max_step: convergence, what is left to go for any unknown in its own sigmas. max_iterations: steps tried.
 
@@ -68,7 +68,7 @@ class SolveOptions:
     hopeless: float = np.inf
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Solved:
     """The minimum and how it was reached. tree: what the system there was eliminated to, by QR or Cholesky.
 

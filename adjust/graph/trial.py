@@ -4,7 +4,6 @@ Eigenvalues of a corridor's normal matrix differ by the fourth power of its leng
 squares away no redundancy number tells; the work of the force against the square of the rows does.
 """
 
-from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -14,9 +13,10 @@ from adjust.graph.cliques import Cliques
 from adjust.graph.datum import normal_diagonal, stacking, visible_keys
 from adjust.graph.elimination import force_on, lost
 from adjust.graph.rank import is_seen, rows_along
+from adjust.model.frozen import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class Trial:
     """lost: share of its variance that the weakest motion loses. seen: whether observations tell of it for sure."""
 

@@ -7,7 +7,6 @@ which carries the camera, or, for a camera by itself, those of the difference so
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from gtsam import Pose3, Rot3
@@ -24,6 +23,7 @@ from adjust.lenses.models import (
 )
 from adjust.model.arrays import BoolArray, FloatArray
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import Estimate, ParameterName
 from adjust.model.survey import Camera
 
@@ -33,7 +33,7 @@ _STEPS = 30
 _SMALL = 1e-12
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Optics:
     """A camera as it projects: ``values`` (n,) of a lens model and its ``constants`` (4,)."""
 
@@ -47,7 +47,7 @@ class Optics:
         return away if np.isinf(distance) else distance * away
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Difference:
     """Where the second camera sees what the first one sees at ``uv`` (n, 2) px, minus that: ``shift`` (n, 2) px.
 

@@ -7,13 +7,13 @@ radius of AICON's polynomial.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from adjust.lenses.compared import Optics, image_derivatives
 from adjust.lenses.models import LensModel, lens_derivatives, principal_components, project
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from adjust.native import lenses as kernels
 
@@ -29,7 +29,7 @@ _DIFFERENCE_PX = 0.01
 _USUALLY_HELD = ("k4", "k5", "k6")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Conversion:
     """A converted lens.
 
@@ -202,7 +202,7 @@ def _fit(
     )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Factorised:
     """QR decomposition of a matrix whose columns were divided by ``scale``."""
 

@@ -5,18 +5,18 @@ the first pixel is (0, 0), the edge of the image at -1/2. Focal lengths scale to
 shifts, and distortion stays what it is in normalised coordinates: coefficients in 1/mm^n go with ``scale^-n``.
 """
 
-from dataclasses import dataclass
 
 import numpy as np
 
 from adjust.lenses.models import LensModel, principal_components
+from adjust.model.frozen import frozen
 from adjust.model.survey import Camera, FloatArray, ImageCrop
 
 UNITS = ("1", "px", "px")
 """Of ``CROP``."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class CroppedLens:
     """values (n,); by_lens (n,): by those of the whole image, by_crop (n, 3): by ``CROP``."""
 

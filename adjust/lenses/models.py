@@ -6,12 +6,12 @@ pixel origin (``brown_backward_dbat``). The formulas are in ``adjust/native/lens
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
 from adjust.lenses.radial import RadialProfile, invert_radius, radial_profile
 from adjust.model.errors import SurveyError, listed
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, Camera, FloatArray
 from adjust.native import lenses as kernels
 
@@ -25,7 +25,7 @@ MAX_ITERATIONS = 50
 _NEWTON = kernels.Newton(MAX_ITERATIONS, RAY_TOLERANCE)
 
 
-@dataclass(frozen=True)
+@frozen
 class LensModel:
     """A lens model: its number in the kernels, its parameters in order and their units.
 

@@ -4,12 +4,12 @@ Every model maps a radius r (tangent of the angle to the axis, the angle itself 
 mm) to ``f(r) = r N(r^2) / D(r^2)``, N and D polynomials with ascending coefficients.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial import polynomial
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.native import lenses as kernels
 
@@ -17,7 +17,7 @@ SMALLEST_ROOT = 1e-12
 """Reciprocals of squared radii below this mean that the radius is out of any camera's sight."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class RadialProfile:
     """A radial function f(r) = r N(r^2) / D(r^2) that grows from 0 to ``limit`` (infinite where it always grows)."""
 

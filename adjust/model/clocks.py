@@ -10,9 +10,9 @@ from where it is at them (:mod:`adjust.observations.clocks`).
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.names import natural_key
 from adjust.model.result import ParameterName
 from adjust.model.survey import Clock, Survey
@@ -54,7 +54,7 @@ def clock_text(name: ParameterName) -> str:
         name[0]].format(name[1])  # fmt: skip
 
 
-@dataclass(frozen=True)
+@frozen
 class EpochTimes:
     """By epoch its time, s, or its number where the unit is ``INTERVALS``. middle: of the session."""
 

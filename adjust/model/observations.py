@@ -9,6 +9,7 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model.arrays import BoolArray, FloatArray, IntArray
+from adjust.model.frozen import frozen
 
 FrameKind = Literal["world", "station", "camera", "target", "table", "mount"]
 ReadingKind = Literal[
@@ -16,7 +17,7 @@ ReadingKind = Literal[
 ]
 
 
-@dataclass(frozen=True)
+@frozen
 class FrameRef:
     """A frame by name; ``epoch_id`` where the frame moves."""
 
@@ -32,7 +33,7 @@ class FrameRef:
         return f"{self.kind}:{self.frame_id}" + (f"@{self.epoch_id}" if self.epoch_id else "")
 
 
-@dataclass(frozen=True)
+@frozen
 class PositionRef:
     """A position: a world point (``point_id`` alone), a point of a target, or the origin of a frame."""
 
@@ -52,7 +53,7 @@ def position_text(ref: PositionRef) -> str:
     return frame_text(ref.frame) + (f"/{ref.point_id}" if ref.point_id else "")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ImageBlock:
     """The image points that one camera saw of one target (or of the world's points) at one epoch.
 
@@ -94,7 +95,7 @@ class ImageBlock:
         return self if self.used is None else replace(self.part(self.used), used=None)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ImagePoints:
     """The image points (N,) of B blocks, block after block, as :class:`ImageBlock` has them.
 
@@ -136,7 +137,7 @@ class ImageBlocks(tuple[ImageBlock, ...]):
         return type(self), (tuple(self), self.points)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class TableReading:
     """Angles (k,) rad read off a table's axes at an epoch, with covariance (k, k); a start even if not used."""
 
@@ -148,7 +149,7 @@ class TableReading:
     used: bool = True
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Pair:
     """A measured ``b_from_a``: a pose with covariance (6, 6), or a rotation with covariance (3, 3)."""
 
@@ -161,7 +162,7 @@ class Pair:
     used: bool = True
 
 
-@dataclass(frozen=True)
+@frozen
 class Closure:
     """A loop of pairs that a mechanical mount closes: only as well as the mount repeats.
 
@@ -180,7 +181,7 @@ class Closure:
         return np.diag(sigma**2)
 
 
-@dataclass(frozen=True)
+@frozen
 class Distance:
     """A distance in m between two positions (caliper, tape, laser)."""
 
@@ -193,7 +194,7 @@ class Distance:
     used: bool = True
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Coordinates:
     """World coordinates (n, 3) m of n positions, with their joint covariance (3n, 3n).
 
@@ -236,7 +237,7 @@ class Reading:
     used: bool = True
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ReadingCovariance:
     """Joint covariance (n, n) of n readings, in rad^2, rad m, m^2; it replaces their sigmas. All used, or none."""
 
@@ -249,7 +250,7 @@ class ReadingCovariance:
         return ReadingCovariance(tuple(self.reading_ids[k] for k in rows), self.cov[np.ix_(rows, rows)])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class CoordinateDifferences:
     """World coordinates of ``to`` minus those of ``at``, (n, 3) m of n baselines, with joint covariance (3n, 3n).
 
@@ -265,7 +266,7 @@ class CoordinateDifferences:
     set_id: str = ""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Level:
     """Inclination (rad) of a body's axis above the horizontal, from a spirit level or an accelerometer (asin f/g).
 
@@ -281,7 +282,7 @@ class Level:
     used: bool = True
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Alignment:
     """Two axes of two bodies are parallel: the components (2,) rad of ``axis_in_a`` seen from b, across ``axis_in_b``.
 
@@ -300,7 +301,7 @@ class Alignment:
     used: bool = True
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class LaserSpot:
     """Where a beam meets the plane of a target at an epoch: (2,) m, x and y in the target, covariance (2, 2)."""
 
@@ -314,7 +315,7 @@ class LaserSpot:
     used: bool = True
 
 
-@dataclass(frozen=True)
+@frozen
 class OnSurface:
     """A position lies at ``offset`` (m) from a surface, with sigma (m): a feeler, a rail, a ball bar.
 

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Literal, Protocol, overload
 
@@ -10,6 +9,7 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.model.errors import Explanation
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, Survey, VectorParameter
 
 # ("lens", camera) ("station_from_camera", camera) ("world_from_station", station[, epoch])
@@ -20,7 +20,7 @@ from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, 
 ParameterName = tuple[str, ...]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Estimate:
     """The adjusted value of one parameter.
 
@@ -67,7 +67,7 @@ def adjusted_numbers(
     return parameter.by_name | dict(zip(found.components, map(float, found.value), strict=True))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ImageResiduals:
     """Residuals of all image points, block after block in the order of ``Survey.image_blocks``.
 
@@ -84,7 +84,7 @@ class ImageResiduals:
     used: BoolArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ReadingResiduals:
     """Residuals of all readings (N,), in the order of ``Survey.readings``; rad or m.
 
@@ -106,7 +106,7 @@ class ReadingResiduals:
     influence: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ObservationResidual:
     """One observation that is not an image point: (k,) components in SI units.
 
@@ -134,7 +134,7 @@ Named = tuple[str, str, tuple[str, ...], tuple[str, ...], tuple[str, ...]]
 _OF_COMPONENTS = ("observed", "adjusted", "residual", "sigma", "redundancy", "standardized")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class OtherArrays:
     """What ``Adjustment.other_residuals`` (M) say, as arrays: n_components, used, test, most redundancy of a component.
 
@@ -235,7 +235,7 @@ def arrays_of(residuals: Sequence[ObservationResidual]) -> OtherArrays:
     return OtherArrays(n, used, np.array([o.test for o in residuals]), redundancy, *columns)
 
 
-@dataclass(frozen=True)
+@frozen
 class GroupSummary:
     """Redundancy and weighted square sum of one group; ``factor`` is its variance component Omega / r."""
 
@@ -254,7 +254,7 @@ CAUTIOUS_SIGMAS = "cautious sigmas"
 """How the warning begins that residuals are smaller than their sigmas: nobody is misled by these."""
 
 
-@dataclass(frozen=True)
+@frozen
 class GlobalTest:
     """Chi-square test of sigma0 (two-sided): passed when ``lower <= omega <= upper``."""
 
@@ -293,7 +293,7 @@ class GlobalTest:
         )
 
 
-@dataclass(frozen=True)
+@frozen
 class Component:
     """The variance component of one group.
 
@@ -317,7 +317,7 @@ class Component:
     upper: float = math.nan
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class VarianceComponents:
     """Variance components of all groups. correlation: (k, k) between those in ``estimated``, in that order.
 
@@ -333,7 +333,7 @@ class VarianceComponents:
     method: str
 
 
-@dataclass(frozen=True)
+@frozen
 class Decision:
     """One step of an outlier search: what was left out or taken back, why and when.
 
@@ -387,7 +387,7 @@ class JointCovariances(Protocol):
         return None
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@frozen(eq=False)
 class Adjustment:
     """A solved survey with its precision.
 

@@ -1,13 +1,13 @@
 """Where an adjustment stopped that found no minimum."""
 
-from dataclasses import dataclass
 
 from gtsam import Pose3
 
 from adjust.model.arrays import FloatArray
+from adjust.model.frozen import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class GroupFit:
     """A group of n observations: root mean square over sigmas at the start and where it stopped; its worst owners."""
 
@@ -18,7 +18,7 @@ class GroupFit:
     worst: tuple[tuple[str, float], ...]
 
 
-@dataclass(frozen=True)
+@frozen
 class Pull:
     """What the gradient of v'Pv asks of the unknowns of a kind: how many of its own sigmas each would go by itself.
 
@@ -31,7 +31,7 @@ class Pull:
     largest: tuple[str, float]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class UnknownState:
     """An unknown at the start and where it stopped: a Pose3, or (n,) free components in ``units``."""
 
@@ -42,7 +42,7 @@ class UnknownState:
     value: Pose3 | FloatArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Stopped:
     """Where an adjustment stopped that found no minimum. last_step: of any unknown, in its sigmas."""
 

@@ -6,7 +6,7 @@ first pixel is (0, 0). Tangents of poses are GTSAM's: rotation (rad) then transl
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 from typing import Literal
 
@@ -16,6 +16,7 @@ from gtsam import Pose3
 from adjust.model.arrays import BoolArray as BoolArray
 from adjust.model.arrays import FloatArray as FloatArray
 from adjust.model.arrays import IntArray as IntArray
+from adjust.model.frozen import frozen
 from adjust.model.observations import (
     Alignment,
     Closure,
@@ -39,7 +40,7 @@ from adjust.model.observations import (
 Treatment = Literal["free", "held", "prior"]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PoseParameter:
     """A rigid motion ``a_from_b`` and how it is treated.
 
@@ -55,7 +56,7 @@ class PoseParameter:
     held: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PointParameter:
     """Coordinates of a point in the world, (3,) m, and how they are treated; ``prior_cov`` is (3, 3).
 
@@ -68,7 +69,7 @@ class PointParameter:
     held: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class VectorPrior:
     """Prior knowledge of some components of a vector: ``mean`` (k,) and ``cov`` (k, k) in the order of ``names``."""
 
@@ -77,7 +78,7 @@ class VectorPrior:
     cov: FloatArray
 
 
-@dataclass(frozen=True)
+@frozen
 class Tie:
     """Component ``name`` follows ``to`` with a constant factor: fy = ratio * fx."""
 
@@ -86,7 +87,7 @@ class Tie:
     factor: float = 1.0
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class VectorParameter:
     """Named scalars of one owner; those in ``free`` are unknowns, the others keep their value.
 
@@ -105,7 +106,7 @@ class VectorParameter:
         return dict(zip(self.names, map(float, self.values), strict=True))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class LensDrift:
     """How parameters of a lens change: from one block of epochs to the next, or with the temperature.
 
@@ -121,7 +122,7 @@ class LensDrift:
     reference_temperature: float | None = None
 
 
-@dataclass(frozen=True)
+@frozen
 class LensSharing:
     """Free parameters of a lens that are those of another camera: one unknown with several users.
 
@@ -135,7 +136,7 @@ class LensSharing:
 CROP = ("scale", "left", "top")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ImageCrop:
     """Images that show a part of the sensor, or in another size.
 
@@ -148,7 +149,7 @@ class ImageCrop:
     size: tuple[int, int] | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class LensParameter:
     """The lens of a camera and how it is treated.
 
@@ -173,7 +174,7 @@ class LensParameter:
     crops: Mapping[str, ImageCrop] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Clock:
     """When a camera exposes, or readings are taken: components of ``adjust.model.clocks.CLOCK``.
 
@@ -184,7 +185,7 @@ class Clock:
     jitter: float = 0.0
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Camera:
     """A camera, x right, y down, z forward, fixed on a station. ``image_size`` is (width, height) in pixels."""
 
@@ -197,7 +198,7 @@ class Camera:
     """When it exposes; None: at the epochs' times."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Station:
     """A rigid body that carries cameras and targets: the head, a relay station, a tripod.
 
@@ -219,7 +220,7 @@ class Station:
 TABLE_GEOMETRY = ("non_orthogonality", "axis_offset", "zero_1", "zero_2")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Table:
     """A turntable of one or two axes, outermost (fixed to the base) first.
 
@@ -240,7 +241,7 @@ class Table:
     """When its axes were read."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Target:
     """Known points on one rigid body: a board, a marker block. It stands in the world or on a station.
 
@@ -263,7 +264,7 @@ class Target:
     reference_temperature: float = 20.0
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Point:
     """A beacon or tie point in the world."""
 
@@ -285,7 +286,7 @@ def tilt_axes(direction: FloatArray) -> FloatArray:
     return np.array([e1, np.cross(direction, e1)])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Vertical:
     """The direction of the plumb line in the world, for levels and for instruments that are set up level.
 
@@ -299,7 +300,7 @@ class Vertical:
     radius: float | None = None
 
 
-@dataclass(frozen=True)
+@frozen
 class Bearings:
     """How horizontal angles are counted: from the world's axis ``zero``, and clockwise seen from above or not.
 
@@ -313,7 +314,7 @@ class Bearings:
 INSTRUMENT = ("distance_offset", "distance_scale", "refraction", "vertical_index")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Instrument:
     """A total station, theodolite or level.
 
@@ -325,7 +326,7 @@ class Instrument:
     parameters: VectorParameter = field(default_factory=lambda: VectorParameter(INSTRUMENT, np.zeros(4)))
 
 
-@dataclass(frozen=True)
+@frozen
 class Setup:
     """An instrument set up once: its readings of kind "direction" share one orientation unknown.
 
@@ -344,7 +345,7 @@ class Setup:
 BEAM = ("offset_1", "offset_2", "slope_1", "slope_2")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Beam:
     """A laser beam fixed on a body (a mount, a station): the line ``offset + s * (e + slope)`` in that body's frame.
 
@@ -366,7 +367,7 @@ SURFACES: Mapping[str, tuple[str, ...]] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Surface:
     """A plane, line or sphere in the world on which positions lie (see ``OnSurface``).
 
@@ -381,7 +382,7 @@ class Surface:
     parameters: VectorParameter | None = None
 
 
-@dataclass(frozen=True)
+@frozen
 class Datum:
     """Where origin, directions and scale come from.
 
@@ -394,7 +395,7 @@ class Datum:
     stations: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Survey:
     """A whole survey: what there is, what was observed (``adjust.model.observations``) and what defines the datum."""
 

@@ -12,8 +12,9 @@ which are unknowns already (motions of an axis as in ISO 230-7).
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
+
+from adjust.model.frozen import frozen
 
 HARMONICS: Mapping[str, str] = {"angle": "rad", "axial": "m", "radial": "m", "tilt": "rad"}
 """Kinds of harmonics and their units."""
@@ -23,7 +24,7 @@ _REAL, _COMPLEX = ("cos", "sin"), ("re", "im")
 _NAME = re.compile(r"(angle|axial|radial|tilt)_([12])_(cos|sin|re|im)_([mp]?)([1-9]\d*)")
 
 
-@dataclass(frozen=True)
+@frozen
 class Harmonic:
     """One component: of which kind and axis (0 or 1), its signed order k, and whether it is the second of its pair."""
 

@@ -4,7 +4,3 @@ Here belongs what is evaluated once per image point, pixel, pose or clique: lens
 poses, recursions over a Bayes tree, fits of corners and spots, minimal poses, rendering. What is called once a survey,
 or can be said in batches by NumPy, SciPy or OpenCV, does not belong here. A module of Python for each header of C++.
 """
-
-from adjust.native.library import instruction_set
-
-__all__ = ["instruction_set"]

@@ -5,11 +5,11 @@ the rows of the pairs, multifrontal (``reflections.h``): more work, and digits w
 symbolic part is that of Davis (2005, algorithm 849).
 """
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.library import Function
 
@@ -35,7 +35,7 @@ _pair_gradient = Function(
 _solve_poses = Function("solve_poses", f"{_CLIQUES} x[N,6] room[*]")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class CliquePattern:
     """Cliques of a Bayes tree of N poses, parents first; poses are numbered by the clique in which they are eliminated.
 
@@ -105,7 +105,7 @@ def clique_pattern(n: int, a: IntArray, b: IntArray) -> CliquePattern:
     return CliquePattern(order, clique[order], key_ptr, number[keys], n_front, above)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PoseTree:
     """A Bayes tree of poses: its cliques, GTSAM's variable of every number (N,), and [R S] of all cliques."""
 

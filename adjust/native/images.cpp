@@ -2,6 +2,7 @@
 #include "calibration.h"
 #include "chains.h"
 #include "changes.h"
+#include "condensed.h"
 #include "parallels.h"
 #include "planes.h"
 #include "point_tests.h"
@@ -24,7 +25,7 @@ extern "C" __attribute__((visibility("default"))) const Entry *images() {
         entry<plane_poses>("plane_poses"), entry<fit_lens>("fit_lens"), entry<turns_by>("turns_by"),
         entry<turns_of>("turns_of"), entry<row_influences>("row_influences"), entry<residual_tests>("residual_tests"),
         entry<sums_of_blocks>("sums_of_blocks"), entry<farthest_points>("farthest_points"),
-        entry<controlled_directions>("controlled_directions"), entry<point_tests>("point_tests"), entry<change_squares>("change_squares"),
+        entry<controlled_directions>("controlled_directions"), entry<external_reliability>("external_reliability"), entry<point_tests>("point_tests"), entry<change_squares>("change_squares"),
         entry<parallel_pairs>("parallel_pairs"),
         entry<number_rows>("number_rows"), entry<record_rows>("record_rows"), {nullptr, nullptr, nullptr}};
     return table;

@@ -59,7 +59,7 @@ struct Batch {
 };
 
 struct Room {
-    alignas(64) double A[MAX_LOCAL][2 * CHUNK];  // whitened rows as columns: all of u, then all of v
+    alignas(64) double A[MAX_LOCAL + N_SHAPE][2 * CHUNK];  // whitened rows as columns: all of u, then all of v
     alignas(64) double in[8][CHUNK];
 };
 
@@ -290,67 +290,10 @@ inline void block_rows(Ints which, const Batch &B, Out<double, 3> out) {
     for (int64_t i = 0; i < which.n[0]; ++i) rows_of_block(which[i], B, room, [&](int64_t row, int j, double v) { out(i, row, j) = v; });
 }
 
-// Turns rows B (its columns one after the other, of a whole number of vectors) into the upper triangular R (k, k) above
-// them by reflections (Householder; Golub and Van Loan 2013, 5.2), which leave nothing of B. What is left of a column that
-// others make up is rounding: no direction to reflect along.
-inline void add_rows(double (*R)[MAX_LOCAL + N_SHAPE], double *const *B, int k, int rows) {
-    for (int j = 0; j < k; ++j) {
-        V squares = {};
-        for (int p = 0; p < rows; p += W) squares += load(B[j] + p) * load(B[j] + p);
-        const double below = sum(squares), a = R[j][j];
-        double whole = below;
-        for (int i = 0; i <= j; ++i) whole += R[i][j] * R[i][j];
-        if (below <= 1e-28 * whole) continue;
-        const double beta = a < 0.0 ? root(a * a + below) : -root(a * a + below), head = a - beta, tau = (beta - a) / beta;
-        for (int c = j + 1; c < k; ++c) {
-            V dot = {};
-            for (int p = 0; p < rows; p += W) dot += load(B[j] + p) * load(B[c] + p);
-            const double s = tau * (R[j][c] + sum(dot) / head);
-            R[j][c] -= s;
-            const V step = all<V>(s / head);
-            for (int p = 0; p < rows; p += W) store(B[c] + p, load(B[c] + p) - step * load(B[j] + p));
-        }
-        R[j][j] = beta;
-    }
-}
-
-// For each listed block, which have equally many points and columns: rows (m, k) with the normal equations of its own over
-// its local unknowns, the shape of its target, and the residual; m the least of k and its rows. factors (g, n, 4): what the
-// derivatives by x, y, z and z again of each point are multiplied by.
-inline void condensed_rows(Ints which, const Batch &B, In<double, 3> factors, Out<double, 3> out) {
-    Room room;
-    alignas(64) double shape[N_SHAPE][2 * CHUNK];
-    double *columns[MAX_LOCAL + N_SHAPE];
-    V least = V{};
-    for (int64_t i = 0; i < which.n[0]; ++i) {
-        const int64_t b = which[i], z = B.lenses.n_free[B.blocks.camera[b]] + 5;
-        const int n = int(B.n_local(b)), k = n + N_SHAPE + 1;
-        for (int j = 0; j < n; ++j) columns[j] = room.A[j];
-        for (int s = 0; s < N_SHAPE; ++s) columns[n + s] = shape[s];
-        columns[n + N_SHAPE] = room.A[n];
-        double R[MAX_LOCAL + N_SHAPE][MAX_LOCAL + N_SHAPE] = {};
-        each_chunk(B, b, [&](int64_t lo, int size) {
-            const Chunk chunk(B, lo, size, room);
-            clear_unused(B, b, room);
-            local_columns(B, b, chunk, least, room);
-            for (int s = 0; s < N_SHAPE; ++s) {
-                const double *by_point = room.A[smaller(z - 2 + s, z)];
-                for (int p = 0; p < chunk.full; ++p) {  // those that fill up the last vector weigh nothing
-                    const double f = p < size ? factors(i, lo - B.blocks.ptr[b] + p, s) : 0.0;
-                    shape[s][p] = f * by_point[p], shape[s][chunk.full + p] = f * by_point[chunk.full + p];
-                }
-            }
-            add_rows(R, columns, k, 2 * chunk.full);
-        });
-        for (int64_t j = 0; j < out.n[1]; ++j)
-            for (int c = 0; c < k; ++c) out(i, j, c) = R[j][c];
-    }
-}
-
 // Upper triangular R with R'R = H, positive semidefinite (n, n), in place; a vanishing pivot leaves a zero row. H is
 // scaled to a unit diagonal first, so a pivot below 1e-14 is rounding.
-inline void half_cholesky(double (*H)[MAX_LOCAL], int n) {
-    double d[MAX_LOCAL];
+template <int WIDTH> inline void half_cholesky(double (*H)[WIDTH], int n) {
+    double d[WIDTH];
     for (int i = 0; i < n; ++i) d[i] = H[i][i] > 0.0 ? root(H[i][i]) : 0.0;
     for (int i = 0; i < n; ++i)
         for (int j = i; j < n; ++j) H[i][j] = d[i] > 0.0 && d[j] > 0.0 ? H[i][j] / (d[i] * d[j]) : 0.0;

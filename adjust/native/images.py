@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.native.blocks import run_ranges
 from adjust.native.library import Function
-from adjust.native.parallel import run_ranges
 from adjust.native.trees import TREE, TreeArrays
 
 SEGMENT_LENS, SEGMENT_POSE, SEGMENT_TABLE, SEGMENT_WARP = 0, 1, 2, 3
@@ -39,7 +39,11 @@ _point_columns = Function(
 _normal_equations = Function("normal_equations", f"which[*] {_BATCH} H[B,m,m] chi[B] depth[B]")
 _errors = Function("errors", f"which[*] {_BATCH} chi[B] depth[B]")
 _block_rows = Function("block_rows", f"which[g] {_BATCH} out[g,*,*]")
-_condensed_rows = Function("condensed_rows", f"which[g] {_BATCH} factors[g,*,{N_SHAPE}] out[g,*,*]")
+_condensed_rows = Function(
+    "condensed_rows",
+    f"which[g] {_BATCH} {SEGMENTS} {CHAINED} first[B] point[N] table[*,{N_SHAPE}] columns[g,w] lens[g,m,*] "
+    f"camera[g,m,6] target[g,m,6] shape[g,m,{N_SHAPE}] e[g,m] length[g,m] entry[g,m,w] column[g,m,w]",
+)
 _serve = Function(
     "serve",
     f"which[*] {_BATCH} {SEGMENTS} {CHAINED} height[B] first[B] rows[B] at[B] r_at[B] H[B,m,m] flat[*] r[*]",
@@ -210,13 +214,44 @@ def block_rows(which: IntArray, at: BlocksAt, out: FloatArray) -> None:
     _block_rows(which, *at.arrays, out)
 
 
-def condensed_rows(which: IntArray, at: BlocksAt, factors: FloatArray, out: FloatArray) -> None:
-    """Of g blocks of one size rows (g, m, n_lens + 6 + n_warp + 4 + 1) with the normal equations of all their rows.
+class ShapeFactors(NamedTuple):
+    """By what the derivatives by x, y, z and z again of points are multiplied for the shape of their target.
 
-    Columns: local unknowns, the four of the shape, residual. factors: (g, n, 4), by what the derivatives by x, y, z and
-    z again of every point are multiplied for the shape. m: as many as columns, or as rows where these are fewer.
+    Those of the point (N,) of block b: ``table[first[b] + point]`` (.., 4); first -1: of no target.
     """
-    _condensed_rows(which, *at.arrays, factors, out)
+
+    first: IntArray
+    point: IntArray
+    table: FloatArray
+
+
+class CondensedRows(NamedTuple):
+    """Rows (g, m) of g blocks with the normal equations of all their rows; m: as many as columns, or rows where fewer.
+
+    By their lens (g, m, ..), a motion of the camera and of the target, each in its own axes (g, m, 6), and the shape
+    (g, m, 4). e: (g, m). length: (g, m) how many entries each has over the keys; entry, column: of these, room for all
+    (g, m, w).
+    """
+
+    lens: FloatArray
+    camera: FloatArray
+    target: FloatArray
+    shape: FloatArray
+    e: FloatArray
+    length: IntArray
+    entry: FloatArray
+    column: IntArray
+
+
+def condensed_rows(
+    which: IntArray, at: BlocksAt, keys: ByKeys, shapes: ShapeFactors, columns: IntArray, out: CondensedRows
+) -> int:
+    """Into ``out`` the rows of g blocks of one size; how many entries they have.
+
+    columns: (g, w) of the keys of each, -1 for what is held.
+    """
+    segments, C, D, _ = keys
+    return _condensed_rows(which, *at.arrays, *segments, C, D, *shapes, columns, *out)
 
 
 class RowPlaces(NamedTuple):

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.native.blocks import run_ranges
 from adjust.native.library import Function
-from adjust.native.parallel import run_ranges
 
 BROWN = 0
 FISHEYE = 1

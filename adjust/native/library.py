@@ -9,7 +9,7 @@ import ctypes
 import os
 from array import array
 from collections.abc import Callable
-from functools import cache
+from functools import cache, cached_property
 from operator import index
 from pathlib import Path
 from typing import Any
@@ -93,7 +93,6 @@ class Function:
     def __init__(self, name: str, arguments: str, instructions: str | None = None) -> None:
         self.name = name
         self._arguments = arguments
-        self._declared = [_declared(part) for part in arguments.split()]
         self._instructions = instructions
         self._run: Callable[[int], int] | None = None
         self._kinds = ""
@@ -107,6 +106,11 @@ class Function:
     def using(self, instructions: str | None) -> "Function":
         """The same function with a set of vector instructions; that in use for None."""
         return Function(self.name, self._arguments, instructions)
+
+    @cached_property
+    def _declared(self) -> list[tuple[str, tuple["_Dimension", ...]]]:
+        """Name and dimensions of every argument."""
+        return [_declared(part) for part in self._arguments.split()]
 
     def kinds(self) -> list[tuple[str, str]]:
         """Name and kind of every argument, as the library knows them: f, i, s, u, b (``_KINDS``).

@@ -96,7 +96,24 @@ inline void controlled_directions(int64_t first, int64_t last, AdjustedPoints P,
     for (int64_t i = first; i < last; ++i) freedom.data[i] = Directions(P, i).freedom();
 }
 
-// The columns of ObservationTests, by these names. lambda0: of tests with one and two components.
+// Length of the least detectable bias in sigmas, along the weakest direction that is controlled, and how far it moves the unknowns.
+struct LeastBias {
+    int freedom;
+    double weakest, size, moved;
+
+    LeastBias(const Directions &d, bool used, Vector lambda0) : freedom(d.freedom()) {
+        constexpr double none = __builtin_inf();
+        weakest = d.controlled(0) ? d.k[0] : freedom ? d.k[1] : none, size = freedom ? root(lambda0[freedom - 1] / weakest) : none;
+        moved = !used ? 0.0 : freedom ? size * root(larger(1.0 - weakest, 0.0)) : none;
+    }
+};
+
+// External reliability of every point. lambda0: of tests with one and two components.
+inline void external_reliability(int64_t first, int64_t last, AdjustedPoints P, Vector lambda0, Out<double, 1> external) {
+    for (int64_t i = first; i < last; ++i) external.data[i] = LeastBias(Directions(P, i), P.used[i], lambda0).moved;
+}
+
+// The columns of TestColumns, by these names. lambda0: of tests with one and two components.
 inline void point_tests(int64_t first, int64_t last, AdjustedPoints P, Vector lambda0, Out<double, 1> redundancy, Out<double, 1> least,
                         Out<double, 1> statistic, Out<double, 1> detectable, Out<double, 1> external, Out<double, 2> w, Out<double, 2> error,
                         Out<double, 2> detectable_component, Out<double, 2> bias) {
@@ -117,14 +134,13 @@ inline void point_tests(int64_t first, int64_t last, AdjustedPoints P, Vector la
         double over[2] = {}, T = 0.0;
         for (int j = 0; j < 2; ++j)
             if (d.controlled(j)) over[j] = along[j] / d.k[j], T += along[j] * over[j];
-        const int freedom = d.freedom();
+        const auto [freedom, weakest, size, moved] = LeastBias(d, used, lambda0);
         redundancy.data[i] = used ? K[0] + K[2] : 0.0;
         least.data[i] = smaller(larger(d.k[0], 0.0), 1.0);
         statistic.data[i] = freedom ? T : not_a_number();
         back.times(-d.x * over[0] + d.y * over[1], -d.y * over[0] - d.x * over[1], &error(i, 0));
-        const double weakest = d.controlled(0) ? d.k[0] : freedom ? d.k[1] : none, size = freedom ? root(lambda0[freedom - 1] / weakest) : none;
         detectable.data[i] = size;
-        external.data[i] = !used ? 0.0 : freedom ? size * root(larger(1.0 - weakest, 0.0)) : none;
+        external.data[i] = moved;
         double x = d.x, y = d.y;
         if (!d.controlled(0)) x = -d.y, y = d.x;
         const double turn = (magnitude(x) >= magnitude(y) ? x : y) < 0.0 ? -size : size;  // the largest component is positive

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.native.blocks import run_ranges, run_split, split_blocks
 from adjust.native.library import Function
-from adjust.native.parallel import run_ranges, run_split, split_blocks
 
 _ADJUSTED = "v[N,2] M[N,3] W[N,3] used[N]"
 _POINTS = f"first last {_ADJUSTED}"
@@ -17,6 +17,7 @@ _residual_tests = Function("residual_tests", f"{_POINTS} redundancy[N,2] standar
 _sums_of_blocks = Function("sums_of_blocks", f"which[*] ptr[B+1] {_ADJUSTED} sums[B,3]")
 _farthest_points = Function("farthest_points", "which[*] ptr[B+1] uv[N,2] centre[B,2] farthest[B]")
 _controlled_directions = Function("controlled_directions", f"{_POINTS} freedom[N]")
+_external_reliability = Function("external_reliability", f"{_POINTS} lambda0[2] external[N]")
 _point_tests = Function(
     "point_tests",
     f"{_POINTS} lambda0[2] redundancy[N] least[N] statistic[N] detectable[N] external[N] w[N,2] error[N,2] "
@@ -24,8 +25,8 @@ _point_tests = Function(
 )
 _change_squares = Function(
     "change_squares",
-    "first[J+1] rows[k] B[k,w] A_ptr[m+1] A_column[a] A_entry[a] e[m] own_ptr[n+1] own_column[o] own_entry[o] U[n,c] "
-    "x[n,w] s[n,w] mark[n] touched[n] left[q,w] shared[q,c] columns[2,w] squares[J,q] M[J,q,q] g[J,q]",
+    "first[J+1] rows[k] at[k] table[*] A_ptr[m+1] A_column[a] A_entry[a] e[m] own_ptr[n+1] own_column[o] own_entry[o] "
+    "U[n,c] x[n,w] s[n,w] mark[n] touched[n] left[q,w] shared[c,w] columns[2,w] squares[J,q] M[J,q,q] g[J,q]",
 )
 _parallel_pairs = Function("parallel_pairs", "first last end u[N,d] head[h,N+31] rest[N+31] least found[m,3]")
 _HEAD, _BEHIND = 16, 31
@@ -42,6 +43,10 @@ class AdjustedPoints(NamedTuple):
     M: FloatArray
     W: FloatArray
     used: BoolArray
+
+    def at(self, rows: IntArray) -> "AdjustedPoints":
+        """Some of them."""
+        return AdjustedPoints(self.v[rows], self.M[rows], self.W[rows], self.used[rows])
 
 
 def residual_tests(points: AdjustedPoints) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -74,10 +79,15 @@ def controlled_directions(points: AdjustedPoints, freedom: IntArray) -> None:
     run_ranges(_controlled_directions, len(points.v), *points, freedom)
 
 
+def external_reliability(points: AdjustedPoints, lambda0: FloatArray, external: FloatArray) -> None:
+    """Into ``external`` (N,) how far the least detectable bias of each point moves the unknowns, as ``point_tests``."""
+    run_ranges(_external_reliability, len(points.v), *points, lambda0, external)
+
+
 def point_tests(points: AdjustedPoints, lambda0: FloatArray, out: tuple[FloatArray, ...]) -> None:
     """Into ``out`` redundancy, least, statistic, detectable, external (N,), then w, error, detectable_component, bias.
 
-    The latter (N, 2); all as ``ObservationTests`` has them. lambda0: (2,) of tests with one and two components.
+    The latter (N, 2); all as ``TestColumns`` has them. lambda0: (2,) of tests with one and two components.
     """
     run_ranges(_point_tests, len(points.v), *points, lambda0, *out)
 
@@ -90,20 +100,26 @@ class SparseRows(NamedTuple):
     entry: FloatArray
 
 
+class ColumnsOfRows(NamedTuple):
+    """Columns (k, q) of some rows (k,) of a system: those of the i-th are ``table[at[i] : at[i] + q]``."""
+
+    rows: IntArray
+    at: IntArray
+    table: FloatArray
+
+
 def change_squares(
-    first: IntArray, rows: IntArray, B: FloatArray, A: SparseRows, e: FloatArray, own: SparseRows, U: FloatArray
+    first: IntArray, B: ColumnsOfRows, q: int, A: SparseRows, e: FloatArray, own: SparseRows, U: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Of columns B (k, q) in these rows (k,) of a system, run j from ``first[j]`` on: the sums over all runs from j on.
+    """Of q columns B of rows of a system, run j from ``first[j]`` on: the sums over all runs from j on.
 
     The diagonal (J, q) of B'B, ``B' (I - A Q A') B`` (J, q, q) and B'e (J, q), with Q = own + U U', U (n, c).
     """
-    (k, q), (n, c), J, w = B.shape, U.shape, len(first) - 1, -(-B.shape[1] // 8) * 8
-    padded = np.zeros((k, w))
-    padded[:, :q] = B
+    (n, c), J, w = U.shape, len(first) - 1, -(-q // 8) * 8
     later = np.zeros((n, w)), np.zeros((n, w)), np.full(n, -1), np.empty(n, dtype=np.int64)
-    sums = np.zeros((q, w)), np.zeros((q, c)), np.zeros((2, w))
+    sums = np.zeros((q, w)), np.zeros((c, w)), np.zeros((2, w))
     out = np.empty((J, q)), np.empty((J, q, q)), np.empty((J, q))
-    _change_squares(first, rows, padded, *A, e, *own, U, *later, *sums, *out)
+    _change_squares(first, *B, *A, e, *own, U, *later, *sums, *out)
     return out
 
 

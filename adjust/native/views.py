@@ -7,8 +7,8 @@ is not one each. Threads share the poses. The formulas are in ``views.h`` and ``
 import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.native.blocks import run_split, split_blocks
 from adjust.native.library import Function
-from adjust.native.parallel import run_split, split_blocks
 
 PLANAR = 1e-4
 """Thickness against extent below which points count as a plane."""

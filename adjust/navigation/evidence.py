@@ -1,10 +1,11 @@
 """Explanations of an epoch judged: adjusted, their spots tested, compared by their evidence."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.navigation.fit import PoseFit, Prior, fit_pose, fit_without_outliers, local, log_evidence
 from adjust.navigation.system import Sightings, System, evaluate, visible
@@ -25,7 +26,7 @@ MOST_NAMINGS = 24
 _SAME = 1e-3  # rad and m; two roots of the minimal problem that one adjustment brings together
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Candidate:
     """A pose that explains an epoch: its fit, what was rejected (spots), -2 ln evidence and posterior probability.
 

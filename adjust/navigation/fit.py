@@ -6,10 +6,10 @@ for it (Koch 1999, section 3.2), and its error is ``gain noise + B eta``: B tell
 together.
 """
 
-from dataclasses import dataclass
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.navigation import DONE, PoseArrays, PriorArrays, SpotArrays, gauss_newton
 from adjust.navigation.system import Sightings
@@ -22,7 +22,7 @@ _NO_ROWS: IntArray = np.zeros(0, dtype=np.int64)
 _LOG_2PI = float(np.log(2.0 * np.pi))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Prior:
     """Knowledge of the pose: its error is ``e + B eta`` with e of covariance cov (6, 6), all in its tangent.
 
@@ -40,7 +40,7 @@ class Prior:
         return np.asarray(self.cov + self.B @ self.B.T)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PoseFit:
     """A pose (4, 4) from spots ``used`` (n,) of beacons ``beacon`` (n,) and perhaps a prior.
 

@@ -6,12 +6,12 @@ only the beacons that it predicts near a spot are tried. The candidates are adju
 by their evidence: what cannot be told apart is reported, all of it.
 """
 
-from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
 from adjust.lenses.models import MODELS, focal_length_px
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.navigation import FoundArrays, SkyArrays, search
 from adjust.navigation.evidence import (
@@ -147,7 +147,7 @@ def _with_partial_prior(seen: Sightings, prior: Prior, alpha: float) -> tuple[Ca
     return judged(seen, [(prior.pose, seen.label)], prior, alpha)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Partial:
     """A naming under way: match (n,) beacons, -1 not (yet) named; which spots are decided; the pose so far."""
 

@@ -5,12 +5,13 @@ radians, images pixels. Covariances of poses are in GTSAM's tangent: rotation, t
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Literal
 
 import numpy as np
 from gtsam import Pose3
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 
 Status = Literal["fixed", "bridged", "ambiguous", "undetermined", "none"]
@@ -19,7 +20,7 @@ Labels = tuple[tuple[str | None, ...], ...]
 """One tuple per ``NavigationEpoch.spots``: the beacon of each spot or None."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class HeadCamera:
     """A calibrated camera of the head: ``lens`` (n,) and ``constants`` (4,) as ``adjust.lenses.models`` has them."""
 
@@ -31,7 +32,7 @@ class HeadCamera:
     station_from_camera: Pose3
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class HeadTable:
     """A calibrated turntable that carries the head; with its geometry by name (:class:`adjust.model.survey.Table`)."""
 
@@ -41,7 +42,7 @@ class HeadTable:
     mount_from_station: Pose3
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Head:
     """The calibrated head.
 
@@ -54,7 +55,7 @@ class Head:
     table: HeadTable | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Beacons:
     """Known beacons: m names, ``x_in_world`` (m, 3) m and their joint covariance (3m, 3m) m^2.
 
@@ -67,7 +68,7 @@ class Beacons:
     cross_cov: FloatArray | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Spots:
     """Spots of one camera: uv (n, 2) px, cov (n, 2, 2) px^2; beacon_ids where they are known, None where not."""
 
@@ -77,7 +78,7 @@ class Spots:
     beacon_ids: tuple[str | None, ...] | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PosePrior:
     """What is known of a pose beforehand; ``np.inf`` on the diagonal of cov (6, 6): nothing of that component."""
 
@@ -85,7 +86,7 @@ class PosePrior:
     cov: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class NavigationEpoch:
     """What was observed at one epoch.
 
@@ -100,7 +101,7 @@ class NavigationEpoch:
     prior: PosePrior | None = None
 
 
-@dataclass(frozen=True)
+@frozen
 class Motion:
     """Constant velocity between epochs.
 
@@ -113,7 +114,7 @@ class Motion:
     sigma_speed: float = 0.5
 
 
-@dataclass(frozen=True)
+@frozen
 class NavigateOptions:
     """How poses are found.
 
@@ -127,7 +128,7 @@ class NavigateOptions:
     alpha: float = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Shares:
     """The covariance (6, 6) of a pose by where it comes from; ``correlation`` between beacons and calibration."""
 
@@ -138,7 +139,7 @@ class Shares:
     correlation: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Solution:
     """One pose that explains an epoch.
 
@@ -154,7 +155,7 @@ class Solution:
     probability: float
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class EpochPose:
     """The pose of one epoch and how far it can be trusted.
 
@@ -191,7 +192,7 @@ class EpochPose:
         return np.asarray(np.sqrt(np.diag(self.cov)))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Trajectory:
     """The poses of a sequence. Errors of beacons and calibration are common to all epochs and do not average out."""
 

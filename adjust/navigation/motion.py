@@ -5,12 +5,12 @@ about them would become surer than it may. The filter here carries them beside i
 Schmidt 1966): the error of its state is ``e + B eta``, and every step transforms both parts exactly.
 """
 
-from dataclasses import dataclass
 
 import numpy as np
 from gtsam import Pose3
 
 from adjust.frames.tables import table_motions
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from adjust.navigation.fit import PoseFit, Prior, local, local_derivative
 from adjust.navigation.model import Motion, NavigationEpoch, PosePrior
@@ -48,7 +48,7 @@ def table_prior(system: System, epoch: NavigationEpoch) -> Prior | None:
     return Prior(pose.matrix(), by_angles @ reading @ by_angles.T, B + system.F[end : end + 6], np.arange(6))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class MotionState:
     """Pose (4, 4) and body rates (6,) at a time; errors ``e + B eta``, e of covariance P (12, 12), B (12, r)."""
 

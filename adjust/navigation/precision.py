@@ -1,11 +1,11 @@
 """Precision of a pose: what each source of error contributes, what stays open, and what to expect beforehand."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from gtsam import Pose3
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native import navigation as native
 from adjust.navigation.fit import PoseFit, Prior, fit_pose
@@ -15,7 +15,7 @@ from adjust.navigation.system import Sightings, System, evaluate, in_view, make_
 _OPEN = 1e-8  # of the largest eigenvalue of the scaled information
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Expected:
     """What a pose would have: covariance (6, 6), shares, the beacons seen, and the open directions by name.
 

@@ -1,11 +1,11 @@
 """A sequence of epochs navigated: poses with covariance, without initial values and, where need be, without names."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from adjust.navigation.evidence import Candidate
 from adjust.navigation.fit import PoseFit, Prior, fit_pose, local
@@ -45,7 +45,7 @@ def navigate(
     head: Head,
     beacons: Beacons,
     epochs: Sequence[NavigationEpoch],
-    options: NavigateOptions = NavigateOptions(),  # noqa: B008  frozen
+    options: NavigateOptions = NavigateOptions(),
     progress: Callable[[int, int], None] | None = None,
 ) -> Trajectory:
     """Poses of the head at all epochs, in their order, which is that of time.
@@ -78,7 +78,7 @@ def _times(epochs: Sequence[NavigationEpoch]) -> list[float]:
     return given if len(given) == len(epochs) else [float(i) for i in range(len(epochs))]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Epoch:
     """An epoch that is to be solved."""
 

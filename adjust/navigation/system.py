@@ -1,12 +1,13 @@
 """Head and beacons as the arrays that the compiled code takes, checked once."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from adjust.lenses.models import MODELS, unit_rays
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.lenses import FISHEYE, MAX_LENS
 from adjust.native.navigation import SpotArrays, SystemArrays, spot_rows
@@ -15,7 +16,7 @@ from adjust.navigation.model import Beacons, Head, HeadCamera, NavigationEpoch, 
 _BORDER_PX = 3.0
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class System:
     """The calibrated head and the beacons.
 
@@ -40,7 +41,7 @@ class System:
         return self.arrays.F
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Sightings:
     """The spots of an epoch, camera after camera.
 

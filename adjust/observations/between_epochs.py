@@ -8,7 +8,6 @@ a time dt after e, and a table at angles ``sum_k w_k(dt) a_k``.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import gtsam
@@ -16,6 +15,7 @@ import numpy as np
 
 from adjust.frames.state import State
 from adjust.frames.unknowns import ShiftedSlot, Unknowns
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from adjust.spatial.rigid import rigid
 from adjust.spatial.rigid_motions import Motions, exp, right_jacobian, right_jacobian_inverse
@@ -45,7 +45,7 @@ def weights(times: FloatArray, dt: FloatArray) -> tuple[FloatArray, FloatArray]:
     return w, by
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Interpolated:
     """Of s slots with n nodes each the weights (s, n) and by_dt (s, n) at their times, and how clocks move these.
 

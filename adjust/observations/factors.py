@@ -4,7 +4,6 @@ A residual is predicted minus observed, unwhitened; the noise model alone whiten
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -12,6 +11,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.frames.state import State
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Chain, Unknown, Unknowns, VectorMap
+from adjust.model.frozen import frozen
 from adjust.model.observations import Coordinates, Distance, Pair
 from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, VectorPrior
 from adjust.observations.adapter import evaluated
@@ -24,7 +24,7 @@ Residual = Callable[[gtsam.Values], tuple[FloatArray, Iterable[tuple[int, FloatA
 PoseOf = Callable[[gtsam.Values], tuple[Pose3, Jacobians]]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ObservationFactor:
     """A factor that is not an image batch, with what a report needs to know of it. ``observed``: (k,)."""
 
@@ -87,7 +87,7 @@ class ChainPose:
         return Pose3(Rot3(c.R[0]), c.t[0]), jacobians
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Position:
     """A position in the world: a world point (key or held value), or a point fixed in the frame of a chain.
 

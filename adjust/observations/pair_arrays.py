@@ -1,19 +1,20 @@
 """Measured pairs as arrays: rotations, translations and covariances of all at once, checked and whitened."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, lru_cache
 
 import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import Pair, frame_text
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.spatial.rigid_motions import Motions
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PairArrays:
     """E measured ``b_from_a``: rotations (E, 3, 3), translations (E, 3) m, nan where only the rotation was measured.
 

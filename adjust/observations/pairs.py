@@ -18,6 +18,7 @@ from gtsam import Pose3
 from adjust.frames.state import State
 from adjust.frames.tree import FrameTree
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Link, Unknowns
+from adjust.model.frozen import frozen
 from adjust.model.observations import Pair
 from adjust.model.result import Named, OtherArrays, Residuals
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
@@ -68,7 +69,7 @@ def native_factor(
     return gtsam.BetweenFactorPose3(b, a, b_from_a, noise(W))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PairStatistics:
     """Of every pair (E,): residual (E, dim) Log(measured^-1 adjusted), in frame a, and what the rest says of it.
 

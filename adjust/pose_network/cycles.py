@@ -15,11 +15,11 @@ eliminated, and the pairs with a label tell where loops are left. One that is in
 
 import heapq
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, IntArray
 from adjust.native.loops import horton_loops, label_chords, shortest_loop
 
@@ -35,7 +35,7 @@ def adjacency(n: int, a: IntArray, b: IntArray) -> tuple[IntArray, IntArray, Int
     return ptr, np.asarray(others[order]), order // 2
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Forest:
     """A forest of shortest ways: of each station (n,) the parent, the pair to it (-1 at roots), depth and part.
 

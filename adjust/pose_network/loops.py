@@ -5,10 +5,11 @@ the identity without errors. Its logarithm is the misclosure, in the frame of th
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.pose_network.cycles import Forest, forest_loops
 from adjust.spatial.rigid_motions import Motions, identities, right_jacobian_inverse
@@ -17,7 +18,7 @@ _AT_ONCE = 200_000
 """Pairs of loops whose misclosures are found in one go."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Tree:
     """What loops have in common that are those of a forest of shortest ways, each closed by one pair.
 
@@ -41,7 +42,7 @@ class Tree:
             yield v, forest.parent[v], forest.by[v], self.sense[v] > 0
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Loops:
     """L loops: loop k are the pairs ``pair_idx[ptr[k]:ptr[k + 1]]`` in the order of the walk.
 

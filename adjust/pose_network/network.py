@@ -1,13 +1,14 @@
 """Stations joined by measured relative poses or rotations, as arrays, and what defines the datum."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model.errors import IndeterminateError, SurveyError, listed
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, Datum, FloatArray, IntArray, PoseParameter, Survey
 from adjust.observations.pair_arrays import PairArrays
 from adjust.pose_network.cycles import connected_parts
@@ -16,7 +17,7 @@ from adjust.spatial.rigid import nearest_rotation
 _FEW = 8
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Topology:
     """Who was measured with whom: pair e joins stations ``a_idx[e]`` and ``b_idx[e]``."""
 
@@ -36,7 +37,7 @@ class Topology:
         return len(self.pair_ids)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PoseNetwork(Topology):
     """N stations and E measured pairs ``b_from_a``; made by :func:`network_of`, which checks everything.
 

@@ -1,7 +1,7 @@
 """Least squares over a pose network: its stations and pairs as the one graph, solved as every survey is."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from gtsam import Pose3, Rot3
@@ -11,6 +11,7 @@ from adjust.graph.building import GraphBuilder
 from adjust.graph.datum import inner_datum
 from adjust.graph.solver import Solved, SolveOptions, solve
 from adjust.model.errors import IndeterminateError, NotConvergedError
+from adjust.model.frozen import frozen
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray
 from adjust.pose_network.network import PoseNetwork, check_determined, survey_of
@@ -19,7 +20,7 @@ from adjust.pose_network.start import find_network_start
 Progress = Callable[[int, float], None]
 
 
-@dataclass(frozen=True)
+@frozen
 class NetworkOptions:
     """How a network is solved.
 
@@ -37,7 +38,7 @@ class NetworkOptions:
 DEFAULTS = NetworkOptions()
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Minimum:
     """Where least squares ended: poses (N, 3, 3), (N, 3) of all stations, and the graph with its solution."""
 

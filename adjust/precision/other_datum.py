@@ -5,7 +5,7 @@ survey that no observation sees can be chosen anew.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -18,6 +18,7 @@ from adjust.graph.assembly import AdjustmentGraph, values_of
 from adjust.graph.building import GraphBuilder
 from adjust.graph.datum import InnerDatum, datum_rows, inner_datum, survey_motions
 from adjust.model.errors import SurveyError, listed
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.rewriting import Rewriting
 from adjust.model.survey import Datum, FloatArray, PointParameter, PoseParameter, Survey
@@ -28,7 +29,7 @@ from adjust.spatial.motions import moved_value
 _ROUNDS, _SETTLED = 20, 1e-13
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class TransformedPrecision(Covariances):
     """Covariances in the new datum.
 

@@ -5,7 +5,6 @@ Q_vv P. For an image point both components are tested together: v' Q_vv^-1 v, ch
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import compress
 from typing import TYPE_CHECKING
@@ -19,6 +18,7 @@ from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.datum import survey_motions
 from adjust.graph.solver import Solved
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.names import grouped
 from adjust.model.result import (
     Adjustment,
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from adjust.observations.pairs import PairStatistics
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ObservationRows:
     """An observation over its keys: A (k, n) and its residual e (k,), both whitened.
 

@@ -1,17 +1,17 @@
 """Covariances in another datum, S Q S' with ``S = I - G (R G)^-1 R`` (Baarda 1973; Koch 1999 section 3.3.6)."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 
 Products = Callable[[Mapping[int, FloatArray]], dict[int, FloatArray]]
 """From rows (k, dim) of some keys, R, to Q R' (dim, k) of every key."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class STransformation:
     """What the covariances of a solution lack to be in a datum: per key G (dim, k) and Q R' (R G)^-T (dim, k).
 

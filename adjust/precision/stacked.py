@@ -15,7 +15,7 @@ from adjust.precision.tree import Half, TreeCovariance, squares, squares_of_sums
 
 AT_ONCE = 64
 """Columns that the matrix is multiplied by in one go."""
-_PAIRS = 200
+_PAIRS = 64
 """Pairs of unknowns of which some are hidden that are brought together in one go."""
 
 

@@ -44,13 +44,15 @@ def squares(half: Callable[[sparse.csr_array], Half], A: sparse.csr_array) -> Fl
     out = np.zeros((A.shape[0],) * 2)
     parts = [slice(i, i + _COLUMNS) for i in range(0, A.shape[0], _COLUMNS)]
     while parts:
-        kept = list[tuple[slice, IntArray, FloatArray]]()
+        kept, place = list[tuple[slice, IntArray, FloatArray]](), np.full(A.shape[1], -1)
         for i, part in enumerate(parts):
             rows, U = half(A[part])
+            place[rows] = np.arange(len(rows))
             for other, before, V in kept:
-                _, here, there = np.intersect1d(rows, before, assume_unique=True, return_indices=True)
-                across = U[here].T @ V[there]
+                there = np.flatnonzero(place[before] >= 0)
+                across = U[place[before[there]]].T @ V[there]
                 out[part, other], out[other, part] = across, across.T
+            place[rows] = -1
             if i == len(kept) and sum(V.nbytes for _, _, V in kept) < _ROOM:
                 kept.append((part, rows, U))
                 out[part, part] = U.T @ U

@@ -7,7 +7,7 @@ the table in the world and every camera in the mount.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from gtsam import Pose3, Rot3
@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from adjust.adjustment import adjust
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, Station, Survey, Table
 from adjust.published.method import Calibration, CpcInput, calibrate, propagate
@@ -28,7 +29,7 @@ _GEOMETRY = ("non_orthogonality", "axis_offset")
 _ZEROS = ("zero_1", "zero_2")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ComparedPose:
     """One rigid motion ``a_from_b`` both ways. (6,): turns about the axes of b (rad), then along those of a (m).
 
@@ -50,7 +51,7 @@ class ComparedPose:
         return np.concatenate([turn, self.published.translation() - self.joint.translation()])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class HeadComparison:
     """The table in the world, then every camera in the mount ("mount_from_camera", id). notes: what was left out."""
 
@@ -59,7 +60,7 @@ class HeadComparison:
     notes: tuple[str, ...]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Axes:
     """The names of axes: ``world_from_w``, ``mount_from_b`` (also of the table), ``camera_from_c`` of the main one."""
 
@@ -227,7 +228,7 @@ def _mount_from_camera(adjusted: Adjustment, station: Station, camera_id: str) -
     return mount_from_station.compose(_pose(adjusted, ("station_from_camera", camera_id)))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Both:
     """The joint adjustment and the steps' calibration, whose cov (n, n) has its components at these places."""
 

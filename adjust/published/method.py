@@ -1,13 +1,14 @@
 """The whole calibration, its sigmas as the paper forms them, and their propagation from what was observed."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from adjust.published.steps import (
     TableImages,
@@ -24,7 +25,7 @@ from adjust.spatial.rotation_forms import euler_from_matrix, matrix_from_euler
 _STEP = 1e-6  # rad, m: of the numerical derivatives; second differences stay below a billionth
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PaperRotation:
     """``C_a^b``: the matrix that takes coordinates in a to coordinates in b (``b_from_a``).
 
@@ -45,7 +46,7 @@ class PaperRotation:
         return np.degrees(euler_from_matrix(self.matrix, "213"))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PaperVector:
     """``r_ij^k``: from the origin of i to that of j, in the axes of k; (3,) mm. nan: a component by definition."""
 
@@ -53,7 +54,7 @@ class PaperVector:
     sigma_mm: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class CpcInput:
     """What the calibration starts from.
 
@@ -69,7 +70,7 @@ class CpcInput:
     angle_sigma_rad: float
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Calibration:
     """The result in the paper's notation; ``rotations["C_t^w"]``, ``vectors["r_bz^b"]``, cameras in lower case.
 
@@ -99,7 +100,7 @@ class Calibration:
         return Pose3(Rot3(self.rotations[rotation].matrix), self.vectors[vector].value_mm / 1e3)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Table:
     """What the main camera tells: C_tw (3, 3), the table's place (3,) and the body's height over it in m, by name."""
 

@@ -9,12 +9,12 @@ one; each step is the least in itself, not the sum of all steps, so that the res
 in second order; equal weights mean equal sigmas of Euler angles; near gimbal lock the angles cannot be corrected.
 """
 
-from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 
 from adjust.model.errors import NotConvergedError, SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from adjust.pose_network.loops import evaluate_loops, loop_vectors
 from adjust.relay.loops import LoopBasis, loop_basis
@@ -28,7 +28,7 @@ ARCSECOND = np.pi / (180.0 * 3600.0)
 CROSS = np.swapaxes(skew(np.eye(3)), 0, 1)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PaperOptions:
     """How the paper's iteration runs.
 
@@ -41,7 +41,7 @@ class PaperOptions:
     max_iterations: int = 20
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PaperSolution:
     """What the iteration found.
 

@@ -6,13 +6,13 @@ station_from_camera. The table turns the body by ``Rx(omega) Rz(Omega)``: auxili
 Rotations of small angles (a, b, c) are ``[[1, c, -b], [-c, 1, a], [b, -a, 1]]`` (A2, A3).
 """
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from adjust.frames.tables import turns
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.spatial.rigid import nearest_rotation, rotation_log
 
@@ -21,7 +21,7 @@ STILL_RAD = 1e-3
 SMALL_ANGLES = ("alpha", "beta", "gamma", "phi", "theta", "psi")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class TableImages:
     """What one camera's own calibration tells of its n images on the table.
 
@@ -67,7 +67,7 @@ class TableImages:
         return np.asarray((np.abs(self.angles[:, 1]) < STILL_RAD) & ~self.about_main())
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Fit:
     """Least squares with equal weights: cov is that of the values with the variance of unit weight of its residuals."""
 

@@ -16,13 +16,13 @@ were found safe.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import gtsam
 import numpy as np
 
 from adjust.model.errors import NotConvergedError, SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from adjust.observations.factors import Jacobians, custom
 from adjust.observations.pair_arrays import whitening
@@ -40,7 +40,7 @@ MAX_HARD_LOOPS = 200
 MAX_TREE_SIDE = 3000
 
 
-@dataclass(frozen=True)
+@frozen
 class ConditionOptions:
     """When to stop, and which loops.
 
@@ -54,7 +54,7 @@ class ConditionOptions:
     loops: Literal["auto", "shortest", "tree"] = "auto"
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ConditionAdjustment:
     """pairs: adjusted pairs and statistics. basis: the loops used. closure: the largest misclosure left."""
 

@@ -5,12 +5,12 @@ C(n - 1, 2) are independent. With E pairs measured among n stations in c parts t
 E - n + c independent loop conditions (the dimension of the cycle space), each of 3 equations (rotations) or 6 (poses).
 """
 
-from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
 
 from adjust.model.errors import listed
+from adjust.model.frozen import frozen
 from adjust.model.survey import IntArray
 from adjust.pose_network.cycles import connected_parts, loop_labels
 from adjust.pose_network.network import Topology
@@ -18,7 +18,7 @@ from adjust.pose_network.network import Topology
 _NAMED = 12
 
 
-@dataclass(frozen=True)
+@frozen
 class Counts:
     """Numbers of a network, and what is weak in it by id.
 

@@ -1,13 +1,13 @@
 """Independent loops of a network, and their misclosures one by one (:mod:`adjust.pose_network.loops`)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from adjust.pose_network.cycles import adjacency, breadth_first, flat, short_loops, shortest_loops
 from adjust.pose_network.loops import Loops, misclosures, tree_loops, walked
@@ -26,7 +26,7 @@ _SEEN = 200
 SEARCH_BUDGET = 20_000_000
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class LoopBasis(Loops):
     """E - n + c independent loops.
 
@@ -101,7 +101,7 @@ def _basis(topology: Topology, found: Loops, minimal: bool, note: str) -> LoopBa
     return LoopBasis(found.ptr, found.pair_idx, found.sense, found.start_idx, topology, minimal, note, tree=found.tree)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class LoopMisclosures:
     """Misclosures of the measured pairs: vector (L, dim), cov (L, dim, dim), test = w' cov^-1 w (L,), p_value (L,).
 

@@ -6,7 +6,6 @@ A station is here any frame that carries an eye: a camera, a marker block, a who
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from itertools import chain
 
 import gtsam
@@ -14,6 +13,7 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import Pair, frame_text
 from adjust.model.survey import FloatArray
 from adjust.observations.factors import gaussian
@@ -22,7 +22,7 @@ from adjust.pose_network.network import Topology
 from adjust.spatial.rigid_motions import Motions
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class MeasuredPairs:
     """Measured pairs ``b_from_a`` with covariances ``cov`` (E, dim, dim); all rotations, or all rigid motions."""
 

@@ -1,10 +1,10 @@
 """What the adjustment of a relay network gives back, the same for both forms."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from adjust.observations.pair_arrays import whitening
 from adjust.observations.pairs import pair_tests
@@ -18,7 +18,7 @@ Joint = Callable[[Sequence[int]], FloatArray]
 _UNCONTROLLED = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class AdjustedPairs:
     """Adjusted pairs with their statistics (Baarda 1968), a priori sigma0 = 1.
 

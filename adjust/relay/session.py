@@ -5,7 +5,7 @@ time stays flat however long they are. :meth:`NetworkSession.finish` ends in the
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -14,6 +14,7 @@ from gtsam import Pose3, Rot3
 from adjust.adjustment import adjust
 from adjust.graph.assembly import StartValues
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import Pair
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, PoseParameter, Station, Survey
@@ -34,7 +35,7 @@ _SECTION = 1000
 """Latest stations that are always kept moving; older ones may rest until :meth:`NetworkSession.finish`."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Addition:
     """What an addition did.
 

@@ -6,16 +6,16 @@ Exp and Log follow Sola, Deray and Atchuthan (2018, "A micro Lie theory", eqs. 1
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.pairs import right_jacobians
 from adjust.spatial.rigid import adjoint, rigid, rotation_exp, rotation_log
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Motions:
     """n rotations (translation None) or rigid motions: rotation (n, 3, 3), translation (n, 3) m."""
 

@@ -12,7 +12,6 @@ sign of the permutation (i, j, k), ``R_ik = e sin b``, ``R_ij = -e cos b sin c``
 ``R_jk = -e cos b sin a``, ``R_kk = cos b cos a``. At ``cos b = 0`` (gimbal lock) a and c cannot be told apart.
 """
 
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -20,6 +19,7 @@ from gtsam import Rot3
 
 from adjust.frames.tables import turns
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 
 EulerOrder = Literal["zyx", "213"]
@@ -28,8 +28,10 @@ EulerOrder = Literal["zyx", "213"]
 GIMBAL_COSINE = 1e-7
 
 
-@dataclass(frozen=True)
+@frozen
 class _Order:
+    """Axes of the three turns from the left, and the sense in which all turn."""
+
     axes: tuple[int, int, int]
     sense: float
 

@@ -6,7 +6,6 @@ degrees counter-clockwise of it, seen from above. Directions that are unknown (o
 are so by two small turns.
 """
 
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
@@ -16,13 +15,14 @@ from gtsam import Rot3
 
 from adjust.frames.unknowns import Unknowns, VectorMap, vector_map
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, Survey, Vertical, tilt_axes
 from adjust.spatial.rigid import skew
 
 VERTICAL = ("vertical",)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Horizon:
     """The horizons at n positions.
 
@@ -38,7 +38,7 @@ class Horizon:
     height_by_tilt: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Plumb:
     """The plumb line at given tilts: ``up`` and ``zero`` (3,) at the world's origin and how they turn with the tilts.
 
@@ -116,7 +116,7 @@ def _tilted_plumb(upright: Plumb, tilt: FloatArray) -> Plumb:
     return Plumb(R @ upright.up, R @ upright.zero, turns, upright.radius)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class VerticalMap:
     """The plumb line of a survey from its values; ``key`` of the tilt, None where it is held."""
 

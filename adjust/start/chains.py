@@ -1,13 +1,13 @@
 """Chains of poses and what observations say of their products, as arrays."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from adjust.frames.unknowns import Chain
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.observations.images.segments import ranges
 
@@ -26,7 +26,7 @@ class ChainObservation(NamedTuple):
     ends: tuple[bool, bool] = (True, True)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Chains:
     """Chains padded to L links: slots (n, L), -1 behind the end, which of them (n, L) are inverted."""
 
@@ -62,7 +62,7 @@ class Chains:
         return row[order], column[order]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Observations:
     """n observations as arrays: the product of each chain is one of its poses (K, 4, 4), which begin by first (n + 1,).
 

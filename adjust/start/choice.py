@@ -1,13 +1,14 @@
 """Which start values an adjustment begins with: those given, and where they lead nowhere those found without them."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.graph.assembly import StartValues, values_of
 from adjust.model.errors import GivenUpError, NotConvergedError, SurveyError, listed
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 from adjust.start.given import GivenStarts, given_starts, without_starts
@@ -23,7 +24,7 @@ _TURNED = np.deg2rad(20.0)
 _SHOWN = 8
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Begun:
     """A survey without what its search for start values does not trust, the values, and notes on what was left out.
 

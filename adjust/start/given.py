@@ -1,12 +1,13 @@
 """Start values that came with a survey: which there are, the survey without them, and a start moved onto them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from gtsam import Pose3
 
 from adjust.frames.tree import in_world
+from adjust.model.frozen import frozen
 from adjust.model.result import ParameterName
 from adjust.model.rewriting import Rewriting
 from adjust.model.survey import FloatArray, PointParameter, PoseParameter, Survey
@@ -14,7 +15,7 @@ from adjust.spatial.rigid import align, as_pose3
 from adjust.start.search import Start
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class GivenStarts:
     """Values of parameters that are free in all components: points (3,) m by id, poses by parameter name."""
 

@@ -1,7 +1,6 @@
 """What the images of a survey say by themselves: lenses, poses of targets, rays to points; and which not to trust."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -9,6 +8,7 @@ import numpy as np
 from adjust.frames.lens_states import lenders
 from adjust.frames.unknowns import Chain
 from adjust.lenses.models import MODELS
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.start.chains import Chains, Observations
 from adjust.start.lens.start import start_lens
@@ -16,7 +16,7 @@ from adjust.start.positions import PointField, Sight
 from adjust.start.views import Sighting, Views, block_text, ends_of, make_views, sightings, sights_of, untrustworthy
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Images:
     """lenses: by camera (n,). views: images of targets; sights: of world points. reasons: against blocks, by number."""
 

@@ -1,12 +1,12 @@
 """Two unknown poses at once, from the known motion between them: the hand-eye and robot-world problems."""
 
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import coo_array
 
 from adjust.frames.unknowns import Chain, Link
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.names import grouped
 from adjust.model.survey import FloatArray, IntArray
 from adjust.spatial.averaging import pose_distance
@@ -20,7 +20,7 @@ _CLEAR_TURNS = np.deg2rad(20.0)
 """Spread of turns below which the errors of a few views count for much in what they determine."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Group:
     """Observations ``first * motions[i] * second = products[i]`` with both ends unknown."""
 
@@ -120,7 +120,7 @@ def _side_by_side(network: FrameNetwork) -> str | None:
     return None
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _RowsOfPoses:
     """Chains ``before * first * motion * second * after`` that lack a row of poses on either side of a motion.
 

@@ -1,11 +1,11 @@
 """All poses of the network together: a short least squares on the chains, each weighted by what its view can tell."""
 
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import csc_array
 
 from adjust.graph.elimination import positive_definite_lu
+from adjust.model.frozen import frozen
 from adjust.model.memory import content, once
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.spatial.averaging import pose_distance
@@ -18,7 +18,7 @@ _DAMPING = 1e-7  # of the diagonal: what the observations leave open stays where
 _GROSS_PX = 3.0
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Misfits:
     """n observations as arrays, chains padded to L links and alternatives to k; a pose behind all others is identity.
 

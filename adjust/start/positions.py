@@ -7,12 +7,13 @@ import numpy as np
 
 from adjust.frames.unknowns import Chain
 from adjust.model.boards import deformed
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef, PositionRef
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.start.network import FrameNetwork
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Sight:
     """A block of world points: positions (n,) in the survey's points, rays (n, 3) in the camera, camera_from_world."""
 

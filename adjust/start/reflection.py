@@ -5,10 +5,10 @@ plane; only the start values do.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.observations import PositionRef
 from adjust.model.result import Adjustment
 from adjust.model.survey import BoolArray, FloatArray, Survey
@@ -20,7 +20,7 @@ _SIGMAS = 10.0
 _FLAT = 0.05
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Apart:
     """Points with start values: ids, the values given and found (n, 3) m, and which (n,) lie far from each other."""
 

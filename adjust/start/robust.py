@@ -5,13 +5,13 @@ what most points agree on; there every point is tested with the error probabilit
 the residuals are together far smaller than the sigmas say, nothing contradicts these and nothing is looked for.
 """
 
-from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.solver import Solved, SolveOptions, solve
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.precision.precision import Precision
 from adjust.testing.criteria import cauchy_weights, limits, typical_factor
@@ -20,7 +20,7 @@ from adjust.testing.gross_errors import Search, State, Verdicts, all_at_once, on
 _FAMILY = 0.001
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Screened:
     """A clean solution with its precision, and which image points (N,), in the order of the blocks, it uses."""
 

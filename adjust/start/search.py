@@ -4,7 +4,6 @@ One search: of the steps that are possible with what is known by now the safest 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
@@ -15,6 +14,7 @@ from adjust.frames.tree import FrameTree
 from adjust.frames.unknowns import Unknowns
 from adjust.graph.assembly import StartValues
 from adjust.model.errors import IndeterminateError, SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, Survey
 from adjust.observations.geometry.building import frame_refs, position_refs
@@ -36,7 +36,7 @@ _ROUNDS = 3
 _POLISH_PX = 2.0  # below this the robust means are a good start already
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Start(StartValues):
     """Start values for every parameter that the survey needs: of tables their angles and geometry, of boards the warp.
 

@@ -1,7 +1,6 @@
 """Blocks of image points as rays, and the camera poses that each explains by itself."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple
@@ -11,6 +10,7 @@ import numpy as np
 from adjust.lenses.models import camera_constants, focal_length_px, lens_model, unit_rays
 from adjust.model.boards import deformed
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import BoolArray, Camera, FloatArray, IntArray, Survey
 from adjust.native.views import refine_poses, view_errors, view_offsets
@@ -32,7 +32,7 @@ class Sighting(NamedTuple):
     uv: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class View:
     """One image and what explains it. x: (n, 3) m in the target. rays: (n, 3) unit in the camera.
 
@@ -47,7 +47,7 @@ class View:
     error_px: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Sights:
     """Images as rays, one after the other by ptr (B + 1,): x (N, 3) m in the target, rays (N, 3) unit in the camera.
 
@@ -71,7 +71,7 @@ class Sights:
         return Sights(self.block_idx[kept], self.x[rows], self.rays[rows], ends_of(sizes), self.focal_px[kept])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Views:
     """Images that some pose explains: poses (K, 4, 4) camera_from_target, image after image by first (B + 1,).
 

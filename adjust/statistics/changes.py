@@ -9,18 +9,19 @@ can be paid for; each that is found is added to the model before the next is loo
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 from scipy import sparse
 
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS
+from adjust.model.frozen import frozen
 from adjust.model.names import natural_key
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import side_by_side
-from adjust.native.point_tests import SparseRows, change_squares
+from adjust.native.point_tests import ColumnsOfRows, SparseRows, change_squares
 from adjust.precision.precision import noise_of
 from adjust.statistics.condensed import CondensedSystem
 from adjust.statistics.result import Change, ChangeShift
@@ -38,9 +39,9 @@ _SHAPES = {True: (("width", "1"), ("height", "1"), ("sag along x", "m"), ("sag a
            False: (("width", "1"), ("height", "1"), ("depth", "1"), ("", "1"))}  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Unit:
-    """What may change: kind and name of its owner, rows (k,) of the condensed system, columns B (k, q) in these.
+    """What may change: kind and name of its owner, columns B (k, q) in rows (k,) of the condensed system.
 
     run: (k,) of which run of epochs a row is; epochs: the first epoch of every run; one run: the same at all epochs.
     """
@@ -48,14 +49,28 @@ class Unit:
     kind: str
     name: str
     what: str
-    rows: IntArray
-    B: FloatArray
+    columns: ColumnsOfRows
     run: IntArray
     epochs: tuple[str, ...]
     components: tuple[tuple[str, str], ...]
 
+    @property
+    def rows(self) -> IntArray:
+        """(k,)."""
+        return self.columns.rows
 
-@dataclass(frozen=True, eq=False)
+    @property
+    def B(self) -> FloatArray:
+        """(k, q)."""
+        return np.asarray(self.columns.table[self.columns.at[:, None] + np.arange(len(self.components))])
+
+    def at(self, which: IntArray) -> "Unit":
+        """Of its rows some, in this order."""
+        rows, at, table = self.columns
+        return replace(self, columns=ColumnsOfRows(rows[which], at[which], table), run=self.run[which])
+
+
+@frozen(eq=False)
 class _Candidates:
     """A unit's possible changes (J, ...), scaled so that B'B has a unit diagonal: M (J, q, q), g (J, q), scale (J, q).
 
@@ -68,7 +83,7 @@ class _Candidates:
     scale: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Chosen:
     """What was found, less what was found before it: B (m, q) over all rows, and left = (I - A Q A') B.
 
@@ -96,7 +111,7 @@ class ChangeSearch:
         read = {r.epoch_id for r in adjustment.survey.table_readings}
         self.runs = _MOST_RUNS if s.structured is None else max(2, len(self.epochs), len(read))
         units = list(self._units(self.runs))
-        columns = sum(u.B.shape[1] * len(u.epochs) for u in units)
+        columns = sum(len(u.components) * len(u.epochs) for u in units)
         if s.structured is not None:
             self.rows, self.own = (SparseRows(x.indptr.astype(np.int64), x.indices.astype(np.int64), x.data)
                                    for x in (self.A, s.structured.own))  # fmt: skip
@@ -170,13 +185,14 @@ class ChangeSearch:
                 lens = vectors[("lens", name)]
                 free = tuple((x, lens.units[lens.names.index(x)]) for x in lens.free) if lens.key is not None else ()
                 if free and len(first) > 1:
-                    yield Unit(kind, name, "lens", rows, c.lens[rows, : len(free)], run, first, free)
+                    yield Unit(kind, name, "lens", _columns(rows, c.own.lens), run, first, free)
             if len(first) > 1:
-                B = c.camera[rows] if kind == "camera" else c.target[rows]
-                yield Unit(kind, name, "position", rows, B, run, first, poses)
+                B = c.own.camera if kind == "camera" else c.own.target
+                yield Unit(kind, name, "position", _columns(rows, B), run, first, poses)
             if kind == "target":
                 flat = bool(np.ptp(whole[name][:, 2]) < 1e-9)
-                yield Unit(kind, name, "shape", rows, c.shape[rows], np.zeros_like(run), first[:1], _SHAPES[flat])
+                once = np.zeros_like(run), first[:1]
+                yield Unit(kind, name, "shape", _columns(rows, c.own.shape), *once, _SHAPES[flat])
         yield from self._table_units(most_runs)
 
     def _table_units(self, most_runs: int) -> Iterator[Unit]:
@@ -193,16 +209,17 @@ class ChangeSearch:
             rows = np.concatenate([np.arange(s.ptr[s.n_image + i], s.ptr[s.n_image + i + 1]) for i in mine])
             epochs = [others[i].ids[1] for i, w in zip(mine, W, strict=True) for _ in range(len(w))]
             run, first = _runs(*_coded(epochs), most_runs)
-            axes = tuple(others[mine[0]].components)
+            axes, apart = tuple(others[mine[0]].components), np.arange(len(rows))
             if len(first) > 1:
                 zeros = tuple((x, "rad") for x in axes)
-                yield Unit("table", table.table_id, "zero", rows, np.vstack(W), run, first, zeros)
+                yield Unit("table", table.table_id, "zero", _columns(rows, np.vstack(W), apart), run, first, zeros)
             for axis, name in enumerate(axes):
                 angle = np.array([others[i].observed[axis] for i in mine])
                 waves = np.stack([f(k * angle) for k in (1, 2) for f in (np.sin, np.cos)], axis=1)
                 B = np.concatenate([w[:, axis, None] * wave for w, wave in zip(W, waves, strict=True)])
                 said = tuple((f"{name} {f} {k}a".replace(" 1a", " a"), "rad") for k in (1, 2) for f in ("sin", "cos"))
-                yield Unit("table", table.table_id, f"reading of {name}", rows, B, np.zeros_like(run), first[:1], said)
+                once = np.zeros_like(run), first[:1], said
+                yield Unit("table", table.table_id, f"reading of {name}", _columns(rows, B, apart), *once)
 
     def _taken_over(self, u: Unit) -> bool:
         """Whether unknowns take over all of it: it is a test like the others, and finds nothing."""
@@ -221,20 +238,21 @@ class ChangeSearch:
 
     def _structured(self, u: Unit) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Of every run and all later ones the diagonal of B'B (J, q), M (J, q, q) and g (J, q)."""
-        return change_squares(_first(u), u.rows, np.ascontiguousarray(u.B), self.rows, self.e, self.own, self.shared)
+        return change_squares(_first(u), u.columns, len(u.components), self.rows, self.e, self.own, self.shared)
 
     def _whole(self, u: Unit) -> tuple[FloatArray, FloatArray, FloatArray]:
         """The same of a system without structure."""
-        J, q = len(u.epochs), u.B.shape[1]
-        columns = (u.run * q)[:, None] + np.arange(q)
-        B = sparse.csr_matrix((u.B.ravel(), columns.ravel(), np.arange(0, u.B.size + 1, q)), (len(u.rows), J * q))
-        both = np.cumsum(_by_run(u, np.column_stack([u.B, self.e[u.rows]]))[::-1], axis=0)[::-1]
-        taken = self.system.among_sums((B.T @ self.A[u.rows]).tocsr(), q)
+        B, J, q = u.B, len(u.epochs), len(u.components)
+        some = B.any(axis=1)
+        places = ((u.run[some] * q)[:, None] + np.arange(q)).ravel(), np.repeat(u.rows[some], q)
+        turned = sparse.csr_matrix((B[some].ravel(), places), (J * q, self.A.shape[0]))
+        both = np.cumsum(_by_run(u, B, np.column_stack([B, self.e[u.rows]]))[::-1], axis=0)[::-1]
+        taken = self.system.among_sums(turned @ self.A, q)
         return np.einsum("jqq->jq", both[:, :, :q]), both[:, :, :q] - taken, both[:, :, q]
 
     def _chosen(self, c: _Candidates, j: int, before: Sequence[_Chosen]) -> _Chosen:
         """Its directions that show, less what they have in common with those before."""
-        u, B = c.unit, np.zeros((len(self.e), c.unit.B.shape[1]))
+        u, B = c.unit, np.zeros((len(self.e), len(c.unit.components)))
         mine = u.run >= (j + 1 if len(u.epochs) > 1 else 0)
         B[u.rows[mine]] = u.B[mine] * c.scale[j]
         left = B - self.A @ self.system.times_covariance(np.asarray(self.A.T @ B))
@@ -247,11 +265,14 @@ class ChangeSearch:
         return _Chosen(B @ V, left @ V, inverse, inverse @ (V.T @ c.g[j]))
 
 
+def _columns(rows: IntArray, B: FloatArray, at: IntArray | None = None) -> ColumnsOfRows:
+    """Columns that rows (k,) of the system have in those rows of B, or in others (k,)."""
+    return ColumnsOfRows(rows, (rows if at is None else at) * B.shape[1], B.ravel())
+
+
 def _by_runs(u: Unit) -> Unit:
-    """With its rows in the order of the runs, less those that have nothing of it."""
-    some = np.flatnonzero(u.B.any(axis=1))
-    order = some[np.argsort(u.run[some], kind="stable")]
-    return replace(u, rows=u.rows[order], B=u.B[order], run=u.run[order])
+    """With its rows in the order of the runs."""
+    return u if (u.run[1:] >= u.run[:-1]).all() else u.at(np.argsort(u.run, kind="stable"))
 
 
 def _coded(epochs: Sequence[str]) -> tuple[IntArray, tuple[str, ...]]:
@@ -276,9 +297,9 @@ def _first(u: Unit) -> IntArray:
     return np.searchsorted(u.run, np.arange(len(u.epochs) + 1))
 
 
-def _by_run(u: Unit, other: FloatArray) -> FloatArray:
+def _by_run(u: Unit, B: FloatArray, other: FloatArray) -> FloatArray:
     """B' times other columns (k, r), of every run apart: (J, q, r)."""
-    return np.array([u.B[i:j].T @ other[i:j] for i, j in pairwise(_first(u).tolist())])
+    return np.array([B[i:j].T @ other[i:j] for i, j in pairwise(_first(u).tolist())])
 
 
 def _from_runs_on(of_runs: FloatArray) -> FloatArray:
@@ -288,7 +309,7 @@ def _from_runs_on(of_runs: FloatArray) -> FloatArray:
 
 def _given(c: _Candidates, known: _Chosen) -> _Candidates:
     """Candidates with M and g where one more change is part of the model."""
-    K = _from_runs_on(_by_run(c.unit, known.left[c.unit.rows])) * c.scale[:, :, None]
+    K = _from_runs_on(_by_run(c.unit, c.unit.B, known.left[c.unit.rows])) * c.scale[:, :, None]
     M = c.M - K @ known.inverse @ K.transpose(0, 2, 1)
     return replace(c, M=0.5 * (M + M.transpose(0, 2, 1)), g=c.g - K @ known.amounts)
 

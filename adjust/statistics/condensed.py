@@ -1,30 +1,32 @@
 """A solved survey as one linear system that stays small: the image points of a block stand in a few rows.
 
-A block's 2n whitened rows over its local unknowns are turned (orthogonally) into as many rows as there are columns: the
-same normal equations, gradients and quadratic forms for any n. Beside the columns of the unknowns the rows are kept by
+A block's 2n whitened rows over its local unknowns are turned into as many rows as there are columns, the triangle of
+their normal equations: the same gradients and quadratic forms for any n. The solution knows a block by that triangle
+too, so that nothing is lost that its covariances still have. Beside the columns of the unknowns the rows are kept by
 what a block could have besides: a motion of its camera, of its target, other lens parameters than those of the other
 epochs, another shape of its target. What the residuals say of these is asked in :mod:`adjust.statistics.changes`.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from collections.abc import Sequence
+from functools import cached_property
+from typing import NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
 from adjust.frames.tables import adjoint_of_inverse
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.singles import beside_images
 from adjust.model.boards import BENT, deformation
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
-from adjust.native.images import N_SHAPE
+from adjust.native.images import N_SHAPE, CondensedRows, ShapeFactors
 from adjust.native.lenses import MAX_LENS
 from adjust.native.parallel import side_by_side
 from adjust.observations.images.bundles import BundleBatch
 from adjust.precision.precision import Precision
 from adjust.statistics.rows import (
-    Entries,
     ImageRows,
     KeyColumns,
     bundle_order,
@@ -34,62 +36,65 @@ from adjust.statistics.rows import (
 )
 from adjust.statistics.system import LinearSystem, assembled
 
+_Number = TypeVar("_Number", bound=np.generic)
 _FLAT = 1e-9
-_OWN = (MAX_LENS, MAX_LENS + 6, MAX_LENS + 12, MAX_LENS + 12 + N_SHAPE)
-"""Where lens, camera, target and shape end among the columns that a block could have besides."""
 
 
-@dataclass(frozen=True, eq=False)
-class CondensedSystem:
-    """The system, whose first observations are the image blocks, and its m image rows by what a block has of its own.
+class Own(NamedTuple):
+    """Rows (m, ..) by what image blocks could have besides.
 
-    block: (m,) index into ``Survey.image_blocks``. lens: (m, MAX_LENS) by the free lens parameters of its camera.
-    camera, target: (m, 6) by a motion of the camera in its own axes, of the target in its own axes (rotation,
-    translation). shape: (m, 4) by the shape of the target: flat ones grow along x and y, and bend (unit sags) along x
-    and y; others grow along x, y and z, the last column is zero. e: (m,). numbers: the image block
-    of each of the first observations. key_columns: of the system.
+    lens: (m, ..) by the free lens parameters of its camera, then zeros. camera, target: (m, 6) by a motion of the
+    camera in its own axes, of the target in its own axes (rotation, translation). shape: (m, 4) by the shape of the
+    target: flat ones grow along x and y, and bend (unit sags) along x and y; others grow along x, y and z, the last
+    column is zero.
     """
 
-    system: LinearSystem
-    block: IntArray
     lens: FloatArray
     camera: FloatArray
     target: FloatArray
     shape: FloatArray
+
+
+@frozen(eq=False)
+class CondensedSystem:
+    """The system, whose first observations are the image blocks, and its m image rows by what a block has of its own.
+
+    block: (m,) index into ``Survey.image_blocks``. own: by what a block could have besides. e: (m,). numbers: the
+    image block of each of the first observations. key_columns: of the system.
+    """
+
+    system: LinearSystem
+    block: IntArray
+    own: Own
     e: FloatArray
     numbers: IntArray
     key_columns: KeyColumns
 
-    def point_rows(self, row: int) -> tuple[IntArray, FloatArray]:
-        """Columns (k,) and the whitened rows (2, k) over them of an image point that is in use."""
+    def point_rows(self, points: IntArray) -> list[tuple[IntArray, FloatArray]]:
+        """Of image points that are in use columns (k,), and the whitened rows (2, k) over them of each."""
         graph = self.system.precision.graph
-        images, at = graph.images, int(graph.image_rows[row])
-        if at >= images.n_points:  # its rows are among those of the system
-            A, i = self.system.A, int(np.searchsorted(self._first_points, row, side="right")) - 1
-            first = int(self._first_rows[i]) + 2 * (row - int(self._first_points[i]))
-            begin, middle, end = A.indptr[first : first + 3].tolist()
-            columns, place = np.unique(A.indices[begin:end], return_inverse=True)
-            out = np.zeros((2, len(columns)))
-            out[0, place[: middle - begin]], out[1, place[middle - begin :]] = A.data[begin:middle], A.data[middle:end]
-            return columns, out
-        b = int(np.searchsorted(images.ptr, at, side="right")) - 1
-        columns, rows = self._rows_of(b)
-        first = 2 * (at - int(images.ptr[b]))
-        return columns, rows[first : first + 2]
+        images, at = graph.images, graph.image_rows[points]
+        known = at < images.n_points
+        found = {int(i): self._row_of_system(int(points[i])) for i in np.flatnonzero(~known)}
+        block = np.searchsorted(images.ptr, at, side="right") - 1
+        for mine in images.alike(np.unique(block[known])):
+            rows, from_keys = images.rows(mine), images.local_from_keys(mine)
+            for i in np.flatnonzero(known & np.isin(block, mine)).tolist():
+                b, first = int(np.searchsorted(mine, block[i])), 2 * int(at[i] - images.ptr[block[i]])
+                columns = np.concatenate([self.key_columns[key] for key in images.keys[block[i]]])
+                kept = columns >= 0
+                found[i] = columns[kept], (rows[b, first : first + 2, :-1] @ from_keys[b])[:, kept]
+        return [found[i] for i in range(len(points))]
 
-    @cached_property
-    def _rows_of(self) -> Callable[[int], tuple[IntArray, FloatArray]]:
-        """Columns (k,) and rows (2 n, k) of the n points of an image block; the last blocks are kept."""
-        images = self.system.precision.graph.images
-
-        @lru_cache(64)  # the worst points of a survey are in few of its images
-        def of(b: int) -> tuple[IntArray, FloatArray]:
-            columns = np.concatenate([self.key_columns[key] for key in images.keys[b]])
-            kept, which = columns >= 0, np.array([b])
-            rows = images.rows(which)[0, :, :-1] @ images.local_from_keys(which)[0]
-            return columns[kept], np.asarray(rows[:, kept])
-
-        return of
+    def _row_of_system(self, point: int) -> tuple[IntArray, FloatArray]:
+        """The same of one whose rows are among those of the system."""
+        A, i = self.system.A, int(np.searchsorted(self._first_points, point, side="right")) - 1
+        first = int(self._first_rows[i]) + 2 * (point - int(self._first_points[i]))
+        begin, middle, end = A.indptr[first : first + 3].tolist()
+        columns, place = np.unique(A.indices[begin:end], return_inverse=True)
+        out = np.zeros((2, len(columns)))
+        out[0, place[: middle - begin]], out[1, place[middle - begin :]] = A.data[begin:middle], A.data[middle:end]
+        return columns, out
 
     def has_own_poses(self, kind: str, name: str, blocks: IntArray) -> bool:
         """Whether a camera's or target's image blocks have poses of its own, one an epoch, which nothing else touches.
@@ -134,14 +139,14 @@ class CondensedSystem:
         return np.cumsum([0] + [len(b.uv) for b in blocks])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Part:
-    """Some blocks by their numbers: rows of the system, block (m,) of each and what it could have besides (m, 30)."""
+    """Some blocks by their numbers: rows of the system, block (m,) of each, by what it could have besides."""
 
     rows: ImageRows
     numbers: IntArray
     block: IntArray
-    own: FloatArray
+    own: Own
 
 
 def condensed_system(precision: Precision) -> CondensedSystem:
@@ -153,72 +158,64 @@ def condensed_system(precision: Precision) -> CondensedSystem:
         parts.append(_known(graph, n, key_columns))
         for part, bundle in enumerate(graph.bundles, 1):
             number = np.flatnonzero(graph.image_parts == part)
-            parts.append(_unknown(bundle, number, n, key_columns))
+            parts.append(_unknown(graph, bundle, number, n, key_columns))
         rows = [p.rows for p in parts]
-        e, lengths, used = (np.concatenate([getattr(p, x) for p in rows]) for x in ("e", "lengths", "used"))
+        e, lengths, used = (_joined([getattr(p, x) for p in rows]) for x in ("e", "lengths", "used"))
         return ImageRows(stacked([p.A for p in rows]), e, lengths, used, [g for p in rows for g in p.groups])
 
     system = assembled(precision, image_rows)
-    numbers, block, own = (np.concatenate([getattr(p, x) for p in parts]) for x in ("numbers", "block", "own"))
-    lens, camera, target, shape = np.split(own, _OWN[:-1], axis=1)
-    return CondensedSystem(system, block, lens, camera, target, shape, system.e[: len(block)], numbers, columns)
+    numbers, block = (_joined([getattr(p, x) for p in parts]) for x in ("numbers", "block"))
+    own = Own(*(_joined(x) for x in zip(*(p.own for p in parts), strict=True)))
+    return CondensedSystem(system, block, own, system.e[: len(block)], numbers, columns)
+
+
+def _joined(parts: Sequence[NDArray[_Number]]) -> NDArray[_Number]:
+    """One behind the other; not copied where there is one."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
+def _most_lens(graph: AdjustmentGraph) -> int:
+    """Free parameters of a lens, at most."""
+    return int(graph.images.state.lenses.n_free.max(initial=0))
 
 
 def _known(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> _Part:
     """Blocks of known targets, those of the same size together."""
-    images, entries = graph.images, Entries()
-    number = graph.image_numbers
+    images, number = graph.images, graph.image_numbers
     shapes, columns, sets = _shapes(graph), columns_of_blocks(graph, key_columns), images.alike()
     heights = [images.condensed_height(int(mine[0])) for mine in sets]
     ends = np.cumsum([0, *(len(mine) * k for mine, k in zip(sets, heights, strict=True))]).tolist()
-    own, e = np.zeros((ends[-1], _OWN[-1])), np.empty(ends[-1])
+    own = Own(*(np.empty((ends[-1], k)) for k in (_most_lens(graph), 6, 6, N_SHAPE)))
+    e, length = np.empty(ends[-1]), np.empty(ends[-1], dtype=np.int64)
 
-    def condensed(i: int) -> FloatArray:
-        """Rows by the keys of the i-th set, the rest of which goes where it belongs."""
-        rows, shape = slice(ends[i], ends[i + 1]), (len(sets[i]), heights[i])
-        return _condensed(graph, sets[i], shapes, own[rows].reshape(*shape, -1), e[rows].reshape(shape))
+    def condensed(i: int) -> tuple[FloatArray, NDArray[np.int32]]:
+        """Entries of the i-th set and their columns; the rest goes where it belongs."""
+        rows, size, across = slice(ends[i], ends[i + 1]), (len(sets[i]), heights[i]), columns(sets[i])
+        lens, camera, target, shape = (x[rows].reshape(*size, x.shape[1]) for x in own)
+        entry, column = np.empty((*size, across.shape[1])), np.empty((*size, across.shape[1]), dtype=np.int64)
+        places = e[rows].reshape(size), length[rows].reshape(size), entry, column
+        out = CondensedRows(lens, camera, target, shape, *places)
+        found = images.condensed_rows(sets[i], shapes, across, out)
+        return entry.ravel()[:found].copy(), column.ravel()[:found].astype(np.int32)
 
-    for i, by_key in enumerate(side_by_side(condensed, range(len(sets)))):
-        entries.add_blocks(np.arange(ends[i], ends[i + 1]).reshape(-1, heights[i]), columns(sets[i]), by_key)
+    parts = [(np.zeros(0), np.zeros(0, dtype=np.int32)), *side_by_side(condensed, range(len(sets)))]
+    entry, column = (np.concatenate(x) for x in zip(*parts, strict=True))
+    A = sparse.csr_matrix((entry, column, np.append(0, np.cumsum(length)).astype(np.int32)), (len(e), n))
     order = np.concatenate([np.zeros(0, dtype=np.int64), *sets])
     groups = [images.blocks[b].group for b in order.tolist()]
-    A, of_blocks = entries.matrix((len(e), n)), np.repeat(np.array(heights, dtype=np.int64), list(map(len, sets)))
-    A.eliminate_zeros()  # rows that are triangular leave half of it empty
+    of_blocks = np.repeat(np.array(heights, dtype=np.int64), list(map(len, sets)))
     rows = ImageRows(A, e, of_blocks, np.ones(len(groups), dtype=np.bool_), groups)
     return _Part(rows, number[order], np.repeat(number[order], of_blocks), own)
 
 
-def _shapes(graph: AdjustmentGraph) -> Callable[[IntArray], FloatArray]:
-    """Of image points (..) of known targets what their derivatives are to be multiplied by: (.., 4)."""
-    first, every, images = dict[str | None, int](), [np.zeros((1, N_SHAPE))], graph.images
+def _shapes(graph: AdjustmentGraph) -> ShapeFactors:
+    """Of the image points of known targets."""
+    first, every, images = dict[str | None, int](), [np.zeros((0, N_SHAPE))], graph.images
     for target in graph.survey.targets:
         first[target.target_id] = sum(map(len, every))
         every.append(_shape_factors(target.x_in_target))
     begin = np.array([first.get(b.target_id, -1) for b in images.blocks], dtype=np.int64)
-    of_point = np.repeat(begin, np.diff(images.ptr))
-    table, at = np.concatenate(every), np.where(of_point < 0, 0, of_point + images.point_idx)
-    return lambda points: table[at[points]]
-
-
-def _condensed(
-    graph: AdjustmentGraph, mine: IntArray, shapes: Callable[[IntArray], FloatArray], own: FloatArray, e: FloatArray
-) -> FloatArray:
-    """Of g blocks that are alike, k rows each, by the columns of their keys (g, k, w); into own (g, k, 30), e (g, k).
-
-    own: of zeros.
-    """
-    images, width = graph.images, int(graph.images.n_rows[mine[0]]) - 1
-    points = images.ptr[mine][:, None] + np.arange(len(images.blocks[mine[0]].uv))
-    rows = images.condensed_rows(mine, shapes(points))
-    nl = images.state.lenses.n_free[images.camera[mine]]
-    lens, camera, pose, shape = np.split(own, _OWN[:-1], axis=2)
-    for count in np.unique(nl):  # warps make up for lens parameters in the number of columns
-        those = nl == count
-        lens[those, :, :count] = rows[those][:, :, :count]
-        pose[those] = rows[those][:, :, count : count + 6]
-    camera[:] = pose @ adjoint_of_inverse(images.chains.R[mine], images.chains.t[mine])
-    shape[:], e[:] = rows[:, :, width:-1], rows[:, :, -1]
-    return rows[:, :, :width] @ images.local_from_keys(mine)
+    return ShapeFactors(begin, images.point_idx, np.concatenate(every))
 
 
 def _shape_factors(x: FloatArray) -> FloatArray:
@@ -230,17 +227,18 @@ def _shape_factors(x: FloatArray) -> FloatArray:
     return out
 
 
-def _unknown(bundle: BundleBatch, number: IntArray, n: int, key_columns: KeyColumns) -> _Part:
+def _unknown(graph: AdjustmentGraph, bundle: BundleBatch, number: IntArray, n: int, key_columns: KeyColumns) -> _Part:
     """Blocks of unknown points, whose rows differ in the columns of their points: as they are, two per point."""
     A, e = bundle_rows(bundle, n, key_columns)
     used, lengths = np.repeat(bundle.unsorted(bundle.used), 2).astype(float), 2 * np.diff(bundle.block_ptr)
-    of_row = np.repeat(np.arange(len(lengths)), lengths)
-    local = bundle.A.reshape(-1, MAX_LENS + 7)[bundle_order(bundle)] * used[:, None]
-    own, pose = np.zeros((len(local), _OWN[-1])), local[:, MAX_LENS : MAX_LENS + 6]
-    own[:, :MAX_LENS] = local[:, :MAX_LENS]
-    by_camera = adjoint_of_inverse(bundle.chains.R, bundle.chains.t)
-    own[:, _OWN[0] : _OWN[1]] = np.einsum("ni,nij->nj", pose, by_camera[of_row])
+    of_row, order, k = np.repeat(np.arange(len(lengths)), lengths), bundle_order(bundle), _most_lens(graph)
+    by_lens, by_pose = bundle.A[:, :, :k], bundle.A[:, :, MAX_LENS : MAX_LENS + 6]
+    lens, pose = by_lens.reshape(len(order), k)[order], by_pose.reshape(len(order), 6)[order]
+    if not used.all():
+        A.data *= np.repeat(used, np.diff(A.indptr))
+        lens, pose, e = lens * used[:, None], pose * used[:, None], e * used
+    camera = np.einsum("ni,nij->nj", pose, adjoint_of_inverse(bundle.chains.R, bundle.chains.t)[of_row])
+    own = Own(lens, camera, np.zeros_like(pose), np.zeros((len(pose), N_SHAPE)))
     groups = [b.group for b in bundle.blocks]
-    A = A if used.all() else (sparse.diags(used) @ A).tocsr()
-    rows = ImageRows(A, e * used, lengths.astype(np.int64), np.ones(len(groups), dtype=np.bool_), groups)
+    rows = ImageRows(A, e, lengths.astype(np.int64), np.ones(len(groups), dtype=np.bool_), groups)
     return _Part(rows, number, number[of_row], own)

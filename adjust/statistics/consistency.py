@@ -7,11 +7,11 @@ global test stands out in its own part.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.names import numbered
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
@@ -63,9 +63,12 @@ def consistency(adjustment: Adjustment, condensed: CondensedSystem | None, alpha
     )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Part:
-    """A part: the observations (k,) of the condensed system that belong to it; none where only its sums are known."""
+    """A part: the observations (k,) of the condensed system that belong to it; none where only its sums are known.
+
+    n_rows: their rows there.
+    """
 
     kind: str
     name: str
@@ -73,6 +76,7 @@ class Part:
     n: float
     redundancy: float
     omega: float
+    n_rows: int = 0
 
 
 def parts_of_network(adjustment: Adjustment) -> tuple[Part, ...]:
@@ -84,7 +88,7 @@ def parts_of_network(adjustment: Adjustment) -> tuple[Part, ...]:
 def parts_of(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> tuple[Part, ...]:
     """All parts that are neither the whole nor without redundancy. blocks: the image block of each observation."""
     found, out = contributions(adjustment, system, blocks), list[Part]()
-    counted = found[0] != 0.0
+    counted, lengths = found[0] != 0.0, np.diff(system.ptr)
     total = int(np.count_nonzero(counted))
     for kind, names in _labels(adjustment, system, blocks).items():
         called, of = numbered((None, *names))
@@ -95,10 +99,10 @@ def parts_of(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> 
             continue
         first = np.flatnonzero(np.diff(of[every], prepend=0))
         sums = np.add.reduceat(found[:, every], first, axis=1).tolist()
-        edges = pairwise([*first.tolist(), len(every)])
+        edges, n_rows = pairwise([*first.tolist(), len(every)]), np.add.reduceat(lengths[every], first).tolist()
         out += [
-            Part(kind, str(called[i]), every[a:b], n, r, omega)
-            for i, (a, b), n, r, omega in zip(of[every[first]].tolist(), edges, *sums, strict=True)
+            Part(kind, str(called[i]), every[a:b], n, r, omega, rows)
+            for i, (a, b), n, r, omega, rows in zip(of[every[first]].tolist(), edges, *sums, n_rows, strict=True)
             if r > _LEAST and b - a < total
         ]
     return tuple(out)
@@ -150,7 +154,7 @@ def tested_parts(
     n, r, omega = (np.array([getattr(part, x) for part in parts]) for x in ("n", "redundancy", "omega"))
     found = _p_relative(adjustment, r, omega) if relative else upper_tail_bound(omega, r)
     if system is not None and not relative:
-        for i in _undecided(system, parts, (n, r, omega, found), level):
+        for i in _undecided(parts, (n, r, omega, found), level):
             rows = _rows(system, parts[i])
             found[i] = min(found[i], upper_tail(omega[i], eigenvalues(system, rows, round(n[i]))))
     out = [
@@ -168,12 +172,9 @@ def _p_relative(adjustment: Adjustment, r: FloatArray, omega: FloatArray) -> Flo
     return np.where(some, fisher.sf(omega / r / factor, r, np.where(some, left, 1.0)), 1.0)
 
 
-def _undecided(
-    system: LinearSystem, parts: Sequence[Part], known: tuple[FloatArray, ...], level: float
-) -> list[int]:
+def _undecided(parts: Sequence[Part], known: tuple[FloatArray, ...], level: float) -> list[int]:
     """Of which parts the bound of the probability and what could be better do not say the same."""
-    lengths, (n, r, omega, bound) = np.diff(system.ptr), known
-    n_rows = np.array([lengths[part.members].sum() for part in parts])
+    (n, r, omega, bound), n_rows = known, np.array([part.n_rows for part in parts])
     k = np.maximum(np.minimum(n_rows, n), 1.0)
     lost = n - r  # degrees of freedom that the unknowns take; evenly, the variance is least
     scale = np.maximum(n - k + k * (1.0 - lost / k) ** 2, 1e-12) / r

@@ -5,7 +5,6 @@ of uncertainty (GUM, JCGM 100:2008) is ``Q = sum of Q N_g Q``, N_g the normal ma
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +12,7 @@ from scipy import sparse
 
 from adjust.frames.tree import in_world
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment, ParameterName, VarianceComponents
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import side_by_side
@@ -38,13 +38,16 @@ def shifts(condensed: CondensedSystem, rows: Sequence[int], bias: Mapping[int, F
 
 def _right(condensed: CondensedSystem, rows: Sequence[int], bias: Mapping[int, FloatArray]) -> sparse.csc_matrix:
     """The right-hand sides (n, k) of the normal equations for these biases."""
-    system, parts = condensed.system, list[tuple[IntArray, FloatArray]]()
+    system, n = condensed.system, condensed.n_points
+    points = [row for row in rows if row < n]
+    of_points = iter(condensed.point_rows(np.array(points, dtype=np.int64)))
+    parts = list[tuple[IntArray, FloatArray]]()
     for row in rows:
-        if row < condensed.n_points:
-            columns, A = condensed.point_rows(row)
+        if row < n:
+            columns, A = next(of_points)
             parts.append((columns, A.T @ bias[row]))
         else:
-            parts.append(system.bias_column(row - condensed.n_points + system.n_image, bias[row]))
+            parts.append(system.bias_column(row - n + system.n_image, bias[row]))
     places, values = (np.concatenate(x) for x in zip(*parts, strict=True))
     ptr = np.cumsum([0, *(len(x) for x, _ in parts)])
     return sparse.csc_matrix((values, places, ptr), (len(system.columns), len(rows)))
@@ -97,7 +100,7 @@ def furthest_of(dx: FloatArray, sigmas: FloatArray, coordinates: sparse.csr_matr
     return Furthest(at, dx[at, k], ratio[at, k], place, np.sqrt(squares[place, k]))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Shared:
     """How far things move by what all unknowns share, ``U' y``: at most the length of y times that of their own part.
 
@@ -133,7 +136,7 @@ class _Shared:
         return (int(self.number[at]), float(np.sqrt(squares[at]))) if squares[at] > found**2 else None
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Reach:
     """What biases move where Q = own + U' U: the sets of unknowns that one touches by both, all others by U' U alone.
 

@@ -12,13 +12,14 @@ equations; the covariance of the estimated factors, relative to themselves, is 2
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
 import scipy
 from scipy import sparse
 
+from adjust.model.frozen import frozen
 from adjust.model.rewriting import Fields
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.statistics.normal import Normal, inverse_of_factor
@@ -33,7 +34,7 @@ _WITH_SIGMA = ("distances", "levels", "on_surfaces")
 Matrix: TypeAlias = FloatArray | sparse.csr_matrix
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class MixedBlock:
     """A correlated block of several groups: A (k, n), e (k,) and cov (k, k) not whitened, group (k,) numbers."""
 
@@ -43,7 +44,7 @@ class MixedBlock:
     group: IntArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class GroupSums:
     """Per group whitened A'A (n, n), A'e (n,), e'e and number of components; mixed blocks apart; rows of the datum.
 
@@ -69,7 +70,7 @@ class GroupSums:
         return GroupSums(N, b, c, n, mixed, self.datum)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Moments:
     """At given factors: q (G,), r (G,) and S (G, G)."""
 

@@ -1,7 +1,6 @@
 """The normal matrix of a linear system, factored by the structure that surveys have."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -9,6 +8,7 @@ import numpy as np
 import scipy
 from scipy import sparse
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from adjust.precision.s_transformation import without_datum_rows
 
@@ -26,7 +26,7 @@ _ROOM, _WIDEST = 20_000_000, 500
 """Numbers that the shared part of an inverse may need, and unknowns of a core: more are faster through a tree."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Inverse:
     """An inverse (n, n) as a sum: ``own + U' U``.
 
@@ -44,7 +44,7 @@ class Inverse:
 
 
 def structured_inverse(N: sparse.csc_matrix, scale: FloatArray) -> Inverse | None:
-    """The inverse of a matrix (n, n), its unknowns counted in these scales (n,), where it is an arrow; None of others.
+    """The inverse of a symmetric matrix (n, n), its unknowns in these scales (n,), where it is an arrow; else None.
 
     An arrow has few unknowns that most others touch, the core, and small sets that touch nothing but these: a survey of
     many epochs, or of many points seen from a few places. Linear in n.
@@ -54,13 +54,14 @@ def structured_inverse(N: sparse.csc_matrix, scale: FloatArray) -> Inverse | Non
     rest = np.flatnonzero(degree <= 2 * np.median(degree))
     if not 0 < len(core) <= min(_WIDEST, _ROOM // n):
         return None
-    N = N.tocsr()
-    own, across = N[rest][:, rest], N[rest][:, core]
+    by_row = N.T  # the same, for it is symmetric
+    of_rest = by_row[rest]
+    own, across = of_rest[:, rest], of_rest[:, core]
     label = sets_apart(own)
     sizes = np.bincount(label)
     if sizes.max() > _SMALL_SET:
         return None
-    head, pieces = N[core][:, core].toarray(), list[tuple[IntArray, FloatArray, FloatArray]]()
+    head, pieces = by_row[core][:, core].toarray(), list[tuple[IntArray, FloatArray, FloatArray]]()
     for k in np.unique(sizes).tolist():
         sets = np.argsort(label, kind="stable")[np.repeat(sizes, sizes) == k].reshape(-1, k)
         for mine in np.array_split(sets, -(-sets.size // _PIECE)):
@@ -150,10 +151,12 @@ class Normal:
     """A normal matrix (n, n), factored: solutions, and its inverse in the datum of the survey."""
 
     def __init__(self, N: sparse.csc_matrix, motions: FloatArray) -> None:
-        self.N, self.motions, self.n = N, motions, N.shape[0]
+        """N: is scaled where it is, and not to be used any more."""
+        self.motions, self.n = motions, N.shape[0]
         self.scale = 1.0 / np.sqrt(np.maximum(N.diagonal(), 1e-300))
-        self._scaled = N.copy()
-        self._scaled.data *= self.scale[N.indices] * np.repeat(self.scale, np.diff(N.indptr))
+        N.data *= self.scale[N.indices]
+        N.data *= np.repeat(self.scale, np.diff(N.indptr))
+        self._scaled = N
         self.structured = structured_inverse(self._scaled, self.scale) if self.n > PLAIN else None
         """The inverse as a sum, where many small sets of unknowns share few others; None for others."""
 

@@ -1,7 +1,6 @@
 """Confidence ellipsoids, and the precision of one point, station or camera relative to another."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from gtsam import Pose3
@@ -9,6 +8,7 @@ from gtsam import Pose3
 from adjust.graph.assembly import values_of
 from adjust.graph.building import GraphBuilder
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray
@@ -62,15 +62,15 @@ def relative_precision(
     found = [(known[a], known[b]) for a, b in pairs]
     unknowns = (tuple(dict.fromkeys([*a.by, *b.by])) for a, b in found)
     adjustment.precision.bring_together((names[0], names[1]) for names in unknowns if len(names) == 2)
-    covs = np.array([_difference_cov(adjustment, a, b) for a, b in found]).reshape(-1, 6, 6)
+    covs = [_covariance(adjustment, a, b) for a, b in found]
+    own = np.array([cov[3:, 3:] for cov in covs]).reshape(-1, 3, 3)
     sigma0 = adjustment.sigma0 if scaled and adjustment.redundancy > 0 else None
-    regions = ellipsoids(covs[:, 3:, 3:], level, sigma0, adjustment.redundancy)
-    nowhere = Ellipsoid(np.zeros(0), np.zeros((3, 0)), level, scaled)
-    return tuple(_relative(*both, cov, region if np.isfinite(both[1].x - both[0].x).all() else nowhere)
-                 for both, cov, region in zip(found, covs, regions, strict=True))  # fmt: skip
+    regions = ellipsoids(own, level, sigma0, adjustment.redundancy)
+    none = Ellipsoid(np.zeros(0), np.zeros((3, 0)), level, scaled)
+    return tuple(_relative(*both, cov, region, none) for both, cov, region in zip(found, covs, regions, strict=True))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Place:
     """A position x (3,), its axes R (3, 3), and derivatives (6, dim) by unknowns: turn (own axes), x (world)."""
 
@@ -120,24 +120,23 @@ class _Places:
         return _Place(called, np.asarray(pose.translation()), R, by)
 
 
-def _difference_cov(adjustment: Adjustment, a: _Place, b: _Place) -> FloatArray:
-    """Covariance (6, 6) of b relative to a: turn, and difference of the positions."""
+def _covariance(adjustment: Adjustment, a: _Place, b: _Place) -> FloatArray:
+    """Of b relative to a (6, 6): turn in the axes of b, position in the world."""
     dims = {n: J.shape[1] for p in (a, b) for n, J in p.by.items()}
-    back = np.eye(3) if a.R is None or b.R is None else b.R.T @ a.R
+    back = b.R.T @ a.R if a.R is not None and b.R is not None else np.eye(3)
     columns = [np.zeros((6, 0))]
     for n, dim in dims.items():
         of_a, of_b = (p.by.get(n, np.zeros((6, dim))) for p in (a, b))
         columns.append(np.vstack([of_b[:3] - back @ of_a[:3], of_b[3:] - of_a[3:]]))
     J = np.hstack(columns)
-    return np.asarray(J @ adjustment.precision.joint(list(dims)) @ J.T) if dims else np.zeros((6, 6))
+    return np.asarray(J @ np.asarray(adjustment.precision.joint(list(dims))) @ J.T if dims else np.zeros((6, 6)))
 
 
-def _relative(a: _Place, b: _Place, cov: FloatArray, region: Ellipsoid) -> RelativePrecision:
-    of_rotation = None if a.R is None or b.R is None else cov[:3, :3]
-    d, own = b.x - a.x, cov[3:, 3:]
+def _relative(a: _Place, b: _Place, cov: FloatArray, region: Ellipsoid, none: Ellipsoid) -> RelativePrecision:
+    """region: of positions; none: where there are none."""
+    d, own, of_rotation = b.x - a.x, cov[3:, 3:], cov[:3, :3] if a.R is not None and b.R is not None else None
     if not np.isfinite(d).all():
-        nan = np.full((3, 3), np.nan)
-        return RelativePrecision(a.name, b.name, d, nan, float("nan"), float("nan"), region, of_rotation)
+        return RelativePrecision(a.name, b.name, d, np.full((3, 3), np.nan), np.nan, np.nan, none, of_rotation)
     length = float(np.linalg.norm(d))
     u = d / length if length > 0.0 else np.zeros(3)
     along = float(np.sqrt(max(0.0, float(u @ own @ u))))

@@ -1,20 +1,22 @@
 """Tests, minimal detectable biases and external reliability of every observation of an adjusted survey."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
 from adjust.model.arrays import largest
+from adjust.model.frozen import frozen
 from adjust.model.names import numbered
 from adjust.model.result import Adjustment, ReadingResiduals
 from adjust.model.survey import FloatArray, IntArray
-from adjust.native.point_tests import AdjustedPoints, controlled_directions, point_tests
+from adjust.native.point_tests import AdjustedPoints, controlled_directions, external_reliability, point_tests
 from adjust.observations.pair_arrays import upper_inverse
 from adjust.precision.precision import Precision, precision_of
 from adjust.statistics.condensed import CondensedSystem, condensed_system
 from adjust.statistics.effects import influences
-from adjust.statistics.result import Influence, ObservationTests, Reliability
+from adjust.statistics.result import Influence, ObservationTests, Reliability, TestColumns
 from adjust.statistics.rows import groups_of_others
 from adjust.testing.criteria import Criteria, LevelOptions, criteria
 from adjust.testing.single_tests import Whitened, component_tests, whitened
@@ -27,7 +29,7 @@ _OF_COMPONENTS = ("w", "error", "detectable_component", "bias")
 """Columns as :func:`adjust.native.point_tests.point_tests` fills them."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Batch:
     """Observations of the same number of components: their rows in the table, what they are whitened with."""
 
@@ -54,7 +56,7 @@ def reliability(
     for batch in batches:
         sizes[batch.rows], freedom[batch.rows] = batch.x.g.shape[1], batch.x.freedom
     found = criteria(options, int(np.count_nonzero(freedom)), int(sizes.max(initial=1)))
-    tests = _table(adjustment, points, batches, np.concatenate([[0], np.cumsum(sizes)]), freedom, found)
+    tests = _table(adjustment, _Made(points, batches, sizes, adjustment.reading_residuals, found), freedom)
     if adjustment.survey.is_pose_network and len(sizes) > LARGEST_NETWORK:
         most_influences = 0
     return Reliability(
@@ -134,34 +136,70 @@ def _readings(precision: Precision, known: ReadingResiduals | None) -> list[_Bat
     return [_Batch(first + np.arange(n), x, W[:, None, None], 1.0 / W[:, None, None])]
 
 
-def _table(
-    adjustment: Adjustment, points: AdjustedPoints, batches: Sequence[_Batch], ptr: IntArray, freedom: IntArray,
-    found: Criteria,
-) -> ObservationTests:  # fmt: skip
-    M, K, n_image = len(freedom), int(ptr[-1]), len(points.v)
-    columns = {name: np.empty(M) for name in _OF_ROWS} | {name: np.empty(K) for name in _OF_COMPONENTS}
-    of_images = [columns[name][:n_image] for name in _OF_ROWS]
-    of_images += [columns[name][: 2 * n_image].reshape(-1, 2) for name in _OF_COMPONENTS]
-    point_tests(points, np.ascontiguousarray(found.lambda0[:2]), tuple(of_images))
-    used = np.empty(M, dtype=np.bool_)
-    used[:n_image] = points.used
-    for batch in batches:
-        rows = batch.rows
-        parts = (ptr[rows][:, None] + np.arange(batch.x.g.shape[1])).ravel()
-        used[rows] = batch.x.used
-        for name, values in _columns(batch, found).items():
-            columns[name][rows if values.ndim == 1 else parts] = values.ravel()
-    readings = adjustment.reading_residuals
-    if readings is not None:  # of joint readings: the shares of the degrees of freedom, not of a bias that shows
-        columns["redundancy"][M - len(readings.used) :] = readings.redundancy
+@frozen(eq=False)
+class _Made:
+    """What the tests of all observations are made of. n_components: (M,) of each."""
+
+    points: AdjustedPoints
+    batches: Sequence[_Batch]
+    n_components: IntArray
+    readings: ReadingResiduals | None
+    criteria: Criteria
+
+    @cached_property
+    def _of_batches(self) -> list[dict[str, FloatArray]]:
+        return [_columns(batch, self.criteria) for batch in self.batches]
+
+    @property
+    def lambda0(self) -> FloatArray:
+        """(2,) of tests with one and two components."""
+        return np.ascontiguousarray(self.criteria.lambda0[:2])
+
+    def of(self, observations: IntArray | None = None) -> TestColumns:
+        """Of some in ascending order, or of all."""
+        number = np.arange(len(self.n_components)) if observations is None else observations
+        ptr, n_image = np.append(0, np.cumsum(self.n_components[number])), len(self.points.v)
+        columns = {x: np.empty(len(number)) for x in _OF_ROWS} | {x: np.empty(int(ptr[-1])) for x in _OF_COMPONENTS}
+        n = int(np.searchsorted(number, n_image))
+        points = self.points if n == n_image else self.points.at(number[:n])
+        outs = [columns[name][:n] for name in _OF_ROWS]
+        outs += [columns[name][: 2 * n].reshape(-1, 2) for name in _OF_COMPONENTS]
+        point_tests(points, self.lambda0, tuple(outs))
+        for batch, found in zip(self.batches, self._of_batches, strict=True):
+            some = np.flatnonzero(np.isin(batch.rows, number))
+            rows = np.searchsorted(number, batch.rows[some])
+            parts = (ptr[rows][:, None] + np.arange(batch.x.g.shape[1])).ravel()
+            for name, values in found.items():
+                columns[name][rows if values.ndim == 1 else parts] = values[some].ravel()
+        if self.readings is not None:  # of joint ones: the shares of the degrees of freedom, not of a bias that shows
+            first = len(self.n_components) - len(self.readings.used)
+            mine = number[number >= first]
+            columns["redundancy"][len(number) - len(mine) :] = self.readings.redundancy[mine - first]
+        return TestColumns(ptr, **columns)
+
+    def external(self) -> FloatArray:
+        """External reliability (M,) of all."""
+        out = np.empty(len(self.n_components))
+        external_reliability(self.points, self.lambda0, out[: len(self.points.v)])
+        for batch, found in zip(self.batches, self._of_batches, strict=True):
+            out[batch.rows] = found["external"]
+        return out
+
+
+def _table(adjustment: Adjustment, made: _Made, freedom: IntArray) -> ObservationTests:
+    n_image = len(made.points.v)
+    used = np.empty(len(freedom), dtype=np.bool_)
+    used[:n_image] = made.points.used
+    for batch in made.batches:
+        used[batch.rows] = batch.x.used
     sizes, others = np.diff(adjustment.image_residuals.block_ptr), groups_of_others(precision_of(adjustment).graph)
     blocks = [(b.group, n) for b, n in zip(adjustment.survey.image_blocks, sizes.tolist(), strict=True) if n]
-    counts = [*(n for _, n in blocks), *[1] * len(others)]
     names, group = numbered([*(g for g, _ in blocks), *others])
+    counts: IntArray = np.array([*(n for _, n in blocks), *[1] * len(others)], dtype=np.int64)
     return ObservationTests(
-        n_image=n_image, ptr=ptr, group=np.repeat(group, counts), group_names=tuple(names), used=used,
-        n_components=np.diff(ptr), freedom=freedom, criteria=found,
-        omega=adjustment.omega, total_redundancy=adjustment.redundancy, sigma0=adjustment.sigma0, **columns,
+        n_image=n_image, runs=(group, counts), group_names=tuple(names), used=used, n_components=made.n_components,
+        freedom=freedom, external=made.external(), of=made.of, criteria=made.criteria,
+        omega=adjustment.omega, total_redundancy=adjustment.redundancy, sigma0=adjustment.sigma0,
     )  # fmt: skip
 
 
@@ -191,17 +229,21 @@ def _influences(
 ) -> tuple[Influence, ...]:  # fmt: skip
     if most <= 0:
         return ()
-    worth = np.where(tests.used & (tests.freedom > 0), tests.external, -1.0)
+    worth = np.where(tests.freedom > 0, tests.external, 0.0)
     rows = largest(worth, most)
-    rows = rows[worth[rows] > 0.0].tolist()
-    if not rows:
+    rows = rows[worth[rows] > 0.0]
+    if not len(rows):
         return ()
+    order = np.sort(rows)
+    found, at = tests.of(order), np.searchsorted(order, rows).tolist()
     W_of = {int(b.rows[i]): b.W[i] for b in batches for i in np.flatnonzero(np.isin(b.rows, rows))}
     bias = {}
-    for row in rows:
-        own = tests.bias[tests.ptr[row] : tests.ptr[row + 1]]
-        bias[row] = (np.insert(points.W[row], 2, 0.0).reshape(2, 2) if row < tests.n_image else W_of[row]) @ own
-    return influences(system or condensed_system(precision_of(adjustment)), rows, bias)
+    for row, i in zip(rows.tolist(), at, strict=True):
+        W = np.insert(points.W[row], 2, 0.0).reshape(2, 2) if row < tests.n_image else W_of[row]
+        bias[row] = W @ found.bias[found.ptr[i] : found.ptr[i + 1]]
+    moved = influences(system or condensed_system(precision_of(adjustment)), rows.tolist(), bias)
+    return tuple(replace(x, detectable=float(found.detectable[i]), external=float(found.external[i]))
+                 for x, i in zip(moved, at, strict=True))  # fmt: skip
 
 
 def _uncontrolled(adjustment: Adjustment, tests: ObservationTests) -> tuple[str, ...]:

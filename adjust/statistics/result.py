@@ -1,12 +1,13 @@
 """What the statistics of an adjustment give back: tables for a report, all values in SI units, angles in radians."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
 from adjust.model.errors import listed
+from adjust.model.frozen import frozen
 from adjust.model.result import ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.testing.criteria import Criteria
@@ -14,37 +15,25 @@ from adjust.testing.distributions import norm
 from adjust.testing.single_tests import p_posterior, p_prior, p_tau
 
 
-@dataclass(frozen=True, eq=False)
-class ObservationTests:
-    """Tests and reliability of every observation: image points first, then ``Adjustment.other_residuals``, M in all.
+@frozen(eq=False)
+class TestColumns:
+    """Tests and reliability of some observations, k in all, with the components ``ptr[i]`` to ``ptr[i + 1]`` of K.
 
-    n_image: rows of image points, in the order of ``ImageResiduals``. ptr: (M + 1,) ranges of an observation's
-    components in the arrays of length K. group: (M,) into ``group_names``. used: (M,).
-
-    n_components: (M,). freedom: (M,) controlled directions, the degrees of freedom of the test; 0: uncontrolled.
-    redundancy: (M,) sum of the redundancy numbers, 0 where not used. least: (M,) the smallest share of an error of
+    redundancy: (k,) sum of the redundancy numbers, 0 where not used. least: (k,) the smallest share of an error of
     this observation, in any direction, that shows in its own residuals (the redundancy number where it has one
     component); of what is not used how certain its prediction is, 1 / (1 + variance of the prediction / its own).
-    statistic: (M,) v' inv(Q_vv) v over the controlled directions. p: (M,) a priori (chi-square). p_posterior: (M,)
-    with sigma0 estimated (F; the tau-test where there is one component). fails: (M,) where p is below the level of the
-    criteria. Probabilities are computed when they are asked for.
-    detectable: (M,) length of the least detectable bias in sigmas of the observation, over the controlled directions;
-    inf where there is none. external: (M,) lambda-bar, how far that bias moves the unknowns: no unknown, and no
-    function of them, moves by more than this many of its sigmas; 0 where not used.
+    statistic: (k,) v' inv(Q_vv) v over the controlled directions. detectable: (k,) length of the least detectable bias
+    in sigmas of the observation, over the controlled directions; inf where there is none. external: (k,) lambda-bar,
+    how far that bias moves the unknowns: no unknown, and no function of them, moves by more than this many of its
+    sigmas; 0 where not used.
 
     w: (K,) Baarda's w of the single components, positive where the observed value is too large; nan where
-    uncontrolled. tau: (K,) Pope's. p_w, p_tau: (K,) two-sided. error: (K,) estimated gross error (observed minus
-    true) in the component's unit. detectable_component: (K,) minimal detectable bias of the component alone, in its
-    unit. bias: (K,) the least detectable bias as a vector, in units.
+    uncontrolled. error: (K,) estimated gross error (observed minus true) in the component's unit.
+    detectable_component: (K,) minimal detectable bias of the component alone, in its unit. bias: (K,) the least
+    detectable bias as a vector, in units.
     """
 
-    n_image: int
     ptr: IntArray
-    group: IntArray
-    group_names: tuple[str, ...]
-    used: BoolArray
-    n_components: IntArray
-    freedom: IntArray
     redundancy: FloatArray
     least: FloatArray
     statistic: FloatArray
@@ -54,10 +43,64 @@ class ObservationTests:
     error: FloatArray
     detectable_component: FloatArray
     bias: FloatArray
+
+
+class _Column:
+    """Of tests, by its name, an array of all observations."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, tests: "ObservationTests", owner: type) -> FloatArray:
+        found: FloatArray = getattr(tests.every, self._name)
+        return found
+
+
+@frozen(eq=False)
+class ObservationTests:
+    """Tests and reliability of every observation: image points first, then ``Adjustment.other_residuals``, M in all.
+
+    n_image: rows of image points, in the order of ``ImageResiduals``. runs: of observations one after the other of the
+    same group its number in group_names, and how many they are. used, n_components: (M,). freedom: (M,) controlled
+    directions, the degrees of freedom of the test; 0: uncontrolled. external: (M,) as in ``TestColumns``, whose arrays
+    of all observations this has by their names; they are computed when one is asked for. of: those of some
+    observations, in ascending order.
+
+    p: (M,) a priori (chi-square). p_posterior: (M,) with sigma0 estimated (F; the tau-test where there is one
+    component). fails: (M,) where p is below the level of the criteria. tau: (K,) Pope's. p_w, p_tau: (K,) two-sided.
+    """
+
+    n_image: int
+    runs: tuple[IntArray, IntArray]
+    group_names: tuple[str, ...]
+    used: BoolArray
+    n_components: IntArray
+    freedom: IntArray
+    external: FloatArray
+    of: Callable[[IntArray | None], TestColumns]
     criteria: Criteria
     omega: float
     total_redundancy: int
     sigma0: float
+
+    redundancy, least, statistic, detectable = _Column(), _Column(), _Column(), _Column()
+    w, error, detectable_component, bias = _Column(), _Column(), _Column(), _Column()
+
+    @cached_property
+    def every(self) -> TestColumns:
+        """Of all observations."""
+        return self.of(None)
+
+    @property
+    def ptr(self) -> IntArray:
+        """(M + 1,) ranges of an observation's components in the arrays of length K."""
+        return self.every.ptr
+
+    @cached_property
+    def group(self) -> IntArray:
+        """(M,) into ``group_names``."""
+        numbers, counts = self.runs
+        return np.repeat(numbers, counts)
 
     @cached_property
     def p(self) -> FloatArray:
@@ -90,13 +133,13 @@ class ObservationTests:
         return p_tau(self.tau[:, None], np.repeat(self.used, self.n_components), self.total_redundancy)[:, 0]
 
 
-@dataclass(frozen=True)
+@frozen
 class Influence:
     """What an undetected bias of the least detectable size does.
 
     row: of ``ObservationTests``. name, component, unit: the unknown that moves most in its sigmas; shift in that unit,
     ratio = shift / sigma. position, position_shift: the point or station whose origin moves furthest, m ("" and 0.0
-    where there is none).
+    where there is none). detectable, external: of the observation, as in ``TestColumns``.
     """
 
     row: int
@@ -107,9 +150,11 @@ class Influence:
     ratio: float
     position: ParameterName
     position_shift: float
+    detectable: float = np.nan
+    external: float = np.nan
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Reliability:
     """Tests of all observations, what they could not find, and what is not controlled.
 
@@ -125,7 +170,7 @@ class Reliability:
     redundancy: int
 
 
-@dataclass(frozen=True)
+@frozen
 class Alternative:
     """Two explanations that the data hardly tell apart: with ``instead`` out, ``kept`` would fit.
 
@@ -145,7 +190,7 @@ class Alternative:
         )
 
 
-@dataclass(frozen=True)
+@frozen
 class Correlation:
     """Two components of unknowns with their correlation coefficient."""
 
@@ -156,7 +201,7 @@ class Correlation:
     coefficient: float
 
 
-@dataclass(frozen=True)
+@frozen
 class WeakPart:
     """A component that moves in a weak direction: by ``amount`` (its unit) for one sigma of the direction."""
 
@@ -166,7 +211,7 @@ class WeakPart:
     amount: float
 
 
-@dataclass(frozen=True)
+@frozen
 class WeakDirection:
     """A combination of unknowns that the survey determines badly.
 
@@ -182,7 +227,7 @@ class WeakDirection:
         return f"{self.inflation:.3g} times weaker together than alone: {listed(named, most)}"
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Ellipsoid:
     """A confidence region: semi_axes (k,) m, largest first, axes (3, k) unit vectors in the world, at ``level``.
 
@@ -200,7 +245,7 @@ class Ellipsoid:
         return len(self.semi_axes)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class RelativePrecision:
     """Precision of b relative to a, whatever the datum of position.
 
@@ -218,7 +263,7 @@ class RelativePrecision:
     rotation_cov: FloatArray | None
 
 
-@dataclass(frozen=True)
+@frozen
 class BudgetLine:
     """What one source contributes to the standard uncertainty: u (unit of the parameter), share of the variance.
 
@@ -233,7 +278,7 @@ class BudgetLine:
     freedom: float
 
 
-@dataclass(frozen=True)
+@frozen
 class BudgetEntry:
     """Uncertainty budget of one component of a parameter (GUM, 8.1): largest source first.
 
@@ -251,7 +296,7 @@ class BudgetEntry:
     lines: tuple[BudgetLine, ...]
 
 
-@dataclass(frozen=True)
+@frozen
 class PartTest:
     """Whether the residuals of one part of a survey are as large as its sigmas say.
 
@@ -278,7 +323,7 @@ class PartTest:
         )
 
 
-@dataclass(frozen=True)
+@frozen
 class ChangeShift:
     """One component of a change: its amount in ``unit`` as the residuals have it, and the sigma of that."""
 
@@ -291,7 +336,7 @@ class ChangeShift:
 _IN_UNITS = {"rad": (" arcsec", 180.0 * 3600.0 / np.pi), "m": (" mm", 1e3), "1": ("", 1.0)}
 
 
-@dataclass(frozen=True)
+@frozen
 class Change:
     """What the residuals say that a camera, target or table has of its own: a score test of what was no unknown.
 
@@ -321,7 +366,7 @@ class Change:
         return f"{said}: {', '.join(parts)} (p {self.p:.2g})"
 
 
-@dataclass(frozen=True)
+@frozen
 class Consistency:
     """Whether every part of a survey fits, and whether cameras and targets stayed the same.
 

@@ -1,7 +1,6 @@
 """The whitened row of every observation of a graph over every unknown, sparse."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -9,6 +8,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from adjust.graph.assembly import AdjustmentGraph
+from adjust.model.frozen import frozen
 from adjust.model.result import ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.lenses import MAX_LENS
@@ -17,7 +17,7 @@ from adjust.observations.images.bundles import BundleBatch
 from adjust.observations.terrestrial.layout import Chunk
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Columns:
     """The free components of all unknowns, n in all, in the order of the graph's unknowns.
 
@@ -38,7 +38,7 @@ class Columns:
         return np.concatenate([self.at[n] for n in names] or [np.zeros(0, dtype=np.int64)])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ImageRows:
     """Whitened rows of the image points, as some observations: A (m, n), e (m,), how many rows each has, used, groups.
 
@@ -61,7 +61,7 @@ ItemRows = tuple[Sequence[int], FloatArray, FloatArray]
 """Keys of an observation, its whitened rows over them, and its whitened residuals."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class SurveyRows:
     """All observations at some values: ``A``, ``e``, ``ptr``, ``used`` as in ``LinearSystem``; groups (M,).
 

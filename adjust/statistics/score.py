@@ -5,7 +5,6 @@ v'Pv falls by ``g' inv(M) g``, and the change is ``-inv(M) g`` (score test, Rao 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
@@ -13,6 +12,7 @@ import numpy as np
 from scipy import sparse
 
 from adjust.frames.lens_states import lenders
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.statistics.normal import DENSE
@@ -27,7 +27,7 @@ _CUTS = 40
 _SMALL = 1_000_000  # numbers of a matrix that is written out
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Score:
     """theta: (k,) the change. cov: (k, k), a priori. drop: of v'Pv. seen: how many of the k directions show."""
 
@@ -51,7 +51,7 @@ Part = tuple[IntArray, FloatArray]
 """Rows (r,) of a linear system, and the derivatives (r, k) of their whitened residuals by a change."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class LinearScores:
     """An adjustment as a linear system, for scores."""
 
@@ -238,7 +238,7 @@ def drift_times(n: int) -> FloatArray:
     return np.asarray(np.linspace(-0.5, 0.5, n))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class SharedLens:
     """What ``camera`` shares with ``lender``: names (k,) with units, by how much its own would differ, cov a priori.
 

@@ -1,13 +1,14 @@
 """The whole adjustment of a survey: without its gross errors, and with estimated variances where that is asked for."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.graph.assembly import StartValues, values_of
 from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError, listed
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment, Component, VarianceComponents
 from adjust.model.subsets import positions_of
 from adjust.model.survey import Survey
@@ -32,7 +33,7 @@ _OTHERS = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
+@frozen
 class CleanOptions:
     """reject_pairs: leave out what contradicts the rest: pairs, and observations of all kinds but image points.
 

@@ -4,7 +4,6 @@ The solver condenses image points and hides unknowns; what compares observations
 influences, the search for outliers) needs them apart. Rows are linearised at the solution: ``e(x + dx) = e + A dx``.
 """
 
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
@@ -12,6 +11,7 @@ import numpy as np
 from scipy import sparse
 
 from adjust.graph.assembly import AdjustmentGraph
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.parallel import side_by_side
@@ -24,7 +24,7 @@ from adjust.statistics.normal import PLAIN, Inverse, Normal
 from adjust.statistics.rows import Columns, Entries, ItemRows, KeyColumns, MakeImageRows, points_apart, survey_rows
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class JointReadings:
     """Readings with a joint covariance. rows: (k,) of the system. W: (k, k), inv(cov) = W'W, that whitens them."""
 
@@ -32,7 +32,7 @@ class JointReadings:
     W: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class LinearSystem:
     """All observations at the solution, image points first, then ``Adjustment.other_residuals``; M in all.
 
@@ -154,7 +154,8 @@ class LinearSystem:
         if (weights[kept] != 1.0).any():
             weighted = A.copy()
             weighted.data *= np.repeat(weights[kept], np.diff(A.indptr))
-        return Normal((A.T @ weighted + self.datum.T @ self.datum).tocsc(), self.motions)
+        N = (A.T @ weighted).tocsc()
+        return Normal((N + self.datum.T @ self.datum).tocsc() if self.datum.shape[0] else N, self.motions)
 
     @cached_property
     def sigmas(self) -> FloatArray:

@@ -6,12 +6,13 @@ would leave the positive factors or go far, the scoring of their logarithms. In 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.graph.assembly import StartValues, values_of
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment, Component, VarianceComponents
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.precision.precision import precision_of
@@ -36,7 +37,7 @@ _LEVEL = 0.95
 """Of the confidence limits."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Scaled:
     """A survey adjusted with its estimated variances, and the components that were found."""
 
@@ -44,7 +45,7 @@ class Scaled:
     components: VarianceComponents
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class LinearComponents:
     """Factors of a linear system. theta: (G,) of all groups; estimated: (G,) which were; S: (k, k) of the sets.
 

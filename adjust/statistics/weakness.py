@@ -1,12 +1,12 @@
 """What is badly determined, by name: correlations, unknowns that replace each other, the weakest deformation."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from scipy import sparse
 
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import side_by_side
@@ -149,7 +149,7 @@ def _named(system: LinearSystem, found: _Found) -> tuple[Correlation, ...]:
     return tuple(Correlation(c.names[i], c.components[i], c.names[j], c.components[j], x) for i, j, x in order)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Structure:
     """A covariance matrix as a sum, its U over the sigmas, and the components (k,) that share enough with others."""
 

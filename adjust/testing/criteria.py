@@ -8,12 +8,12 @@ Baarda's B-method asks the same lambda0 of all tests, so that a bias is found eq
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from adjust.testing.distributions import chi2, ncx2
 
@@ -28,7 +28,7 @@ _OF_A_FACTOR = 0.001
 _CAUCHY = 2.385**2
 
 
-@dataclass(frozen=True)
+@frozen
 class LevelOptions:
     """How observations are tested.
 
@@ -48,7 +48,7 @@ class LevelOptions:
         return "sidak" if self.alpha0 is None else "b"
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Criteria:
     """Levels, critical values of chi-square and non-centralities of tests with 1, 2, ... components; (q,), q >= 6."""
 

@@ -17,6 +17,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from adjust.model.errors import IndeterminateError, NotConvergedError
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.testing.criteria import (
     MANY,
@@ -33,7 +34,7 @@ _LONGEST = 60
 """Observations that may go before the likeliest explanation is no longer looked for: far too much is wrong then."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Verdicts:
     """Of M observations: test statistics, degrees of freedom (0 where nothing tests one), which are in use.
 
@@ -64,7 +65,7 @@ def one_group(
     return Verdicts(statistic, freedom, used, freedom > 0, none, np.array([omega]), np.array([redundancy]))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class State(Generic[S]):
     """A solution without what is out. limit: (M,) of the tests, widened; over: (M,) tests over it, 0 where untested.
 

@@ -6,12 +6,12 @@ x (k,) and covariance C, ``x' inv(C) x`` is chi-square with k degrees of freedom
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from adjust.model.boards import BENT
 from adjust.model.clocks import CLOCK, CLOCKS
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import FloatArray
 from adjust.model.tables import harmonic
@@ -22,7 +22,7 @@ LEVEL = 0.05
 _BOARD = {"bend": (*BENT, "warp_xy"), "stretch": ("scale_x", "scale_y", "shear"), "expansion": ("expansion",)}
 
 
-@dataclass(frozen=True)
+@frozen
 class Significance:
     """The test of one term. statistic: F, or chi-square where sigma0 is known and ``freedom`` has one number."""
 

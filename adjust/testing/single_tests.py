@@ -6,10 +6,10 @@ rank(K) degrees of freedom, ``K^+ g`` the estimated gross error and K the normal
 Teunissen 2006). All in sigmas of the observation; the other two functions turn to its components.
 """
 
-from dataclasses import dataclass
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.testing.distributions import chi2, fisher, student
 
@@ -17,7 +17,7 @@ CONTROLLED = 1e-6
 """Share of an error that must show in the residuals to be told from rounding."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Whitened:
     """n observations of k components: g (n, k), K (n, k, k), eigenvalues (n, k) ascending, vectors (n, k, k), used."""
 

@@ -8,13 +8,13 @@ TriggerSelector TriggerMode TriggerSource TriggerSoftware DeviceSerialNumber. Dr
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 
 GrayImage = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 FeatureValue = bool | int | float | str
@@ -22,7 +22,7 @@ ImageSource = Callable[[float, float], GrayImage]
 """What a simulated camera looks at: of exposure time (us) and gain (dB), the image (h, w) that is seen now, 8 bit."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Frame:
     """One image that a camera handed over.
 
@@ -42,7 +42,7 @@ class Frame:
     complete: bool = True
 
 
-@dataclass(frozen=True)
+@frozen
 class CameraInfo:
     """A camera that a driver can reach: ``open_camera(info.address)`` opens it."""
 

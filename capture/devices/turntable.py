@@ -6,12 +6,12 @@ Angles are radians, one per axis, outermost first; they count whole turns, becau
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 
 TURN = 2 * math.pi
@@ -46,7 +46,7 @@ class StoppedError(TurntableError):
     """The move was ended by ``stop``."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Axis:
     """An axis and how far it may turn, rad; the limits count whole turns and so guard the cable too.
 
@@ -92,7 +92,7 @@ class Axis:
         return way / self.speed + self.speed / self.acceleration
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Location:
     """Where a table was sent and where it says it is, (n,) rad each, and when; ``setpoint`` is nan before any move."""
 
@@ -102,7 +102,7 @@ class Location:
     time_ns: int
 
 
-@dataclass(frozen=True)
+@frozen
 class Settle:
     """How the readback tells that an axis has come to rest; angles in rad.
 
@@ -118,7 +118,7 @@ class Settle:
     poll_s: float = 0.01
 
 
-@dataclass(frozen=True)
+@frozen
 class AxisState:
     """What a controller says of an axis: angle (rad, in the controller's count of turns), and a fault in its words."""
 

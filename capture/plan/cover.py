@@ -2,12 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from gtsam import Pose3
 
 from adjust.lenses.models import camera_constants, lens_model, monotone_radius_px, project
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, Camera, FloatArray, PoseParameter, Station, Survey, Target
 from adjust.start.network import table_from_mount
 from capture.plan.table import AxisPlan, TablePlan
@@ -16,7 +16,7 @@ _CELLS = (12, 10)
 _LEAST_GAIN = 0.5  # of a cell: what a pose must add before poses are taken for the sake of their angle
 
 
-@dataclass(frozen=True)
+@frozen
 class CoverRequest:
     """How to cover: number of poses, margin at the border (px), steps per axis in the search, steepest view (rad)."""
 

@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from capture.plan.given import with_given
 from capture.plan.poses import Pose, check_names, read_poses
@@ -22,7 +23,7 @@ _LEAST = {"repeats": 1, "retries": 0, "wait_s": 0, "retry_pause_s": 0, "overhead
 FeatureValue = bool | int | float | str
 
 
-@dataclass(frozen=True)
+@frozen
 class CameraPlan:
     """A camera of the project, where it is reached and how it is set; ``settings`` in the order of the file."""
 
@@ -32,7 +33,7 @@ class CameraPlan:
     options: Mapping[str, FeatureValue] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
+@frozen
 class CaptureOptions:
     """How a set of images is taken.
 
@@ -52,7 +53,7 @@ class CaptureOptions:
     quality: bool = True
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Shot:
     """One epoch that is to be taken: where the table stands, and which repeat of that pose it is."""
 
@@ -62,7 +63,7 @@ class Shot:
     angles: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class CapturePlan:
     """All that a session needs to know; ``shots`` in the order in which they are taken.
 
@@ -174,7 +175,7 @@ def check_plan_limits(plan: CapturePlan) -> None:
                 raise type(error)(f"{plan.file}: pose {pose.pose_id!r}: {error}") from error
 
 
-@dataclass(frozen=True)
+@frozen
 class Estimate:
     """What a plan will take: seconds of motion, of waiting and of taking images."""
 

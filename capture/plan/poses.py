@@ -2,12 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from capture.plan.given import with_given
 from capture.plan.table import TablePlan
@@ -21,7 +21,7 @@ _KINDS = ("grid", "list", "cover", "still")
 _MOST_POSES = 100_000
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Pose:
     """A position of the table, (n,) rad (empty where there is no table); its id names its epochs."""
 

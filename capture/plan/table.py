@@ -1,12 +1,13 @@
 """The section [table] of a capture plan, and the table that it describes."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from capture.devices.turntable import Axis, Controller, Settle
 from capture.devices.turntables.moving import MovingTable
@@ -35,7 +36,7 @@ _AXIS = (
 )
 
 
-@dataclass(frozen=True)
+@frozen
 class AxisPlan:
     """An axis and how its controller counts: angle = sign * (controller's angle) + zero, rad.
 
@@ -51,7 +52,7 @@ class AxisPlan:
     noise: float = 0.0
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class TablePlan:
     """A table of the project: its axes outermost first, how it is reached, when it counts as settled.
 

@@ -1,11 +1,12 @@
 """How good an image is, quickly enough to be told while the session runs: light, sharpness, targets, coverage."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import cv2
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray
 from capture.devices.camera import Frame, GrayImage
 from survey.detection.batch import detect_image
@@ -18,7 +19,7 @@ _EDGE_SHARE = 0.25  # of the strongest gradient: what counts as an edge
 _FEWEST_EDGE_PX = 50
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ImageQuality:
     """What can be said about one image.
 

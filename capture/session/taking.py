@@ -10,12 +10,13 @@ import socket
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from capture.devices.camera import CameraError, DisconnectedError, Frame
 from capture.devices.turntable import (
     LimitError,
@@ -44,7 +45,7 @@ class SessionStoppedError(SurveyError):
         self.interrupted = interrupted
 
 
-@dataclass(frozen=True)
+@frozen
 class Taken:
     """An epoch that was just taken, for whoever shows the progress; frames by camera_id."""
 
@@ -54,7 +55,7 @@ class Taken:
     total: int
 
 
-@dataclass(frozen=True)
+@frozen
 class Outcome:
     """What a session did: epochs planned, taken before and now, retries by kind of fault."""
 

@@ -3,10 +3,10 @@
 import json
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 
 Angles = Callable[[], tuple[float, float]]
 """The true angles (axis1, axis2) of the table at this moment, rad."""
@@ -19,7 +19,7 @@ def write_angles(path: Path, axis1_rad: float, axis2_rad: float) -> None:
     os.replace(temporary, path)
 
 
-@dataclass(frozen=True)
+@frozen
 class AnglesFile:
     """Reads what ``write_angles`` wrote: ``AnglesFile(path)()``."""
 

@@ -5,7 +5,7 @@ with the exposure time, so the room needs 10 ms, and at 0.25 ms it is dark and t
 """
 
 from collections import OrderedDict
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from itertools import count
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy.typing as npt
 from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from survey.simulate.draft import Draft
 from survey.simulate.facets import PlacedTarget
@@ -37,7 +38,7 @@ _NON_ORTHOGONALITY_ARCSEC, _AXIS_OFFSET_MM = 60.0, 0.35
 _Light = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]
 
 
-@dataclass(frozen=True)
+@frozen
 class LabPose:
     """A position of the table that is worth an image: what to take there, and of what."""
 
@@ -48,7 +49,7 @@ class LabPose:
     exposure_us: float
 
 
-@dataclass(frozen=True)
+@frozen
 class LabSize:
     """How many positions there are: with the board, for each camera, and with beacons."""
 
@@ -56,7 +57,7 @@ class LabSize:
     n_beacon: int = 0
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class SimulatedLab:
     """See the module. ``noise_seed``: of the noise of the images, one for each process that plays a camera."""
 

@@ -13,7 +13,6 @@ comparable; they are left out by name.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.epochs.states import differences_of, laid_onto, origin
 from adjust.model.errors import listed
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from adjust.spatial.motions import values_motions
 from adjust.spatial.rotation_forms import quaternion_wxyz
@@ -39,7 +39,7 @@ _LEVEL = 0.01
 _DETERMINED = 1e-9
 
 
-@dataclass(frozen=True)
+@frozen
 class Place:
     """A point or pose in the world: x_mm, quaternion w x y z (of a pose), covariance row by row in its tangent, SI."""
 
@@ -55,7 +55,7 @@ class Place:
         return x if self.wxyz is None else Pose3(Rot3.Quaternion(*self.wxyz), x)
 
 
-@dataclass(frozen=True)
+@frozen
 class FreeDatum:
     """Of an epoch: open_motions (k, 7) t, rotation vector, ln scale; names that carry it; everything in the world."""
 
@@ -64,7 +64,7 @@ class FreeDatum:
     places: tuple[Place, ...]
 
 
-@dataclass(frozen=True)
+@frozen
 class Moved:
     """A place in the common datum: x_mm and sigmas_mm (3,), and of a pose its quaternion and sigmas (arcsec)."""
 

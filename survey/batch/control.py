@@ -8,10 +8,10 @@ A sigma a posteriori is itself estimated, by the sigma0 of its epoch: a deviatio
 redundancy of that epoch, and is judged by the normal number that is as improbable.
 """
 
-from dataclasses import dataclass
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.testing.distributions import chi2, norm, student
 
@@ -23,7 +23,7 @@ _MEDIAN_RANGE = 0.9538725524
 """Median of |x1 - x2| of two normal numbers in their sigmas: sqrt(2) times the 75 % quantile of the normal."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Series:
     """A number over the epochs: value and sigma (n,) in ``unit``, at ``epoch`` (n,), positions in the batch.
 
@@ -38,7 +38,7 @@ class Series:
     freedom: FloatArray
 
 
-@dataclass(frozen=True)
+@frozen
 class Run:
     """Neighbours ``first`` to ``last`` (positions in the series) that chance hardly makes.
 
@@ -50,7 +50,7 @@ class Run:
     last: int
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Chart:
     """What the chart of a series says.
 

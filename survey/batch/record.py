@@ -2,12 +2,13 @@
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, field
 from pathlib import Path
 from typing import Any, TypeGuard
 
 from adjust.frames.unknowns import POSE_COMPONENTS
 from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
+from adjust.model.frozen import frozen
 from survey.batch.common_datum import FreeDatum, Place, free_datum
 from survey.folder.locking import BusyError
 from survey.folder.shapes import NUMBER, POSITIVE, REAL, WHOLE, Each, Either, misfit
@@ -80,7 +81,7 @@ def _is_turn(values: object, n: int) -> bool:
     return _is_row(values, n) and abs(sum(v * v for v in values) - 1.0) < 1e-3
 
 
-@dataclass(frozen=True)
+@frozen
 class Number:
     """An estimated number that is there once in a survey: name ``kind/id/component``, in the unit of result files."""
 
@@ -90,7 +91,7 @@ class Number:
     sigma: float
 
 
-@dataclass(frozen=True)
+@frozen
 class Turn:
     """An estimated rotation: quaternion w x y z of ``a_from_b``, sigmas (arcsec) of small rotations about b's axes."""
 
@@ -99,7 +100,7 @@ class Turn:
     sigmas_arcsec: tuple[float, ...]
 
 
-@dataclass(frozen=True)
+@frozen
 class Record:
     """One folder of a batch.
 

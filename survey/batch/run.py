@@ -5,13 +5,14 @@ import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.native.parallel import cores
 from survey.batch.cache import fingerprint, unchanged_solution
 from survey.batch.cluster import on_cluster
@@ -23,7 +24,7 @@ from survey.folder.text import NOT_OURS
 Told = Callable[[Record], None]
 
 
-@dataclass(frozen=True)
+@frozen
 class BatchOptions:
     """How a batch is run.
 

@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from adjust.model.frozen import frozen
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import norm
 from survey.batch.common_datum import Moved, in_common_datum, incomparable, scale_is_open
@@ -18,7 +19,7 @@ LEVEL = 0.05
 """Error probability of all charts together, for the tests of agreement and of slopes."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Finding:
     """What is wrong with a chart: ``disagrees``, ``drifts``, ``outside`` of own sigmas, or the kind of a run.
 
@@ -29,7 +30,7 @@ class Finding:
     epochs: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Trends:
     """Charts of all numbers that two epochs or more have, most alarming first.
 

@@ -1,6 +1,8 @@
 """The commands ``adjust``, for one project folder or many as a batch, and ``report``, its precision report alone."""
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,6 +11,7 @@ from survey.commands.common import (
     TEST_FAILED,
     begin_adjusting,
     is_set,
+    load_late,
     not_negative,
     positive,
     require_project,
@@ -16,11 +19,13 @@ from survey.commands.common import (
     show,
     tell,
     tested,
+    use_memory_again,
 )
 from survey.commands.parser import command, flag, group, project_folder
 
 if TYPE_CHECKING:
     from survey.batch.record import Record
+    from survey.project.tables.files import Begun
 
 
 @command(
@@ -76,15 +81,13 @@ def adjust(arguments: argparse.Namespace) -> int:
 
 
 def _adjust_one(folder: Path, arguments: argparse.Namespace) -> int:
-    begin_adjusting()
     require_project(folder, arguments.out)
     if arguments.candidate is not None:
+        begin_adjusting()
         from survey.jobs.adjusting.trying import try_job
 
         say(arguments, try_job(folder, arguments.candidate))
-    from survey.project.tables.files import reading_ahead
-
-    with reading_ahead(folder) as ahead:
+    with _beginning(folder) as ahead:
         from survey.jobs.adjusting.job import adjust_job
         from survey.report.language import ReportOptions
 
@@ -96,6 +99,19 @@ def _adjust_one(folder: Path, arguments: argparse.Namespace) -> int:
     if is_set(arguments, "verbose"):
         say(arguments, *(f"{step}: {seconds:.2f} s" for step, seconds in outcome.run.seconds.items()))
     return tested(outcome.solution["summary"])
+
+
+@contextmanager
+def _beginning(folder: Path) -> Iterator[dict[Path, "Begun"]]:
+    """Large tables are read while libraries are loaded, and these before the rest of this program."""
+    use_memory_again()
+    from survey.folder.ahead import reading_ahead
+
+    with reading_ahead(folder) as ahead:
+        load_late()
+        from survey.project.tables.files import begin_tables
+
+        yield begin_tables(ahead)
 
 
 def _adjust_batch(arguments: argparse.Namespace) -> int:
@@ -145,13 +161,10 @@ def _adjust_batch(arguments: argparse.Namespace) -> int:
 )
 def report(arguments: argparse.Namespace) -> int:
     """The command ``report``."""
-    begin_adjusting()
     require_project(arguments.folder, arguments.out)
-    from survey.project.tables.files import reading_ahead
-
     language = arguments.language if arguments.language != "en" else None
     flags = {"language": language, "pdf": arguments.pdf, "check": arguments.check, "out": arguments.out}
-    with reading_ahead(arguments.folder) as ahead:
+    with _beginning(arguments.folder) as ahead:
         from survey.jobs.adjusting.job import adjust_job
         from survey.report.language import ReportOptions
         from survey.solution.earlier.runs import command_line

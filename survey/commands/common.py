@@ -20,6 +20,7 @@ from survey.folder.messages import message, shown
 
 DONE, FAILED, USAGE, TEST_FAILED, INTERRUPTED = 0, 1, 2, 3, 130
 _OBJECTS = 400_000  # new ones before Python looks for cycles: loading modules makes 150,000 and no cycles
+_TURN = 0.0005  # s that a thread which comes back from a kernel waits for one that runs Python
 _MALLOC = {-3: 2**30, -1: 2**30, -2: 2**26, -8: 1}  # M_MMAP_THRESHOLD, _TRIM_THRESHOLD, _TOP_PAD (bytes), _ARENA_MAX
 _OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)  # writing does not say which file
 
@@ -73,16 +74,23 @@ def run_as_program(main: Callable[[], int]) -> NoReturn:
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     gc.set_threshold(_OBJECTS)
+    sys.setswitchinterval(_TURN)
     code = main()
     gc.freeze()  # at its end Python looks for cycles once more, in all that was ever loaded
     sys.exit(code)
 
 
 def begin_adjusting() -> None:
-    """Before a command that adjusts and ends: less to load, and memory that was freed is used again.
+    """Before a command that adjusts and ends: less to load, and memory that was freed is used again."""
+    use_memory_again()
+    load_late()
 
-    Modules that load when their contents are first looked at: SciPy imports all of NumPy and needs little of it. Large
-    arrays come and go by the hundred; given back every time, the system clears as many pages as the command has points.
+
+def use_memory_again() -> None:
+    """Before the first thread and the first array.
+
+    Large arrays come and go by the hundred; given back every time, the system clears as many pages as the command has
+    points.
     """
     import ctypes  # here: --help starts without it
 
@@ -91,6 +99,10 @@ def begin_adjusting() -> None:
     if sys.platform == "linux" and (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:  # of glibc
         for option, value in _MALLOC.items():
             mallopt(option, value)
+
+
+def load_late() -> None:
+    """Modules that load when their contents are first looked at: SciPy imports all of NumPy and needs little of it."""
     for name in ("numpy.f2py", "numpy.testing"):  # not numpy.ma: two threads that are first to use a lazy module fail
         spec = None if name in sys.modules else importlib.util.find_spec(name)
         if spec is not None and spec.loader is not None:
@@ -110,7 +122,7 @@ class Version(argparse.Action):
         from importlib.metadata import PackageNotFoundError, version
 
         from adjust.model.errors import SurveyError
-        from adjust.native import instruction_set
+        from adjust.native.library import instruction_set
 
         try:
             core = f"(native core: {instruction_set()})"

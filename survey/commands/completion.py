@@ -3,9 +3,9 @@
 import argparse
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
 
+from adjust.model.frozen import frozen
 from survey.commands.common import DONE
 from survey.commands.parser import Commands, Parser
 
@@ -18,7 +18,7 @@ Next: open a new shell, type {program} and press Tab
 """
 
 
-@dataclass(frozen=True)
+@frozen
 class Flag:
     """A flag of a command. choices: what may follow it, empty where that is free or nothing."""
 
@@ -28,7 +28,7 @@ class Flag:
     takes_value: bool
 
 
-@dataclass(frozen=True)
+@frozen
 class Command:
     """A command, its flags, and the words that may stand in it where they are known."""
 

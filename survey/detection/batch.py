@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -13,6 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from adjust.native.parallel import cores
 from survey.detection.checkerboard import find_checkerboard
@@ -54,7 +55,7 @@ _MOST_THREADS = 8  # so many keep busy beside Python's lock, which is free for n
 _IMAGES_PER_PROCESS = 50  # a process takes some seconds to start, the time of that many images
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class DetectionTask:
     """One image and what to look for in it: targets by id, and spots where options are given."""
 

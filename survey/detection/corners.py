@@ -3,7 +3,7 @@
 A whole board has squares beside each other, and ends where it was said to end.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import cv2
@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.native import vision
 from adjust.native.vision import may_go_on, squares_follow
@@ -24,7 +25,7 @@ CROSSING_FLOOR_PX, MARKER_FLOOR_PX = 0.0002, 0.0005
 _PIXEL_VARIANCE = 1.0 / 12.0
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class CornerFit:
     """Fitted corners: uv (n, 2) px, cov (n, 2, 2) px^2, blur (n,) px of the lens without the pixel, contrast (n,) grey.
 

@@ -5,11 +5,11 @@ are not independent, and what a scene shows differs from tile to tile (clusters;
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.testing.distributions import fisher
 from survey.detection.gray import Gray32
@@ -33,7 +33,7 @@ _STRAIGHT, _EDGE = 0.8, 0.03
 """Share of one direction among the gradients around, and of the contrast in the gradient, that make an edge."""
 
 
-@dataclass(frozen=True)
+@frozen
 class ImageDefect:
     """kind: ``bayer mosaic``, ``interlaced`` or ``motion blur``. size: share of the grey value, px, px; sigma of it.
 

@@ -7,12 +7,13 @@ that were declared is looked for too: another dictionary, inverted print, mirror
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import cv2
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from survey.detection.corners import CornerFit, refine_corners, unbent
 from survey.detection.gray import Gray8, Gray32, reduced
@@ -186,7 +187,7 @@ _FEWEST, _SHARE = 4, 0.4
 Markers = Charuco | MarkerGrid | MarkerBlock
 
 
-@dataclass(frozen=True)
+@frozen
 class OtherMarkers:
     """How n markers are seen. dictionary: to be declared. inverted, mirrored: the image. legacy: of a ChArUco board."""
 

@@ -1,15 +1,16 @@
 """What detection gives back, as frozen values."""
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Detection:
     """Points of one target in one image; empty where it was not found, and ``reason`` says why.
 
@@ -35,7 +36,7 @@ def nothing_found(reason: str, other_size: tuple[int, int] | None = None) -> Det
     return Detection(*none, reason=reason, other_size=other_size)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Spots:
     """Luminous spots of one image, brightest first: uv (n, 2) px, cov (n, 2, 2) px^2, full width at half maximum (n,).
 
@@ -52,7 +53,7 @@ class Spots:
         return len(self.uv)
 
 
-@dataclass(frozen=True)
+@frozen
 class SpotOptions:
     """Which spots to look for.
 
@@ -66,7 +67,7 @@ class SpotOptions:
     max_count: int = 1000
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ImageReport:
     """What became of one image.
 

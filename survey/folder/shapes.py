@@ -6,13 +6,14 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, TypeGuard
+
+from adjust.model.frozen import frozen
 
 _LARGEST = 1e15
 
 
-@dataclass(frozen=True)
+@frozen
 class Each:
     """A dictionary of any keys, all values of one shape; ``key`` may refuse some."""
 
@@ -20,7 +21,7 @@ class Each:
     key: Callable[[str], bool] = lambda _: True
 
 
-@dataclass(frozen=True)
+@frozen
 class Either:
     """One of several shapes."""
 

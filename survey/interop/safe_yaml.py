@@ -6,7 +6,6 @@ is, which gives its errors lines too. OpenCV's files begin with "%YAML:1.0" and 
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 import yaml
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from survey.folder.text import decode, read_bytes, suggestion
 from survey.interop.networks.foreign import Where, number
@@ -25,7 +25,7 @@ OPENCV_MATRIX = "tag:yaml.org,2002:opencv-matrix"
 _LOADER: type = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Entry:
     """A place in such a file: text, a list or a mapping, with its line and the keys that lead to it."""
 

@@ -8,13 +8,13 @@ along -z) and stand where the first epoch has them.
 import json
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from gtsam import Pose3
 
 from adjust.lenses.models import MODELS, camera_constants, focal_length_px
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef
 from adjust.model.survey import Camera, FloatArray, IntArray
 from survey.interop.cameras.values import CameraValues
@@ -26,7 +26,7 @@ _COLORS = {"beacon": (214, 39, 40), "target": (31, 119, 180), "camera": (44, 160
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Scene:
     """What is drawn, in the world. ellipsoids: by beacon, (4, 4) of the unit sphere, not enlarged; its cov (3, 3)."""
 

@@ -1,12 +1,12 @@
 """The job of the command ``align``: adjust the readings, write the working sheet, keep the rounds."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from markupsafe import Markup
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import csv_rows, csv_text, read_text, time_text
@@ -21,7 +21,7 @@ PAGE, ROUNDS = "alignment.html", "alignment_rounds.csv"
 ROUND_COLUMNS = ("date", "task", "state", "x_arcsec", "y_arcsec", "z_arcsec", "sigma_x", "sigma_y", "sigma_z")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class AlignOutcome:
     """The sheets, and where they were written."""
 

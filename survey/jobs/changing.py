@@ -3,11 +3,12 @@
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Any
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from survey.folder.replacing import place_for, replace_parts
 from survey.folder.whole import complete
 from survey.jobs.adjusting.outcome import AdjustOutcome, made
@@ -19,7 +20,7 @@ from survey.solution.earlier.previous import Move, change_dict, change_lines, mo
 from survey.solution.earlier.runs import Clock
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Change:
     """What becomes of a project. entries: what is new of it in the place where it is made.
 
@@ -36,7 +37,7 @@ class Change:
     told: bool = False
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ChangeOutcome:
     """A changed project, adjusted. start: how the adjustment began, for people.
 

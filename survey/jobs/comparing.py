@@ -2,7 +2,6 @@
 
 import math
 import os
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from adjust.epochs.congruence import CongruenceOptions, congruence
 from adjust.epochs.congruence_result import Congruence, CongruenceTest, Motion
 from adjust.epochs.deformation import Deformation, station_deformations
 from adjust.model.errors import SurveyError, listed
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from adjust.observations.copies import shared_observations
 from survey.folder.plain import attributes, plain
@@ -25,7 +25,7 @@ ALPHA = 0.05
 _MOST = 60
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class CompareOutcome:
     """Both folders with their adjustments, the deformation of neighbouring stations, and the congruence of all.
 

@@ -8,7 +8,7 @@
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 
 from adjust.graph.assembly import values_of
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from survey.folder.replacing import filling
 from survey.folder.text import read_bytes, suggestion
@@ -67,7 +68,7 @@ _ENDINGS = {
 }
 
 
-@dataclass(frozen=True)
+@frozen
 class ConvertOutcome:
     """What was written. counts: by what they count. values: which poses or coordinates. left_out: for people."""
 

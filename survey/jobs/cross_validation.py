@@ -6,7 +6,7 @@ that name in its tour).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,7 @@ from adjust.lenses.compared import (
 )
 from adjust.model.arrays import FloatArray
 from adjust.model.errors import SurveyError, listed
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from adjust.model.survey import Camera, Survey
 from survey.jobs.adjusting.steps import adjust_project
@@ -33,7 +34,7 @@ from survey.project.reading import leaving_out
 from survey.solution.quantities import scale_of
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class LensHalves:
     """One camera's two lenses. difference: of the second to the first, at ``Difference.uv``.
 
@@ -81,7 +82,7 @@ class LensHalves:
                 "covered": self.difference.fitted}  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class CrossValidation:
     """A project's epochs in two halves. epochs: of each. sigma0: of each. distance: m, of the points compared."""
 

@@ -9,10 +9,10 @@ Nothing is adjusted: every command obeys the file from then on.
 import getpass
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write, suggestion, time_text
 from survey.project import Project
@@ -25,7 +25,7 @@ from survey.project.reading import leaving_out, read_all
 FILE = f"{OBSERVATIONS_FOLDER}/{EXCLUSIONS_FILE}"
 
 
-@dataclass(frozen=True)
+@frozen
 class ExcludeOutcome:
     """What was left out or taken back, by name, with what each name means; ``path``: the file that has it."""
 

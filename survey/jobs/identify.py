@@ -5,7 +5,7 @@ half as near again; everything else is left unidentified and reported.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -13,6 +13,7 @@ from gtsam import Pose3
 
 from adjust.frames.lens_times import LensTimes
 from adjust.lenses.models import MODELS, camera_constants, project
+from adjust.model.frozen import frozen
 from adjust.model.names import natural_key
 from adjust.model.observations import FrameRef, ImageBlock
 from adjust.model.result import Adjustment, ParameterName
@@ -24,7 +25,7 @@ from survey.solution.frames import AdjustedFrames
 _SECOND_BEST = 1.5
 
 
-@dataclass(frozen=True)
+@frozen
 class Identification:
     """Image blocks of identified beacons, and notes about what was not identified."""
 
@@ -87,7 +88,7 @@ def rough_positions(survey: Survey) -> dict[str, FloatArray]:
     return known
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class SpotView:
     """Spots of one image and what its camera is by the adjustment; pose: world_from_camera, None where not known."""
 

@@ -1,7 +1,7 @@
 """The jobs ``plan`` (what a network of pairs will tell, before it is measured) and ``add`` (let one grow)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +9,7 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model.errors import SurveyError, listed
+from adjust.model.frozen import frozen
 from adjust.model.observations import Pair
 from survey.jobs.changing import Change, ChangeOutcome, changed_project
 from survey.project import Definition, read_definition
@@ -33,7 +34,7 @@ _MOST_SHOWN = 8
 _MOST_NAMED = 12
 
 
-@dataclass(frozen=True)
+@frozen
 class PlanOutcome:
     """What can be said before measuring, section by section; ``problems`` for people, worst first."""
 

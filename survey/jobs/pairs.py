@@ -5,7 +5,7 @@
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef, Pair, frame_text
 from adjust.model.survey import FloatArray, PoseParameter, Station, Survey
 from adjust.relay.eyes.drift import sequences
@@ -44,7 +45,7 @@ _OPTIONS = AdjustmentOptions(sigmas="a_priori")
 """Pairs that share errors close their loops too well, so sigma0 says nothing of them."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PairsOutcome:
     """What was found and where it stands. written: the project folder with the pairs, None where none was asked for.
 

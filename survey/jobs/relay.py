@@ -6,13 +6,14 @@
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.result import Adjustment
 from adjust.model.subsets import in_use
@@ -35,7 +36,7 @@ _GROWTH_S = (0.1, 0.3, 1.0, 3.0, 9.0)
 _COLUMNS = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class RelayPairs:
     """eyes: every two eyes by themselves. closed: the same with loops closed, None without loop. joint: all at once.
 
@@ -52,7 +53,7 @@ class RelayPairs:
         return tuple(self.joint.pair(p.a.frame_id, p.b.frame_id, p.group) for p in self.eyes.pairs)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class RelayTrackers:
     """What trackers on one station gave: clocks against the first, drift, pairs; growth (L, k - 1, 2) by interval.
 

@@ -3,13 +3,13 @@
 import json
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from survey.folder.replacing import filling
 from survey.folder.text import atomic_write, id_problem
 from survey.project.images import IMAGE_ENDINGS, visible
@@ -25,7 +25,7 @@ _MARKERS = 4  # in one image: no chance of a false one each
 _SQUARE_MM = 30.0
 
 
-@dataclass(frozen=True)
+@frozen
 class StartOutcome:
     """A project that was begun.
 

@@ -7,7 +7,6 @@ aligns it: a foot at (x, y) of the body, which stands too high by ``(w x p)_z = 
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -15,6 +14,7 @@ from gtsam import Rot3
 
 from adjust.frames.tree import FrameTree
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray
@@ -31,7 +31,7 @@ STATES: Mapping[State, str] = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
+@frozen
 class AxisState:
     """What is off about one axis of the body: angle and sigma (rad); ``uncertainty`` is that of the stated level."""
 
@@ -42,7 +42,7 @@ class AxisState:
     state: State
 
 
-@dataclass(frozen=True)
+@frozen
 class FootMove:
     """How far a foot is to move along the body's z axis (m), against the one that stays, and in turns of its screw."""
 
@@ -53,7 +53,7 @@ class FootMove:
     stays: bool
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Sheet:
     """One alignment: w (3,) rad with covariance (3, 3), what it means about each axis and at each foot.
 

@@ -1,12 +1,12 @@
 """Batches from Python: ``survey.adjust_many(folders)``."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from survey.batch.charts import control_chart
 from survey.batch.page import write_overview
 from survey.batch.record import CAUSES, FAILED, Record
@@ -20,7 +20,7 @@ from survey.notebook.plots import Plot
 from survey.report.drawing import ON_WHITE, standalone
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Batch:
     """Records of all folders, in their order; data frames, control charts by name, an overview report."""
 

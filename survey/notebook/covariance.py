@@ -1,17 +1,17 @@
 """A covariance by names, as a value that shows itself."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from survey.notebook.frames import pandas
 from survey.notebook.names import Cell, Component, heading, html_table
 from survey.solution.quantities import correlations_in, sigmas_in
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Covariance:
     """Joint covariance of components of estimates: ``matrix`` (n, n) in SI units, rad, px as ``units`` says.
 

@@ -4,7 +4,6 @@ Every function gives a new frame; changing one changes no result. Sigmas are sca
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter, itemgetter
 from typing import Any, Protocol, TypeVar
@@ -12,6 +11,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from gtsam import Pose3
 
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from adjust.statistics.result import RelativePrecision
 from survey.folder.extras import library
@@ -154,7 +154,7 @@ def unknowns(s: Solved) -> Any:
     return frame(_parts(s), columns[:4], {name: name for name in columns})
 
 
-@dataclass(frozen=True)
+@frozen
 class _Part:
     """One component of an estimate, in units inside; of a pose it has no value."""
 

@@ -1,13 +1,13 @@
 """Plots by name: the pictures of the report, one by one, as SVG."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from markupsafe import Markup
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray
 from survey.folder.text import atomic_write, choice_hint, suggestion
@@ -21,7 +21,7 @@ from survey.solution.statistics import correlation_matrix
 from survey.solution.verdict import suspects
 
 
-@dataclass(frozen=True)
+@frozen
 class Plot:
     """A picture that a notebook shows; ``svg`` is the file."""
 

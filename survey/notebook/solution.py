@@ -1,7 +1,6 @@
 """A solved survey as a notebook user wants it: data frames, covariances and plots by name, and its report."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -9,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from survey.jobs.adjusting.published_methods import published_dict
 from survey.notebook import frames
@@ -25,7 +25,7 @@ from survey.solution.statistics import Statistics, statistics_of
 from survey.solution.verdict import MISFIT, UNTESTED, fit_of
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Solution:
     """An adjusted project. Data frames are made new each time they are asked for; nothing in here changes.
 

@@ -1,10 +1,11 @@
 """The five steps over frozen values: read -> problem -> solve -> precision -> report. Each step returns a new value."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import Survey
 from survey.folder.text import suggestion
 from survey.jobs.adjusting.outcome import run_info
@@ -49,7 +50,7 @@ def include(folder: str | Path, *names: str, reason: str = "", author: str = "")
     return include_job(Path(folder), names, reason, author)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Problem:
     """What is to be adjusted: a project and how. It shows what is observed and what is asked for."""
 

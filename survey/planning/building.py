@@ -1,13 +1,14 @@
 """From a project and its plan to a survey with predicted observations, its values, and candidates."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from adjust.design import Candidate, predict, with_candidates
 from adjust.graph.assembly import StartValues
 from adjust.model.errors import SurveyError, listed
+from adjust.model.frozen import frozen
 from adjust.model.observations import ImageBlock, PositionRef, TableReading
 from adjust.model.result import Adjustment
 from adjust.model.survey import IntArray, Point, PointParameter, Station, Survey
@@ -17,7 +18,7 @@ from survey.planning.values import PlannedValues, gathered, placed_moments
 from survey.project import Project
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Planned:
     """A survey of existing and planned observations, the values of everything, and what could be added.
 

@@ -4,12 +4,13 @@
 >>> print(outcome.text())
 """
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from adjust.diagnosis.beforehand import Beforehand, Finding, coverage, look_beforehand
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import Survey
 from survey.jobs.adjusting.steps import with_loops_closed
 from survey.jobs.detecting.image_defects import defective
@@ -24,7 +25,7 @@ _LARGE = 1500
 """Unknowns up to which candidates are thought of where no plan.toml lists some: above that they take minutes."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class CheckOutcome:
     """What was found in a project. next_best: candidates of plan.toml, the most useful first."""
 

@@ -1,7 +1,7 @@
 """The job behind ``labsurvey plan --error-analysis``: figures 4 to 6 of the head's paper, and tolerances from them."""
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ from markupsafe import Markup
 from adjust.design.error_analysis import BeaconField, tolerance
 from adjust.design.error_figures import ErrorFigure, error_figures
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from survey.folder.plain import plain
 from survey.folder.replacing import write_set
 from survey.planning.page import html_page
@@ -22,7 +23,7 @@ BOUNDED = BeaconField(nearest_m=0.1)
 _NUMBERS = {"beacon position": "4", "camera position": "5", "camera attitude": "6"}
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ErrorAnalysis:
     """The figures with a nearest depth and as the paper has them, and the tolerances for ``rms_px``."""
 

@@ -2,7 +2,6 @@
 
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 from tqdm import tqdm
@@ -21,6 +20,7 @@ from adjust.design import (
 )
 from adjust.design.selection import Criterion
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import json_text
@@ -37,7 +37,7 @@ from survey.project.project import RESULTS
 from survey.solution.network.counts import network_dict, pair_network
 
 
-@dataclass(frozen=True)
+@frozen
 class PlanRequest:
     """What is asked of a plan.
 

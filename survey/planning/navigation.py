@@ -1,6 +1,6 @@
 """Precision of navigated poses before anything is measured, what each part may contribute, and where beacons go."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from itertools import count, islice
 
@@ -11,6 +11,7 @@ from gtsam import Pose3
 from adjust.design.placement import Placement, PlacementOptions, place_beacons
 from adjust.design.pose_budget import PoseBudget, PoseTolerance, pose_budget, pose_tolerances, simulate_poses
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray
@@ -22,7 +23,7 @@ from survey.solution.frames import AdjustedFrames
 _TRIALS = 1000
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class NavigationOutcome:
     """Navigation from the planned beacons, and from beacons placed for it.
 

@@ -1,7 +1,6 @@
 """``plan.toml``: what is to be measured, what could be measured in addition, and the precision that is wanted."""
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +8,7 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.design import Candidate, Seeing
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, Survey
 from survey.folder.text import id_problem
 from survey.folder.units import to_si
@@ -26,7 +26,7 @@ _HAND_KEYS = ("camera", "target", "count", "distance_mm", "tilt_deg", "seed")
 _SEEN_KEYS = ("margin_px", "nearest_mm", "farthest_mm", "widest_incidence_deg", "fewest_points", "two_sided")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Moment:
     """One planned epoch: what moves and where to, and which images are taken.
 
@@ -45,7 +45,7 @@ class Moment:
     pose: Pose3 | None = None
 
 
-@dataclass(frozen=True)
+@frozen
 class ByHand:
     """Poses as a person would give them: a target anywhere in the frame of a camera, tilted, at some distance (m)."""
 
@@ -57,7 +57,7 @@ class ByHand:
     seed: int
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Moments:
     """A series of epochs; ``by_hand`` where their poses are still to be drawn."""
 
@@ -65,7 +65,7 @@ class Moments:
     by_hand: ByHand | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class NewPoint:
     """A beacon that could be added, with surveyed coordinates (sigma m) or without (nan)."""
 
@@ -74,7 +74,7 @@ class NewPoint:
     sigma: float
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Measurements:
     """Epochs, single observations and new beacons, planned or possible; observations have no values yet."""
 
@@ -83,7 +83,7 @@ class Measurements:
     points: tuple[NewPoint, ...] = ()
 
 
-@dataclass(frozen=True)
+@frozen
 class Requirement:
     """Sigmas (SI) that the components matching ``pattern`` must have, by unit: rad, m, px."""
 
@@ -91,7 +91,7 @@ class Requirement:
     sigma: dict[str, float]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Plan:
     """The whole file."""
 

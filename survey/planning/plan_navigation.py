@@ -1,12 +1,12 @@
 """Where the head will be navigated, how well its pose must be known, and where beacons could be: of ``plan.toml``."""
 
 import math
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from gtsam import Pose3, Rot3
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, Survey
 from survey.folder.units import to_si
 from survey.planning.plan_readings import few, planned_poses
@@ -22,7 +22,7 @@ _NAVIGATION_KEYS = (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class NavigationPlan:
     """Where the head will be, how well its pose must be known (rad, m per component), and where beacons could be.
 

@@ -1,7 +1,7 @@
 """All that is known of a plan, as plain values."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from adjust.design import (
     group_redundancy,
 )
 from adjust.design.pose_budget import PoseTolerance
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray
 from adjust.precision.precision import precision_of
@@ -27,7 +28,7 @@ from survey.planning.plan_file import Plan
 from survey.solution.quantities import key_of, sigma_unit_for_people
 
 
-@dataclass(frozen=True)
+@frozen
 class Met:
     """A component with the sigma that is required of it and the one that is planned (SI), and what people read."""
 
@@ -43,7 +44,7 @@ class Met:
         return self.planned <= self.required * (1 + 1e-9)
 
 
-@dataclass(frozen=True)
+@frozen
 class Gained:
     """A component with its sigma before and after what is to be added (SI), and what people read."""
 
@@ -59,7 +60,7 @@ class Gained:
         return self.after / self.before if self.before > 0.0 else 1.0
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PlanResult:
     """All that is known of a plan."""
 

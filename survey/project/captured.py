@@ -8,12 +8,13 @@ import json
 import os
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from survey.folder.shapes import NUMBER, WHOLE, Each, Either, misfit
 from survey.folder.text import id_problem
@@ -54,7 +55,7 @@ def quality_path(folder: Path) -> Path:
     return folder / CAPTURE_FOLDER / "quality.jsonl"
 
 
-@dataclass(frozen=True)
+@frozen
 class Coverage:
     """Which cells of a camera's image have had a target point so far; ``cells`` across and down."""
 

@@ -7,11 +7,12 @@ same costs one look at their directory entries, and reading them only where that
 import json
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Literal
 
 from adjust.model.errors import SurveyError, listed
+from adjust.model.frozen import frozen
 from survey.folder.text import NOT_OURS, read_bytes
 
 DETECTED_FILE = "detected.json"
@@ -21,7 +22,7 @@ _SETTLED_NS = 2_000_000_000  # file systems keep times to two seconds: what is y
 _LARGEST = 2**30
 
 
-@dataclass(frozen=True)
+@frozen
 class DetectedImage:
     """An image and what became of it. file: its path in the project. sha256, size (bytes), mtime_ns: of the image.
 
@@ -97,7 +98,7 @@ def file_of(path: Path, name: str) -> DetectedImage:
     return DetectedImage(name, read_bytes(path)[1], status.st_size, status.st_mtime_ns, seen)
 
 
-@dataclass(frozen=True)
+@frozen
 class ImageNews:
     """Images whose points are not those of the file that is there now, in natural order.
 

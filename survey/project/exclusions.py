@@ -21,11 +21,11 @@ spot         ``camera/epoch/spot``; u_px and v_px tell which one it was when it 
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from survey.folder.plain import attributes
 from survey.folder.text import csv_rows, csv_text, decode, read_bytes, read_text, suggestion
 from survey.project.tables.reading import LARGEST_ROWS, Layout, check_header
@@ -41,7 +41,7 @@ _FORMS = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
+@frozen
 class Name:
     """What is excluded: one of ``WHAT`` and its id."""
 
@@ -60,7 +60,7 @@ class Name:
         return dict(zip(next(form for form in forms if len(form) == len(parts)), parts, strict=True))
 
 
-@dataclass(frozen=True)
+@frozen
 class Exclusion:
     """A row in force. line: where it stands. at: image coordinates (u, v) px of a spot when it was excluded."""
 
@@ -77,7 +77,7 @@ class Exclusion:
                 **attributes(self, "reason", "author", "time")}  # fmt: skip
 
 
-@dataclass(frozen=True)
+@frozen
 class Row:
     """A row as it stands in the file, in force or not."""
 

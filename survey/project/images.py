@@ -2,12 +2,13 @@
 
 import hashlib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import field, fields, is_dataclass
 from pathlib import Path
 
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.names import natural_key
 from survey.folder.text import id_problem, suggestion
 from survey.project.detected import ImageKey
@@ -51,7 +52,7 @@ def _epoch_id(path: Path) -> str:
     return path.stem
 
 
-@dataclass(frozen=True)
+@frozen
 class Sought:
     """Targets by id, and the smallest and largest diameter (px) of spots where these are looked for."""
 

@@ -3,13 +3,14 @@
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 from gtsam import Rot3
 
+from adjust.model.frozen import frozen
 from adjust.model.observations import Closure, FrameRef, ReadingKind
 from adjust.model.survey import FloatArray, Survey
 from survey.folder.locking import OBSERVATIONS_FOLDER as OBSERVATIONS_FOLDER
@@ -72,7 +73,7 @@ DEMANDED = {
 POSITION, ROTATION = "position", "rotation"
 
 
-@dataclass(frozen=True)
+@frozen
 class SpotsRequest:
     """Light spots that ``detect`` looks for in ``cameras``.
 
@@ -86,7 +87,7 @@ class SpotsRequest:
     gate_px: float = 15.0
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class SpotBlock:
     """Spots that one camera saw at one epoch, not yet identified: ``spot_ids`` n, uv (n, 2) px, cov (n, 2, 2) px^2."""
 
@@ -97,7 +98,7 @@ class SpotBlock:
     cov: FloatArray
 
 
-@dataclass(frozen=True)
+@frozen
 class Tolerance:
     """One demand. of: a key of ``DEMANDED``; ids: whose (all where empty).
 
@@ -116,7 +117,7 @@ class Tolerance:
     within: float | None = None
 
 
-@dataclass(frozen=True)
+@frozen
 class AdjustmentOptions:
     """How the project is adjusted and reported: the tables [adjustment], [tolerances.NAME] and [identification].
 
@@ -146,7 +147,7 @@ class AdjustmentOptions:
     power: float = 0.80
 
 
-@dataclass(frozen=True)
+@frozen
 class Foot:
     """A screw or edge that carries a body, at (x, y) m in the body's plane."""
 
@@ -155,7 +156,7 @@ class Foot:
     y: float
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class AlignmentTask:
     """A body that is to be turned until its axes are those of ``onto`` (the table [align.ID]).
 
@@ -171,7 +172,7 @@ class AlignmentTask:
     tolerance: float | None = None
 
 
-@dataclass(frozen=True)
+@frozen
 class Accuracy:
     """What an instrument's readings are worth where the table gives no sigma, in SI; None where not given.
 
@@ -206,7 +207,7 @@ class Accuracy:
         return {"direction": self.direction, "angle": self.angle, "zenith": self.zenith, "azimuth": self.azimuth}[kind]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Sigmas:
     """A priori sigmas where the tables give none, in SI.
 
@@ -220,7 +221,7 @@ class Sigmas:
     instruments: Mapping[str, Accuracy] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
+@frozen
 class LeftOut:
     """An exclusion in force, and how many images, image points, spots without a name and readings it meets."""
 
@@ -235,7 +236,7 @@ class LeftOut:
         return attributes(self, "n_images", "n_image_points", "n_spots", "n_readings")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Definition:
     """What survey.toml says, and the images that are there; ``survey`` has no observations.
 
@@ -257,7 +258,7 @@ class Definition:
     alignment_tasks: tuple[AlignmentTask, ...] = ()
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@frozen(eq=False)
 class Project(Definition):
     """A definition whose ``survey`` holds the observations too; ``spots`` are image points without identity.
 

@@ -5,11 +5,11 @@ Ids: ``r2c5`` (row, column) for corners of boards, ``m17.3`` (marker id, corner)
 upper left one of the upright marker, clockwise, as in OpenCV.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 
 
@@ -25,7 +25,7 @@ def _grid(columns: int, rows: int, spacing_m: float) -> tuple[tuple[str, ...], F
     return ids, x.copy()
 
 
-@dataclass(frozen=True)
+@frozen
 class Checkerboard:
     """``columns`` x ``rows`` inner corners, ``square_m`` apart; corner r0c0 is the origin, x along the columns."""
 
@@ -50,7 +50,7 @@ class Checkerboard:
         return tuple(np.rot90(place, step).ravel() for step in steps)
 
 
-@dataclass(frozen=True)
+@frozen
 class Charuco:
     """OpenCV's ChArUco board of ``squares_x`` x ``squares_y`` squares; r0c0 is its inner corner 0.
 
@@ -69,7 +69,7 @@ class Charuco:
         return _grid(self.squares_x - 1, self.squares_y - 1, self.square_m)
 
 
-@dataclass(frozen=True)
+@frozen
 class MarkerGrid:
     """ArUco or AprilTag markers in ``columns`` x ``rows``, ids row by row from ``first_id``, as OpenCV's GridBoard."""
 
@@ -93,7 +93,7 @@ class MarkerGrid:
         return tuple(ids), np.array(xs)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class MarkerBlock:
     """Markers anywhere on a rigid body: ``corners`` gives each marker's four corners, (4, 3) m."""
 
@@ -107,7 +107,7 @@ class MarkerBlock:
         return ids, np.concatenate([self.corners[marker] for marker in markers])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PointList:
     """Points that no program finds by itself; their image points come from a file."""
 

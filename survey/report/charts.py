@@ -1,12 +1,12 @@
 """Charts: residuals of a camera, quantiles, correlations, lines and dots over numbers, bars, what is seen when."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from markupsafe import Markup
 
 from adjust.model.arrays import ranked
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from adjust.model.survey import BoolArray, Camera, FloatArray, IntArray
 from adjust.testing.distributions import beta, norm
@@ -24,7 +24,7 @@ _ABOVE, _BELOW = 18.0, 26.0  # of the pictures of a camera
 _LEFT, _RIGHT, _TOP, _BOTTOM = 58.0, 14.0, 26.0, 42.0  # of a chart over numbers
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class CameraResiduals:
     """Image points of one camera: ``uv``, ``residuals``, ``standardized`` (n, 2); ``used``, ``suspect`` (n,)."""
 
@@ -202,7 +202,7 @@ def quantiles(name: str, w: FloatArray) -> Markup:
     return d.svg(side, side, parts, t("Quantiles of group {name}", name=name))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Series:
     """Points (n,) over (n,); ``line`` joined, else dots; error: (n,) bars of one sigma, or None."""
 

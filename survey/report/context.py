@@ -1,11 +1,11 @@
 """What every section of a report is made from, and the choice of what it shows."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from adjust.model.arrays import largest
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from survey.solution.dictionary import RunInfo
@@ -14,7 +14,7 @@ from survey.solution.residual_tables import ImageRows
 from survey.solution.statistics import Statistics
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Listed:
     """The rows of the table of all observations, of ``total``, without what statistics say of them.
 
@@ -28,7 +28,7 @@ class Listed:
     rest: str
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Context:
     """The adjustment, its solution as plain values, and the image points row by row; ``suspect`` (N,).
 

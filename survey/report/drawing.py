@@ -1,11 +1,11 @@
 """Pieces of SVG: lines, labels, ellipses, axes, legends, scale bars, in coordinates of the picture, y down."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from markupsafe import Markup
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from survey.report.language import esc
 
@@ -147,7 +147,7 @@ def heading(words: str) -> str:
     return text(0, 12, words, colour=INK, size=11.5)
 
 
-@dataclass(frozen=True)
+@frozen
 class Scale:
     """A linear axis: values from ``low`` to ``high`` stand at ``start`` to ``end`` of the picture."""
 

@@ -9,13 +9,13 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 from markupsafe import Markup, escape
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 
 _CATALOGUES = Path(__file__).with_name("catalogues")
 LANGUAGES = ("en", *sorted(path.stem for path in _CATALOGUES.glob("*.toml")))
@@ -37,7 +37,7 @@ _WORDS = frozenset(("required", "planned"))
 _current: ContextVar[str] = ContextVar("language", default="en")
 
 
-@dataclass(frozen=True)
+@frozen
 class ReportOptions:
     """How results are written.
 
@@ -57,7 +57,7 @@ class MissingTranslationError(KeyError):
     """A text of the report that a language does not know: a bug, found by the tests."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Catalogue:
     """A language: its decimal sign, ``texts`` by their English form, ``messages`` as patterns with what they become.
 

@@ -5,13 +5,14 @@ import os
 import shutil
 import subprocess
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from survey.report.context import Context
 from survey.report.language import language, localised, speaking, t
@@ -71,7 +72,7 @@ _OF_STATISTICS = frozenset((
 ))  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class BegunPage:
     """A page without what statistics say. made: sections by their anchors."""
 

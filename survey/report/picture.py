@@ -1,11 +1,11 @@
 """The survey seen from above and from a corner, drawn as SVG; confidence ellipsoids enlarged by a stated factor."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from markupsafe import Markup
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from survey.report import drawing as d
 from survey.report.language import localised, t
@@ -17,7 +17,7 @@ _AXES = 0.07
 """Length of the axes of the world, as a share of all there is to be seen."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class View:
     """Picture coordinates of world points, ``to_picture`` (n, 3) -> (n, 2), and the picture units per metre."""
 

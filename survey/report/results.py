@@ -1,11 +1,11 @@
 """The results of a survey as files: ``solution.json``, ``covariance.npz``, residuals as CSV and ``report.html``."""
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from adjust.native.parallel import Beside
 from survey.folder.replacing import changing, replace_parts
@@ -84,7 +84,7 @@ class ResultFiles:
         return {name: self.folder / name for name in sorted(self._begun, key="solution.json".__eq__)}
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class BegunResults:
     """What needs the adjustment alone, in the making. page: gives the report as far as it is one without statistics."""
 

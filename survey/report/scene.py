@@ -12,6 +12,7 @@ import numpy as np
 from gtsam import Pose3
 from markupsafe import Markup
 
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Target
@@ -27,7 +28,7 @@ _MOST_SPOTS = 500
 T = TypeVar("T")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Spot:
     """A position (3,) m with its covariance (3, 3) m^2, a posteriori where the report is; ``kind`` point or station."""
 
@@ -37,7 +38,7 @@ class Spot:
     cov: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Shot:
     """A camera where it stood: ``world_from_camera``, half angles of its field of view; ``main`` of the first epoch."""
 

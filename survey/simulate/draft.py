@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from gtsam import Pose3
 
+from adjust.model.frozen import frozen
 from adjust.model.observations import ImageBlock, TableReading
 from adjust.model.survey import Camera, FloatArray, LensParameter, Point, PoseParameter, Station, Survey, Table, Target
 from adjust.spatial.averaging import wrapped
@@ -24,7 +25,7 @@ _HYPOT, _ACOS, _ATAN2 = (np.vectorize(f, otypes=[float]) for f in (math.hypot, m
 """Not NumPy's own, whose last digit depends on the processor: equal seeds give equal surveys."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Shot:
     """One image to be taken: the targets that are meant to be in it, and whether the lights are off and beacons lit."""
 

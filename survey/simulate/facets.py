@@ -4,17 +4,18 @@ The square of a checkerboard between r0c0, r0c1, r1c1 and r1c0 is dark, as is th
 of squares outside the inner corners and a bright margin. Targets show a plain back.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 from gtsam import Pose3
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from survey.project.dictionaries import charuco_board, marker_cells
 from survey.project.targets import Charuco, Checkerboard, DetectableTarget, MarkerBlock, MarkerGrid
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PlacedTarget:
     """A target in front of the camera, with the grey values of its ink and its paper."""
 
@@ -24,7 +25,7 @@ class PlacedTarget:
     bright_gray: float = 220.0
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Facet:
     """A plane of grey cells: ``camera_from_facet`` columns are x, y axes and origin; z = x cross y is its back."""
 
@@ -53,7 +54,7 @@ class Facet:
         return bool(self.x_edges[0] <= a <= self.x_edges[-1] and self.y_edges[0] <= b <= self.y_edges[-1])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Patch:
     """Cells (rows, columns), 0 dark and 1 bright, over a rectangle of a plane: origin and width of one cell, in m."""
 

@@ -1,10 +1,11 @@
 """Ready simulated surveys, each with its truth: ``(survey, truth) = stereo(seed)``."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from gtsam import Pose3
 
+from adjust.model.frozen import frozen
 from adjust.model.observations import Coordinates, Distance, PositionRef
 from adjust.model.survey import Station, Survey
 from survey.project.targets import Checkerboard, MarkerGrid
@@ -22,7 +23,7 @@ MEASURED_DISTANCES = (("B01", "B02"), ("B03", "B04"), ("B05", "B06"), ("B07", "B
 SMALL_BOARD = Checkerboard(9, 6, 0.025)
 
 
-@dataclass(frozen=True)
+@frozen
 class LabSize:
     """How much is measured in the whole laboratory; numbers of epochs are per camera where cameras are named."""
 

@@ -1,7 +1,7 @@
 """Fresh noise on every observation and prior of a survey, drawn around the truth with its own covariance."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -9,13 +9,14 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.design.noise import draw, moved, with_drawn_priors
+from adjust.model.frozen import frozen
 from adjust.model.observations import Pair, TableReading
 from adjust.model.survey import FloatArray, Survey
 from survey.simulate.readings import fresh_readings
 from survey.simulate.scene import Scene, Truth
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Ideal:
     """Error-free image points (N, 2) px of a survey, factors (N, 2, 2) of their noise, and other readings by field."""
 

@@ -7,7 +7,6 @@ sum to pixels, illumination, Gaussian noise and the digits of the sensor. What i
 
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
@@ -18,6 +17,7 @@ from gtsam import Pose3
 from scipy.special import erf
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from adjust.native.vision import Facets, draw_facets, pixel_corner_rays, spread_and_sum
 from survey.simulate.facets import Facet, PlacedTarget, facets_of
@@ -28,7 +28,7 @@ _Gray32 = npt.NDArray[np.float32]
 _kept = threading.local()
 
 
-@dataclass(frozen=True)
+@frozen
 class BrownCamera:
     """A camera with OpenCV's lens model; ``image_size`` (width, height) px, ``distortion`` up to k6, the rest zero."""
 
@@ -52,7 +52,7 @@ class BrownCamera:
         return self.distortion + (0.0,) * (8 - len(self.distortion))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Beacons:
     """Luminous spots that face the camera, at ``x_in_camera`` (n, 3) m.
 
@@ -67,7 +67,7 @@ class Beacons:
     profile: Literal["disc", "gaussian"] = "disc"
 
 
-@dataclass(frozen=True)
+@frozen
 class Imaging:
     """How light becomes digits.
 

@@ -5,7 +5,6 @@ there cannot hide by being made twice.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property, reduce
 from typing import Any
 
@@ -15,6 +14,7 @@ from gtsam import Pose3
 
 from adjust.frames.lens_times import block_starts, crop_starts
 from adjust.model.boards import BOARD
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef, ImageBlock, PositionRef
 from adjust.model.result import ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey, Target
@@ -102,7 +102,7 @@ def _moving(axis: str, number: int, geometry: Mapping[str, float], angle: FloatA
     return moved
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Scene:
     """A survey and its true values; the methods say what is where and what a camera would see.
 

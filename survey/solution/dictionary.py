@@ -1,12 +1,13 @@
 """The solution of a survey as one dictionary of plain values: what ``solution.json`` holds and reports print."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 import numpy as np
 
 from adjust.epochs.states import datum_carriers, open_directions
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment, GroupSummary
 from adjust.precision.precision import in_conditions
 from adjust.statistics.result import Consistency
@@ -30,7 +31,7 @@ CONVENTIONS = {
 }
 
 
-@dataclass(frozen=True)
+@frozen
 class RunInfo:
     """What was run: everything in a result file that the adjustment itself does not know.
 

@@ -5,7 +5,6 @@ Everything that a report or a result file says about the precision of an unknown
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -14,6 +13,7 @@ from gtsam import Pose3
 
 from adjust.model.clocks import INTERVALS
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.model.tables import harmonic
@@ -27,7 +27,7 @@ ARCSEC_PER_RAD = 180.0 * 3600.0 / np.pi
 PROBABILITY = 0.95
 
 
-@dataclass(frozen=True)
+@frozen
 class Scale:
     """What covariances of unknowns are multiplied with: ``factor`` is 1 (a priori) or sigma0 (a posteriori).
 
@@ -199,7 +199,7 @@ def pose_dict(pose: Pose3) -> dict[str, Any]:
     return first_row(motion_columns(pose.rotation().matrix()[None], pose.translation()[None]))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PoseColumns:
     """Poses ``a_from_b`` by columns (n, 3) or (n, 4). rows: by name. status: of each."""
 

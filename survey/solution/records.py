@@ -6,7 +6,6 @@ Such entries are dictionaries where they are asked for.
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from json.encoder import encode_basestring
 from math import isfinite
@@ -14,6 +13,7 @@ from typing import Any, overload
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.text import NUMBERS, TEXT, WORD, Words, record_rows
 from survey.folder.plain import PlainEntries, PlainRecords
@@ -27,7 +27,7 @@ _FLOATS, _WORDS = {float}, {str}
 _JSON = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Form:
     """Records with the same keys. rows: (n,) their numbers among all. tree: columns by key, nested as they are."""
 

@@ -4,13 +4,13 @@ Rows are made by the core: a million image points take a fraction of a second.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import chain, groupby
 from math import isfinite
 from typing import Any
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.observations import Reading
 from adjust.model.result import Adjustment, ImageResiduals, Named, names_of
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
@@ -35,7 +35,7 @@ _CHUNK = 16_384
 _NEEDS_QUOTES = frozenset(',"\r\n')
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ImageRows:
     """What belongs to each row of ``Adjustment.image_residuals``.
 

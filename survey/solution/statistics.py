@@ -1,12 +1,13 @@
 """What the statistics of an adjustment say, gathered for reports and result files."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
 
 from adjust.epochs.states import origin
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment, Decision, Estimate, ParameterName, VarianceComponents
 from adjust.model.survey import FloatArray
 from adjust.native.parallel import Beside
@@ -32,7 +33,7 @@ from survey.solution.quantities import PROBABILITY, Scale, correlations_in, esti
 from survey.solution.tolerances import Verdict, verdicts
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class CorrelationMatrix:
     """Correlations (n, n) between components; ``labels`` n, ``starts`` of the parameters they belong to, by name."""
 
@@ -42,7 +43,7 @@ class CorrelationMatrix:
     matrix: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Statistics:
     """Tests and reliability, variance components where they were asked for, and what else a report shows.
 
@@ -102,9 +103,10 @@ def statistics_of(
         weak = made.of(lambda: weak_directions(adjustment, system=system))
         correlated = made.of(lambda: correlations(adjustment, system=system))
         budget = made.of(lambda: _budget(adjustment, names[:MOST_BUDGETS], system, scale.factor))
+        left_out = consistent().left_out  # first: it takes longest
         return Statistics(
             reliable(), components, correlated(), weak(), near, budget(), drawn, adjustment.decisions, judged,
-            consistent(), (*consistent().left_out, *_left_out(adjustment, system, len(names))),
+            consistent(), (*left_out, *_left_out(adjustment, system, len(names))),
         )  # fmt: skip
 
 

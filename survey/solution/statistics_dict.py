@@ -103,11 +103,10 @@ def _component(x: Component) -> dict[str, Any]:
 
 def _influence(adjustment: Adjustment, found: Statistics, x: Influence) -> dict[str, Any]:
     kind, ids = observation_name(adjustment, x.row)
-    tests = found.reliability.tests
     unit, factor = sigma_unit_for_people(x.unit)
     entry: dict[str, Any] = {
-        "kind": kind, "ids": list(ids), "detectable_sigmas": float(tests.detectable[x.row]),
-        "external": float(tests.external[x.row]), "moves": _path(x.name, x.component),
+        "kind": kind, "ids": list(ids), "detectable_sigmas": x.detectable,
+        "external": x.external, "moves": _path(x.name, x.component),
         key_of("by", unit): x.shift * factor, "in_its_sigmas": x.ratio,
     }  # fmt: skip
     return entry | ({"position": _path(x.position), "position_by_mm": 1e3 * x.position_shift} if x.position else {})

@@ -5,19 +5,19 @@ not proven is not met. A demand on the uncertainty alone is met where the expand
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment, Estimate
 from adjust.testing.distributions import norm, student
 from survey.project.project import DEMANDED, POSITION, ROTATION, Tolerance
 from survey.solution.quantities import PROBABILITY, Scale
 
 
-@dataclass(frozen=True)
+@frozen
 class Verdict:
     """How one result stands to one demand; SI units or px.
 

@@ -1,17 +1,17 @@
 """What is to be thought of an adjustment: which observations are suspect, and the verdict in words."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.result import CAUTIOUS_SIGMAS, Adjustment
 from adjust.statistics.result import Consistency
 from adjust.testing.criteria import limits
 
 
-@dataclass(frozen=True)
+@frozen
 class Suspects:
     """Observations whose test exceeds its limit, all of them taken together at the level alpha (Sidak 1967).
 

@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +9,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from survey.folder.locking import BusyError
 from survey.folder.text import suggestion
 from survey.report.language import message
@@ -37,7 +37,7 @@ _NEW_PROJECT = ("init", "show")  # jobs after which the page shows another proje
 _Handler = Callable[[Work, Request], Awaitable[Response]]
 
 
-@dataclass(frozen=True)
+@frozen
 class Way:
     """An address of the interface. calls: what of ``survey.Workbench`` it is; changes: whether files may change.
 

@@ -2,12 +2,12 @@
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from starlette.requests import Request
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 
 if TYPE_CHECKING:
     from survey.solution.earlier.changes import Changes
@@ -126,7 +126,7 @@ def _plan(bench: "Workbench", body: Body, _: object) -> "Told":
                                   place=int(body.number("place", 0.0))))  # fmt: skip
 
 
-@dataclass(frozen=True)
+@frozen
 class Asked:
     """What a page asks of a project. calls: what of ``survey.Workbench`` it is; changes: whether files may change.
 

@@ -2,11 +2,12 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import IntArray
 from survey.folder.text import NOT_OURS, read_bytes
 from survey.project.project import RESULTS
@@ -23,7 +24,7 @@ _LAYOUT = Layout(
 )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Kept:
     """A solution as it was written: summary, warnings, limits of the chi-square test of image points and of |w|."""
 

@@ -6,7 +6,6 @@ back.
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef, ImageBlock, frame_text, position_text
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
@@ -28,7 +28,7 @@ _Key = tuple[str, str, str | None]
 _MOST_SIGMAS = 300_000  # rows: a page of more does without the sigmas of places
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PointRows:
     """N image points in the order of ``survey.image_blocks``, with what the solution says of them.
 

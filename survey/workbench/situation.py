@@ -9,6 +9,7 @@ import numpy as np
 
 from adjust.lenses.models import MODELS
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
@@ -35,7 +36,7 @@ class CancelledError(SurveyError):
     """The adjustment was given up because somebody asked for that."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Judgement:
     """An adjustment, its summary with the verdict on every part, its warnings, and what was tested for them."""
 
@@ -59,7 +60,7 @@ def judgement_of(adjustment: Adjustment, project: Project) -> Judgement:
     return Judgement(adjustment, Snapshot(adjustment.estimates, summary), warnings_with(adjustment, tested), tested)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Situation:
     """A project as it is read, and its solution.
 
@@ -126,7 +127,7 @@ class Situation:
         return files, {(one.name, one.at) for one in self.exclusions.values()}
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Step:
     """A decision that can be taken back: rows of exclusions.csv, and files (by path in the folder) before and after.
 

@@ -16,8 +16,9 @@ from survey.cli import main
 NEEDLESS = (
     "cv2", "matplotlib", "pycolmap", "pandas", "pyarrow", "distributed", "scipy.stats", "scipy.optimize",
     "scipy.linalg", "scipy.sparse.linalg", "scipy.sparse.csgraph", "scipy.spatial", "scipy.fft",
-    "numpy.f2py.crackfortran",
+    "numpy.f2py.crackfortran", "tqdm",
     "adjust.pose_network", "adjust.relay", "adjust.diagnosis.table", "survey.detection", "survey.simulate",
+    "survey.jobs.detecting.job",
 )  # fmt: skip
 CODE = """
 import sys

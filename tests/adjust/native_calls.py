@@ -35,6 +35,7 @@ from adjust.precision.precision import Precision
 from adjust.relay.loops import loop_basis
 from adjust.relay.network import topology
 from adjust.start import find_start
+from adjust.statistics.condensed import condensed_system
 from survey.detection import SpotOptions, detect_image, detect_spots
 from survey.detection.corners import grown
 from survey.project.targets import Checkerboard
@@ -121,9 +122,11 @@ def _images() -> None:
     point_tests.sums_of_blocks(ptr, points)
     point_tests.farthest_points(ptr, points.v, np.zeros((len(ptr) - 1, 2)))
     point_tests.controlled_directions(points, np.zeros(n, dtype=np.int64))
+    point_tests.external_reliability(points, lambda0, np.zeros(n))
     point_tests.point_tests(points, lambda0, tuple(np.zeros((n,) if i < 5 else (n, 2)) for i in range(9)))
     eye, ones = point_tests.SparseRows(np.arange(4), np.arange(3), np.ones(3)), np.ones((3, 2))
-    point_tests.change_squares(np.array([0, 1, 3]), np.arange(3), ones, eye, ones[:, 0].copy(), eye, ones)
+    B = point_tests.ColumnsOfRows(np.arange(3), 2 * np.arange(3), ones.ravel())
+    point_tests.change_squares(np.array([0, 1, 3]), B, 2, eye, ones[:, 0].copy(), eye, np.ones((3, 8)))
     point_tests.UnitVectors(np.eye(20, 64)[[0, 1, 1, 5, 19]]).parallel(0, 5, 5, 0.9)
     words = text.Words.of(["a", "bc", ""])
     text.number_rows(words, np.array([0, 1, 2]), words, np.array([1, 1, 0]), points.v[:3], [3, 0])
@@ -133,7 +136,7 @@ def _images() -> None:
     precision.joint([names[0], names[-1]])
     batch = graph.images
     batch.rows(np.array([0]))
-    batch.condensed_rows(np.array([0]), np.ones((1, len(batch.blocks[0].uv), 4)))
+    condensed_system(precision)
     batch.local_from_keys(np.array([0]))
     solved = solve_network(pose_networks.simulate(3, 2).network)
     solved.pairs  # noqa: B018  # is computed when asked for

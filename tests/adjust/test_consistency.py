@@ -203,8 +203,9 @@ def test_a_change_of_place_is_left_out_where_poses_of_its_own_take_it_over_and_o
         A, seen = condensed.system.A.toarray(), [survey.image_blocks[b] for b in condensed.block]
         search = {(c.unit.kind, c.unit.name) for c in ChangeSearch(adjustment, condensed).candidates
                   if c.unit.what == "position"}  # fmt: skip
-        of_target = [("target", t.target_id, condensed.target) for t in survey.targets]
-        for kind, name, by_motion in [("camera", c.camera_id, condensed.camera) for c in survey.cameras] + of_target:
+        own = condensed.own
+        of_target = [("target", t.target_id, own.target) for t in survey.targets]
+        for kind, name, by_motion in [("camera", c.camera_id, own.camera) for c in survey.cameras] + of_target:
             mine = [name in (b.camera_id, b.target_id) and int(b.epoch_id[1:]) > 2 for b in seen]
             B = np.zeros((len(A), 6))
             B[: len(seen)][mine] = by_motion[mine]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adjust.native import parallel, vision
+from adjust.native import blocks, parallel, vision
 from adjust.native.lenses import BROWN, N_LENS, lens_residuals, lens_rows
 from adjust.native.library import Function, instruction_set, instruction_sets, opened
 from adjust.precision.precision import Precision
@@ -62,9 +62,9 @@ def test_vector_instructions_change_nothing(name: str, instructions: str) -> Non
             continue
         (answer, plain), (other_answer, wide) = call.again("base"), call.again(instructions)
         assert answer == other_answer
-        if name == "serve":
-            plain, wide = [_squares_of_served(call, plain)], [_squares_of_served(call, wide)]
-            written = ["R'R"]
+        if name in ("serve", "condensed_rows"):
+            squares = _squares_of_served if name == "serve" else _squares_of_condensed
+            plain, wide, written = [squares(call, plain)], [squares(call, wide)], ["R'R"]
         else:
             arrays = [(argument, kind) for argument, kind in call.function.kinds() if kind not in "nd"]
             kept = [i for i, (argument, kind) in enumerate(arrays) if kind.isupper() and argument not in _WORK]
@@ -98,10 +98,22 @@ def _squares_of_served(call: Call, arrays: list[np.ndarray]) -> np.ndarray:
     return np.concatenate(out)
 
 
+def _squares_of_condensed(call: Call, arrays: list[np.ndarray]) -> np.ndarray:
+    """The same of the rows over the keys, by what a block could have besides, and e."""
+    names = [argument for argument, kind in call.function.kinds() if kind not in "nd"]
+    a = dict(zip(names, arrays, strict=True))
+    rows = np.repeat(np.arange(a["e"].size), a["length"].ravel())
+    A = np.zeros((a["e"].size, int(a["columns"].max()) + 1))
+    A[rows, a["column"].ravel()[: len(rows)]] = a["entry"].ravel()[: len(rows)]
+    own = (a[name] for name in ("lens", "camera", "target", "shape"))
+    M = np.concatenate([A.reshape(*a["e"].shape, -1), *own, a["e"][:, :, None]], axis=2)
+    return np.swapaxes(M, 1, 2) @ M
+
+
 def _solution(monkeypatch: pytest.MonkeyPatch, threads: int) -> str:
     """Digest of image points of boards and of beacons: solution, covariances, redundancy."""
     monkeypatch.setenv("LABSURVEY_THREADS", str(threads))
-    monkeypatch.setattr(parallel, "_WORTHWHILE", 1)
+    monkeypatch.setattr(blocks, "_WORTHWHILE", 1)
     digest = hashlib.sha256()
     scenes = (
         head_on_table(1, n_cameras=2, n_table_epochs=4, n_free_epochs=3),
@@ -124,13 +136,13 @@ def _solution(monkeypatch: pytest.MonkeyPatch, threads: int) -> str:
 @pytest.mark.slow
 def test_threads_do_not_change_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     taken: list[int] = []
-    pool = parallel._pool
+    shared_out = parallel.shared_out
 
-    def counted(workers: int) -> Any:
-        taken.append(workers)
-        return pool(workers)
+    def counted(function: Any, parts: Any) -> Any:
+        taken.append(parallel.workers())
+        return shared_out(function, parts)
 
-    monkeypatch.setattr(parallel, "_pool", counted)
+    monkeypatch.setattr(parallel, "shared_out", counted)
     alone = _solution(monkeypatch, 1)
     assert not taken
     assert _solution(monkeypatch, 2) == alone

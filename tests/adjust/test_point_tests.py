@@ -8,6 +8,7 @@ from scipy import sparse
 
 from adjust.native.point_tests import (
     AdjustedPoints,
+    ColumnsOfRows,
     SparseRows,
     UnitVectors,
     change_squares,
@@ -135,11 +136,13 @@ def test_changes_from_every_run_on_are_those_of_the_dense_matrices() -> None:
     rows, e = rng.permutation(m)[:16], rng.standard_normal(m)
     A = sparse.random_array((m, n), density=0.2, rng=rng, format="csr")
     half = sparse.block_diag([rng.standard_normal((k, k)) for k in (3, 5, 1, 7, 4)])
-    own, U = (half @ half.T).tocsr(), rng.standard_normal((n, 6))
-    for q in (1, 6, 8, 14):
-        B = rng.standard_normal((16, q))
+    own = (half @ half.T).tocsr()
+    for q, c in ((1, 6), (6, 8), (8, 1), (14, 19)):
+        table, at, U = rng.standard_normal((40, q + 3)), rng.permutation(40)[:16], rng.standard_normal((n, c))
+        table[at[[2, 5]]] = 0.0
+        B, columns = table[at, 2 : q + 2], ColumnsOfRows(rows, at * (q + 3) + 2, table.ravel())
         A_rows, own_rows = (SparseRows(x.indptr.astype(int), x.indices.astype(int), x.data) for x in (A, own))
-        squares, M, g = change_squares(first, rows, B, A_rows, e, own_rows, U)
+        squares, M, g = change_squares(first, columns, q, A_rows, e, own_rows, U)
         for j, start in enumerate(first[:-1]):
             C, X = B[start:], A.toarray()[rows[start:]].T @ B[start:]
             expected = C.T @ C - X.T @ (own.toarray() + U @ U.T) @ X

@@ -5,7 +5,7 @@ import pytest
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from adjust.model.arrays import ranked
+from adjust.model.arrays import largest, ranked
 from adjust.statistics.effects import Reach, furthest_of
 from adjust.statistics.normal import Inverse, sets_apart
 
@@ -56,3 +56,11 @@ def test_values_of_some_ranks(far: float) -> None:
         values[3] += far
         ranks = np.unique(np.linspace(0, len(values) - 1, 160).astype(np.int64))
         assert ranked(values, ranks).tolist() == np.sort(values)[ranks].tolist()
+
+
+@pytest.mark.parametrize("most", [0, 1, 3, 300, 5_000])
+def test_the_largest_of_many_values_are_the_first_in_order(most: int) -> None:
+    random = np.random.default_rng(8)
+    drawn, few = random.normal(size=12_345), random.integers(0, 9, 12_345).astype(float)
+    for values in (drawn, np.sort(drawn), np.sort(drawn)[::-1], few, drawn[:12]):
+        assert largest(values, most).tolist() == np.argsort(-values, kind="stable")[:most].tolist()

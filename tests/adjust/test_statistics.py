@@ -15,6 +15,8 @@ from adjust.graph.assembly import StartValues
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.result import Adjustment
 from adjust.model.survey import Datum, FloatArray, PointParameter, PoseParameter, Station, Survey
+from adjust.precision.precision import precision_of
+from adjust.statistics.changes import ChangeSearch
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.effects import shifts
 from adjust.statistics.relative_precision import relative_precision
@@ -24,6 +26,8 @@ from adjust.statistics.system import linear_system
 from adjust.testing.criteria import LevelOptions, criteria, noncentrality, sidak
 from survey.simulate import head_on_table, resample, stereo
 from tests.adjust import helpers as h
+from tests.benchmarks.data import Calibration, matrix, pixels, rough_start
+from tests.benchmarks.data import survey as survey_of
 
 
 def both(survey: Survey, start: StartValues) -> tuple[Adjustment, h.Dense, FloatArray]:
@@ -77,8 +81,19 @@ def test_the_whole_reliability_against_one_dense_matrix(case: Callable[[], tuple
     check_influences(adjustment, full, Q, found, columns, system.columns.names)
 
 
+def four_corners() -> tuple[Survey, StartValues]:
+    """Of a board that is as it is and before a lens that is known: fewer rows in an image than columns."""
+    survey, truth = stereo(1, n_pairs=6)
+    x = survey.targets[0].x_in_target
+    corners = np.array([np.argmax(a * x[:, 0] + b * x[:, 1]) for a in (-1.0, 1.0) for b in (-1.0, 1.0)])
+    blocks = [replace(b, point_idx=corners, uv=b.uv[corners], cov=b.cov[corners]) for b in survey.image_blocks]
+    assert all((b.point_idx == np.arange(len(b.uv))).all() for b in survey.image_blocks)
+    known = tuple(replace(c, lens=replace(c.lens, free=())) for c in survey.cameras)
+    return replace(survey, cameras=known, image_blocks=tuple(blocks)), h.start_at(truth)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [known_targets, bundle, free_network, table])
+@pytest.mark.parametrize("case", [known_targets, bundle, free_network, table, four_corners])
 def test_the_condensed_system_is_the_same_system(case: Callable[[], tuple[Survey, StartValues]]) -> None:
     adjustment, _, _ = both(*case())
     full = linear_system(adjustment)
@@ -93,11 +108,56 @@ def test_the_condensed_system_is_the_same_system(case: Callable[[], tuple[Survey
     e, f = full.e[full.used[full.row_of]], small.e[small.used[small.row_of]]
     assert float(f @ f) == pytest.approx(float(e @ e), rel=1e-9)
     np.testing.assert_allclose(scale * (B.T @ f), scale * (A.T @ e), atol=1e-7)
-    for row in np.flatnonzero(full.used[: full.n_image])[::7].tolist():
-        columns, rows = condensed.point_rows(row)
+    some = np.flatnonzero(full.used[: full.n_image])[::7][::-1]
+    for row, (columns, rows) in zip(some.tolist(), condensed.point_rows(some), strict=True):
         whole = np.zeros((2, A.shape[1]))
         whole[:, columns] = rows
         np.testing.assert_allclose(whole * scale, full.A[2 * row : 2 * row + 2].toarray() * scale, atol=1e-9)
+
+
+def long_lens() -> Calibration:
+    """A board at two metres, seen by a lens of 16,000 px: an image hardly tells its distance from the focal length."""
+    rng, n = np.random.default_rng(1), 12
+    v, u = (index.ravel() for index in np.mgrid[:10, :10])
+    board, lens = np.column_stack([u, v, 0 * u]) * 0.01, np.array([16e3, 16e3, 640.0, 512.0, 0.0, 0.0, 0.0, 0.0])
+    poses = np.array([
+        matrix(np.zeros(3), np.array([*rng.uniform(-0.01, 0.01, 2), rng.uniform(1.9, 2.1)]))
+        @ matrix(np.array([*rng.uniform(-0.6, 0.6, 2), 0.0]), np.zeros(3))
+        @ matrix(np.array([0.0, 0.0, rng.uniform(-3.0, 3.0)]), np.zeros(3))
+        @ matrix(np.zeros(3), -board.mean(axis=0)) for _ in range(n)
+    ])  # fmt: skip
+    uv = np.array([pixels(board @ m[:3, :3].T + m[:3, 3], lens) for m in poses])
+    uv += 0.05 * rng.normal(size=uv.shape)
+    return Calibration(board, uv, np.zeros(n, dtype=np.int64), np.arange(n), np.array(0.05), np.array([10, 10]),
+                       lens[None], np.eye(4)[None], poses)  # fmt: skip
+
+
+@pytest.mark.slow
+def test_condensing_images_that_tell_little_loses_nothing() -> None:
+    """Normal equations of every image to the last digits; score tests as from all rows, as far as Q has digits."""
+    case = long_lens()
+    adjustment = adjust(survey_of(case), rough_start(case))
+    full, condensed = linear_system(adjustment), condensed_system(precision_of(adjustment))
+    A, B = full.A.toarray(), condensed.system.A.toarray()
+    for b in range(len(case.epoch)):
+        own, mine = slice(200 * b, 200 * b + 200), condensed.block == b
+        every = np.c_[A[own], full.e[own]].astype(np.longdouble)
+        few = np.c_[B[mine], condensed.e[mine]].astype(np.longdouble)
+        some = np.abs(every).sum(axis=0) > 0.0
+        length = np.sqrt((every[:, some] ** 2).sum(axis=0))
+        every, few = every[:, some] / length, few[:, some] / length
+        assert np.linalg.cond(every.astype(float)) > 3e5
+        assert np.abs(every.T @ every - few.T @ few).max() < 4e-15
+    basis = np.linalg.qr(A / np.linalg.norm(A, axis=0))[0]
+    search = ChangeSearch(adjustment, condensed)
+    found = next(c for c in search.candidates if c.unit.what == "lens")
+    epoch = np.repeat([search.epochs.index(b.epoch_id) for b in adjustment.survey.image_blocks], 200)
+    of_lens, e = A[:, full.columns.at["lens", "c0"]], full.e - basis @ (basis.T @ full.e)
+    for j, (M, g, scale) in enumerate(zip(found.M, found.g, found.scale, strict=True), 1):
+        later = np.where(epoch[:, None] >= j, of_lens, 0.0) * scale
+        np.testing.assert_allclose(later.T @ e, g, atol=1e-11)
+        later -= basis @ (basis.T @ later)
+        np.testing.assert_allclose(later.T @ later, M, atol=2e-7)
 
 
 def check_tests(adjustment: Adjustment, full: h.Dense, Q: FloatArray, found) -> None:

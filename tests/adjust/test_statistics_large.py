@@ -1,5 +1,6 @@
 """What the statistics do in large surveys, against what they do in small ones."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
@@ -9,7 +10,7 @@ from scipy import sparse
 
 from adjust.adjustment import adjust
 from adjust.model.result import Adjustment
-from adjust.native import parallel
+from adjust.native import blocks
 from adjust.observations.images import batch as batch_module
 from adjust.precision.precision import precision_of
 from adjust.statistics import changes, weakness
@@ -216,24 +217,39 @@ def test_threads_and_portions_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> 
         condensed = condensed_system(precision_of(adjustment))
         found = reliability(adjustment, system=condensed)
         listed = correlations(adjustment, 0.5, system=condensed.system)
-        tests = [x for x in vars(found.tests).values() if isinstance(x, np.ndarray)]
+        tests = [found.tests.external, found.tests.freedom, *vars(found.tests.every).values()]
         tests += [found.tests.p, found.tests.p_posterior, found.tests.p_w, found.tests.p_tau]
-        rows = [condensed.system.A.toarray(), condensed.e, condensed.lens, condensed.camera, condensed.shape]
+        rows = [condensed.system.A.toarray(), condensed.e, *condensed.own]
         shifts = np.array([x.shift for x in found.influences])
         return [*tests, *rows, shifts, np.array([x.coefficient for x in listed])]
 
-    monkeypatch.setattr(parallel, "_WORTHWHILE", 300)
+    monkeypatch.setattr(blocks, "_WORTHWHILE", 300)
     monkeypatch.setattr(batch_module, "_AT_ONCE", 200)
     found = []
     for threads in ("1", "3"):
         monkeypatch.setenv("LABSURVEY_THREADS", threads)
         found.append(everything())
-    monkeypatch.setattr(parallel, "_WORTHWHILE", 50_000)
+    monkeypatch.setattr(blocks, "_WORTHWHILE", 50_000)
     found.append(everything())
     assert len(found[0][0]) > 900
     for others in found[1:]:
         for a, b in zip(found[0], others, strict=True):
             np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("case", [lab, free, lambda: adjust(*net.hall(2, n_points=30))])
+def test_tests_of_some_observations_are_those_of_all(case: Callable[[], Adjustment]) -> None:
+    tests = reliability(case(), most_influences=0).tests
+    rows = np.flatnonzero(np.arange(len(tests.used)) % 7 == 3)
+    assert rows[-1] > tests.n_image
+    parts = np.concatenate([np.arange(tests.ptr[i], tests.ptr[i + 1]) for i in rows])
+    some = tests.of(rows)
+    np.testing.assert_array_equal(np.diff(some.ptr), tests.n_components[rows])
+    np.testing.assert_array_equal(tests.every.external, tests.external)
+    for name in ("redundancy", "least", "statistic", "detectable", "external"):
+        np.testing.assert_array_equal(getattr(some, name), getattr(tests, name)[rows])
+    for name in ("w", "error", "detectable_component", "bias"):
+        np.testing.assert_array_equal(getattr(some, name), getattr(tests, name)[parts])
 
 
 def test_what_others_say_as_arrays_is_what_they_say_one_by_one() -> None:

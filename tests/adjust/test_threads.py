@@ -65,10 +65,12 @@ def test_the_same_bits_for_any_number_of_threads(
 def test_steps_beside_each_other(threads: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each gives its result or raises; all are done when it is left; a step shares out work, parts of it do not."""
     monkeypatch.setenv("LABSURVEY_THREADS", threads)
-    others, done, gate = set[str](), list[int](), threading.Event()
+    names, done, gate, two = set[str](), list[int](), threading.Event(), threading.Barrier(2)
 
     def part(i: int) -> int:
-        others.add(threading.current_thread().name)
+        names.add(threading.current_thread().name)
+        if threads == "3" and i < 2:
+            two.wait(5.0)  # each by another thread
         return sum(side_by_side(lambda j: i * j, range(4)))
 
     def failing() -> int:
@@ -89,7 +91,37 @@ def test_steps_beside_each_other(threads: str, monkeypatch: pytest.MonkeyPatch) 
     with pytest.raises(ValueError, match="step"):
         everything()
     assert done == [1]
-    assert all(name.startswith("adjust") for name in others) == (threads == "3")
+    assert any(name.startswith("adjust") for name in names) == (threads == "3")
+
+
+def test_who_asks_for_a_step_that_nobody_has_begun_does_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And parts are shared out to no more threads than there are cores left."""
+    monkeypatch.setenv("LABSURVEY_THREADS", "2")
+    begun, gate, names = threading.Event(), threading.Event(), list[str]()
+
+    def named() -> str:
+        return threading.current_thread().name
+
+    def waiting() -> str:
+        begun.set()
+        assert gate.wait(5.0)
+        return named()
+
+    with Beside() as steps:
+        first = steps.of(waiting)
+        assert begun.wait(5.0)
+        second = steps.of(named)
+        assert second() == named()
+        names += side_by_side(lambda _: named(), range(50))
+        gate.set()
+        assert first().startswith("stage")
+    assert set(names) == {named()}
+    with pytest.raises(ValueError, match="0"):
+        side_by_side(_failing, range(50))
+
+
+def _failing(i: int) -> int:
+    raise ValueError(str(i))
 
 
 def test_a_forked_process_begins_threads_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:

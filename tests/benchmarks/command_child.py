@@ -50,17 +50,14 @@ class InTurn:
         self.open[steps] = self.now(), []
         return steps
 
-    def map(self, function: Callable[[Any], Any], parts: Iterable[Any]) -> list[Any]:
-        """As of an executor: parts that are shared out."""
+    def shared_out(self, function: Callable[[Any], Any], parts: Iterable[Any]) -> list[Any]:
+        """As that of ``parallel``."""
         out, seconds = [], []
-        parallel._here.busy = True
-        try:
+        with parallel.doing("part"):
             for part in parts:
                 begin = time.thread_time()
                 out.append(function(part))
                 seconds.append(time.thread_time() - begin)
-        finally:
-            del parallel._here.busy
         self.parts += saved(seconds)
         return out
 
@@ -68,13 +65,11 @@ class InTurn:
         """As of ``Beside``: a step beside others; its own parts do not count twice."""
         begin = self.now()
         done: Future[Any] = Future()
-        parallel._here.step = True
-        try:
-            done.set_result(step())
-        except Exception as error:  # the one who waits is told
-            done.set_exception(error)
-        finally:
-            del parallel._here.step
+        with parallel.doing("step"):
+            try:
+                done.set_result(step())
+            except Exception as error:  # the one who waits is told
+                done.set_exception(error)
         self.open[steps][1].append(self.now() - begin)
         return done.result
 
@@ -87,7 +82,7 @@ class InTurn:
 def main() -> None:
     """Runs the command of the arguments."""
     pool = InTurn()
-    parallel._pool = lambda workers: pool
+    parallel.shared_out = pool.shared_out
     parallel.Beside.__enter__ = lambda self: pool.beside(self)
     parallel.Beside.__exit__ = lambda self, *_: pool.finished(self)
     plain = parallel.Beside.of

@@ -9,7 +9,8 @@ from adjust.model.errors import SurveyError
 from adjust.native.vision import of_neighbours
 from survey.detection import detect_image
 from survey.detection.corners import grown
-from survey.jobs.adjusting.job import adjust_job, detect_job
+from survey.jobs.adjusting.job import adjust_job
+from survey.jobs.detecting.job import detect_job
 from survey.project.targets import Checkerboard
 from survey.simulate.rendering import BrownCamera, Imaging, PlacedTarget, render
 from tests.data import data_folder

@@ -6,8 +6,8 @@ import math
 import threading
 import time
 import tomllib
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from adjust.model.survey import (
 )
 from adjust.model.survey import Point as WorldPoint
 from survey import project as files
+from survey.folder import ahead as reading_ahead
 from survey.folder.units import from_si, to_si
 from survey.project.declared.toml_text import key_lines, read_tables
 from survey.project.tables import files as table_reading
@@ -314,8 +315,14 @@ def test_blank_lines_and_quotes_go_the_other_way(good: Path) -> None:
 def two_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two threads, and every table is a large one."""
     monkeypatch.setenv("LABSURVEY_THREADS", "2")
-    for module in ("files", "arrow"):
-        monkeypatch.setattr(f"survey.project.tables.{module}.LARGE", 0)
+    for module in ("project.tables.files", "project.tables.arrow", "folder.ahead"):
+        monkeypatch.setattr(f"survey.{module}.LARGE", 0)
+
+
+@contextmanager
+def _tables_ahead(folder: Path) -> Iterator[dict[Path, table_reading.Begun]]:
+    with reading_ahead.reading_ahead(folder) as ahead:
+        yield table_reading.begin_tables(ahead)
 
 
 @pytest.mark.usefixtures("two_threads")
@@ -327,14 +334,14 @@ def test_large_tables_are_read_ahead(good: Path, monkeypatch: pytest.MonkeyPatch
         return read(path, *more)
 
     monkeypatch.setattr(table_reading, "_read", asking)
-    with table_reading.reading_ahead(good) as ahead:
+    with _tables_ahead(good) as ahead:
         expected = sorted([*ahead, good / "sheet_points.csv"])
         after = files.read(good, ahead)
         assert ahead == {}  # nothing of them stays
     assert good / "observations" / "image_points.csv" in expected
     assert (sorted(asked), differences(before.survey, after.survey), after.inputs) == (expected, [], before.inputs)
     monkeypatch.setenv("LABSURVEY_THREADS", "1")
-    with table_reading.reading_ahead(good) as ahead:
+    with _tables_ahead(good) as ahead:
         assert ahead == {}
 
 
@@ -343,7 +350,7 @@ def test_large_tables_are_read_ahead(good: Path, monkeypatch: pytest.MonkeyPatch
 def test_a_table_that_changed_since_it_was_read_ahead_is_read_again(good: Path, replaced: bool) -> None:
     path = good / "observations" / "image_points.csv"
     text = path.read_text()
-    with table_reading.reading_ahead(good) as ahead:
+    with _tables_ahead(good) as ahead:
         for begun in ahead.values():
             begun.table()
         if replaced:
@@ -359,14 +366,14 @@ def test_a_table_that_changed_since_it_was_read_ahead_is_read_again(good: Path, 
 def test_what_is_wrong_with_a_table_is_told_when_it_is_asked_for(good: Path) -> None:
     path = good / "observations" / "image_points.csv"
     path.write_text(path.read_text() + "e10\n")
-    with table_reading.reading_ahead(good) as ahead:
+    with _tables_ahead(good) as ahead:
         begun = ahead[path]
         with pytest.raises(SurveyError, match=r"image_points\.csv:\d+: found 1 fields, expected"):
             files.read(good, ahead)
-    with table_reading.reading_ahead(good):
+    with _tables_ahead(good):
         pass  # nobody asks
     (good / "survey.toml").write_text("format = 0\n")
-    with table_reading.reading_ahead(good) as ahead, pytest.raises(SurveyError, match=r"survey\.toml:1: format"):
+    with _tables_ahead(good) as ahead, pytest.raises(SurveyError, match=r"survey\.toml:1: format"):
         files.read(good, ahead)
     with pytest.raises(SurveyError, match="found 1 fields"):
         begun.table()
@@ -382,8 +389,8 @@ def test_nothing_is_read_any_more_when_a_command_has_failed(good: Path, monkeypa
         done.append(True)
         return path.read_bytes()
 
-    monkeypatch.setattr(table_reading, "content", content)
-    with suppress(SurveyError), table_reading.reading_ahead(good) as ahead:
+    monkeypatch.setattr(reading_ahead, "content", content)
+    with suppress(SurveyError), _tables_ahead(good) as ahead:
         assert begun.wait(30.0)
         threading.Timer(0.1, go_on.set).start()
         raise SurveyError("a command that failed")

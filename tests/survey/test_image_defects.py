@@ -13,8 +13,9 @@ from adjust.model.errors import SurveyError
 from survey.cli import main
 from survey.detection import detect_image
 from survey.detection.defects import bayer_mosaic, image_defect, interlaced_fields, motion_blur
-from survey.jobs.adjusting.job import adjust_job, detect_job
+from survey.jobs.adjusting.job import adjust_job
 from survey.jobs.detecting.image_defects import blurred
+from survey.jobs.detecting.job import detect_job
 from survey.planning.checking import check_job
 from survey.project.detected import DetectedImage
 from survey.project.targets import Charuco, Checkerboard

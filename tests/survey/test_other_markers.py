@@ -9,7 +9,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.model.errors import SurveyError
 from survey.detection.markers import other_markers
-from survey.jobs.adjusting.job import detect_job
+from survey.jobs.detecting.job import detect_job
 from survey.project.targets import Charuco, MarkerGrid
 from survey.simulate.rendering import BrownCamera, Imaging, PlacedTarget, render
 

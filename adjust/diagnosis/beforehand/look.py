@@ -1,7 +1,6 @@
 """Everything that is told beforehand, in the order in which it is to be mended."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from adjust.diagnosis.beforehand.values import valued
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Finding
 from adjust.model.errors import IndeterminateError, SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
 from adjust.start import find_start
@@ -23,7 +23,7 @@ _FOCAL, _PERCENT = ("fx", "c", "ck"), 1.0
 """A length at a distance is wrong by as many per cent as the focal length."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Beforehand:
     """All findings, problems first. expected: precision at the start values, None where there is none."""
 

@@ -1,7 +1,6 @@
 """Sigmas and values that look like another unit, or like a decimal point that has slipped."""
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from adjust.diagnosis.units.readings import misread_readings
 from adjust.diagnosis.weights.impossible import doubtful_sigmas
 from adjust.diagnosis.weights.sigmas import ODD, id_of, kind_of, odd_among
 from adjust.model.errors import listed
+from adjust.model.frozen import frozen
 from adjust.model.names import grouped
 from adjust.model.observations import Distance, Reading
 from adjust.model.result import Adjustment
@@ -42,7 +42,7 @@ def valued(case: Case, expected: Adjustment | None) -> Iterator[Finding]:
         yield Finding("problem", "slipped decimal", (slip.name,), slip.said, "write it as it was read")
 
 
-@dataclass(frozen=True)
+@frozen
 class _Slip:
     """An observation by its name, what is wrong, and the points that it concerns."""
 

@@ -1,7 +1,7 @@
 """A camera that is another one from some epoch on, and what of it changed: its place, its focus, its images."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from gtsam import Pose3
@@ -20,6 +20,7 @@ from adjust.diagnosis.hypothesis import (
 )
 from adjust.diagnosis.images import TURNED, turned
 from adjust.lenses.models import CENTRE, FOCAL
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 from adjust.spatial.rigid import rotation_log
@@ -29,7 +30,7 @@ _ALPHA = 1e-5
 _NEAR = np.radians(10.0)  # lenses that were found in images of both ways are not good
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Difference:
     """Lens and place of a camera after a step against before: free lens parameters, then a motion (rad, m), and cov.
 

@@ -1,12 +1,12 @@
 """What every single image says about one pose of a survey, when all the others are as an adjustment has them."""
 
-from dataclasses import dataclass
 
 import numpy as np
 
 from adjust.diagnosis.alone import view_covariance
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.prediction import Altered, Prediction
+from adjust.model.frozen import frozen
 from adjust.model.names import grouped
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, IntArray
@@ -20,7 +20,7 @@ _MOST = 240  # images of one owner that are compared with each other
 _LEAST = 2  # images on either side of a step
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Series:
     """The values (n, 4, 4) that n images give one link of their chains.
 
@@ -33,7 +33,7 @@ class Series:
     cov: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Step:
     """A series with another value from block ``first`` on. gain: drop of the bounded sum of squares; cuts: compared.
 

@@ -5,7 +5,7 @@ neighbouring epochs. What is tried are clocks as unknowns (:mod:`adjust.diagnosi
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
@@ -18,6 +18,7 @@ from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.prediction import Linear
 from adjust.diagnosis.sequences import hand_poses
 from adjust.diagnosis.time.clocks import Freed, as_unknowns, keyed, spoken
+from adjust.model.frozen import frozen
 from adjust.model.names import grouped
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment, ParameterName
@@ -77,7 +78,7 @@ def _smooth(uv: FloatArray) -> tuple[FloatArray, FloatArray]:
     return speed, bend
 
 
-@dataclass(frozen=True)
+@frozen
 class _Late:
     """How cameras are late. weight: how much later each point of an image is by one unit; components: of a clock."""
 

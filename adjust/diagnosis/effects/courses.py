@@ -1,7 +1,6 @@
 """Unknowns through time, as an adjustment has them: the parts of the linear system that tell each at every epoch."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from gtsam import Pose3
@@ -9,6 +8,7 @@ from gtsam import Pose3
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.prediction import Linear
 from adjust.lenses.models import CENTRE, FOCAL
+from adjust.model.frozen import frozen
 from adjust.model.names import numbered
 from adjust.model.result import ParameterName
 from adjust.model.survey import IntArray, Survey
@@ -33,7 +33,7 @@ MOVED = {  # name of the unknown: of the mistake, kind of the thing, what happen
 }
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Course:
     """An unknown, or some components of it, through time, as an adjustment has it. labels: of its parts."""
 

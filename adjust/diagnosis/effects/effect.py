@@ -1,7 +1,7 @@
 """A change of what was observed, of a size to be estimated; scored at the solution, then tried."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -11,6 +11,7 @@ from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.prediction import Linear
 from adjust.diagnosis.trial import misfit_of
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from adjust.model.rewriting import Fields, with_rows
 from adjust.model.survey import FloatArray, Survey
@@ -23,7 +24,7 @@ _CLEAR_PART = 0.05  # of the misfit beyond noise
 _SMALL = 9.0  # a further drop of v'Pv that is not worth another adjustment
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Effect:
     """hypothesis: without its survey and the size in its words. first: its score.
 

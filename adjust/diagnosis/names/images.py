@@ -4,7 +4,7 @@ Evidence: what the adjustment says such a block should show under the other name
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, LeaveOut, Place, Rename
 from adjust.diagnosis.prediction import Prediction
+from adjust.model.frozen import frozen
 from adjust.model.names import grouped
 from adjust.model.observations import ImageBlock
 from adjust.model.rewriting import with_rows
@@ -24,7 +25,7 @@ POINTS = "points exchanged", "point_id", "points"
 _POINTS, _TARGETS, _BLOCKS, _MOST = 6, 8, 24, 3
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Now:
     """squares: of every block those over sigmas of its points (n,), over scale, bounded."""
 

@@ -5,7 +5,6 @@ divided anew between the two places where most of them meet.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import combinations, islice
 
 import numpy as np
@@ -14,6 +13,7 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.names.images import POINTS, exchange, points_exchanged
 from adjust.diagnosis.prediction import Prediction
+from adjust.model.frozen import frozen
 from adjust.model.names import grouped
 from adjust.model.subsets import with_points
 from adjust.model.survey import BoolArray, FloatArray, IntArray
@@ -27,7 +27,7 @@ _SUSPECTS, _MOST, _PAIRS = 8, 3, 300
 _EVIDENCE = 100.0  # places without any residual: as of what single images show
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Rays:
     """blocks, points: (n,) of which image block and which point. o, d: (n, 3) m, unit, world. focal_px: (n,)."""
 

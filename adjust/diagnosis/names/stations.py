@@ -6,7 +6,7 @@ says the other one's has the wrong name.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from heapq import heappop, heappush
 from itertools import combinations
 
@@ -16,6 +16,7 @@ from gtsam import Pose3
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, Rename
 from adjust.diagnosis.screen import Screen, at_best, improvement, screen
+from adjust.model.frozen import frozen
 from adjust.model.names import grouped
 from adjust.model.observations import FrameRef, Pair, frame_text
 from adjust.model.rewriting import with_rows
@@ -68,7 +69,7 @@ def _suspects(survey: Survey, misses: FloatArray) -> list[FrameRef]:
     return sorted(several, key=lambda end: -several[end])[:_SUSPECTS]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Ways:
     """From every frame, by each of its pairs in use, that which misses least first: to another one.
 

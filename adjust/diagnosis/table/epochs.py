@@ -1,7 +1,7 @@
 """Single epochs at which table readings and images disagree: readings mistyped or exchanged, points misnumbered."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from gtsam import Pose3
@@ -19,6 +19,7 @@ from adjust.diagnosis.table.rereading import (
     reread,
 )
 from adjust.diagnosis.table.views import TableViews
+from adjust.model.frozen import frozen
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import PoseParameter, Survey
 from adjust.spatial.averaging import wrapped
@@ -32,7 +33,7 @@ _ALIKE = 10.0, np.radians(0.02)
 """Sigmas, and rad beside them, by which readings that were exchanged are each other's at most."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Wrong:
     """What is wrong at one epoch or two: in words, how the survey would be without it, and as edits.
 

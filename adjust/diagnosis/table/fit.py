@@ -3,12 +3,12 @@
 Every view says ``inner_from_outer = inner_from_mount * mount_from_table(angles) * table_from_outer``.
 """
 
-from dataclasses import dataclass
 
 import numpy as np
 
 from adjust.diagnosis.table.views import TableViews, given_geometry
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from adjust.spatial.averaging import mean_pose
 from adjust.spatial.rigid import adjoint, inverse, rigid, rotation_exp, rotation_log
@@ -21,7 +21,7 @@ _STEPS = 12
 _GEOMETRY_SIGMAS = np.array([np.radians(1.0), 0.02])  # weak: only so that no direction is wholly open
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class TableFit:
     """mount_from_inner (c, 4, 4), table_from_place (p, 4, 4), chi2 (n,) of each view, and ``scale``.
 

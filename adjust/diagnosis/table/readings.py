@@ -1,7 +1,7 @@
 """Mistakes that all readings of a table share: axes exchanged, wrong units, epochs out of step."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -9,6 +9,7 @@ import numpy as np
 from adjust.diagnosis.hypothesis import ChangeColumns, Hypothesis, Place
 from adjust.diagnosis.table.views import TableViews
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.memory import content, once
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, IntArray, Survey
@@ -31,7 +32,7 @@ _UNITS = (  # factor from what stands there to what is meant, and how that comes
 )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Misread:
     """What may have happened to the readings (e, k) rad: of which axes and of which epochs they are, and what factors.
 
@@ -55,7 +56,7 @@ class Misread:
         return None if self.epochs is not None else np.diag(self.factors) @ np.eye(len(self.axes))[list(self.axes)]
 
 
-@dataclass(frozen=True)
+@frozen
 class Verdict:
     """The likeliest hypothesis and the typical disagreement (rad) of the turns, as it stands and under it."""
 

@@ -1,11 +1,12 @@
 """Single epochs that disagree with the rest: the angles that their images say, how else these may have come about."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from adjust.diagnosis.table.fit import TableFit, residuals
 from adjust.diagnosis.table.views import TableViews
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray, Target
 from adjust.spatial.averaging import wrapped
 from adjust.spatial.rigid import inverse, rotation_exp, rotation_log, transform
@@ -14,7 +15,7 @@ from adjust.testing.distributions import chi2
 _LIMIT = float(chi2.isf(1e-9, 6))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Reread:
     """Angles (k,) rad that the images of an epoch say, their sigmas, and whether they explain the images."""
 

@@ -5,12 +5,12 @@ the outer axis: ``R1(a1) R2(-a2) = S R1(a1) R2(a2) S`` with S half a turn about 
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.table.readings import column_edit, with_angles
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment, ParameterName, adjusted_pose
 from adjust.model.survey import FloatArray, PoseParameter, Survey, Table
 from adjust.spatial.rigid import inverse, rigid, rotation_exp, rotation_log
@@ -20,7 +20,7 @@ _WRONG_RAD = np.radians(90.0)
 _RIGHT_RAD = np.radians(45.0)
 
 
-@dataclass(frozen=True)
+@frozen
 class SignVerdict:
     """Axes whose readings have the wrong sign, what showed it, and how far off (rad) it is as it stands and negated."""
 

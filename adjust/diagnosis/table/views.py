@@ -1,7 +1,7 @@
 """What the images of targets say about a table's motions: one pose per view, from that image alone."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -9,13 +9,14 @@ import numpy as np
 from adjust.diagnosis.alone import single_views, view_covariance
 from adjust.diagnosis.case import Case
 from adjust.frames.tables import table_poses
+from adjust.model.frozen import frozen
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import FloatArray, IntArray, Survey, Table, Target
 from adjust.spatial.rigid import adjoint, inverse, rigid, rotation_exp
 from adjust.start.views import View, untrustworthy
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class TableViews:
     """All views between something carried by a table (*inner*) and something in the world (*outer*).
 

@@ -5,7 +5,7 @@ the poses of single images), by least squares; the unit is the interval between 
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from gtsam import Pose3
@@ -14,6 +14,7 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.sequences import Link, links
 from adjust.diagnosis.time.clocks import Freed, as_unknowns
+from adjust.model.frozen import frozen
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import PoseParameter, Station, Survey
 from adjust.testing.criteria import sidak
@@ -24,7 +25,7 @@ _ALONE_PX = 1.0
 _SPREAD = 5.0
 
 
-@dataclass(frozen=True)
+@frozen
 class Offset:
     """Of a camera after another, in intervals between epochs. misses: m, typical, of the board between the two."""
 

@@ -4,11 +4,12 @@ Ratios of units and conventions of angles are exact; a ratio that observations s
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
 from adjust.diagnosis.hypothesis import Place
+from adjust.model.frozen import frozen
 from adjust.model.observations import ReadingKind
 from adjust.model.survey import FloatArray, IntArray
 
@@ -21,7 +22,7 @@ UNITS = {"m": "metres", "mm": "millimetres", "deg": "degrees", "gon": "gon", "mg
 LENGTHS: tuple[ReadingKind, ...] = ("slope_distance", "horizontal_distance", "height_difference")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Written:
     """How the tables of a project write what was observed, as far as that is known.
 
@@ -46,7 +47,7 @@ class Written:
 UNKNOWN = Written()
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Scope:
     """Readings or pairs (rows) that are mended together; text: what they are called."""
 
@@ -55,7 +56,7 @@ class Scope:
     place: Place
 
 
-@dataclass(frozen=True)
+@frozen
 class Misreading:
     """True value = factor * read + offset (rad or m).
 

@@ -6,7 +6,7 @@ millimetres of its point nor a hundred metres above it.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -16,6 +16,7 @@ from adjust.diagnosis.hypothesis import ChangeReadings, Hypothesis, Place
 from adjust.diagnosis.screen import Screen, at_best, screen, screen_without
 from adjust.diagnosis.weights.impossible import SURE
 from adjust.model.errors import listed
+from adjust.model.frozen import frozen
 from adjust.model.observations import Reading, position_text
 from adjust.model.result import Adjustment
 from adjust.model.rewriting import Fields, with_rows
@@ -43,7 +44,7 @@ _SEEN = 1e-4
 """Share of a constant's column that no unknown takes over, below which it does not show."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Constant:
     """rows: of the readings that a change by 1 m (of a scale: by 1) changes by ``by`` (n,)."""
 

@@ -1,7 +1,7 @@
 """The ways in which a measured pose or rotation is misread, each with the words for it and what was meant."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from gtsam import Pose3, Rot3
@@ -9,6 +9,7 @@ from gtsam import Pose3, Rot3
 from adjust.diagnosis.hypothesis import ChangeColumns, Edit, ExchangeColumns
 from adjust.diagnosis.units.conventions import ANGLE_RATIOS, LENGTH_RATIOS, UNKNOWN, Written
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import Pair
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, IntArray, Survey
@@ -19,7 +20,7 @@ _QUATERNION, _SHIFT = ("qw", "qx", "qy", "qz"), ("tx_mm", "ty_mm", "tz_mm")
 _EULER = ("euler_x_deg", "euler_y_deg", "euler_z_deg")
 
 
-@dataclass(frozen=True)
+@frozen
 class Convention:
     """name: of the kind of mistake. said: what is wrong. remedy: in pairs.csv. mend: the motion as it was meant.
 

@@ -6,7 +6,7 @@ and shifts of both sides must be those of one rigid body. Inverting both sides o
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -19,6 +19,7 @@ from adjust.diagnosis.sequences import Link, fitted, hand, links, typical
 from adjust.diagnosis.units.conventions import Scope, shrinking
 from adjust.diagnosis.units.motions import CONVENTIONS, Convention, Motion, edits_of, mended, miss, rotation_of
 from adjust.model.errors import listed
+from adjust.model.frozen import frozen
 from adjust.model.memory import remembered
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import FloatArray, IntArray, Survey
@@ -162,7 +163,7 @@ def _by_loops(survey: Survey, meant: Mapping[int, Motion], rows: frozenset[int])
         rows, now = rows ^ turns[best], float(left[best])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Judge:
     """worst: pairs that fit least, first. evidence: of other motions of some pairs, how much less these miss."""
 

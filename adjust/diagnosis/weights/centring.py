@@ -5,13 +5,14 @@ horizontal direction, of a target in each reading, of an instrument in all readi
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.weights.likeliest import likeliest_size
+from adjust.model.frozen import frozen
 from adjust.model.names import grouped
 from adjust.model.result import Adjustment
 from adjust.model.rewriting import with_rows
@@ -33,7 +34,7 @@ _LAST = 1.5
 """Evidence: as for sigmas, larger variances fit anything, so what else there is to try is tried first."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Error:
     """Of a target in one reading, or of the instrument of a set-up: rows (r,) and their whitened derivatives (r, c)."""
 

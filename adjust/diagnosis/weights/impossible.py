@@ -5,7 +5,7 @@ refractive index is not.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from adjust.diagnosis.hypothesis import ChangeColumns, ChangeReadings, Edit, Hyp
 from adjust.diagnosis.units.conventions import ANGLES, UNKNOWN, Written
 from adjust.diagnosis.weights.sigmas import id_of, kind_of
 from adjust.model.errors import listed
+from adjust.model.frozen import frozen
 from adjust.model.names import grouped
 from adjust.model.observations import Distance, Reading
 from adjust.model.rewriting import with_rows
@@ -39,7 +40,7 @@ _OF_LENGTHS = {1000.0: "are metres, read as millimetres"}
 _TABLES = {"readings": "terrestrial", "distances": "distances", "pairs": "pairs"}
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Sigmas:
     """Sigmas of observations of one kind and group.
 

@@ -4,7 +4,6 @@ A direction u = R a of a body turns with its pose by ``du = -R [a]x dw`` (pertur
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import gtsam
@@ -12,6 +11,7 @@ import numpy as np
 
 from adjust.frames.state import State
 from adjust.frames.unknowns import Chain, Unknowns, VectorMap
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.observations.factors import Residual
 from adjust.observations.images.batch import Chains
@@ -19,7 +19,7 @@ from adjust.spatial.rigid import skew
 from adjust.spatial.vertical import VerticalMap
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Predicted:
     """Predicted minus observed (n, k) of n observations, and its derivatives by pose (n, k, 6) and vector (n, k, m)."""
 
@@ -90,7 +90,7 @@ class PoseBatch:
             yield vector.key, by_vector[at][components] @ vector.matrix
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Linked:
     """What is predicted, of which observation every link of a chain is, and C (links, 6, 6): poses by links."""
 

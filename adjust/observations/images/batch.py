@@ -18,15 +18,18 @@ from adjust.frames.unknowns import Chain
 from adjust.model.boards import warming_of
 from adjust.model.observations import ImageBlock, ImagePoints
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.native.blocks import run_split, split_blocks
 from adjust.native.images import (
     N_SHAPE,
     BlockArrays,
     BlocksAt,
     ByKeys,
+    CondensedRows,
     KeyArrays,
     PointArrays,
     PointStatistics,
     RowPlaces,
+    ShapeFactors,
     all_statistics,
     block_rows,
     condensed_rows,
@@ -38,7 +41,6 @@ from adjust.native.images import (
     serve,
     square_root_information,
 )
-from adjust.native.parallel import run_split, split_blocks
 from adjust.native.trees import KeyCovariances, TreeArrays
 from adjust.observations.adapter import evaluated
 from adjust.observations.images.segments import block_keys
@@ -235,13 +237,14 @@ class ImageBatch:
             if keys:
                 graph.add(evaluated(noise[int(self.height[i])], keys, partial(self.residual, i)))
 
-    def alike(self) -> list[IntArray]:
-        """All blocks in sets with the same numbers of points, rows and columns, none of much more than ``_AT_ONCE``."""
-        sizes = np.stack([np.diff(self.ptr), self.n_rows, self.of_blocks.columns], axis=1)
+    def alike(self, which: IntArray | None = None) -> list[IntArray]:
+        """These blocks, or all, in sets with the same numbers of points, rows and columns, of about ``_AT_ONCE``."""
+        among = np.arange(len(self.blocks)) if which is None else which
+        sizes = np.stack([np.diff(self.ptr)[among], self.n_rows[among], self.of_blocks.columns[among]], axis=1)
         kinds, kind = np.unique(sizes, axis=0, return_inverse=True)
         sets: list[IntArray] = []
         for j, n in enumerate(kinds[:, 0].tolist()):
-            mine, most = np.flatnonzero(kind.ravel() == j), max(_AT_ONCE // max(n, 1), 1)
+            mine, most = among[kind.ravel() == j], max(_AT_ONCE // max(n, 1), 1)
             sets += [mine[i : i + most] for i in range(0, len(mine), most)]
         return sets
 
@@ -255,15 +258,12 @@ class ImageBatch:
         block_rows(which, self.at(self.W_all_columns), out)
         return out
 
-    def condensed_rows(self, which: IntArray, factors: FloatArray) -> FloatArray:
-        """Rows (g, m, local unknowns, 4 of the shape and 1) of the used points of g blocks that are alike.
+    def condensed_rows(self, which: IntArray, shapes: ShapeFactors, columns: IntArray, out: CondensedRows) -> int:
+        """Into ``out`` rows of the used points of g alike blocks, with the same normal equations as all of them.
 
-        The same normal equations as all their rows; factors as :func:`adjust.native.images.condensed_rows` has them.
+        As :func:`adjust.native.images.condensed_rows`, weights left aside.
         """
-        b = int(which[0])
-        out = np.zeros((len(which), self.condensed_height(b), int(self.n_rows[b]) + N_SHAPE))
-        condensed_rows(which, self.at(self._used_weights), factors, out)
-        return out
+        return condensed_rows(which, self.at(self._used_weights), self.by_keys, shapes, columns, out)
 
     def condensed_height(self, b: int) -> int:
         """How many rows these are for a block like ``b``."""

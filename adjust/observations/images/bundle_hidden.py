@@ -4,6 +4,7 @@ import numpy as np
 import scipy
 
 from adjust.model.survey import FloatArray, IntArray
+from adjust.native.blocks import run_split
 from adjust.native.bundles import (
     PointCovariances,
     between_poses,
@@ -16,7 +17,6 @@ from adjust.native.bundles import (
     with_poses,
 )
 from adjust.native.lenses import MAX_LENS
-from adjust.native.parallel import run_split
 from adjust.observations.images.bundles import BundleBatch
 
 

@@ -17,6 +17,7 @@ from adjust.frames.unknowns import Chain, Unknowns
 from adjust.model.errors import IndeterminateError
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import FloatArray
+from adjust.native.blocks import run_split
 from adjust.native.bundles import (
     ReducedArrays,
     SightArrays,
@@ -31,7 +32,6 @@ from adjust.native.bundles import (
     symmetric_rows,
 )
 from adjust.native.lenses import MAX_LENS
-from adjust.native.parallel import run_split
 from adjust.observations.adapter import evaluated
 from adjust.observations.images.bundle_layout import BundleLayout
 from adjust.spatial.motions import motions_of, points_motions, poses_at, poses_motions

@@ -7,7 +7,6 @@ covariances as if it had eliminated them first (Triggs et al. 2000, section 6).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import accumulate
 
 import gtsam
@@ -15,8 +14,9 @@ import numpy as np
 
 from adjust.frames.unknowns import Unknowns
 from adjust.model.errors import IndeterminateError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
-from adjust.native.parallel import run_split, split_blocks
+from adjust.native.blocks import run_split, split_blocks
 from adjust.native.reduction import WEAKEST_PIVOT, ReducedPoses, ReductionArrays, leaf_rows, pose_steps, reduce_poses
 from adjust.observations.adapter import evaluated
 from adjust.observations.images.batch import ImageBatch
@@ -30,7 +30,7 @@ _WIDEST_INTERFACE = 700
 _AT_EPOCHS = ("world_from_station", "carrier_from_target")
 
 
-@dataclass(frozen=True)
+@frozen
 class Leaves:
     """Cliques of one frontal pose each, eliminated before a tree: those of S, the others, lie in one of its cliques.
 
@@ -44,7 +44,7 @@ class Leaves:
     data: FloatArray
 
 
-@dataclass(frozen=True)
+@frozen
 class Interface:
     """What the reduced poses share with everything else: keys, and the first column of each."""
 

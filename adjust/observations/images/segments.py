@@ -4,11 +4,11 @@ A block meets its *sources* one after the other: the lens of its camera, the slo
 Each has the same segments in every block, so they are listed once and then copied to where the sources are met.
 """
 
-from dataclasses import dataclass
 
 import numpy as np
 
 from adjust.frames.state import State
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.images import SEGMENT_LENS, SEGMENT_POSE, SEGMENT_TABLE, SEGMENT_WARP, SegmentArrays
 
@@ -28,7 +28,7 @@ def first_seen(values: IntArray) -> tuple[IntArray, IntArray]:
     return first[order], number[which]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class BlockKeys:
     """The keys of all blocks, block after block, each key once a block.
 

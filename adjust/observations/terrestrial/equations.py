@@ -5,11 +5,12 @@ instrument (rows: zero, counter-clockwise, up), with heights h along the plumb l
 axes. Axes that turn by a small w, about the world's axes, change ``F d`` by ``F (d x w)``.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from functools import cached_property
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.spatial.vertical import Horizon
 
@@ -21,7 +22,7 @@ rotation (3, about its own axes) of the body that an instrument which is not lev
 N_COLUMNS = 22
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Readings:
     """What (n,) readings join, as numbers of arrays, -1 for none; heights (n, 3): instrument, target, second target."""
 
@@ -52,7 +53,7 @@ class Readings:
         )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Geometry:
     """Present values by number.
 
@@ -120,7 +121,7 @@ def _heights(r: Readings, u: Geometry, rows: IntArray, A: FloatArray) -> FloatAr
     return np.asarray(h.height[b] - h.height[a] + raised)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Sights:
     """Sights (m,) of some readings to one of their ends, whose derivatives begin at ``column``, as they always are.
 
@@ -157,7 +158,7 @@ def _sights_of(r: Readings, rows: IntArray, to: IntArray, height: int, column: i
     )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Sorted:
     """Rows of readings by kind, all but height differences as sights, and those of angles to their second targets.
 

@@ -12,6 +12,7 @@ import scipy
 
 from adjust.frames.unknowns import Unknowns, VectorMap
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import PositionRef, Reading
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Setup, Survey
 from adjust.observations.factors import ChainPose, Position
@@ -25,7 +26,7 @@ KINDS = {
 _DISTANCES = (k.SLOPE, k.HORIZONTAL)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ReadingArrays(k.Readings):
     """N readings in the order of ``Survey.readings``."""
 
@@ -35,7 +36,7 @@ class ReadingArrays(k.Readings):
     used: BoolArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Chunk:
     """Rows of one factor. whitener: (m, m), upside of ``inv(cov) = W'W``, where the rows have a joint covariance."""
 
@@ -51,7 +52,7 @@ class Chunk:
         return sum(self.dims)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ChainRow:
     """A reading whose ``column`` to ``column + 3`` follow a chain: block (3, dim) per key, at ``goal[key]``."""
 
@@ -61,7 +62,7 @@ class ChainRow:
     goal: Mapping[int, int]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Layout:
     """Everything about readings that does not change with the values.
 

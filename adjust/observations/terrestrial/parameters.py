@@ -1,13 +1,14 @@
 """The unknowns that readings bring along, and what their survey must provide: instruments, setups, orientations."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import TypeVar
 
 import numpy as np
 
 from adjust.frames.unknowns import Unknowns, VectorMap, vector_map
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import PositionRef, Reading
 from adjust.model.result import ParameterName
 from adjust.model.survey import (
@@ -28,7 +29,7 @@ ORIENTATION = ("orientation",)
 HEIGHTS = ("zenith", "height_difference")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class TerrestrialParameters:
     """Vectors by id, in the order in which the arrays of a batch hold them; instruments are 4 numbers, centrings 3."""
 

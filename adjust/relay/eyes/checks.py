@@ -1,10 +1,10 @@
 """What has to be so before eyes can be found: turns about two axes that stand out of the noise."""
 
-from dataclasses import dataclass
 
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from adjust.relay.eyes.setup import EyeSetup
 from adjust.spatial.rigid import rotation_log
@@ -14,7 +14,7 @@ _WEAKEST_TURN = 10.0
 """Sigmas of a turn that the turns about the second axis must have, all epochs together."""
 
 
-@dataclass(frozen=True)
+@frozen
 class OutlierEpoch:
     """An epoch whose condition between two eyes was left out: ``test`` is chi-square with 6 degrees of freedom."""
 

@@ -6,11 +6,12 @@ intervals grow with the root of time where the world drifts, and not at all wher
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from adjust.model.errors import NotConvergedError, SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from adjust.relay.eyes.checks import refuse_undetermined
 from adjust.relay.eyes.eyes import EyeAdjustment, station_of
@@ -23,7 +24,7 @@ from adjust.testing.distributions import norm
 _PARTS = (slice(0, 3), slice(3, 6))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class DriftModel:
     """Random walk of each tracker: sigmas per root second, rotation (k,) rad and position (k,) m.
 

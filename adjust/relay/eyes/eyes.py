@@ -7,12 +7,13 @@ Two eyes give one pair; more give the whole station at once, with the joint cova
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.result import GlobalTest
 from adjust.model.survey import FloatArray
@@ -28,7 +29,7 @@ _UNCERTAIN = 0.1
 """Sigma (rad) of the rotation of an eye from which it is undetermined."""
 
 
-@dataclass(frozen=True)
+@frozen
 class EyeOptions:
     """reject: epochs that contradict the others are left out and listed.
 
@@ -39,7 +40,7 @@ class EyeOptions:
     free_scales: bool = False
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class EyeAdjustment:
     """Eyes of one station; the first defines the station's frame.
 

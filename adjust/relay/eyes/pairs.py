@@ -1,13 +1,14 @@
 """All pairs of a station's eyes, each from its two eyes alone, and what pairs share because they share an eye."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from itertools import combinations
 
 import numpy as np
 import scipy.linalg
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import Pair
 from adjust.model.survey import FloatArray
 from adjust.pose_network.loops import evaluate_loops
@@ -20,7 +21,7 @@ from adjust.relay.normal_equations import condition_matrix
 _EYES = EyeOptions()
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class EyePairs:
     """pairs: with their own covariances. joint_cov: (6p, 6p) with what they share. refused: pairs that cannot be found.
 
@@ -33,7 +34,7 @@ class EyePairs:
     adjustments: tuple[EyeAdjustment, ...] = field(repr=False)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class LoopedPairs:
     """Pairs after their loops were closed as if they were independent.
 

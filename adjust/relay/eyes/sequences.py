@@ -1,16 +1,16 @@
 """What eyes observed, as frozen values: poses or motions of eyes."""
 
-from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef
 from adjust.model.survey import FloatArray
 from adjust.spatial.rigid_motions import Motions
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class EyeSequence:
     """Poses of one eye in the world that it watches at n epochs, or its motions over n intervals.
 

@@ -1,12 +1,12 @@
 """From sequences of poses or motions to conditions between eyes, with start values."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.pose_network.cycles import Forest, adjacency, breadth_first, connected_parts
@@ -18,7 +18,7 @@ from adjust.spatial.rigid_motions import Motions
 from adjust.start.closed_forms.hand_eye import relative_motions, solve_ax_xb
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class EyeSetup:
     """problem: ready to be solved. epoch_ids: of each condition (m,). motions: whether motions were observed.
 

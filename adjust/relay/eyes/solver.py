@@ -10,19 +10,19 @@ linearised at the adjusted observations (Koch 1999, section 3.9.2; Helmert 1872)
 with all true poses as unknowns.
 """
 
-from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 
 from adjust.model.errors import NotConvergedError
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.spatial.rigid_motions import Motions, right_jacobian, right_jacobian_inverse
 
 _MOST_STEPS, _STILL = 50, 1e-9
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class EyeConditions:
     """m conditions between observed poses ``k_idx`` and ``l_idx`` (m,).
 
@@ -47,7 +47,7 @@ class EyeConditions:
         return EyeConditions(*(getattr(self, name)[mask] for name in self.__dataclass_fields__))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class EyeProblem:
     """observed: (n,) poses or motions. cov: (n, 6, 6), or the joint one (6n, 6n). free: which of the unknowns (u,) are.
 
@@ -62,7 +62,7 @@ class EyeProblem:
     n_scales: int = 0
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class EyeSolution:
     """unknowns: (u,). scales: exponents. cov: (6f + s,) squared, of the free unknowns in order and then the scales.
 
@@ -89,7 +89,7 @@ class EyeSolution:
         return 6 * np.count_nonzero(free[:idx]) + np.arange(6 if free[idx] else 0, dtype=np.int64)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Linearised:
     """f (m, 6) and its derivatives: by_k, by_l (m, 6, 6) observations, by (6m, 6f + s) unknowns, dense."""
 

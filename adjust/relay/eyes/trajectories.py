@@ -5,13 +5,13 @@ turns. Motions over an interval do not know in which world an eye counts, so tra
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.observations.between_epochs import weights
@@ -28,7 +28,7 @@ _AS_WELL = 1.5  # mean square misfit of another offset, in that of the best
 _MOST_NOISE = 2.0  # variance of a pose in between, in those of the poses around it
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Trajectory:
     """world_from_eye (n,) at times_s (n,), increasing, on the eye's own clock."""
 
@@ -124,7 +124,7 @@ class Trajectory:
         return np.asarray(2.0 * np.arcsin(np.sqrt(square)) / (2.0 * _HALF_S))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class TimeOffset:
     """Clock b shows ``offset_s`` more than clock a. sigma_s: from the scatter of the offsets of separate parts.
 
@@ -229,7 +229,7 @@ def _refined(a: Trajectory, b: Trajectory, times: FloatArray, offset: float) -> 
     return offset + float(found.x), float(found.fun)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class CommonMotions:
     """Motions of several eyes over the same intervals: times_s (n, 2) on the first clock; motions: per eye (n,)."""
 

@@ -1,14 +1,14 @@
 """Points from rays: linear intersection, then Gauss-Newton on the angles; many points at once."""
 
-from dataclasses import dataclass
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from adjust.spatial.averaging import medians
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Intersection:
     """Intersected points.
 

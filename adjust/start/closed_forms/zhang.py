@@ -1,16 +1,16 @@
 """Focal lengths and principal point from homographies of a plane."""
 
-from dataclasses import dataclass
 
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 
 _CONDITION = 2e-3  # smallest against largest useful singular value at which a parameter still counts as determined
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PinholeStart:
     """fx, fy, u0, v0 in pixels; ``variant`` says what was assumed: full, centred or square (centred, fx = fy)."""
 

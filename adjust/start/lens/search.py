@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from adjust.lenses.models import (
     unit_rays,
 )
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import Camera, FloatArray
 from adjust.native.lenses import Lens, fit_lens
 from adjust.native.views import homographies
@@ -35,7 +35,7 @@ _SIMPLE_PX = 2.0
 _RADIAL = {"k1": 1, "k2": 2, "K1": 1, "K2": 2, "A1": 1, "A2": 2}
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Fit:
     """A lens (n,) with the poses (B, 4, 4), the median error px, and the covariance (p, p) of what was free."""
 
@@ -45,7 +45,7 @@ class _Fit:
     cov: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Trial:
     """A lens (n,) to begin with, how it was found, and the poses (B, 4, 4) that images have with it.
 
@@ -59,7 +59,7 @@ class _Trial:
     error_px: float
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class LensStart:
     """values (n,) of the model, how they were found, and the blocks left out with the reason.
 

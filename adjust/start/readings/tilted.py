@@ -5,12 +5,12 @@ points that it sees and that are known, by resection or by fitting; points follo
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
 from adjust.model.boards import deformed
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef, PositionRef
 from adjust.model.survey import FloatArray, Survey
 from adjust.spatial.averaging import circular_median
@@ -30,7 +30,7 @@ _OFF = np.deg2rad(2.0)
 """A resection that misses its rays by more, in the median, is none."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class TiltedSight:
     """One target from one set-up: unit ray (3,) in the station's frame, orientation zero; distance m, nan if none."""
 

@@ -1,11 +1,12 @@
 """Which part of a survey an observation of a linear system is, and the survey without some of them."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from adjust.graph.assembly import AdjustmentGraph
+from adjust.model.frozen import frozen
 from adjust.model.observations import ImageBlock, ReadingCovariance
 from adjust.model.rewriting import Fields, with_rows
 from adjust.model.survey import BoolArray, IntArray, Survey
@@ -19,7 +20,7 @@ FIELDS = {
 _READINGS = "readings"
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Candidates:
     """Observations that can be left out. place: by observation (field of the survey, index); images by their row.
 

@@ -9,11 +9,11 @@ size: two of nearly the same J cannot be told apart.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import chain, pairwise
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.statistics.outliers.snooping import Snooping
 from adjust.testing.single_tests import CONTROLLED
@@ -32,7 +32,7 @@ _ROOM = 1e8
 """Numbers that these may put into the residuals of all observations."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Exchange:
     """Another explanation: ``instead`` out and ``kept`` back in use; more: by how much its J is larger."""
 
@@ -41,7 +41,7 @@ class Exchange:
     more: float
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Near:
     """Pool (p,) of observations, first the n that are out, and g (r,), R (r, r) of their rows with all of them in."""
 
@@ -77,7 +77,7 @@ def equal_sets(snooping: Snooping, limits: FloatArray) -> list[Exchange]:
     return sorted(smallest, key=lambda x: x.more)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _State:
     """A search with r rejected components. K: (r, r) covariance of their errors, bias: (r,) these themselves.
 

@@ -1,11 +1,12 @@
 """What a search for gross errors is asked for and gives back."""
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Literal
 
 import numpy as np
 
 from adjust.adjustment import AdjustOptions
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment, Decision, ObservationResidual
 from adjust.statistics.result import Alternative
 
@@ -13,7 +14,7 @@ GLOBAL = 100.0**2
 """Factor of variances from which not single observations are wrong, but a unit, a sense or a name of them all."""
 
 
-@dataclass(frozen=True)
+@frozen
 class SearchOptions:
     """family_alpha: error probability of all tests together.
 
@@ -30,7 +31,7 @@ Action = Literal["rejected", "readmitted"]
 DEFAULT_SEARCH = SearchOptions()
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class OutlierSearch:
     """The clean least squares, and how it was found.
 

@@ -8,7 +8,7 @@ they stand condensed, and are screened anew at every solution.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from gtsam import Pose3, Rot3
@@ -16,6 +16,7 @@ from gtsam import Pose3, Rot3
 from adjust.adjustment import adjust
 from adjust.graph.assembly import StartValues, values_of
 from adjust.model.errors import IndeterminateError, NotConvergedError
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.rewriting import with_rows
 from adjust.model.survey import BoolArray, Survey
@@ -33,7 +34,7 @@ _Leave = Callable[[tuple[int, ...], Adjustment], Adjustment]
 """The survey adjusted without these, from the values of an adjustment."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Disagreeing:
     """Pairs (E,) of a network that do not agree with the others, and where these put the stations.
 

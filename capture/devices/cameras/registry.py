@@ -4,15 +4,15 @@ import difflib
 import importlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from types import ModuleType
 from typing import cast
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from capture.devices.camera import Camera, CameraInfo, DriverMissingError
 
 
-@dataclass(frozen=True)
+@frozen
 class DriverDescription:
     """A driver: what it reaches, the form of its addresses, and where its software comes from.
 

@@ -7,13 +7,13 @@ first of its process. Without ``source`` its images are a gradient with the numb
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal, cast, get_args
 from urllib.parse import parse_qs
 
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from capture.devices.camera import (
     Camera,
     CameraError,
@@ -38,7 +38,7 @@ _CHOICES = {
 _HELD: set[str] = set()
 
 
-@dataclass(frozen=True)
+@frozen
 class Fault:
     """What goes wrong at image ``at`` (1 is the first).
 

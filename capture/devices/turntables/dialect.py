@@ -8,11 +8,12 @@ import math
 import re
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from string import Formatter
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from survey.folder.text import suggestion
 from survey.project.declared.node import Node, read_toml
 
@@ -24,7 +25,7 @@ _SPEC = re.compile(r"[-+ #0]{0,3}[0-9]{0,2}(\.[0-9]{1,2})?[bdeEfFgGxX]?")  # of 
 _PLACES = {"axis": "1", "value": 1.0, "delta": 1.0, "counts": 1, "delta_counts": 1}
 
 
-@dataclass(frozen=True)
+@frozen
 class Command:
     """One exchange.
 
@@ -41,7 +42,7 @@ class Command:
     good: re.Pattern[str] | None = None
 
 
-@dataclass(frozen=True)
+@frozen
 class Dialect:
     """How a controller speaks. unit: radians per unit of its angles; counts: its angles are whole numbers."""
 

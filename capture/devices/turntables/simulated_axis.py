@@ -9,8 +9,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 
-@dataclass(frozen=True)
+
+@frozen
 class AxisPhysics:
     """rad, rad/s, rad/s^2. encoder_noise: standard deviation of a reading. home_at: where the reference is."""
 
@@ -22,8 +24,10 @@ class AxisPhysics:
     turns_lost: bool = False  # the readback starts anew after a whole turn
 
 
-@dataclass(frozen=True)
+@frozen
 class _Piece:
+    """A stretch of a motion with one acceleration."""
+
     begin: float
     duration: float
     angle: float

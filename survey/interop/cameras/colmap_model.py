@@ -15,6 +15,7 @@ import numpy.typing as npt
 from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from survey.folder.text import read_bytes
 from survey.interop.cameras.rig import pose_of_quaternion
@@ -28,7 +29,7 @@ MODELS = {
 _NUMBERS = dict(zip((0, 1, 2, 3, 4, 5, 6, 8, 9), MODELS, strict=True))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ColmapCamera:
     """A lens: model, image size and parameters in COLMAP's order."""
 
@@ -38,7 +39,7 @@ class ColmapCamera:
     params: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ColmapImage:
     """An image: its pose, points xy (n, 2) with COLMAP's pixel origin, and the 3-D points they show (-1: none)."""
 

@@ -1,11 +1,11 @@
 """The formats of cameras by name: who reads and writes them, and which endings they have."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 from adjust.model.clocks import clock_text, clocks_of
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from survey.folder.whole import whole_folder
 from survey.interop.cameras import kalibr, mrcal, ros
 from survey.interop.cameras import opencv_files as opencv
@@ -26,7 +26,7 @@ from survey.project import atomic_write
 Files = tuple[Mapping[str, str | bytes], tuple[str, ...]]
 
 
-@dataclass(frozen=True)
+@frozen
 class CameraFormat:
     """read: None where it is only written. write: files by name ("" the one file) and notes. folder: may be one."""
 

@@ -1,7 +1,7 @@
 """What most calibration files of other programs hold: cameras fixed to each other, or one that moves, with lenses."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from adjust.lenses.models import MODELS
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import Camera, FloatArray, LensParameter, Point, PoseParameter, Station, Survey, VectorPrior
 from adjust.spatial.rigid import nearest_rotation
@@ -21,7 +22,7 @@ _ROTATION_TOLERANCE = 1e-3
 """What a written rotation matrix may miss orthonormality by: files round to four digits and fewer."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class RigCamera:
     """One camera: ``lens.values`` are given; rig_from_camera is None where the file has lenses only.
 
@@ -36,7 +37,7 @@ class RigCamera:
     pose_cov: FloatArray | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Rig:
     """Cameras on one body. notes: what was changed on the way here, for people."""
 

@@ -6,7 +6,6 @@ holds lenses, moving poses or covariances.
 """
 
 import xml.sax.saxutils
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from gtsam import Pose3, Rot3
 from scipy.spatial.transform import Rotation
 
 from adjust.model.errors import SurveyError, listed
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef
 from adjust.model.survey import FloatArray, PoseParameter, Station, Survey
 from survey.folder.text import id_problem
@@ -26,7 +26,7 @@ _WORLD = "world"
 _MOST_LINKS = 10_000
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Link:
     """A frame fixed to its parent: ``parent_from_link``."""
 

@@ -4,7 +4,6 @@ Lenses are in the parameters of other programs exactly where they can be, else t
 """
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
@@ -14,6 +13,7 @@ from adjust.lenses.conversion import convert
 from adjust.lenses.models import MODELS, camera_constants, lens_constants
 from adjust.model.boards import deformed
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef, ImageBlock
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import Camera, FloatArray, Station, Survey, Target
@@ -29,7 +29,7 @@ BROWN_8 = (*BROWN_5, "k4", "k5", "k6")
 FISHEYE_4 = ("fx", "fy", "u0", "v0", "k1", "k2", "k3", "k4")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class MappedLens:
     """A lens as another program has it. values: by parameter name. cov: (n, n) in the order of the model, or None.
 
@@ -98,7 +98,7 @@ def _which(camera: Camera) -> str | None:
     return f"camera {camera.camera_id}: its lens is written as it is {' and '.join(parts)}" if parts else None
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Start:
     """What ``AdjustedFrames`` needs of an adjustment, where there is none."""
 
@@ -106,7 +106,7 @@ class _Start:
     estimates: Mapping[ParameterName, Estimate]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class CameraValues:
     """A survey with values: adjusted where the project has results, else its start values.
 
@@ -213,7 +213,7 @@ def one_station(values: CameraValues, station_id: str | None, format: str) -> St
     return values.survey.stations_by_id[ids[0]]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class RigValues:
     """The cameras of one station for a format, each with its lens as that format has it."""
 

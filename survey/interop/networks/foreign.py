@@ -2,13 +2,14 @@
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from adjust.model.errors import SurveyError, listed
+from adjust.model.frozen import frozen
 from adjust.model.observations import PositionRef
 from adjust.model.subsets import with_positions
 from adjust.model.survey import Survey
@@ -26,7 +27,7 @@ _LARGEST = 1e15
 LATIN_1 = "iso-8859-1"
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ForeignNetwork:
     """A file of another program as a survey.
 
@@ -46,7 +47,7 @@ class ForeignNetwork:
     target_kinds: Mapping[str, TargetKind] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
+@frozen
 class Where:
     """A place in a file, for messages."""
 
@@ -58,7 +59,7 @@ class Where:
         return SurveyError(f"{self.path}, line {self.line}: {problem}")
 
 
-@dataclass(frozen=True)
+@frozen
 class Line:
     """One line of a text file without its comment."""
 

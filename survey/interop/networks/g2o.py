@@ -8,7 +8,6 @@ definite as a whole although its blocks of translation and of rotation are; ``bl
 """
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -17,6 +16,7 @@ from gtsam import Pose3, Rot3
 from scipy.spatial.transform import Rotation
 
 from adjust.model.errors import SurveyError, listed
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import BoolArray, FloatArray, PoseParameter, Station, Survey
 from adjust.pose_network.from_survey import network_from_survey
@@ -38,7 +38,7 @@ class _Edge(NamedTuple):
     line: int
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class G2oFile:
     """What a file was read as. notes: what was not taken as it stands, for people."""
 

@@ -8,12 +8,12 @@ times the root of its length in km. Readings beyond ``tol-abs`` are not used, as
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import Bearings, Survey
 from survey.folder.text import suggestion
 from survey.interop.networks.absolute_terms import within_tolerance
@@ -76,7 +76,7 @@ def _parts(network: Element) -> tuple[str, Element, Sequence[Element]]:
     return title, given, bodies
 
 
-@dataclass(frozen=True)
+@frozen
 class _Parameters:
     """What a file asks for. sigma0: in its own unit; alpha: level of tests; tolerance: of absolute terms (m)."""
 

@@ -1,10 +1,10 @@
 """The readings in GNU Gama's input files: clusters of observations, with their deviations or covariances."""
 
 import re
-from dataclasses import dataclass
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.observations import ReadingKind
 from adjust.model.survey import FloatArray
 from survey.folder.text import suggestion
@@ -36,7 +36,7 @@ DEVIATIONS = {
 _ANGULAR = ("direction", "angle", "z-angle", "azimuth")
 
 
-@dataclass(frozen=True)
+@frozen
 class Clusters:
     """What the clusters in one <points-observations> are read with, and the draft that they go to.
 

@@ -5,12 +5,12 @@ deviation that is left out is that of the row before. Section names are English 
 """
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import ReadingKind
 from adjust.model.survey import Bearings, FloatArray
 from survey.folder.text import suggestion
@@ -42,7 +42,7 @@ _HEIGHTS = "levelledheightdifference"
 _AXES_OF: dict[ReadingKind, str] = {"height_difference": "z", "zenith": "xyz", "slope_distance": "xyz"}
 
 
-@dataclass(frozen=True)
+@frozen
 class _Section:
     """A section: its name in lower case without plural, whether in degrees, its lines."""
 

@@ -1,17 +1,18 @@
 """A terrestrial network on its way out of the program: the survey, where its points are, and how well that is known."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import CoordinateDifferences, Coordinates, Distance, PositionRef, Reading
 from adjust.model.survey import FloatArray, Survey
 from survey.solution.quantities import SigmaKind
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class NetworkValues:
     """x: (3,) m by point, adjusted or start values; points without either are missing.
 
@@ -71,7 +72,7 @@ def readings_of(survey: Survey) -> list[Reading]:
     return [r for r in found if between_points(r)]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Triples:
     """Baselines from ``at`` to ``to``, or coordinates of ``to`` (n): values (n, 3) m, cov (3n, 3n), inf: unobserved."""
 

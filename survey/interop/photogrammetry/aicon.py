@@ -7,13 +7,14 @@ to read, its image coordinates are taken too, which it rounds to 1e-6 mm.
 """
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from adjust.lenses.models import MODELS
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import Distance, PositionRef
 from adjust.model.survey import Datum, LensParameter, Point, PointParameter, PoseParameter, Survey
 from survey.interop.cameras.rig import image_blocks, moving_camera, world_from_camera
@@ -28,7 +29,7 @@ _REPORT_NAMES = {"Ck": "ck", "Xh": "xh", "Yh": "yh"}
 _PARAMETER = re.compile(r"\s*(Ck|Xh|Yh|A1|A2|A3|B1|B2|C1|C2)\s*:\s*\S+\s+(\S+)\s*")
 
 
-@dataclass(frozen=True)
+@frozen
 class _Camera:
     """One camera of the .ior file; image size in mm and pixels."""
 
@@ -37,7 +38,7 @@ class _Camera:
     pixel_mm: float
 
 
-@dataclass(frozen=True)
+@frozen
 class _Report:
     """What the report adds: x, y and their deviations (mm) by (image, point), the free parameters."""
 

@@ -4,12 +4,13 @@ Image coordinates are pixels with the origin at the corner of the first pixel, a
 has them. Paths are taken relative to the script's folder and may not leave it.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from adjust.lenses.models import MODELS
+from adjust.model.frozen import frozen
 from adjust.model.survey import Camera, Datum, LensParameter, Point, PointParameter, Station
 from survey.folder.text import suggestion
 from survey.interop.cameras.rig import image_blocks, moving_camera
@@ -21,7 +22,7 @@ _FREE = {"cc": ("c",), "pp": ("px", "py"), "aspect": ("as",)}
 _COLUMNS = ("id", "label", "im", "path", "x", "y", "z", "sx", "sy", "sz", "sxy", "sxyz", "ignored")
 
 
-@dataclass(frozen=True)
+@frozen
 class _Row:
     """One line of a table by the names in its format."""
 

@@ -2,7 +2,6 @@
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ from adjust.diagnosis.hypothesis import (
     SetReadings,
 )
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from survey.folder.text import csv_rows, csv_text, read_text
 from survey.folder.units import from_si, to_si
@@ -37,7 +37,7 @@ OF_IMAGE = ("u_px", "v_px")
 _SIGMAS_OF_IMAGE = ("sigma_u_px", "sigma_v_px", "rho_uv")
 
 
-@dataclass(frozen=True)
+@frozen
 class Changed:
     """A file of a project, by its path in it: its text before and after, and where that is kept that was before."""
 

@@ -6,9 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from adjust.model.errors import SurveyError
-from adjust.native.parallel import Beside
 from survey.folder.replacing import changing, replace_parts
-from survey.jobs.detecting.job import detect_job, remember_images
 from survey.project import read
 from survey.project.project import RESULTS
 from survey.project.tables.files import Begun
@@ -43,20 +41,24 @@ def adjust_job(
     with changing(target) as place:
 
         def detected() -> None:
+            from survey.jobs.detecting.job import detect_job  # here: a survey without images starts without it
+
             with clock.step("detect"):
                 here = place if out is None else None
                 detect_job(folder, progress=progress, everything=redetect, place=here)
 
-        with clock.step("read"), Beside() as loading:
-            loaded = loading.of(_load if ahead else lambda: None)
+        with clock.step("read"):
+            if ahead:
+                _load()
             project = read(folder, ahead)
-            loaded()
         nothing_yet = bool(project.images) and not (project.survey.image_blocks or project.spots)
         if redetect or project.to_detect or (nothing_yet and not project.detected):
             detected()
             with clock.step("read"):
                 project = read(folder)
         elif project.images and out is None:
+            from survey.jobs.detecting.job import remember_images  # here: as above
+
             project = replace(project, detected=remember_images(project, place))
         from survey.jobs.adjusting import outcome as results
         from survey.jobs.adjusting.steps import adjust_project

@@ -3,24 +3,20 @@
 Every flat target is then seen from behind and all fits: what is adjusted is the mirror image of what was measured.
 """
 
-from dataclasses import dataclass, replace
-
-from adjust.diagnosis.hypothesis import ChangeColumns, Hypothesis, Place
-from adjust.diagnosis.images import MIRRORED, from_behind, is_flat, mapped
+from adjust.diagnosis.images import from_behind, is_flat
 from adjust.model.errors import listed
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment
-from survey.jobs.adjusting.edits import OF_IMAGE
 from survey.project import Project
 from survey.project.targets import PointList
 from survey.solution.frames import AdjustedFrames
 
-_BOTTOM = MIRRORED[1]
 _FEWEST, _LOOKED_AT = 3, 12
 """Images of a camera by which it is judged, and at how many one looks."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Sides:
     """From where cameras see printed flat targets. behind: how many images of cameras that see none from its front."""
 
@@ -66,21 +62,3 @@ def mirrored_warnings(project: Project, result: Adjustment) -> tuple[tuple[str, 
         "mirror the images back. Where only the rows of the targets are counted from the other end, no more than their "
         "own axes is wrong",
     )  # fmt: skip
-
-
-def mirrored_back(project: Project) -> tuple[Project, Hypothesis]:
-    """The project with all image points and spots mirrored back, and that as a hypothesis."""
-    survey, sizes = project.survey, {c.camera_id: c.image_size for c in project.survey.cameras}
-    for camera in sizes:
-        epochs = {b.epoch_id for b in survey.image_blocks if b.camera_id == camera}
-        survey = mapped(survey, camera, epochs, _BOTTOM)
-    spots = tuple(_BOTTOM.back(b, sizes[b.camera_id]) for b in project.spots)
-    edits = [ChangeColumns("image_points", OF_IMAGE, _BOTTOM.matrix, _BOTTOM.offset(size), {"camera_id": (camera,)})
-             for camera, size in sizes.items()]  # fmt: skip
-    hypothesis = Hypothesis(
-        "images mirrored",
-        f"all image points are mirrored, {_BOTTOM.text}: they show the front of flat targets from behind",
-        "count v_px from the top in image_points.csv and spots.csv, or mirror the images back and detect them again",
-        Place("camera", tuple(sizes)), survey, tuple(edits),
-    )  # fmt: skip
-    return replace(project, survey=survey, spots=spots), hypothesis

@@ -1,10 +1,11 @@
 """What becomes of an adjusted project: its statistics, its result files, its place among the runs."""
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, field, replace
 from pathlib import Path
 from typing import Any
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from adjust.native.parallel import Beside
 from survey.folder.replacing import replace_parts
@@ -23,7 +24,7 @@ UNSOLVED = (JSON, PAGE)
 """Files of an adjustment that failed."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class AdjustOutcome:
     """An adjusted project and where its results are. solution: all that ``solution.json`` holds."""
 

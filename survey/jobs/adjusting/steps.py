@@ -1,16 +1,15 @@
 """How a project that was read is adjusted: a list of steps, run in order, each handing on what the next one takes."""
 
 import sys
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import replace
 from types import MappingProxyType
-
-from tqdm import tqdm
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.graph.assembly import StartValues
 from adjust.model.errors import IndeterminateError, SurveyError, listed
+from adjust.model.frozen import frozen
 from adjust.model.memory import remembering
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import Survey
@@ -30,7 +29,7 @@ Begin = Callable[[Survey], StartValues | None]
 Progress = Callable[[int, float], None]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Work:
     """What one step hands on to the next: the project with its survey as it is now, and what was noticed.
 
@@ -54,7 +53,7 @@ class Work:
         return replace(self, project=replace(self.project, survey=survey), notes=self.notes + notes)
 
 
-@dataclass(frozen=True)
+@frozen
 class Step:
     """One step: its name in the log, which projects it concerns, and what it makes of them. Raises SurveyError."""
 
@@ -141,13 +140,17 @@ STEPS = (
 )
 
 
+def _unwatched(_iteration: int, _omega: float) -> None:
+    """Nobody looks."""
+
+
 def _untimed(_name: str) -> AbstractContextManager[None]:
     return nullcontext()
 
 
 def adjust_project(
     project: Project, progress: bool, begin: Begin = lambda _: None,
-    timed: Callable[[str], AbstractContextManager[None]] = _untimed, watch: Progress | None = None,
+    timed: Callable[[str], AbstractContextManager[None]] = _untimed, watch: Progress = _unwatched,
 ) -> Adjustment:  # fmt: skip
     """Adjust what was read. Raises SurveyError.
 
@@ -159,24 +162,34 @@ def adjust_project(
                   if project.images else
                   "put images at images/<camera_id>/<epoch_id>.png or tables into observations/")  # fmt: skip
         raise SurveyError(f"{project.folder}: there is nothing to adjust; {remedy}")
-    with tqdm(desc="adjusting", unit=" steps", disable=not progress, file=sys.stderr, leave=False) as bar:
-
-        def told_bar(iteration: int, omega: float) -> None:
-            bar.set_postfix_str(f"v'Pv = {omega:.6g}")
-            bar.update()
-            if watch is not None:
-                watch(iteration, omega)
-
+    with _watched(progress, watch) as told_bar, remembering():
         work = Work(project, begin, told_bar)
-        with remembering():
-            for step in STEPS:
-                if step.concerns(work):
-                    with timed(step.name):
-                        work = step.run(work)
+        for step in STEPS:
+            if step.concerns(work):
+                with timed(step.name):
+                    work = step.run(work)
     result = _result(work)
     tried = 0 if result.diagnosis is None else len(result.diagnosis.lines)
     said = result.warnings[:tried] + work.notes + result.warnings[tried:] + lost_notes(work.lost)
     return told(project, work.survey, replace(result, warnings=said))
+
+
+@contextmanager
+def _watched(bar: bool, watch: Progress) -> Iterator[Progress]:
+    """What is called with every iteration: ``watch``, after a bar on stderr where one is wanted."""
+    if not bar:
+        yield watch
+        return
+    from tqdm import tqdm  # here: a command that is quiet starts without it
+
+    with tqdm(desc="adjusting", unit=" steps", file=sys.stderr, leave=False) as shown:
+
+        def told(iteration: int, omega: float) -> None:
+            shown.set_postfix_str(f"v'Pv = {omega:.6g}")
+            shown.update()
+            watch(iteration, omega)
+
+        yield told
 
 
 def _result(work: Work) -> Adjustment:

@@ -7,13 +7,14 @@ person or another program has a rule of its own: a camera mounted upside down na
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from adjust.frames.tree import FrameTree
 from adjust.frames.unknowns import Unknowns
 from adjust.model.errors import SurveyError, listed
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.spatial.rigid import align
 from adjust.start import Start, find_start, turns_of_views
@@ -23,7 +24,7 @@ _WORSE = 3.0  # times the misfit of the start that a wrong turn has at least
 _LEAST_PX = 1.0  # ... and at least this much
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Symmetric:
     """Turns of the targets that have any: new point indices (n,) and motions (m, 4, 4), by target id."""
 

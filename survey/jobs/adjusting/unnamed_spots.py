@@ -6,19 +6,22 @@ from dataclasses import replace
 from adjust.adjustment import adjust
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.diagnosis import diagnose
-from adjust.diagnosis.hypothesis import Hypothesis
+from adjust.diagnosis.hypothesis import ChangeColumns, Hypothesis, Place
+from adjust.diagnosis.images import MIRRORED, mapped
 from adjust.diagnosis.units.axes import other_axes
 from adjust.model.errors import DiagnosedError, SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
 from adjust.statistics.outliers.supported import supported
+from survey.jobs.adjusting.edits import OF_IMAGE
 from survey.jobs.adjusting.frame_of_coordinates import in_other_frames
-from survey.jobs.adjusting.mirrored_survey import mirrored_back, sides
+from survey.jobs.adjusting.mirrored_survey import sides
 from survey.jobs.adjusting.places import located
 from survey.jobs.adjusting.probable_causes import causes_first
 from survey.jobs.identify import Identification, identified, identify_spots, spot_views, without_points
 from survey.project import Project
 
+_BOTTOM = MIRRORED[1]
 _TIMES, _MORE = 2, 4
 """How many times as many spots have to get a name, and how many more, for a change of coordinates to be tried."""
 
@@ -55,7 +58,7 @@ def _mirrored(project: Project, first: Adjustment, gate_px: float, enough: int, 
     seen = sides(project, first)
     if not seen.behind or seen.some_from_front:
         return []
-    back, hypothesis = mirrored_back(project)
+    back, hypothesis = _mirrored_back(project)
     try:
         again = adjust(supported(without_points(back.survey, back.spots))[0])
     except SurveyError:
@@ -71,3 +74,20 @@ def _told(h: Hypothesis, survey: Survey, names: Identification, looked_at: int, 
 
 def _share(found: Identification) -> str:
     return f"{found.identified} of {found.identified + found.unidentified} spots"
+
+def _mirrored_back(project: Project) -> tuple[Project, Hypothesis]:
+    """The project with all image points and spots mirrored back, and that as a hypothesis."""
+    survey, sizes = project.survey, {c.camera_id: c.image_size for c in project.survey.cameras}
+    for camera in sizes:
+        epochs = {b.epoch_id for b in survey.image_blocks if b.camera_id == camera}
+        survey = mapped(survey, camera, epochs, _BOTTOM)
+    spots = tuple(_BOTTOM.back(b, sizes[b.camera_id]) for b in project.spots)
+    edits = [ChangeColumns("image_points", OF_IMAGE, _BOTTOM.matrix, _BOTTOM.offset(size), {"camera_id": (camera,)})
+             for camera, size in sizes.items()]  # fmt: skip
+    hypothesis = Hypothesis(
+        "images mirrored",
+        f"all image points are mirrored, {_BOTTOM.text}: they show the front of flat targets from behind",
+        "count v_px from the top in image_points.csv and spots.csv, or mirror the images back and detect them again",
+        Place("camera", tuple(sizes)), survey, tuple(edits),
+    )  # fmt: skip
+    return replace(project, survey=survey, spots=spots), hypothesis

@@ -1,12 +1,12 @@
 """Images that are wrong as such, told once for each camera: mosaics, interlaced fields, motion while exposed."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.survey import Survey
 from adjust.native.parallel import side_by_side
 from survey.project.detected import DetectedImage, ImageKey, named
@@ -74,7 +74,7 @@ def _region(gray: "Gray32", report: "ImageReport") -> "Gray32":
     return gray[v:v_end, u:u_end]
 
 
-@dataclass(frozen=True)
+@frozen
 class DefectiveImages:
     """Images of a camera with the same defect; text: what was measured in the first of them. remedy: what to do."""
 

@@ -1,15 +1,17 @@
 """What detection did, for people and programs."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from adjust.model.frozen import frozen
 
 if TYPE_CHECKING:  # brings in OpenCV, which a folder that is detected already does without
     from survey.detection import ImageReport
 
 
-@dataclass(frozen=True)
+@frozen
 class DetectOutcome:
     """What detection did: one report per image that was looked at, the files written, and what people should know.
 

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.lenses.models import MODELS
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from adjust.navigation import Beacons, Head, HeadCamera, HeadTable
 from survey.folder.arrays import packed_arrays, read_arrays
@@ -19,7 +20,7 @@ from survey.folder.text import NOT_OURS
 from survey.project import atomic_write
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Calibration:
     """Head and beacons of an adjustment without the navigated epochs.
 

@@ -4,7 +4,7 @@ import contextlib
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from tqdm import tqdm
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.diagnosis.trajectory import OfTrajectory, causes_of_trajectory
 from adjust.model.errors import IndeterminateError, SurveyError, listed
+from adjust.model.frozen import frozen
 from adjust.model.names import natural_key
 from adjust.navigation import EpochPose, Motion, NavigateOptions, Trajectory, head_and_beacons, navigate
 from survey.folder.plain import attributes
@@ -44,7 +45,7 @@ CALIBRATION = "navigation_calibration.npz"
 STATUSES = ("fixed", "bridged", "ambiguous", "undetermined", "none")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class NavigateOutcome:
     """A navigated project: trajectory, what it was calibrated with, and the files written."""
 

@@ -1,14 +1,15 @@
 """Which lens navigated images have: that of the images which calibrate it, where nothing changed in between."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.names import natural_key
 from adjust.model.survey import Camera, ImageCrop, Survey
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class LensesTaken:
     """By camera whose lens changes: at which epoch it is taken, and the crop that is given for the navigated images."""
 

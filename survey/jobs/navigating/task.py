@@ -1,13 +1,14 @@
 """What of a project is navigated, and what it is calibrated from: station, epochs, their times, spots and readings."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import repeat
 from pathlib import Path
 
 import numpy as np
 
 from adjust.model.errors import SurveyError, listed
+from adjust.model.frozen import frozen
 from adjust.model.names import natural_key
 from adjust.model.observations import ImageBlock
 from adjust.model.subsets import in_use, points_read, with_points
@@ -19,7 +20,7 @@ from survey.jobs.navigating.lenses import with_images_left
 from survey.project import Project
 
 
-@dataclass(frozen=True)
+@frozen
 class NavigateRequest:
     """What is navigated.
 

@@ -5,10 +5,11 @@ the same declarations (``survey.project.reference``).
 What there is stands in ``survey.project.declared.declarations``.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 from typing import Any, Literal
 
+from adjust.model.frozen import frozen
 from survey.folder.units import unit_in
 
 ValueKind = Literal[
@@ -20,7 +21,7 @@ NOTHING = None
 """The default of a key that may be absent and then says nothing."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Key:
     """One key. size: numbers in a list, rows of a square matrix, components of a sigma (one number for all, or a list).
 
@@ -45,7 +46,7 @@ class Key:
         return unit_in(self.name).replace("mm2", "mm²").replace("_per_", "/").removeprefix("1")
 
 
-@dataclass(frozen=True)
+@frozen
 class Declared:
     """A table. path: where it stands in the file, ``ID`` for an id of the user's; several may share one path by ``of``.
 

@@ -3,13 +3,14 @@
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from survey.folder.text import LARGEST_NUMBER, choice_hint, decode, id_problem, read_bytes, suggestion, with_digest
 from survey.folder.units import to_si, unit_in
@@ -78,7 +79,7 @@ def _check_integers(root: "Node", value: object, keys: KeyPath) -> None:
         raise root.error("the number is too large to be meant; correct it", *keys)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Node:
     """``values`` is the table at ``path`` of ``file``; ``lines`` holds the line of every key of the whole file.
 

@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +18,13 @@ import numpy.typing as npt
 from adjust.model.arrays import BoolArray, FloatArray
 from adjust.model.errors import SurveyError
 from adjust.native.parallel import side_by_side, workers
+from survey.folder.ahead import LARGE
 from survey.folder.text import LARGEST_NUMBER, csv_text, utf8
 from survey.project.tables.reading import LARGEST_ROWS, Columns, Layout, TextColumn, check_header, check_rows, first_row
 
-LARGE = 2**20  # bytes of CSV, cells to write / 10: below, loading Arrow (30 ms) costs more than it saves
 _WORTHWHILE = 2**14  # bytes of CSV once it is loaded
 _LARGEST_DECODED = 8 * 2**30  # bytes of the columns of a Parquet file
-_BLOCK, _ROWS = 2**20, 2**17  # bytes read, rows written at a time
+_PIECE, _BLOCK, _ROWS = 2**22, 2**20, 2**17  # bytes of a thread, bytes read, rows written at a time
 _PLAIN = re.compile(r"[\w.:/+-]+").fullmatch  # names that need no quotes in CSV
 _ALIKE = (1e-4, 1e9)  # between these Arrow writes doubles as Python does, but for whole numbers
 
@@ -35,20 +36,27 @@ def csv_columns(data: bytes, layout: Layout) -> dict[str, TextColumn | FloatArra
     """
     if len(data) < (min(_WORTHWHILE, LARGE) if "pyarrow" in sys.modules else LARGE) or b'"' in data:
         return None
-    header = data[: data.find(b"\n")].decode("utf-8-sig", "replace").rstrip("\r").split(",")
+    begin = data.find(b"\n") + 1
+    header = data[: begin - 1].decode("utf-8-sig", "replace").rstrip("\r").split(",")
     if not set(layout.required) <= set(header) <= set(layout.columns) or not len(set(header)) == len(header) > 1:
         return None
     import pyarrow as pa
     from pyarrow import csv as arrow_csv
 
     types = {name: pa.dictionary(pa.int32(), pa.string()) if layout.is_text(name) else pa.float64() for name in header}
-    try:
-        read = arrow_csv.read_csv(
-            pa.BufferReader(data),
-            arrow_csv.ReadOptions(use_threads=workers() > 1, block_size=_BLOCK, skip_rows=1, column_names=header),
+    whole = pa.py_buffer(data)
+
+    def rows(ends: tuple[int, int]) -> Any:
+        first, last = ends
+        return arrow_csv.read_csv(
+            pa.BufferReader(whole.slice(first, last - first)),
+            arrow_csv.ReadOptions(use_threads=False, block_size=_BLOCK, column_names=header),
             arrow_csv.ParseOptions(quote_char=False, ignore_empty_lines=False),
             arrow_csv.ConvertOptions(column_types=types, null_values=[""], strings_can_be_null=False),
-        ).unify_dictionaries()
+        )
+
+    try:
+        read = pa.concat_tables(side_by_side(rows, _pieces(data, begin))).unify_dictionaries()
     except (pa.ArrowException, OSError, ValueError):
         return None
     if read.num_rows > LARGEST_ROWS:
@@ -58,6 +66,15 @@ def csv_columns(data: bytes, layout: Layout) -> dict[str, TextColumn | FloatArra
     if len(out) < len(header) or any(_has_blank(out[name]) for name in layout.required):
         return None
     return out
+
+
+def _pieces(data: bytes, begin: int) -> list[tuple[int, int]]:
+    """Where pieces of whole rows begin and end."""
+    ends = [begin]
+    while ends[-1] < len(data):
+        found = data.find(b"\n", ends[-1] + _PIECE)
+        ends.append(found + 1 if found >= 0 else len(data))
+    return list(pairwise(ends))
 
 
 def _text(column: Any) -> TextColumn:

@@ -1,10 +1,10 @@
 """Tables of coordinates and of coordinate differences (baselines), with covariances within sets of rows."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from adjust.model.frozen import frozen
 from adjust.model.names import natural_key
 from adjust.model.observations import CoordinateDifferences, Coordinates, position_text
 from adjust.model.survey import FloatArray
@@ -16,7 +16,7 @@ from survey.project.tables.reading import Columns, Table, filled, group_columns,
 from survey.project.tables.references import Names, read_ends, timed_position
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Set:
     """Rows that are one observation, in the natural order of their names. of_set: its name, blank for a single row.
 

@@ -6,8 +6,8 @@ import itertools
 import re
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,9 @@ import numpy as np
 
 from adjust.model.arrays import FloatArray, IntArray
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.native.parallel import Beside
-from survey.folder.locking import OBSERVATIONS_FOLDER
+from survey.folder.ahead import LARGE, Ahead, Content, Version, begun, version
 from survey.folder.text import (
     LARGEST_NUMBER,
     atomic_write,
@@ -26,9 +27,8 @@ from survey.folder.text import (
     decode,
     formula_problem,
     utf8,
-    with_digest,
 )
-from survey.project.tables.arrow import LARGE, csv_bytes, csv_columns, parquet_bytes, parquet_columns
+from survey.project.tables.arrow import csv_bytes, csv_columns, parquet_bytes, parquet_columns
 from survey.project.tables.layouts import LAYOUTS
 from survey.project.tables.reading import Columns, Layout, Table, TextColumn, check_header, check_rows, first_row
 
@@ -37,62 +37,38 @@ _NUMBERS = re.compile(r"[-+.\deE ]+")  # the components of an axis in one cell
 Chunk = tuple[IntArray, Sequence[Sequence[str]]]
 
 
-@dataclass(frozen=True, eq=False)
-class _Content:
-    """What is in a file: its bytes, and their sha256."""
-
-    data: Callable[[], bytes]
-    digest: Callable[[], str]
-
-
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Begun:
-    """A table that is being read: the file as it was then, by inode, size and time, and what gives the table."""
+    """A table that is being read: the file as it was then, and what gives the table."""
 
-    file: tuple[int, ...]
+    file: Version
     table: Callable[[], Table]
 
 
-@contextmanager
-def reading_ahead(folder: Path) -> Iterator[dict[Path, Begun]]:
-    """The large tables of a project, which are read while what comes next is loaded; none where there is one thread.
-
-    Nothing of it goes on when this ends. What is wrong with a table is told to who asks for it.
-    """
-    with Beside() as beside:
-        paths = [] if beside.alone else sorted((folder / OBSERVATIONS_FOLDER).glob("*.csv"))
-        large = [path for path in paths if path.stem in LAYOUTS and path.is_file() and path.stat().st_size >= LARGE]
-        yield {path: _begun(path, beside) for path in large}
-
-
-def _begun(path: Path, beside: Beside) -> Begun:
-    file, found = _version(path), _content(path, None, beside)
-    return Begun(file, beside.of(lambda: _read(path, LAYOUTS[path.stem], found)))
+def begin_tables(ahead: Ahead) -> dict[Path, Begun]:
+    """Go on with files that are being read: to the tables that they hold."""
+    begun_tables = {}
+    if ahead.files:
+        import_module("pyarrow.csv")  # before GTSAM, which is loaded with Python's lock held
+    while ahead.files:
+        path, (file, found) = ahead.files.popitem()
+        if path.stem in LAYOUTS:
+            begun_tables[path] = Begun(file, ahead.steps.of(partial(_read, path, LAYOUTS[path.stem], found)))
+    return begun_tables
 
 
-def _version(path: Path) -> tuple[int, ...]:
-    """Another one where a file was replaced or written to."""
-    status = path.stat()
-    return status.st_ino, status.st_size, status.st_mtime_ns
-
-
-def _content(path: Path, instead: str | None, beside: Beside) -> _Content:
-    data = beside.of(lambda: content(path) if instead is None else instead.encode())
-    return _Content(data, beside.of(lambda: with_digest(data())[1]))
-
-
-def read_table(path: Path, layout: Layout, instead: str | None = None, begun: Begun | None = None) -> Table:
+def read_table(path: Path, layout: Layout, instead: str | None = None, ahead: Begun | None = None) -> Table:
     """Read ``.csv`` or ``.parquet``; raises SurveyError with file and line for whatever does not fit the layout.
 
-    instead: what is to stand in it, not yet written. begun: where it was read ahead, taken if the file is as it was.
+    instead: what is to stand in it, not yet written. ahead: where it was read ahead, taken if the file is as it was.
     """
-    if begun is not None and instead is None and begun.file == _version(path):
-        return begun.table()
-    with Beside() as beside:
-        return _read(path, layout, _content(path, instead, beside))
+    if ahead is not None and instead is None and ahead.file == version(path):
+        return ahead.table()
+    with Beside() as steps:
+        return _read(path, layout, begun(lambda: content(path) if instead is None else instead.encode(), steps))
 
 
-def _read(path: Path, layout: Layout, found: _Content) -> Table:
+def _read(path: Path, layout: Layout, found: Content) -> Table:
     if path.suffix == ".parquet":
         columns = parquet_columns(path, found.data(), layout)
         lines = np.arange(1, len(next(iter(columns.values()))) + 1)

@@ -1,9 +1,10 @@
 """Every table of observations but those of image points: what of a survey it holds, how it is read and written."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
+from adjust.model.frozen import frozen
 from adjust.model.observations import position_text
 from adjust.model.survey import Survey
 from survey.project.project import Sigmas
@@ -13,7 +14,7 @@ from survey.project.tables.reading import Columns, Layout, Table
 from survey.project.tables.references import Names
 
 
-@dataclass(frozen=True)
+@frozen
 class Kind:
     """Observations of one kind: their table, and the field of a survey that holds them.
 

@@ -6,7 +6,6 @@ of several columns, each with its unit; angles also as text.
 
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ import numpy.typing as npt
 
 from adjust.model.arrays import BoolArray, FloatArray, IntArray
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from survey.folder.text import formula_problem, id_problem, suggestion
 from survey.folder.units import to_si
 
@@ -24,7 +24,7 @@ ANGLE_UNITS = ("deg", "gon", "arcsec", "mgon", "cc")
 _DMS = re.compile(r"([+-]?)(\d+)-(\d+)-(\d+(?:\.\d*)?)")
 
 
-@dataclass(frozen=True)
+@frozen
 class Layout:
     """The columns of a table. Required ones must be there and filled; optional ones may be absent or blank."""
 
@@ -49,7 +49,7 @@ class Layout:
         return column in self.ids or column in self.optional_text
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class TextColumn:
     """``names`` are the different texts in order of appearance, ``codes`` (n,) the positions in them."""
 
@@ -67,7 +67,7 @@ class TextColumn:
 Columns = Mapping[str, Sequence[str] | TextColumn | FloatArray]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Table:
     """A table that was read: ``lines`` (n,) where its rows stand, and its columns. Blank numbers are nan.
 

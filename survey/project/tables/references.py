@@ -6,9 +6,10 @@ A frame is ``world`` or ``kind:id``, with ``@epoch`` where it moves: ``station:h
 
 import functools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.observations import FrameKind, FrameRef, PositionRef, frame_text
 from adjust.model.survey import Survey
 from survey.folder.text import id_problem, suggestion
@@ -21,7 +22,7 @@ Fail = Callable[[str], SurveyError]
 """What makes an error of a problem: it knows where."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Names:
     """The frames and points of a survey by name.
 

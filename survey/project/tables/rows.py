@@ -3,10 +3,11 @@
 import hashlib
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
+from adjust.model.frozen import frozen
 from survey.folder.text import csv_rows, csv_text, read_text
 from survey.project.detected import ImageKey
 from survey.project.tables.files import cells_of, read_table
@@ -15,7 +16,7 @@ from survey.project.tables.reading import FLAGS, Columns, Layout
 _FALSE = ("false", "0")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class RowTable:
     """Rows of a table. header: its columns in their order; rows: their cells by column."""
 

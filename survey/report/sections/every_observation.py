@@ -195,9 +195,11 @@ def _reliability(c: Context, values: FloatArray) -> dict[str, FloatArray]:
     """Gross error, minimal detectable bias and external reliability; nothing where there are no statistics."""
     if c.statistics is None:
         return dict.fromkeys(("Gross error", "MDB", "λ̄"), np.full(values.shape[1], np.nan))
-    tests, (observation, component) = c.statistics.reliability.tests, values[10:].astype(np.int64)
-    rows = tests.ptr[observation] + component
+    observation, component = values[10:].astype(np.int64)
+    some, at = np.unique(observation, return_inverse=True)
+    tests = c.statistics.reliability.tests.of(some)
+    rows = tests.ptr[at] + component
     return {
         "Gross error": tests.error[rows] * values[8], "MDB": tests.detectable_component[rows] * values[8],
-        "λ̄": tests.external[observation],
+        "λ̄": tests.external[at],
     }  # fmt: skip

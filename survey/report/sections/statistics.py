@@ -75,11 +75,10 @@ def reliability(c: Context) -> Markup:
 
 
 def _influence_row(c: Context, x: Influence) -> tuple[str, ...]:
-    tests, (unit, factor) = c.found.reliability.tests, sigma_unit_for_people(x.unit)
-    detectable, external = float(tests.detectable[x.row]), float(tests.external[x.row])
+    unit, factor = sigma_unit_for_people(x.unit)
     place = name_text(x.position) if x.position else m.MISSING
     return (
-        observation_text(c, x.row), m.fixed(detectable, 1), m.fixed(external, 2),
+        observation_text(c, x.row), m.fixed(x.detectable, 1), m.fixed(x.external, 2),
         m.joined((name_text(x.name), m.code(x.component)), " "),
         m.general(x.shift * factor, 2), unit, m.fixed(x.ratio, 2), place,
         m.general(1e3 * x.position_shift, 2) if x.position else m.MISSING,

@@ -1,19 +1,20 @@
 """What became of a solution: every parameter before and after, in its own sigmas, and the verdict."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 import numpy as np
 from gtsam import Pose3
 
+from adjust.model.frozen import frozen
 from adjust.model.result import Estimate, ParameterName
 from adjust.model.survey import FloatArray
 from survey.folder.plain import plain
 from survey.solution.quantities import sigma_unit_for_people, sigmas_in, unit_for_people
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Snapshot:
     """A solution as it can be kept and compared. summary: sigma0, redundancy, verdict and so on, as plain values."""
 
@@ -21,7 +22,7 @@ class Snapshot:
     summary: Mapping[str, Any]
 
 
-@dataclass(frozen=True)
+@frozen
 class Change:
     """One component of a parameter before and after, in the ``unit`` that people read (rotations about own axes).
 
@@ -37,7 +38,7 @@ class Change:
     ratio: float
 
 
-@dataclass(frozen=True)
+@frozen
 class Changes:
     """All components, the one that moved by most sigmas first; ``new`` and ``gone``: parameters in one only."""
 

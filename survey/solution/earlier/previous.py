@@ -1,7 +1,6 @@
 """What an earlier adjustment of a project left in its results: values to start from, and sigmas to compare with."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ from gtsam import Pose3
 
 from adjust.epochs.states import differences_of
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment, ParameterName
 from adjust.spatial.averaging import mean_pose
 from survey.folder.locking import settled
@@ -28,7 +28,7 @@ _SUMMARY = {"redundancy": WHOLE, "sigma0": Either((POSITIVE, None)), "sigma_fact
 _PLACED = ("world_from_station", "point")
 
 
-@dataclass(frozen=True)
+@frozen
 class Move:
     """How far a station or point went: mm, arcsec, and the largest component in its sigmas of before."""
 

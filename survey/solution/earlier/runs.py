@@ -15,7 +15,6 @@ import shlex
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -23,6 +22,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from survey.folder.plain import plain
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import NOT_OURS, atomic_write, json_text, read_bytes, read_text
@@ -85,7 +85,7 @@ def plain_name(folder: Path) -> str:
     return os.fsencode(folder.resolve().name).decode("utf-8", "replace")
 
 
-@dataclass(frozen=True)
+@frozen
 class Run:
     """A run by its number. summary: verdict, sigma0, redundancy and so on. hashes: of the inputs, by path."""
 

@@ -7,13 +7,13 @@ pairs reach more than one of its frames, each joined to the station.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from gtsam import Pose3
 
+from adjust.model.frozen import frozen
 from adjust.model.names import natural_key
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.result import ParameterName
@@ -28,7 +28,7 @@ _GIVEN = "given:"  # no station's id holds a colon
 _WORLD = "world"
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PairNetwork:
     """counts: of the pairs in use. shifts: the same of those with a translation, where not all have one.
 
@@ -129,7 +129,7 @@ def tied(ends: Ends, links: "Sequence[Link]", bare: tuple[str, ...] = ()) -> Top
     return topology(ends + [(link.link_id, link.frame, link.carrier) for link in links], bare)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Link:
     """A frame whose pose in another one is known without pairs, and the name of the parameter that it is."""
 

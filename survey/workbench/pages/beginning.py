@@ -1,12 +1,13 @@
 """A folder as a page begins with it: projects beside it, and one of images that is to become a project."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from survey.folder.plain import plain
 from survey.project.project import DEFINITION_FILE, IMAGES_FOLDER
@@ -14,7 +15,7 @@ from survey.report.language import message, text_said
 from survey.workbench.pages.capturing import FolderView
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Drawn:
     """What a job adds to the scene, in the world (m).
 
@@ -39,7 +40,7 @@ class Drawn:
         }))  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Told:
     """What a job said: for people, as plain values, and in the scene."""
 

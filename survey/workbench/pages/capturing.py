@@ -2,13 +2,13 @@
 
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from survey.folder.locking import SESSION_LOCK, holder_of
 from survey.project.captured import Coverage, Qualities, is_id, points_of, session_status
@@ -28,7 +28,7 @@ def coverage_dict(found: Mapping[str, Coverage]) -> dict[str, Any]:
     }
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Shown:
     """An image and the target points (n, 2) px in it."""
 
