@@ -18,6 +18,7 @@ ROOT = Path(__file__).parents[2]
 CORPUS = ROOT / "tests" / "fuzz" / "corpus"
 NO_READERS = {
     "survey/commands/opening.py:open_project": "a browser",
+    "survey/report/markup.py:_Compiled.load_bytecode": "beside the package, as its compiled modules",
     "survey/report/modules.py:bundled": "a part of the package",
     "survey/report/modules.py:looks": "a part of the package",
     "survey/report/page.py:_words": "a part of the package",
