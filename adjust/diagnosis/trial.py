@@ -8,7 +8,7 @@ import numpy as np
 
 from adjust.diagnosis.case import CAP, Case, block_squares
 from adjust.diagnosis.hypothesis import Hypothesis
-from adjust.model.errors import SurveyError
+from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.frozen import frozen
 from adjust.model.names import numbered
 from adjust.model.result import Adjustment, names_of
@@ -130,6 +130,8 @@ def _again(hypothesis: Hypothesis, by: FloatArray, case: Case) -> Trial | None:
     """With other sigmas of pairs in the graph of the case; None where that takes another one."""
     try:
         result = case.reweighted(by)
+    except IndeterminateError:  # by rows it may have a solution, ten times as long
+        return Trial(hypothesis, misfit_of(None, case.survey), None, None, True)
     except (SurveyError, RuntimeError):  # the latter as below
         return Trial(hypothesis, misfit_of(None, case.survey), None, None, case.budget.refused)
     return None if result is None else Trial(hypothesis, misfit_of(result, case.survey), result)

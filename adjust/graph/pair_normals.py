@@ -14,6 +14,7 @@ import numpy as np
 from adjust.graph.assembly import AdjustmentGraph, Evaluation
 from adjust.graph.bending import Bending, tree
 from adjust.graph.elimination import EXACT, force_on, lost, numbers, pose_cliques
+from adjust.model.errors import IndeterminateError
 from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray
 from adjust.native.elimination import PoseFactor, PoseTree, pair_gradient
@@ -70,11 +71,12 @@ class PairLinear:
 class PairNormals:
     """The system of a graph with ``only_pairs``, and its elimination by Cholesky. last: keys to be eliminated last.
 
+    exact: whether all digits are wanted; else IndeterminateError is raised where Cholesky refuses.
     b, a: (E,) numbers of the ends of the pairs in use, -1 for what is held. The ends of the others share a clique as
     well, as if these were in use: what is out is tested at the price of what is in.
     """
 
-    def __init__(self, graph: AdjustmentGraph, last: Iterable[int]) -> None:
+    def __init__(self, graph: AdjustmentGraph, last: Iterable[int], exact: bool = True) -> None:
         if graph.pairs is None:
             raise ValueError("the survey has no pairs between fixed stations")
         self.graph, self.batch = graph, graph.pairs
@@ -90,6 +92,7 @@ class PairNormals:
         self.factor = PoseFactor(pattern)
         self.kept = False
         """Whether the factor of the step before serves the next one."""
+        self.exact = exact
         self.by_rows: bool | None = None
         """Whether the normal matrix has too few digits; not known before the first factor."""
 
@@ -127,6 +130,10 @@ class PairNormals:
     def _eliminated(self, linear: PairLinear) -> bool:
         system = self.b, self.a, linear.by_b, linear.by_a, linear.own
         refused = not self.by_rows and self.factor.eliminate(*system) >= 0
+        if not self.exact:
+            if refused:
+                raise IndeterminateError("the normal equations have too few digits for all poses")
+            return True
         if self.by_rows is None or refused:
             self.by_rows = refused or self.lost(linear) > EXACT
         return not self.by_rows or self.factor.eliminate_rows(*system) < 0

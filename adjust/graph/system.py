@@ -25,10 +25,13 @@ class System:
     """What a search steps by. at: everything evaluated at the present values; linear: the system there, with its datum.
 
     judging: whether what is undetermined is named, else it is only no solution. determined: it was judged before.
-    covariances: whether they are wanted in the end. damping: of Marquardt. use_qr: rows are eliminated, not squares.
+    covariances: whether they are wanted in the end. exact: as of ``PairNormals``. damping: of Marquardt. use_qr: rows
+    are eliminated, not squares.
     """
 
-    def __init__(self, graph: AdjustmentGraph, start: gtsam.Values, determined: bool, covariances: bool) -> None:
+    def __init__(
+        self, graph: AdjustmentGraph, start: gtsam.Values, determined: bool, covariances: bool, exact: bool = True
+    ) -> None:
         self.graph, self.determined, self.covariances = graph, determined, covariances
         self.damping, self.judging = 0.0, True
         self.reduced, self.use_qr = True, False
@@ -42,7 +45,7 @@ class System:
         if not np.isfinite(self.omega) and graph.terrestrial is not None:
             graph.terrestrial.require_directions()
         self.datum = inner_datum(graph, self.at)
-        self.pairs = PairNormals(graph, self._last_keys()) if graph.only_pairs else None
+        self.pairs = PairNormals(graph, self._last_keys(), exact) if graph.only_pairs else None
         self._linearize()
 
     def _evaluated(self, values: gtsam.Values) -> Evaluation:

@@ -9,7 +9,9 @@ import pytest
 from adjust.adjustment import adjust
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.pair_normals import PairLinear, PairNormals
+from adjust.model.errors import IndeterminateError
 from adjust.model.survey import PoseParameter, Survey
+from adjust.native.elimination import PoseFactor
 from adjust.native.pairs import compose_poses
 from adjust.observations import pairs as pairs_module
 from adjust.pose_network.solve import minimize
@@ -47,6 +49,20 @@ def test_a_pose_that_nothing_tells_of_is_without_a_pivot_in_rows() -> None:
     normals, linear = system(of_network(1))
     linear.by_b[normals.b == 7], linear.by_a[normals.a == 7] = 0.0, 0.0
     assert normals.factor.eliminate_rows(normals.b, normals.a, linear.by_b, linear.by_a, linear.own) == 7
+
+
+def test_where_cholesky_refuses_what_is_only_compared_does_without_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They take ten times as long: a comparison says that there was no time for them."""
+    graph, asked = of_network(1), list[int]()
+    rough, exact = PairNormals(graph, [], exact=False), PairNormals(graph, [])
+    linear = rough.linearized(graph.prepare(graph.start, True))
+    linear.by_b[rough.b == 7], linear.by_a[rough.a == 7] = 0.0, 0.0
+    monkeypatch.setattr(PoseFactor, "eliminate_rows", lambda *_: asked.append(1) or 7)
+    assert exact.solution(linear) is None
+    assert asked == [1]
+    with pytest.raises(IndeterminateError, match="too few digits"):
+        rough.solution(linear)
+    assert asked == [1]
 
 
 def test_the_clique_after_all_below_it_beside_each_other() -> None:
