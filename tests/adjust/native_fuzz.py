@@ -91,11 +91,12 @@ def _of_numbers(call: Call, rng: np.random.Generator) -> tuple[tuple[Any, ...], 
 
 def _of_shapes(call: Call, rng: np.random.Generator) -> tuple[tuple[Any, ...], str | None]:
     """One array that can no longer be what was declared."""
-    arguments, kinds, shapes = list(call.arguments), call.function.kinds(), dict(call.function.shapes())
+    arguments, kinds = list(call.arguments), call.function.kinds()
+    shapes = [shape for _, shape in call.function.shapes()]  # by place: of several of one name each has its own
     places = [i for i, (_, kind) in enumerate(kinds) if kind not in "nd"]
     i = int(rng.choice(places))
     name, array = kinds[i][0], arguments[i]
-    bound = [k for k, size in enumerate(shapes[name]) if isinstance(size, int) or _named_elsewhere(size, name, shapes)]
+    bound = [k for k, size in enumerate(shapes[i]) if isinstance(size, int) or _named_elsewhere(size, i, shapes)]
     ways = ["kind", "dimension", "nothing", "number"]
     ways += ["length", "empty"] * bool(bound) + ["order"] * (min(array.shape) > 1 and array.ndim > 1)
     ways += ["stride"] * (array.size > 1) + ["locked"] * kinds[i][1].isupper()
@@ -133,11 +134,11 @@ def _one(array: np.ndarray, k: int) -> tuple[int, ...]:
     return tuple(1 if j == k else n for j, n in enumerate(array.shape))
 
 
-def _named_elsewhere(size: Any, name: str, shapes: dict[str, Any]) -> bool:
+def _named_elsewhere(size: Any, i: int, shapes: list[Any]) -> bool:
     """Whether another array has this length by name, so that a change is seen."""
     return size is not None and any(
         isinstance(other, tuple) and other[0] == size[0]
-        for argument, shape in shapes.items() if argument != name for other in shape
+        for j, shape in enumerate(shapes) if j != i for other in shape
     )
 
 
