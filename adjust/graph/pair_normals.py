@@ -130,12 +130,10 @@ class PairNormals:
     def _eliminated(self, linear: PairLinear) -> bool:
         system = self.b, self.a, linear.by_b, linear.by_a, linear.own
         refused = not self.by_rows and self.factor.eliminate(*system) >= 0
-        if not self.exact:
-            if refused:
-                raise IndeterminateError("the normal equations have too few digits for all poses")
-            return True
+        if refused and not self.exact:
+            raise IndeterminateError("the normal equations have too few digits for all poses")
         if self.by_rows is None or refused:
-            self.by_rows = refused or self.lost(linear) > EXACT
+            self.by_rows = refused or (self.exact and self.lost(linear) > EXACT)
         return not self.by_rows or self.factor.eliminate_rows(*system) < 0
 
     def lost(self, linear: PairLinear) -> float:

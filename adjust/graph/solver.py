@@ -53,10 +53,9 @@ class SolveOptions:
     it was least. On long corridors of pairs the first ones raise it before it falls (watchdog technique: Chamberlain,
     Lemarechal, Pedersen and Powell 1982; Nocedal and Wright 2006, section 15.6). determined: what the observations
     determine was judged before; where GTSAM's Cholesky refuses, QR solves. settled: share of chi-square that two steps
-    one after the other have to gain for the search to go on: of a survey that is only compared with others, for which
-    normal equations of few digits will do.
+    one after the other have to gain for the search to go on: of a survey that is only compared with others.
     covariances: whether they are wanted; the tree of nothing but pairs may else be that of a step before. hopeless:
-    chi-square above which the search is given up once it has taken many steps.
+    chi-square above which the search is given up once it has taken many steps. exact: as of ``PairNormals``.
     """
 
     max_step: float = 1e-6
@@ -67,6 +66,7 @@ class SolveOptions:
     settled: float = 0.0
     covariances: bool = True
     hopeless: float = np.inf
+    exact: bool = True
 
 
 @frozen(eq=False)
@@ -96,7 +96,7 @@ class _Loop(System):
     def __init__(
         self, graph: AdjustmentGraph, start: gtsam.Values, options: SolveOptions, progress: Progress | None
     ) -> None:
-        super().__init__(graph, start, options.determined, options.covariances, exact=options.settled == 0.0)
+        super().__init__(graph, start, options.determined, options.covariances, options.exact)
         self.start, self.options, self.progress = start, options, progress
         self.length, self.asked = 1.0, False
         self.moved = self.before = np.inf

@@ -20,6 +20,8 @@ from adjust.model.errors import SurveyError
 from survey.folder.locking import hold, remove_unheld
 
 LARGEST_FILE = 4 * 2**30  # bytes; longer observations go into several projects
+Piece = bytes | memoryview
+"""Of a file."""
 LARGEST_NUMBER = 1e15  # its square and what is made of it stay finite
 FORBIDDEN_IN_IDS = set('/\\:@,;"|<>*?')
 NOT_OURS = (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, RecursionError, OSError)
@@ -32,7 +34,7 @@ _LONGEST_ID = 120  # bytes: an id with a prefix and an ending is still the name 
 _DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{i}" for port in ("COM", "LPT") for i in range(1, 10))}
 
 
-def atomic_write(path: Path, content: bytes | str | Iterable[bytes | memoryview], lasting: bool = False) -> None:
+def atomic_write(path: Path, content: bytes | str | Iterable[Piece], lasting: bool = False) -> None:
     """Write ``content`` (text as UTF-8) under a temporary name beside ``path``, then rename: all of it or nothing.
 
     What killed runs left of the same file goes. lasting: on return even a cut of the power leaves the new file.

@@ -9,6 +9,7 @@ from adjust.model.frozen import frozen
 from adjust.model.result import Adjustment
 from adjust.native.parallel import Beside
 from survey.folder.replacing import changing, replace_parts
+from survey.folder.text import Piece
 from survey.project import atomic_write
 from survey.project.project import RESULTS
 from survey.report.language import ENGLISH_PAGE, ReportOptions
@@ -16,7 +17,7 @@ from survey.report.page import BegunPage, begun_page, finished_page, report_pdf
 from survey.report.terminal import summary_text
 from survey.solution.covariances import covariance_npz
 from survey.solution.dictionary import RunInfo, solution_dict, with_statistics
-from survey.solution.records import Piece, solution_json, solution_pieces
+from survey.solution.records import solution_json, solution_pieces
 from survey.solution.residual_tables import (
     image_residuals_csv,
     image_residuals_parquet,

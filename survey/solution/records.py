@@ -17,12 +17,11 @@ from adjust.model.frozen import frozen
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.text import NUMBERS, TEXT, WORD, Words, record_rows
 from survey.folder.plain import PlainEntries, PlainRecords
+from survey.folder.text import Piece
 
 Column = np.ndarray[Any, Any] | Sequence[str] | Sequence[list[str]]
 """Of n records: floats, whole numbers or truths (n,), lists of floats (n, k), n words, or n lists of words."""
 Tree = Mapping[str, "Column | Tree"]
-Piece = bytes | memoryview
-"""Of a file."""
 _FLOATS, _WORDS = {float}, {str}
 _JSON = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
 

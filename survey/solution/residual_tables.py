@@ -17,7 +17,7 @@ from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.parallel import side_by_side, workers
 from adjust.native.text import NUMBERS, TEXT, WORD, Words, number_rows, record_rows
 from adjust.observations.terrestrial.statistics import reading_names, reading_unit
-from survey.folder.text import cell_text, csv_text
+from survey.folder.text import Piece, cell_text, csv_text
 from survey.project.tables.arrow import parquet_bytes
 from survey.project.tables.reading import TextColumn
 from survey.solution.quantities import units_for_people
@@ -130,12 +130,12 @@ def _quoted(word: str) -> str:
     return word if _NEEDS_QUOTES.isdisjoint(word) else '"' + word.replace('"', '""') + '"'
 
 
-def other_residuals_csv(adjustment: Adjustment) -> list[bytes | memoryview]:
+def other_residuals_csv(adjustment: Adjustment) -> list[Piece]:
     """``residuals_other.csv``, piece by piece: values in mm and degrees, residuals and sigmas in mm and arcseconds."""
     readings, arrays = adjustment.reading_residuals, adjustment.other_arrays
     n = len(adjustment.other_residuals) - (0 if readings is None else len(readings.observed))
     first, at = 0, 0
-    out: list[bytes | memoryview] = [OTHER_COLUMNS.encode() + b"\n"]
+    out: list[Piece] = [OTHER_COLUMNS.encode() + b"\n"]
     columns = np.column_stack([arrays.observed, arrays.adjusted, arrays.residual, arrays.sigma, arrays.redundancies,
                                arrays.standardized, arrays.test[arrays.observation]])  # fmt: skip
     names = names_of(adjustment.other_residuals)[:n]

@@ -9,6 +9,7 @@ import pytest
 from adjust.adjustment import adjust
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.pair_normals import PairLinear, PairNormals
+from adjust.graph.solver import SolveOptions, solve
 from adjust.model.errors import IndeterminateError
 from adjust.model.survey import PoseParameter, Survey
 from adjust.native.elimination import PoseFactor
@@ -63,6 +64,15 @@ def test_where_cholesky_refuses_what_is_only_compared_does_without_rows(monkeypa
     with pytest.raises(IndeterminateError, match="too few digits"):
         rough.solution(linear)
     assert asked == [1]
+
+
+def test_a_survey_that_is_only_compared_has_its_rows_unless_it_does_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = of_network(1)
+    expected = solve(graph, SolveOptions(determined=True)).omega
+    monkeypatch.setattr(PoseFactor, "eliminate", lambda *_: 0)
+    assert solve(graph, SolveOptions(determined=True, settled=1e-9)).omega == pytest.approx(expected, rel=1e-6)
+    with pytest.raises(IndeterminateError, match="too few digits"):
+        solve(graph, SolveOptions(determined=True, settled=1e-9, exact=False))
 
 
 def test_the_clique_after_all_below_it_beside_each_other() -> None:

@@ -32,7 +32,8 @@ def reweighted(result: Adjustment, by: FloatArray, settled: float, paid: Callabl
     if (factors != factors[0]).any():
         pairs = replace(batch, arrays=batch.arrays.with_sigmas_times(by), noise=NoiseCache(), _here=None)
         start = precision.solved.values
-        solved = solve(replace(graph, pairs=pairs), solve_options(NetworkOptions(settled=settled)), paid(), start)
+        how = replace(solve_options(NetworkOptions(settled=settled)), exact=False)
+        solved = solve(replace(graph, pairs=pairs), how, paid(), start)
         residual = pairs.jacobians(solved.values)[0]
         white = np.einsum("nij,nj->ni", pairs.arrays.whitening, residual)
         omega = float((white[pairs.arrays.used] ** 2).sum())

@@ -7,7 +7,6 @@ import io
 import re
 import sys
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ import numpy.typing as npt
 
 from adjust.model.arrays import BoolArray, FloatArray
 from adjust.model.errors import SurveyError
-from adjust.native.parallel import side_by_side, workers
+from adjust.native.parallel import side_by_side
 from survey.folder.ahead import LARGE
 from survey.folder.text import LARGEST_NUMBER, csv_text, utf8
 from survey.project.tables.reading import LARGEST_ROWS, Columns, Layout, TextColumn, check_header, check_rows, first_row
@@ -137,8 +136,7 @@ def csv_bytes(columns: Columns) -> bytes:
         _, ends, data = found.buffers()
         return bytes(data.slice(0, int(np.frombuffer(ends, np.int32)[len(found)])))
 
-    with ThreadPoolExecutor(workers()) as pool:
-        return b"".join(pool.map(rows, range(0, len(arrays[0]), _ROWS)))
+    return b"".join(side_by_side(rows, range(0, len(arrays[0]), _ROWS)))
 
 
 def _coded(column: Sequence[str] | TextColumn | FloatArray) -> TextColumn | FloatArray:
